@@ -1,19 +1,20 @@
-"""Conventions of the whole project, said once.
+"""Geometry of cameras and frames, and the conventions of the whole project.
 
-Transforms  `T_a_b` maps coordinates in b to coordinates in a: `p_a = T_a_b @ p_b`, so chains
-            cancel by eye: `T_map_camera = T_map_keyframe @ T_keyframe_camera`. A 4x4 float64
-            array in numerics; translation and quaternion wxyz on the wire.
-Frames      `camera`: x right, y down, z forward (optical). `odom`: continuous, but after a loss.
-            `map`: globally consistent, moves with corrections. `map` and `odom` start as the
-            first camera frame. (REP-105)
-Units       metres, radians, seconds; stamps are integer nanoseconds; depth is z, not range.
-            0 depth means "not measured".
-Pixels      centres are at integer coordinates: pixel (0, 0) covers [-0.5, 0.5]. Halving an image
-            averages 2x2 blocks, and maps a coordinate c to (c + 0.5) / 2 - 0.5, for colour, depth
-            and intrinsics alike.
-Tangents    6-vectors and 6x6 matrices are ordered rotation (rad), then translation (m), the order
-            of gtsam; perturbations multiply on the right: `T * exp(xi)`.
-Shapes      batches lead. N Gaussians or points, K keyframes, H W image, C classes, M matches.
+Transforms  `T_a_b` maps coordinates in b to coordinates in a: `p_a = T_a_b @ p_b`. Adjacent names
+            cancel in a chain: `T_map_camera = T_map_keyframe @ T_keyframe_camera`. Code uses 4x4
+            float64 arrays; messages use a translation and a quaternion wxyz.
+Frames      `camera`: x right, y down, z forward (optical). `odom`: continuous except after a
+            loss. `map`: globally consistent; changes with corrections. `map` and `odom` initially
+            equal the first camera frame. (REP-105)
+Units       Meters, radians, seconds. Stamps are integer nanoseconds. Depth is z, not range;
+            0 means "not measured".
+Pixels      Centers are at integer coordinates: pixel (0, 0) covers [-0.5, 0.5]. Halving an image
+            averages 2x2 blocks and maps a coordinate c to (c + 0.5) / 2 - 0.5. This applies to
+            color, depth and intrinsics alike.
+Tangents    6-vectors and 6x6 matrices are ordered rotation (rad), then translation (m), as in
+            gtsam. Perturbations multiply on the right: `T * exp(xi)`.
+Shapes      Batch dimensions come first. N: Gaussians or points, K: keyframes, H, W: image size,
+            C: classes, M: matches.
 """
 
 from .camera import Camera

@@ -17,7 +17,7 @@ def intersections(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def ious(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the intersection over union [K, R] of boxes [K, 4] and [R, 4]; 0 of empty boxes.
+    """Return the intersection over union [K, R] of boxes [K, 4] and [R, 4]; 0 for empty boxes.
 
     >>> ious(np.array([[0, 0, 2, 2]]), np.array([[1, 0, 3, 2], [5, 5, 6, 6]])).round(3)
     array([[0.333, 0.   ]])
@@ -33,10 +33,10 @@ def non_maximum_suppression(
     """Return which boxes to keep, highest score first.
 
     The search is greedy: a box is dropped if its intersection over union with a kept box of its
-    class exceeds `max_iou`. Equal scores are taken in the order of the arguments.
+    class exceeds `max_iou`. Boxes of equal scores are processed in the order of the arguments.
 
     Args:
-        boxes: Boxes, [M, 4]; coordinates above -1 where there are several classes.
+        boxes: Boxes, [M, 4]; with several classes, coordinates must be above -1.
         scores: Scores, [M]; at least 0.
         class_ids: Classes, [M]; at least 0. Boxes of different classes never suppress each other.
         max_iou: Largest overlap that two kept boxes may have, 0..1; compared in single precision.
@@ -45,6 +45,6 @@ def non_maximum_suppression(
         Indices of the kept boxes, [K] int64.
     """
     rectangles = np.hstack((boxes[:, :2], boxes[:, 2:] - boxes[:, :2]))
-    above = -1.0  # OpenCV keeps scores above a threshold; a score of 0 counts here.
+    above = -1.0  # OpenCV keeps scores above this threshold; a score of 0 must pass.
     kept = cv2.dnn.NMSBoxesBatched(rectangles, scores, class_ids, above, max_iou)  # type: ignore[call-overload]
     return np.array(kept, np.int64)

@@ -11,17 +11,22 @@ import numpy as np
 
 from ldo_service.errors import DataError
 
-MIN_FOCAL_RATIO, NARROWEST = 0.02, 100.0  # focal lengths over the side: 175 and 0.6 degrees of view
+# Bounds of focal length over image side: fields of view of 175 and 0.6 degrees.
+MIN_FOCAL_RATIO, NARROWEST = 0.02, 100.0
 
-FARTHEST_RADIUS = 4.0  # normalised, 76 degrees from the axis: no pinhole model reaches there
+# Maximum radius in normalized coordinates: 76 degrees from the axis, beyond any pinhole model.
+FARTHEST_RADIUS = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Intrinsics in pixels; pixel centres at integer coordinates.
+    """Pinhole camera: intrinsics in pixels, with pixel centers at integer coordinates.
 
     `distortion` holds OpenCV's coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]); a rectified
-    camera has none. Raises DataError for values that no camera has.
+    camera has none.
+
+    Raises:
+        DataError: A value is implausible for a camera.
     """
 
     width: int
@@ -35,38 +40,46 @@ class Camera:
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if self.width < 1 or self.height < 1:
-            raise DataError(f"camera of {self.width}x{self.height} pixels: both must be positive.")
+            raise DataError(f"camera size {self.width}x{self.height} must be at least 1x1 pixels.")
         if not all(isfinite(n) for n in numbers):
-            raise DataError(f"camera intrinsics {numbers} hold NaN or infinity: recalibrate.")
+            raise DataError(
+                f"camera intrinsics {numbers} contain NaN or infinity. Calibrate the camera again."
+            )
         for name, focal, side in (("fx", self.fx, self.width), ("fy", self.fy, self.height)):
             if not NARROWEST * side >= focal >= MIN_FOCAL_RATIO * side:
                 raise DataError(
-                    f"focal length {name}={focal:g} px does not go with an image of {side} px: no "
-                    "camera sees that little or that much. Is it in pixels, and of this image?"
+                    f"focal length {name}={focal:g} px is implausible for an image side of "
+                    f"{side} px: expected {MIN_FOCAL_RATIO * side:g} to {NARROWEST * side:g} px. "
+                    "Check that it is in pixels and for this resolution."
                 )
         if not (-self.width < self.cx < 2 * self.width):
-            raise DataError(f"cx={self.cx:g} px is far outside an image {self.width} px wide.")
+            raise DataError(
+                f"cx={self.cx:g} px is far outside the image, which is {self.width} px wide."
+            )
         if not (-self.height < self.cy < 2 * self.height):
-            raise DataError(f"cy={self.cy:g} px is far outside an image {self.height} px high.")
+            raise DataError(
+                f"cy={self.cy:g} px is far outside the image, which is {self.height} px high."
+            )
         if len(self.distortion) not in (0, 4, 5, 8):
             raise DataError(
-                f"{len(self.distortion)} distortion coefficients: OpenCV's models have 4, 5 or 8."
+                f"{len(self.distortion)} distortion coefficients are given, expected 0, 4, 5 or 8 "
+                "as in OpenCV's models."
             )
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> "Camera":
-        """The inverse of `dataclasses.asdict`, also where a list stands for the tuple."""
+        """Return the camera from the result of `dataclasses.asdict`; `distortion` may be a list."""
         return Camera(**{**values, "distortion": tuple(values["distortion"])})
 
     @property
     def matrix(self) -> np.ndarray:
-        """K [3, 3]."""
+        """Intrinsic matrix K [3, 3]."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def halved(self) -> "Camera":
-        """The camera of the image whose pixels are means of 2x2 blocks of this one's.
+        """Return the camera of the image halved by averaging 2x2 blocks.
 
-        Distortion acts on normalised coordinates, so its coefficients stay.
+        The distortion coefficients do not change, as they act on normalized coordinates.
         """
         return Camera(
             self.width // 2,
@@ -79,18 +92,19 @@ class Camera:
         )
 
     def rectified(self) -> "Camera":
-        """The same camera without lens distortion."""
+        """Return the camera without lens distortion."""
         return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def rays(self) -> np.ndarray:
-        """Viewing rays [H, W, 3] of all pixels; see `rays_at`."""
+        """Return the viewing rays [H, W, 3] of all pixels; see `rays_at`."""
         return self.rays_at(np.arange(self.width), np.arange(self.height)[:, None])
 
     def rays_at(self, u: np.ndarray | float, v: np.ndarray | float) -> np.ndarray:
-        """Return the viewing rays through pixels, of a camera without lens distortion.
+        """Return the viewing rays through pixels, without lens distortion.
 
         Args:
-            u, v: Columns and rows in pixels, of shapes that broadcast to [...].
+            u: Columns in pixels; broadcast with v to [...].
+            v: Rows in pixels; broadcast with u to [...].
 
         Returns:
             Rays with z = 1 in the camera frame, [..., 3] float64: `rays * depth_m` are points.
@@ -101,20 +115,24 @@ class Camera:
     def points_at(
         self, u: np.ndarray | float, v: np.ndarray | float, depth_m: np.ndarray | float
     ) -> np.ndarray:
-        """Return the points [..., 3] in meters, camera frame, that pixels show at a depth.
+        """Return the 3D points of pixels with depth, without lens distortion.
 
         Args:
-            u, v: Columns and rows in pixels, of shapes that broadcast to [...].
-            depth_m: Depth along the optical axis, [...].
+            u: Columns in pixels; broadcast with v to [...].
+            v: Rows in pixels; broadcast with u to [...].
+            depth_m: Depth along the optical axis, [...] meters.
+
+        Returns:
+            Points in the camera frame, [..., 3] meters.
         """
         return self.rays_at(u, v) * np.asarray(depth_m)[..., None]
 
     def backproject(self, depth_m: np.ndarray) -> np.ndarray:
-        """Camera points [H, W, 3] of a depth image [H, W]; the origin where depth is missing."""
+        """Return camera points [H, W, 3] of depth [H, W]; the origin where depth is missing."""
         return (self.rays() * depth_m[..., None]).astype(np.float32)
 
     def project(self, points_camera: np.ndarray) -> np.ndarray:
-        """Pixel coordinates [..., 2] of camera points [..., 3] with z > 0."""
+        """Return the pixel coordinates [..., 2] of camera points [..., 3] with z > 0."""
         z = points_camera[..., 2]
         return np.stack(
             [
@@ -127,7 +145,7 @@ class Camera:
 
 @lru_cache(maxsize=4)
 def rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Normalised coordinates x, y [H, W] float32 of the pixels, without the lens's distortion."""
+    """Return the normalized coordinates x, y [H, W] float32 of all pixels, undistorted."""
     if any(camera.distortion):
         u, v = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
         pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
@@ -141,9 +159,16 @@ def rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def project(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels u, v float32 of normalised coordinates x, y float32, by OpenCV's model of distortion.
+    """Project normalized coordinates with OpenCV's distortion model.
 
-    NaN beyond the radius at which the polynomial would fold the world back into the image.
+    Args:
+        x: Normalized coordinates, [...] float32.
+        y: Normalized coordinates, [...] float32.
+        camera: The camera, with its lens distortion.
+
+    Returns:
+        Pixels u, v, [...] float32; NaN beyond the radius at which the distortion polynomial turns
+        and would map far points back into the image.
     """
     if any(camera.distortion):
         x, y = _distorted(x, y, camera)
@@ -166,7 +191,7 @@ def _distorted(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray
 
 @lru_cache(maxsize=4)
 def _turning_r2(camera: Camera) -> float:
-    """Squared radius at which the lens's polynomial turns round, or where no lens looks anyway."""
+    """Return the squared radius where the distortion polynomial turns, or the maximum radius."""
     k1, k2, _, _, k3, k4, k5, k6 = _coefficients(camera)
     r = np.linspace(0.0, FARTHEST_RADIUS, 4001)
     r2 = r * r
@@ -176,5 +201,5 @@ def _turning_r2(camera: Camera) -> float:
 
 
 def _coefficients(camera: Camera) -> np.ndarray:
-    """k1 k2 p1 p2 k3 k4 k5 k6, zero where the camera's model has fewer."""
+    """Return k1 k2 p1 p2 k3 k4 k5 k6 [8]; 0 for those that the camera's model lacks."""
     return np.r_[camera.distortion, np.zeros(8)][:8]

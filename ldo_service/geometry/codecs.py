@@ -1,8 +1,9 @@
-"""Images as bytes: raw, JPEG, PNG, and depth compressed with zstd.
+"""Encoding and decoding of images: raw, JPEG, PNG, and depth compressed with zstd.
 
-The size that a PNG or JPEG announces is read before anything is decompressed: a kilobyte of JPEG
-may announce 20000x20000 pixels, for which a decoder allocates 2.3 GB, and 300 bytes of PNG a chunk
-of 4 GB, which OpenCV 5 allocates before it looks for it (both measured).
+The header of a PNG or JPEG is checked before decompression, which limits the memory that a small
+message can allocate. A kilobyte of JPEG may declare 20000x20000 pixels, for which a decoder
+allocates 2.3 GB. A PNG of 300 bytes may declare a chunk of 4 GB, which OpenCV 5 allocates before it
+reads the chunk (both measured).
 """
 
 import struct
@@ -18,12 +19,16 @@ PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
 START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # ITU T.81, table B.1
 
-ZSTD_LEVEL = 1  # 0.8 ms for a VGA depth image; 16-bit PNG takes 17 times that (measured)
+ZSTD_LEVEL = 1  # 0.8 ms for a VGA depth image; 16-bit PNG takes 17 times as long (measured).
 
 
 def read_image_size(data: memoryview) -> tuple[int, int] | None:
-    """Width and height in pixels; None for what is neither PNG nor JPEG, or breaks off before, or
-    is a PNG with a chunk that is longer than the file."""
+    """Read the size of a PNG or JPEG image from its header.
+
+    Returns:
+        Width and height in pixels. None if the data is neither PNG nor JPEG, if the header is
+        truncated, or if a PNG chunk is longer than the data.
+    """
     if bytes(data[:8]) == PNG and len(data) >= 24:
         width, height = struct.unpack(">II", data[16:24])
         return (width, height) if _has_whole_chunks(data) else None
@@ -33,8 +38,10 @@ def read_image_size(data: memoryview) -> tuple[int, int] | None:
 
 
 def _has_whole_chunks(data: memoryview) -> bool:
-    """Whether all of them lie in the file up to the last, which is `IEND`: length, name, content,
-    checksum."""
+    """Return whether all chunks of a PNG up to `IEND` lie within the data.
+
+    A chunk consists of length, name, content and checksum.
+    """
     position = len(PNG)
     while position + 12 <= len(data):
         length, name = struct.unpack(">I4s", data[position : position + 8])
@@ -45,11 +52,14 @@ def _has_whole_chunks(data: memoryview) -> bool:
 
 
 def _of_jpeg(data: memoryview) -> tuple[int, int] | None:
-    """Walk the segments up to the start of the frame: marker, length, content."""
+    """Read the size of a JPEG from its start-of-frame segment.
+
+    A segment consists of marker, length and content.
+    """
     position = 2
     while position + 9 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
-        if marker == 0xFF:  # a fill byte
+        if marker == 0xFF:  # Fill byte.
             position += 1
         elif marker in START_OF_FRAME:
             height, width = struct.unpack(">HH", data[position + 5 : position + 9])
@@ -60,7 +70,20 @@ def _of_jpeg(data: memoryview) -> tuple[int, int] | None:
 
 
 def decode_color(encoding: str, width: int, height: int, data: memoryview) -> np.ndarray:
-    """[H, W, 3] uint8 RGB. Raises FrameError for bytes that are no such image."""
+    """Decode a color image.
+
+    Args:
+        encoding: "rgb8", "bgr8", "jpeg" or "png".
+        width: Declared width in pixels.
+        height: Declared height in pixels.
+        data: The encoded image.
+
+    Returns:
+        [H, W, 3] uint8 RGB.
+
+    Raises:
+        FrameError: The data is not an image of this encoding and size.
+    """
     if encoding == "rgb8":
         return _pixels(data, np.uint8, (height, width, 3))
     if encoding == "bgr8":
@@ -70,11 +93,26 @@ def decode_color(encoding: str, width: int, height: int, data: memoryview) -> np
 
 
 def decode_depth(encoding: str, width: int, height: int, data: memoryview) -> np.ndarray:
-    """[H, W] uint16 or float32, as stored. Raises FrameError for bytes that are no such image."""
+    """Decode a depth image.
+
+    Args:
+        encoding: "png", "z16" or "f32", the last two optionally with "+zstd".
+        width: Declared width in pixels.
+        height: Declared height in pixels.
+        data: The encoded image.
+
+    Returns:
+        [H, W] uint16 or float32, in the stored unit.
+
+    Raises:
+        FrameError: The data is not an image of this encoding and size.
+    """
     if encoding == "png":
         depth = _decompress(data, cv2.IMREAD_UNCHANGED, encoding, width, height)
         if depth.dtype != np.uint16 or depth.ndim != 2:
-            raise FrameError(f"depth PNG holds {depth.dtype}{depth.shape}, must be 16-bit grey.")
+            raise FrameError(
+                f"depth PNG contains {depth.dtype}{depth.shape}, expected a 16-bit gray image."
+            )
         return depth
     dtype = np.uint16 if encoding.startswith("z16") else np.float32
     size = width * height * np.dtype(dtype).itemsize
@@ -83,13 +121,13 @@ def decode_depth(encoding: str, width: int, height: int, data: memoryview) -> np
 
 
 def encode_depth(depth: np.ndarray) -> tuple[Literal["z16+zstd", "f32+zstd"], bytes]:
-    """Encoding name and bytes of a depth image [H, W], uint16 or float32."""
+    """Compress a depth image [H, W] uint16 or float32, and return the encoding and the bytes."""
     compressed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(depth.tobytes())
     return ("z16+zstd" if depth.dtype == np.uint16 else "f32+zstd"), compressed
 
 
 def encode_jpeg(color: np.ndarray, quality: int = 95) -> bytes:
-    """JPEG of [H, W, 3] uint8 RGB."""
+    """Encode a color image [H, W, 3] uint8 RGB as JPEG."""
     bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, quality))
     return data.tobytes()
@@ -98,13 +136,14 @@ def encode_jpeg(color: np.ndarray, quality: int = 95) -> bytes:
 def _pixels(data: memoryview | bytes, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
     if len(data) != np.prod(shape) * np.dtype(dtype).itemsize:
         raise FrameError(
-            f"image has {len(data)} bytes, {np.dtype(dtype)}{shape} needs another count."
+            f"image has {len(data)} bytes, expected {np.prod(shape) * np.dtype(dtype).itemsize} "
+            f"for {np.dtype(dtype)}{shape}."
         )
     return np.frombuffer(data, dtype).reshape(shape)
 
 
 def _expand(data: memoryview, size: int) -> bytes:
-    """Decompress at most `size` bytes: a small message must not unpack to gigabytes."""
+    """Decompress at most `size` + 1 bytes, since a small message may expand to gigabytes."""
     try:
         return zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
     except zstandard.ZstdError as error:
@@ -112,10 +151,10 @@ def _expand(data: memoryview, size: int) -> bytes:
 
 
 def _decompress(data: memoryview, flags: int, encoding: str, width: int, height: int) -> np.ndarray:
-    """A header of another size is refused before memory is taken for it."""
+    """Decode a PNG or JPEG after checking the size in its header."""
     announced = read_image_size(data)
     if announced is None:
-        raise FrameError(f"{len(data)} bytes are no readable {encoding} image.")
+        raise FrameError(f"{len(data)} bytes of data are not a readable {encoding} image.")
     if announced != (width, height):
         raise FrameError(
             f"{encoding} image is {announced[0]}x{announced[1]}, announced as {width}x{height}."
@@ -125,7 +164,7 @@ def _decompress(data: memoryview, flags: int, encoding: str, width: int, height:
     except cv2.error as error:
         raise FrameError(f"{encoding} image cannot be decoded: {error.err}.") from error
     if image is None:
-        raise FrameError(f"{len(data)} bytes are no readable {encoding} image.")
+        raise FrameError(f"{len(data)} bytes of data are not a readable {encoding} image.")
     _require_size(image, width, height, encoding)
     return image
 
@@ -138,7 +177,7 @@ def _require_size(image: np.ndarray, width: int, height: int, encoding: str) -> 
 
 
 def shrunk(crop: np.ndarray, side_px: int) -> np.ndarray:
-    """With its longer side at most `side_px`."""
+    """Return an image scaled down so that its longer side is at most `side_px`."""
     height, width = crop.shape[:2]
     scale = side_px / max(height, width)
     if scale >= 1:

@@ -1,6 +1,6 @@
-"""RGB-D frames as cameras deliver them and as the numerics read them.
+"""RGB-D frames before and after rectification.
 
-A `RawFrame` is what a camera or a data set delivers; a `Rectifier` turns it into an `RgbdFrame`.
+A camera or a data set delivers a `RawFrame`; a `Rectifier` converts it to an `RgbdFrame`.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -17,35 +17,32 @@ from .camera import Camera
 
 @dataclass(frozen=True, slots=True)
 class RgbdFrame:
-    """Colour and depth on one pixel grid, from one rectified camera.
+    """Rectified frame: color and depth on one pixel grid.
 
-    color    [H, W, 3] uint8 RGB
-    depth_m  [H, W] float32, z in metres, 0 where not measured
-    stamp_ns time of the exposure
-    index    running number in its source
-    Raises FrameError when the arrays do not fit the camera or depth is NaN or negative.
+    Raises:
+        FrameError: An array does not fit the camera, or depth is NaN, infinite or negative.
     """
 
-    color: np.ndarray
-    depth_m: np.ndarray
+    color: np.ndarray  # [H, W, 3] uint8 RGB.
+    depth_m: np.ndarray  # [H, W] float32, z in meters; 0 where not measured.
     camera: Camera
-    stamp_ns: int = 0
-    index: int = 0
+    stamp_ns: int = 0  # Time of the exposure.
+    index: int = 0  # Running number of the frame in its source.
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
         if self.color.shape != (*size, 3) or self.color.dtype != np.uint8:
             raise FrameError(
-                f"frame {self.index}: colour is {self.color.dtype}{self.color.shape}, "
-                f"its camera says uint8{(*size, 3)}."
+                f"frame {self.index}: color is {self.color.dtype}{self.color.shape}, "
+                f"expected uint8{(*size, 3)} by the camera."
             )
         if self.depth_m.shape != size or self.depth_m.dtype != np.float32:
             raise FrameError(
                 f"frame {self.index}: depth is {self.depth_m.dtype}{self.depth_m.shape}, "
-                f"its camera says float32{size}."
+                f"expected float32{size} by the camera."
             )
         lowest, highest = float(self.depth_m.min()), float(self.depth_m.max())
-        if not (lowest >= 0.0 and highest < np.inf):  # NaN fails every comparison
+        if not (lowest >= 0.0 and highest < np.inf):  # NaN fails each comparison.
             raise FrameError(
                 f"frame {self.index}: depth must be finite and at least 0 (0 = not measured)."
             )
@@ -56,59 +53,64 @@ Maps = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, slots=True)
 class RawFrame:
-    """Colour and depth registered to it, as a camera delivers them: distorted, in its own units.
+    """Unrectified frame of a camera: color with lens distortion, and depth registered to it.
 
-    color       [H, W, 3] uint8 RGB
-    depth       [H, W] uint16, float32 or float64; z in 1/depth_scale metres; 0, NaN, infinite or
-                negative where not measured
-    depth_scale units of `depth` per metre
-    camera      with its lens distortion
-    stamp_ns    time of the exposure
-    Raises FrameError when the parts do not fit together.
+    Raises:
+        FrameError: The images, the camera and the depth scale do not fit together.
     """
 
-    index: int
-    stamp_ns: int
-    color: np.ndarray
+    index: int  # Running number of the frame in its source.
+    stamp_ns: int  # Time of the exposure.
+    color: np.ndarray  # [H, W, 3] uint8 RGB.
+    # [H, W] uint16, float32 or float64, z in 1/depth_scale meters; 0, NaN, infinite or negative
+    # where not measured.
     depth: np.ndarray
-    depth_scale: float
-    camera: Camera
+    depth_scale: float  # Units of `depth` per meter.
+    camera: Camera  # Intrinsics with lens distortion.
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
         if self.color.dtype != np.uint8 or self.color.shape[2:] != (3,):
             raise FrameError(
-                f"frame {self.index}: colour is {self.color.dtype}{self.color.shape}, "
+                f"frame {self.index}: color is {self.color.dtype}{self.color.shape}, "
                 "expected uint8[H, W, 3] RGB."
             )
         if self.depth.dtype not in (np.uint16, np.float32, np.float64) or self.depth.ndim != 2:
             raise FrameError(
                 f"frame {self.index}: depth is {self.depth.dtype}{self.depth.shape}, "
-                "expected uint16[H, W] or float32[H, W]."
+                "expected uint16[H, W], float32[H, W] or float64[H, W]."
             )
         if self.color.shape[:2] != self.depth.shape:
             raise FrameError(
-                f"frame {self.index}: colour is {_size(self.color)} and depth {_size(self.depth)} "
-                "pixels. Register the depth into the colour camera before sending."
+                f"frame {self.index}: color is {_size(self.color)} and depth {_size(self.depth)} "
+                "pixels. Register the depth to the color camera before sending it."
             )
         if self.depth.shape != size:
             raise FrameError(
                 f"frame {self.index}: images are {_size(self.depth)} pixels and the intrinsics "
-                f"are for {size[1]}x{size[0]}. Give the intrinsics of this resolution."
+                f"are for {size[1]}x{size[0]}. Use the intrinsics of this resolution."
             )
         if not (isfinite(self.depth_scale) and self.depth_scale > 0):
             raise FrameError(
                 f"frame {self.index}: depth_scale is {self.depth_scale}, expected the positive "
-                "number of depth units per metre (1000 for millimetres)."
+                "number of depth units per meter (1000 for millimeters)."
             )
 
     def depth_m(self) -> np.ndarray:
-        """Depth [H, W] float32 in metres, 0 where not measured."""
+        """Return the depth [H, W] float32 in meters; 0 where not measured."""
         return in_meters(self.depth, self.depth_scale)
 
 
 def in_meters(depth: np.ndarray, depth_scale: float) -> np.ndarray:
-    """Depth [H, W] float32 in metres, 0 where `depth`, in 1/depth_scale metres, is no distance."""
+    """Convert a depth image to meters.
+
+    Args:
+        depth: Depth, [H, W], in 1/depth_scale meters.
+        depth_scale: Units of `depth` per meter.
+
+    Returns:
+        [H, W] float32; 0 where `depth` is not positive and finite.
+    """
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         depth_m = depth.astype(np.float32) / np.float32(depth_scale)
         depth_m[~((depth_m > 0) & (depth_m < np.inf))] = 0.0
@@ -120,7 +122,10 @@ def _size(image: np.ndarray) -> str:
 
 
 def undistortion_maps(camera: Camera) -> Maps | None:
-    """Where each rectified pixel lies in the distorted image: u, v [H, W]; None: nowhere else."""
+    """Return the pixels u, v [H, W] of the distorted image at each rectified pixel.
+
+    Return None if the camera has no distortion.
+    """
     if not any(camera.distortion):
         return None
     K, coefficients = camera.matrix, np.array(camera.distortion)
@@ -130,11 +135,15 @@ def undistortion_maps(camera: Camera) -> Maps | None:
 
 
 def rectify(raw: RawFrame, maps: Maps | None) -> RgbdFrame:
-    """Remove lens distortion and units, keeping the intrinsic matrix.
+    """Remove the lens distortion of a frame and convert its depth to meters.
 
-    `maps` are `undistortion_maps(raw.camera)`. Colour is interpolated bilinearly; depth takes the
-    nearest pixel, since a mean across an edge is a surface that does not exist. Pixels that the
-    lens did not see are black with depth 0. Without distortion the colour array is shared.
+    The intrinsic matrix does not change. Color is interpolated bilinearly. Depth takes the nearest
+    pixel, since a mean across an edge is a surface that does not exist. Pixels outside the
+    distorted image are black with depth 0. Without distortion, the color array is shared.
+
+    Args:
+        raw: The frame.
+        maps: Result of `undistortion_maps(raw.camera)`.
     """
     color, depth_m = raw.color, raw.depth_m()
     if maps is not None:
@@ -144,7 +153,7 @@ def rectify(raw: RawFrame, maps: Maps | None) -> RgbdFrame:
 
 
 class Rectifier:
-    """`rectify` with the maps of the last camera kept: a camera rarely changes."""
+    """Rectification of frames that caches the undistortion maps of the last camera."""
 
     def __init__(self) -> None:
         self._camera: Camera | None = None

@@ -1,4 +1,4 @@
-"""Keyframe poses in the map, as one receiver knows them, and measured poses between keyframes.
+"""Keyframe poses in the map, and relative-pose measurements between keyframes.
 
 Conventions: `ldo_service.geometry`.
 """
@@ -13,25 +13,25 @@ import numpy as np
 from . import se3
 from .point_records import RecordTable
 
-APART_M = 100.0  # between submaps that are not joined: farther than depth cameras see
+APART_M = 100.0  # Distance between unmerged submaps: beyond the range of depth cameras.
 NO_REFERENCE = -1
 KEYFRAME = np.dtype(
     [
         ("id", np.int64),
-        ("reference", np.int64),  # that it was measured from
+        ("reference", np.int64),  # Keyframe that it was measured from.
         ("submap", np.int64),
-        ("T_map", float, (4, 4)),
-        ("T_reference", float, (4, 4)),  # T_reference_keyframe
-        ("T_odom", float, (4, 4)),  # T_odom_keyframe
+        ("T_map", float, (4, 4)),  # T_map_keyframe.
+        ("T_reference", float, (4, 4)),  # T_reference_keyframe.
+        ("T_odom", float, (4, 4)),  # T_odom_keyframe.
     ]
 )
 
 
 def T_map_submap(submap: int) -> np.ndarray:
-    """Where the odometry frame of a submap is put [4, 4] until it is joined to an older one.
+    """Return the provisional pose [4, 4] of a submap that is not merged with an older one.
 
-    Below, for a building goes on sideways, and far from all others, so that their surfaces do not
-    meet; float32 still resolves 0.1 mm in the tenth of them.
+    Unmerged submaps are placed below each other, as buildings extend sideways. They are far enough
+    apart that their surfaces do not touch; float32 still resolves 0.1 mm in the tenth of them.
     """
     T = np.eye(4)
     T[1, 3] = submap * APART_M
@@ -39,14 +39,14 @@ def T_map_submap(submap: int) -> np.ndarray:
 
 
 class KeyframePoses:
-    """T_map_keyframe by id, chained from relative measurements and replaced by corrections.
+    """Keyframe poses in the map by id, from relative poses and corrections of the pose graph.
 
-    Every receiver of keyframes keeps one. Two receivers that know the same keyframes and the same
-    correction agree, whatever the order in which these arrived. Grows by 0.4 kB a keyframe.
+    Each receiver of keyframes has one. Receivers with the same keyframes and the same correction
+    agree, whatever the order of their arrival. It grows by 0.4 kB per keyframe.
     """
 
     def __init__(self) -> None:
-        self.version = 0  # of the last correction
+        self.version = 0  # Version of the last correction.
         self._known = RecordTable(KEYFRAME)
 
     def __len__(self) -> int:
@@ -56,19 +56,19 @@ class KeyframePoses:
         return keyframe in self._known
 
     def __getitem__(self, keyframe: int) -> np.ndarray:
-        """T_map_keyframe [4, 4]."""
+        """Return T_map_keyframe [4, 4]."""
         return self._record(keyframe)["T_map"].copy()
 
     def __iter__(self) -> Iterator[int]:
-        """Ascending."""
+        """Iterate over the ids in ascending order."""
         return iter(self._known.ids.tolist())
 
     def of(self, keyframes: Collection[int]) -> np.ndarray:
-        """T_map_keyframe [n, 4, 4] of known ones."""
+        """Return T_map_keyframe [n, 4, 4] of the given keyframes that are known."""
         return self._known.all["T_map"][self._known.rows(keyframes)]
 
     def are_known(self, keyframes: Collection[int]) -> np.ndarray:
-        """[n] bool of n keyframes."""
+        """Return which of n keyframes are known, [n] bool."""
         return self._known.are_known(keyframes)
 
     def add(
@@ -79,10 +79,17 @@ class KeyframePoses:
         T_odom_keyframe: np.ndarray,
         submap: int = 0,
     ) -> np.ndarray:
-        """Place a new keyframe; its T_map_keyframe.
+        """Add a keyframe, and return its T_map_keyframe [4, 4].
 
-        A reference that is not known was missed: odometry to the newest known one of the submap
-        stands in.
+        If the reference is unknown because its message was missed, the pose comes from odometry
+        relative to the newest known keyframe of the submap.
+
+        Args:
+            keyframe: Id of the keyframe.
+            reference: Keyframe that it was measured from, if any.
+            T_reference_keyframe: Relative pose, [4, 4].
+            T_odom_keyframe: Pose in odometry, [4, 4].
+            submap: Submap of the keyframe.
         """
         measured_from = NO_REFERENCE if reference is None else reference
         measured = (measured_from, submap, np.eye(4), T_reference_keyframe, T_odom_keyframe)
@@ -93,7 +100,14 @@ class KeyframePoses:
         return self[keyframe]
 
     def place(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
-        """Put a known keyframe elsewhere, and its link with it, until a correction says more."""
+        """Set the pose of a known keyframe until the next correction.
+
+        Its relative pose to the reference changes accordingly.
+
+        Args:
+            keyframe: Id of the keyframe.
+            T_map_keyframe: New pose, [4, 4].
+        """
         record = self._record(keyframe)
         record["T_map"] = T_map_keyframe
         reference = int(record["reference"])
@@ -103,11 +117,15 @@ class KeyframePoses:
     def correct(
         self, version: int, T_map: Mapping[int, np.ndarray], held: Collection[int] = ()
     ) -> None:
-        """Take over a correction.
+        """Apply a correction of the pose graph; one older than the last changes nothing.
 
-        Keyframes that are newer than the newest it names are chained again from their references,
-        and so are those `held`, whose links are better than what the correction knew; one without
-        a known reference has no such link. An older correction than the last changes nothing.
+        The poses of keyframes newer than the correction are computed again from their references.
+
+        Args:
+            version: Version of the pose graph.
+            T_map: Corrected T_map_keyframe [4, 4] by id.
+            held: Keyframes with relative poses better than those that the correction was computed
+                from. Their poses are also computed again from their references, if these are known.
         """
         if version <= self.version or not T_map:
             return
@@ -126,14 +144,22 @@ class KeyframePoses:
             self._record(keyframe)["T_map"] = placed
 
     def _record(self, keyframe: int) -> np.void:
-        """To be read and written. Raises KeyError when it is not known."""
+        """Return a view of a record, to read and write it.
+
+        Raises:
+            KeyError: The keyframe is unknown.
+        """
         row = self._known.row(keyframe)
         if row is None:
             raise KeyError(keyframe)
         return self._known.all[row]
 
     def _placed(self, record: np.void, newest: int | None) -> np.ndarray:
-        """T_map_keyframe through its reference; without one through odometry from `newest`."""
+        """Compute T_map_keyframe [4, 4] of a record.
+
+        It follows from the reference if that is known, else from odometry relative to `newest`,
+        else from the provisional pose of the submap.
+        """
         reference = int(record["reference"])
         if reference in self:
             T_map = self[reference] @ record["T_reference"]
@@ -144,33 +170,35 @@ class KeyframePoses:
         return se3.orthonormalize(T_map)
 
     def _newest(self, submap: int, before: float = math.inf) -> int | None:
-        """The newest keyframe of a submap among those older than `before`."""
+        """Return the newest keyframe of a submap with an id below `before`, or None."""
         records = self._known.all
         known = records["id"][(records["id"] < before) & (records["submap"] == submap)]
         return int(known[-1]) if len(known) else None
 
     def keep_only(self, keyframes: Iterable[int]) -> None:
-        """Forget all others, for a receiver that needs a few."""
+        """Remove all other keyframes, for a receiver that needs only a few."""
         self._known.keep_only(keyframes)
 
     def T_map_odom(self, keyframe: int) -> np.ndarray:
-        """The odometry frame in the map [4, 4], as seen at a keyframe."""
+        """Return the odometry frame in the map [4, 4] at a keyframe."""
         record = self._record(keyframe)
         return record["T_map"] @ se3.inverse(record["T_odom"])
 
     def snapshot(self) -> dict[str, Any]:
+        """Return the version and the records as arrays."""
         return {"version": self.version, **self._known.columns()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a snapshot."""
         self.version = state["version"]
         self._known.restore(state)
 
 
 @dataclass(frozen=True, slots=True)
 class RelativePose:
-    """Measured T_a_b [4, 4] with its information [6, 6]: rotation, then translation, at b."""
+    """Relative-pose measurement between two keyframes."""
 
-    a: int
-    b: int
-    T_a_b: np.ndarray
-    information: np.ndarray
+    a: int  # Keyframe that the pose is relative to.
+    b: int  # Measured keyframe.
+    T_a_b: np.ndarray  # [4, 4]
+    information: np.ndarray  # [6, 6] for T_a_b * exp(xi): rotation, then translation.

@@ -1,4 +1,4 @@
-"""A table of records by id, in one array: for what is kept of each keyframe as long as the map."""
+"""Compact tables of records by id, for data of each keyframe in the map."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping
 from typing import Any
@@ -6,12 +6,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-MIN_ROOM = 64  # records
-GROWTH = 1.25  # at most a fifth of the room is empty
+MIN_ROOM = 64  # Minimum capacity in records.
+GROWTH = 1.25  # Growth of the capacity: at most a fifth of it is unused.
 
 
 class RecordTable:
-    """Records with a field `id`, ascending; so compact as a dict of arrays is not, by four."""
+    """Records in one array, sorted by their field `id`.
+
+    The table needs a quarter of the memory of a dict of arrays.
+    """
 
     def __init__(self, dtype: DTypeLike) -> None:
         self._room = np.zeros(MIN_ROOM, dtype)
@@ -25,28 +28,30 @@ class RecordTable:
 
     @property
     def all(self) -> np.ndarray:
-        """[N] records: writing to them writes to the table, until one is put or removed."""
+        """View of all records [N]; invalid once a record is added or removed."""
         return self._room[: self._count]
 
     @property
     def ids(self) -> np.ndarray:
+        """Ids [N] in ascending order."""
         return self.all["id"]
 
     def row(self, id_: int) -> int | None:
+        """Return the row of an id, or None if it is unknown."""
         row = int(np.searchsorted(self.ids, id_))
         return row if row < self._count and self.ids[row] == id_ else None
 
     def rows(self, ids: Iterable[int]) -> np.ndarray:
-        """Of those ids that are known, as often as they are named."""
+        """Return the rows of those ids that are known, in the given order with repetitions."""
         rows, is_known = self._found(ids)
         return rows[is_known]
 
     def are_known(self, ids: Iterable[int]) -> np.ndarray:
-        """[n] bool of n ids."""
+        """Return which of n ids are known, [n] bool."""
         return self._found(ids)[1]
 
     def _found(self, ids: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Rows [n] of n ids, and which of these are theirs [n] bool."""
+        """Return the rows [n] of n ids, and which of the ids are known [n] bool."""
         wanted = np.fromiter(ids, np.int64)
         rows = np.searchsorted(self.ids, wanted)
         is_known = rows < self._count
@@ -54,7 +59,12 @@ class RecordTable:
         return rows, is_known
 
     def put(self, id_: int, *values: Any) -> None:
-        """Its other fields, in their order; in place of what was known of it."""
+        """Add or replace a record.
+
+        Args:
+            id_: Id of the record.
+            *values: The other fields, in their order.
+        """
         row = int(np.searchsorted(self.ids, id_))
         if row == self._count or self.ids[row] != id_:
             self._make_room(row)
@@ -68,7 +78,11 @@ class RecordTable:
         self._count += 1
 
     def remove(self, id_: int) -> None:
-        """Raises KeyError when it is not known."""
+        """Remove a record.
+
+        Raises:
+            KeyError: The id is unknown.
+        """
         row = self.row(id_)
         if row is None:
             raise KeyError(id_)
@@ -76,20 +90,21 @@ class RecordTable:
         self._count -= 1
 
     def keep_only(self, ids: Iterable[int]) -> None:
+        """Remove all records except those of the given ids."""
         self.replace_all(self.all[np.sort(np.unique(self.rows(ids)))])
 
     def replace_all(self, records: np.ndarray) -> None:
-        """Exactly these [N], ids ascending."""
+        """Replace the table by records [N] in ascending order of their ids."""
         room = np.zeros(max(MIN_ROOM, len(records)), self._room.dtype)
         room[: len(records)] = records
         self._room, self._count = room, len(records)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """A copy, by the name of the field."""
+        """Return a copy of the table as arrays by the name of the field."""
         return {name: self.all[name].copy() for name in self._room.dtype.names or ()}
 
     def restore(self, columns: Mapping[str, np.ndarray]) -> None:
-        """The inverse of `columns`."""
+        """Replace the table by the result of `columns`."""
         records: np.ndarray = np.zeros(len(columns["id"]), self._room.dtype)
         for name in records.dtype.names or ():
             records[name] = columns[name]
@@ -97,13 +112,17 @@ class RecordTable:
 
 
 class PoseTable(MutableMapping[int, np.ndarray]):
-    """Transforms [4, 4] by id, ascending, in 136 bytes each."""
+    """Transforms [4, 4] by ascending id, in 136 bytes each."""
 
     def __init__(self) -> None:
         self._records = RecordTable([("id", np.int64), ("T", float, (4, 4))])
 
     def __getitem__(self, id_: int) -> np.ndarray:
-        """A copy. Raises KeyError."""
+        """Return a copy of a transform.
+
+        Raises:
+            KeyError: The id is unknown.
+        """
         row = self._records.row(id_)
         if row is None:
             raise KeyError(id_)
@@ -125,9 +144,9 @@ class PoseTable(MutableMapping[int, np.ndarray]):
         return id_ in self._records
 
     def of(self, ids: Iterable[int]) -> np.ndarray:
-        """[n, 4, 4] of known ones."""
+        """Return the transforms [n, 4, 4] of those ids that are known."""
         return self._records.all["T"][self._records.rows(ids)]
 
     def become(self, ids: Collection[int], T: np.ndarray) -> None:
-        """Exactly these, ids ascending."""
+        """Replace the table by transforms [n, 4, 4] with ascending ids."""
         self._records.restore({"id": np.fromiter(ids, np.int64), "T": T})

@@ -9,35 +9,43 @@ from ldo_service.errors import FrameError
 
 from .camera import Camera, project, rays
 
-SAME_SURFACE = 0.05  # neighbouring depths closer than this fraction of depth are one surface
-TIE_PX = 1e-3  # cells overlap by this much, so that float32 leaves no seam between them
-MAX_STRETCH = 2.0  # of a cell against its nominal size
+SAME_SURFACE = 0.05  # Maximum difference of neighboring depths on one surface, fraction of depth.
+TIE_PX = 1e-3  # Overlap of neighboring cells, so that float32 rounding leaves no gap.
+MAX_STRETCH = 2.0  # Maximum size of a cell relative to its nominal size.
 
 
 def register_depth(
     depth_m: np.ndarray, depth_camera: Camera, color_camera: Camera, T_color_depth: np.ndarray
 ) -> np.ndarray:
-    """Depth as the colour camera would measure it, with that camera's lens distortion.
+    """Register a depth image to the color camera, including the lens distortion of that camera.
 
-    Each measured pixel is a cell, `fx_color / fx_depth * z_depth / z_color` pixels wide, around
+    Each measured pixel is a cell that is `fx_color / fx_depth * z_depth / z_color` pixels wide. Its
+    center is
 
-        project_color(T_color_depth @ (ray_depth * depth_m)),
+        project_color(T_color_depth @ (ray_depth * depth_m)).
 
-    stretched to halfway to its neighbours where they lie on the same surface, so that neither a
-    finer colour image nor a slanted surface shows pinholes. The nearest cell wins a pixel, and a
-    pixel has one cell's depth: no surface is interpolated.
+    A cell is stretched halfway to its neighbors on the same surface, so that neither a finer color
+    image nor a slanted surface has holes. A pixel takes the depth of the nearest cell that covers
+    it; depth is not interpolated. The result is deterministic, as a minimum does not depend on the
+    order of the pixels.
 
-    depth_m        [Hd, Wd] z in metres, 0 where not measured; distorted as `depth_camera` says
-    T_color_depth  [4, 4] from depth to colour coordinates
-    Returns [Hc, Wc] float32, z in metres in the colour camera, 0 where nothing lands. A surface
-    that only the colour camera sees stays empty. Rectify it together with the colour image.
-    Raises FrameError when the depth image is not of its camera's size. Deterministic: a minimum
-    does not depend on the order of the pixels.
+    Args:
+        depth_m: Depth, [Hd, Wd], z in meters; 0 where not measured. Distorted as `depth_camera`.
+        depth_camera: Intrinsics of the depth image.
+        color_camera: Intrinsics of the color image.
+        T_color_depth: Transform from depth to color coordinates, [4, 4].
+
+    Returns:
+        [Hc, Wc] float32, z in meters in the color camera; 0 where no cell lands, as on surfaces
+        that only the color camera sees. Rectify it together with the color image.
+
+    Raises:
+        FrameError: The depth image has another size than its camera.
     """
     if depth_m.shape != (depth_camera.height, depth_camera.width):
         raise FrameError(
             f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} pixels and its camera "
-            f"{depth_camera.width}x{depth_camera.height}. Give the intrinsics of this resolution."
+            f"{depth_camera.width}x{depth_camera.height}. Use the intrinsics of this resolution."
         )
     depth_m = np.asarray(depth_m, np.float32)
     x, y, z = _points(depth_m, depth_camera, T_color_depth)
@@ -58,7 +66,7 @@ def register_depth(
 def _points(
     depth_m: np.ndarray, depth_camera: Camera, T_color_depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, y, z [Hd, Wd] float32 in the colour camera."""
+    """Return x, y, z [Hd, Wd] float32 of the depth pixels in the color camera, in meters."""
     ray_x, ray_y = rays(depth_camera)
     R, t = T_color_depth[:3, :3].astype(np.float32), T_color_depth[:3, 3].astype(np.float32)
     x, y, z = (
@@ -68,13 +76,13 @@ def _points(
 
 
 def _same_surface(z: np.ndarray, is_seen: np.ndarray, axis: int) -> np.ndarray:
-    """Whether a pixel and the next one along `axis` are seen and on one surface."""
+    """Return which pixels and their next ones along `axis` are both seen and on one surface."""
     (first, second), (a, b) = _neighbors(z, axis), _neighbors(is_seen, axis)
     return a & b & (np.abs(second - first) < SAME_SURFACE * first)
 
 
 def _neighbors(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Views of each pixel with a next one along `axis`, and of that next one."""
+    """Return views of the pixels with a next one along `axis`, and of these next ones."""
     return (image[:, :-1], image[:, 1:]) if axis == 1 else (image[:-1], image[1:])
 
 
@@ -85,10 +93,20 @@ def _covered(
     axis: int,
     size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """First and last pixel [Hd, Wd] int32 of the cells in one direction, cut at the image.
+    """Compute the range of pixels that each cell covers in one direction.
 
-    A cell of nominal `half` reaches halfway to its neighbours along `axis` and, since a surface
-    may be sheared, by half of what the next ones across differ.
+    A cell reaches halfway to its neighbors along `axis`. As a surface may be sheared, it also
+    extends by half the difference of its center to those of its neighbors across `axis`.
+
+    Args:
+        center: Centers of the cells in this direction, [Hd, Wd] pixels.
+        half: Half of the nominal size of the cells, [Hd, Wd] pixels.
+        is_joined: Which neighbors along axes 0 and 1 are on the same surface.
+        axis: Array axis of the direction.
+        size: Size of the color image in this direction, pixels.
+
+    Returns:
+        First and last pixel of each cell, [Hd, Wd] int32, clipped to the image.
     """
     before, after = half.copy(), half.copy()
     along = _half_gap(center, is_joined[axis], axis)
@@ -108,7 +126,7 @@ def _covered(
 
 
 def _half_gap(center: np.ndarray, is_joined: np.ndarray, axis: int) -> np.ndarray:
-    """Half of how far neighbours along `axis` lie apart; 0 where a surface ends between them."""
+    """Return half the distance of neighboring centers along `axis`; 0 at surface boundaries."""
     here, there = _neighbors(center, axis)
     return 0.5 * np.abs(there - here) * is_joined
 
@@ -120,7 +138,7 @@ def _nearest(
     rows: tuple[np.ndarray, np.ndarray],
     shape: tuple[int, int],
 ) -> np.ndarray:
-    """The smallest z of the cells that cover each pixel; 0 where there is none."""
+    """Return the smallest z of the cells that cover each pixel; 0 without any."""
     is_inside = is_seen & (columns[0] <= columns[1]) & (rows[0] <= rows[1])
     z, u, last_u, v, last_v = (a[is_inside] for a in (z, *columns, *rows))
     nearest = np.full(shape[0] * shape[1], np.inf, np.float32)
@@ -133,7 +151,7 @@ def _nearest(
 
 
 def _cover_row(nearest: np.ndarray, z: np.ndarray, pixel: np.ndarray, more: np.ndarray) -> None:
-    """Lower `nearest` to z at `pixel` and the `more` pixels to its right."""
+    """Reduce `nearest` to z, where that is smaller, at `pixel` and `more` pixels to its right."""
     while len(z):
         np.minimum.at(nearest, pixel, z)
         wider = more > 0
@@ -143,16 +161,27 @@ def _cover_row(nearest: np.ndarray, z: np.ndarray, pixel: np.ndarray, more: np.n
 def resample_color(
     color: np.ndarray, color_camera: Camera, depth_camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colour as the depth camera would see it, for two cameras of one centre and orientation.
+    """Resample a color image to the depth camera, for cameras of equal center and orientation.
 
-    Halved while it is more than 1.5 times finer, then interpolated bilinearly: no aliasing.
-    color [Hc, Wc, 3] uint8. Returns the image [Hd, Wd, 3] uint8 and is_seen [Hd, Wd] bool, false
-    where the colour camera does not look. Raises FrameError when sizes disagree.
+    The image is halved while it is more than 1.5 times finer and then interpolated bilinearly,
+    which avoids aliasing.
+
+    Args:
+        color: Color image, [Hc, Wc, 3] uint8.
+        color_camera: Intrinsics of the color image.
+        depth_camera: Intrinsics of the depth image.
+
+    Returns:
+        The image [Hd, Wd, 3] uint8, and is_seen [Hd, Wd] bool, which is False outside the field of
+        view of the color camera.
+
+    Raises:
+        FrameError: The color image has another size than its camera.
     """
     if color.shape[:2] != (color_camera.height, color_camera.width):
         raise FrameError(
-            f"colour is {color.shape[1]}x{color.shape[0]} pixels and its camera "
-            f"{color_camera.width}x{color_camera.height}. Give the intrinsics of this resolution."
+            f"color is {color.shape[1]}x{color.shape[0]} pixels and its camera "
+            f"{color_camera.width}x{color_camera.height}. Use the intrinsics of this resolution."
         )
     while min(color_camera.fx / depth_camera.fx, color_camera.fy / depth_camera.fy) > 1.5:
         color, color_camera = _halved(color), color_camera.halved()
@@ -172,7 +201,11 @@ def _halved(color: np.ndarray) -> np.ndarray:
 def _color_of_depth_pixels(
     color_camera: Camera, depth_camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where in the colour image each depth pixel lies: u, v [Hd, Wd] float32; whether inside."""
+    """Project the depth pixels into the color image.
+
+    Returns:
+        u, v [Hd, Wd] float32 in pixels, and which of them are inside the image [Hd, Wd] bool.
+    """
     u, v = project(*rays(depth_camera), color_camera)
     width, height = color_camera.width, color_camera.height
     with np.errstate(invalid="ignore"):

@@ -1,7 +1,7 @@
 """Rigid transforms as 4x4 float64 arrays. Conventions: `ldo_service.geometry`.
 
-Besides the group's maps: interpolation between many transforms at once, and the least-squares
-transform between corresponding points (Umeyama, PAMI 1991).
+It contains the maps of the group SE(3) and conversions of rotations. It also interpolates many
+transforms at once and fits a transform to corresponding points (Umeyama, PAMI 1991).
 """
 
 import numpy as np
@@ -11,21 +11,21 @@ Array = np.ndarray
 
 
 def skew(v: Array) -> Array:
-    """Matrix [3, 3] of the cross product: `skew(v) @ w == cross(v, w)`."""
+    """Return the matrix [3, 3] of the cross product: `skew(v) @ w == cross(v, w)`."""
     x, y, z = v
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def exp(xi: Array) -> Array:
-    """Transform [4, 4] of the tangent vector xi [6] (rotation rad, translation m)."""
+    """Return the transform [4, 4] of a tangent vector xi [6] (rotation rad, translation m)."""
     omega, v = np.asarray(xi[:3], float), np.asarray(xi[3:], float)
     theta = float(np.linalg.norm(omega))
     W = skew(omega)
-    if theta < 1e-6:  # second-order series: error below 1e-18
+    if theta < 1e-6:  # Second-order series with an error below 1e-18.
         a, b, c = 1.0 - theta**2 / 6, 0.5 - theta**2 / 24, 1.0 / 6 - theta**2 / 120
     else:
         a = np.sin(theta) / theta
-        b = 2.0 * (np.sin(theta / 2) / theta) ** 2  # 1 - cos would lose digits near zero
+        b = 2.0 * (np.sin(theta / 2) / theta) ** 2  # 1 - cos would lose digits near zero.
         c = (1.0 - a) / theta**2
     T = np.eye(4)
     T[:3, :3] += a * W + b * W @ W
@@ -34,11 +34,11 @@ def exp(xi: Array) -> Array:
 
 
 def log(T: Array) -> Array:
-    """Tangent vector [6] of T [4, 4]; the inverse of `exp` for rotations below pi."""
+    """Return the tangent vector [6] of T [4, 4]; the inverse of `exp` for rotations below pi."""
     omega = Rotation.from_matrix(T[:3, :3]).as_rotvec()
     theta = float(np.linalg.norm(omega))
     W = skew(omega)
-    if theta < 1e-4:  # the closed form loses digits here; the series is exact to 1e-17
+    if theta < 1e-4:  # The closed form loses digits here; the series is exact to 1e-17.
         d = 1.0 / 12 + theta**2 / 720
     else:
         d = (1.0 - theta * np.cos(theta / 2) / (2 * np.sin(theta / 2))) / theta**2
@@ -46,7 +46,7 @@ def log(T: Array) -> Array:
 
 
 def inverse(T: Array) -> Array:
-    """T_b_a of T_a_b; `T` [..., 4, 4] must hold proper rotations."""
+    """Return the inverse [..., 4, 4] of transforms; T must contain proper rotations."""
     out = np.zeros_like(T, dtype=float)
     R_t = np.swapaxes(T[..., :3, :3], -1, -2)
     out[..., :3, :3] = R_t
@@ -56,7 +56,7 @@ def inverse(T: Array) -> Array:
 
 
 def orthonormalize(T: Array) -> Array:
-    """T [4, 4] with the nearest rotation; chains of products leave the group without it."""
+    """Return T [4, 4] with the nearest rotation, since rounding errors of products accumulate."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)
     out[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
@@ -65,7 +65,7 @@ def orthonormalize(T: Array) -> Array:
 
 
 def adjoint(T: Array) -> Array:
-    """Adj [6, 6] with `T * exp(xi) == exp(Adj @ xi) * T`."""
+    """Return the adjoint Adj [6, 6] with `T * exp(xi) == exp(Adj @ xi) * T`."""
     R, t = T[:3, :3], T[:3, 3]
     out = np.zeros((6, 6))
     out[:3, :3] = out[3:, 3:] = R
@@ -74,12 +74,12 @@ def adjoint(T: Array) -> Array:
 
 
 def rotation_angle(T: Array) -> float:
-    """Angle of the rotation of T [4, 4] in radians, 0..pi."""
+    """Return the rotation angle of T [4, 4] in radians, 0..pi."""
     return float(rotation_angles(T))
 
 
 def rotation_angles(T: Array) -> Array:
-    """Angles [...] of the rotations of T [..., 4, 4] in radians, 0..pi."""
+    """Return the rotation angles [...] of T [..., 4, 4] in radians, 0..pi."""
     R = T[..., :3, :3]
     pairs = ((2, 1), (0, 2), (1, 0))
     twice_sin = np.stack([R[..., i, j] - R[..., j, i] for i, j in pairs], axis=-1)
@@ -88,12 +88,12 @@ def rotation_angles(T: Array) -> Array:
 
 
 def distances(T: Array) -> Array:
-    """Lengths [...] of the translations of T [..., 4, 4]."""
+    """Return the lengths [...] of the translations of T [..., 4, 4]."""
     return np.linalg.norm(T[..., :3, 3], axis=-1)
 
 
 def transform(T: Array, points: Array) -> Array:
-    """`points` [..., 3] in frame b, mapped by T_a_b [4, 4] to frame a."""
+    """Return points [..., 3] of frame b mapped by T_a_b [4, 4] to frame a."""
     return points @ T[:3, :3].T + T[:3, 3]
 
 
@@ -101,16 +101,16 @@ def quaternion(R: Array) -> Array:
     """Return the unit quaternions wxyz [..., 4], w >= 0, of rotations R [..., 3, 3].
 
     Raises:
-        ValueError: A matrix has a determinant that is not positive, so it is no rotation.
+        ValueError: A matrix is not a rotation: its determinant is not positive.
     """
-    if not R.size:  # Some of the admitted versions of SciPy refuse an empty batch.
+    if not R.size:  # Some supported versions of SciPy reject an empty batch.
         return np.zeros((*R.shape[:-2], 4))
     xyzw = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(canonical=True)
     return np.roll(xyzw, 1, axis=-1).reshape(*R.shape[:-2], 4)
 
 
 def rotation(q: Array) -> Array:
-    """Rotation [..., 3, 3] of the quaternions q [..., 4] wxyz, which need not be normalised."""
+    """Return the rotations [..., 3, 3] of quaternions wxyz [..., 4], normalized or not."""
     q = np.asarray(q)
     unit = q / np.linalg.norm(q, axis=-1, keepdims=True)
     w, x, y, z = np.moveaxis(unit, -1, 0)
@@ -128,7 +128,7 @@ def rotation(q: Array) -> Array:
 
 
 def from_quaternion(translation: Array, q: Array) -> Array:
-    """T [4, 4] of a translation [3] in metres and a quaternion wxyz [4]."""
+    """Return T [4, 4] of a translation [3] in meters and a quaternion wxyz [4]."""
     T = np.eye(4)
     T[:3, :3] = rotation(np.asarray(q, float))
     T[:3, 3] = translation
@@ -138,26 +138,44 @@ def from_quaternion(translation: Array, q: Array) -> Array:
 def transforms_differ(
     T_a: np.ndarray, T_b: np.ndarray, distance_m: float, angle_rad: float
 ) -> np.ndarray:
-    """Mask [K] of the pairs of transforms [K, 4, 4] that are further apart, or turned by more."""
+    """Return which pairs of transforms differ by more than a distance or an angle.
+
+    Args:
+        T_a: Transforms, [K, 4, 4].
+        T_b: Transforms, [K, 4, 4].
+        distance_m: Maximum distance.
+        angle_rad: Maximum angle.
+
+    Returns:
+        [K] bool.
+    """
     T_a, T_b = np.reshape(T_a, (-1, 4, 4)), np.reshape(T_b, (-1, 4, 4))
     apart_m = np.linalg.norm(T_a[:, :3, 3] - T_b[:, :3, 3], axis=1)
-    # |R_a - R_b| = 2 sqrt(2) sin(angle / 2): unlike the trace it loses no digits at small angles
+    # |R_a - R_b| = 2 sqrt(2) sin(angle / 2); unlike the trace, it keeps all digits at small angles.
     chord = np.linalg.norm(T_a[:, :3, :3] - T_b[:, :3, :3], axis=(1, 2))
     turned_rad = 2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1))
     return (apart_m > distance_m) | (turned_rad > angle_rad)
 
 
 def interpolate(T_a: np.ndarray, T_b: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """T [N, 4, 4] that lie `share` [N] of the way from T_a to T_b [N, 4, 4]: 0 is T_a, 1 is T_b.
+    """Interpolate between pairs of transforms.
 
         T = T_a (exp(s omega), s t),   (exp(omega), t) = T_a^-1 T_b
 
-    Turned about one axis at an even rate, moved along a straight line. Each of the N by itself: the
-    same bits whatever the others are.
+    The rotation is about one axis at a constant rate; the translation is on a straight line. Each
+    result is bitwise independent of the other pairs.
+
+    Args:
+        T_a: Transforms at s = 0, [N, 4, 4].
+        T_b: Transforms at s = 1, [N, 4, 4].
+        share: Parameters s, [N].
+
+    Returns:
+        [N, 4, 4].
     """
     T_a_b = inverse(T_a) @ T_b
     part = np.zeros_like(T_a_b)
-    if len(T_a_b):  # Some of the admitted versions of SciPy refuse an empty batch.
+    if len(T_a_b):  # Some supported versions of SciPy reject an empty batch.
         omega = Rotation.from_matrix(T_a_b[:, :3, :3]).as_rotvec()
         part[:, :3, :3] = Rotation.from_rotvec(share[:, None] * omega).as_matrix()
     part[:, :3, 3] = share[:, None] * T_a_b[:, :3, 3]
@@ -166,10 +184,17 @@ def interpolate(T_a: np.ndarray, T_b: np.ndarray, share: np.ndarray) -> np.ndarr
 
 
 def fit_rigid_transform(points: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """T_target_points [4, 4] minimising sum |T p_k - q_k|^2 over p, q [M, 3], without scale.
+    """Fit a rigid transform between corresponding points, without scale.
 
-    Umeyama, PAMI 1991, eq. 40-42, with the reflection guarded. Points on one line leave the
-    rotation about it free; the residuals are the smallest all the same.
+    It minimizes sum |T p_k - q_k|^2 (Umeyama, PAMI 1991, eq. 40-42) and excludes reflections. If
+    the points are on one line, the rotation about it is arbitrary; the residuals are minimal too.
+
+    Args:
+        points: Points p, [M, 3].
+        target: Corresponding points q, [M, 3].
+
+    Returns:
+        T_target_points, [4, 4].
     """
     mean_p, mean_q = points.mean(axis=0), target.mean(axis=0)
     U, _, Vt = np.linalg.svd((target - mean_q).T @ (points - mean_p))

@@ -1,4 +1,4 @@
-"""Sequences of RGB-D frames, and the ground truth that may come with them."""
+"""Sequences of RGB-D frames with optional ground truth."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -13,34 +13,31 @@ VOID_NAMES = frozenset({"", "undefined", "unknown", "unlabeled", "unlabelled", "
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FrameLabels:
-    """What each pixel shows.
+    """Ground-truth labels of the pixels of a frame."""
 
-    class_ids      [H, W] uint8, index into the class names of the data set
-    instance_ids   [H, W] uint16, one number for each object; 0 for what is none
-    """
-
-    class_ids: np.ndarray
-    instance_ids: np.ndarray
+    class_ids: np.ndarray  # [H, W] uint8, index into the class names of the data set.
+    instance_ids: np.ndarray  # [H, W] uint16, one number per object; 0 without an object.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TrueLabels:
-    """class_names  by class id; pixels of those among VOID_NAMES may be anything
-    frame        the labels of frame `index`, on its pixels; raises FrameError"""
+    """Ground-truth labels of a sequence."""
 
-    class_names: tuple[str, ...]
-    frame: Callable[[int], FrameLabels]
+    class_names: tuple[str, ...]  # Indexed by class id; classes in VOID_NAMES mean no label.
+    frame: Callable[[int], FrameLabels]  # Labels of a frame by its index; raises FrameError.
 
 
 class Sequence(ABC):
-    """RGB-D frames in order of their stamps, from one camera.
+    """RGB-D frames of one camera in the order of their stamps.
 
-    `read(i)` gives what the camera delivered, for a publisher; `sequence[i]` the rectified frame,
-    for the numerics. Both raise FrameError for a frame that cannot be read: skip and count it.
+    `read(i)` returns the frame as the camera delivered it, for a publisher. `sequence[i]` returns
+    the rectified frame, for tracking and mapping. Both raise FrameError for a frame that cannot be
+    read; callers skip and count it.
 
-    name        what to call it in tables
-    raw_camera  intrinsics with lens distortion
-    stamps_ns   [len] int64, ascending
+    Attributes:
+        name: Name of the sequence in tables.
+        raw_camera: Intrinsics with lens distortion.
+        stamps_ns: Stamps, [len] int64, ascending.
     """
 
     def __init__(self, name: str, raw_camera: Camera, stamps_ns: np.ndarray) -> None:
@@ -51,14 +48,25 @@ class Sequence(ABC):
 
     @abstractmethod
     def read(self, index: int) -> RawFrame:
-        """Frame `index` in 0..len-1 as the camera delivered it. Raises FrameError."""
+        """Return a frame as the camera delivered it.
+
+        Args:
+            index: Number of the frame, 0..len-1.
+
+        Raises:
+            FrameError: The frame cannot be read.
+        """
 
     @abstractmethod
     def truth(self) -> Trajectory | None:
-        """True `T_world_camera`, in a world of the data set's choice; None where unknown."""
+        """Return the ground-truth `T_world_camera` in the data set's world frame, or None."""
 
     def true_labels(self) -> TrueLabels | None:
-        """What the pixels show; None where unknown. Raises DataError for files that are broken."""
+        """Return the ground-truth labels, or None without labels.
+
+        Raises:
+            DataError: A file of the labels is invalid.
+        """
         return None
 
     @property
@@ -79,7 +87,7 @@ class Sequence(ABC):
 
 
 class Cached(Sequence):
-    """A sequence whose frames are read once and then kept in memory: for short ones."""
+    """Sequence that keeps all frames in memory after the first read; for short sequences."""
 
     def __init__(self, sequence: Sequence) -> None:
         super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns)
@@ -87,12 +95,15 @@ class Cached(Sequence):
         self._frames: dict[int, RawFrame] = {}
 
     def read(self, index: int) -> RawFrame:
+        """Return a frame; see `Sequence.read`."""
         if index not in self._frames:
             self._frames[index] = self._sequence.read(index)
         return self._frames[index]
 
     def truth(self) -> Trajectory | None:
+        """Return the ground-truth trajectory, or None."""
         return self._sequence.truth()
 
     def true_labels(self) -> TrueLabels | None:
+        """Return the ground-truth labels, or None."""
         return self._sequence.true_labels()

@@ -1,4 +1,4 @@
-"""Association of measurements by their time stamps, online and between complete lists.
+"""Association of measurements by their time stamps, online and for complete lists.
 
 Conventions: `ldo_service.geometry`.
 """
@@ -13,15 +13,25 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, FrameError
 
-REMEMBERED_INTERVALS = 8  # the smallest of them is the stream's period: dropped halves make longer
-RECENT_PAIRS = 200  # that the statistics of skew are taken over: 7 s at 30 Hz
+# Number of recent intervals; the smallest one is the period of the stream, as drops cause longer
+# ones.
+REMEMBERED_INTERVALS = 8
+RECENT_PAIRS = 200  # Number of pairs in the skew statistics: 7 s at 30 Hz.
 
 
 def associate(stamps_a: np.ndarray, stamps_b: np.ndarray, tolerance: float) -> np.ndarray:
-    """Index pairs [M, 2] of stamps at most `tolerance` apart, each used once, ascending in a.
+    """Match the stamps of two lists.
 
-    The closest pair is taken first, then the closest of what is left, as TUM's `associate.py`
-    does. Both lists may be unsorted; all three arguments share one unit (ns or s).
+    The search is greedy as in TUM's `associate.py`: the closest pair is matched first, then the
+    closest of the remaining stamps. All arguments have the same unit (ns or s).
+
+    Args:
+        stamps_a: Stamps, [A], sorted or not.
+        stamps_b: Stamps, [B], sorted or not.
+        tolerance: Maximum distance of the stamps of a pair.
+
+    Returns:
+        Index pairs (a, b), [M, 2], ascending in a; each stamp occurs at most once.
     """
     candidates = _candidates(stamps_a, stamps_b, tolerance)
     gaps = np.abs(stamps_a[candidates[:, 0]] - stamps_b[candidates[:, 1]])
@@ -35,7 +45,7 @@ def associate(stamps_a: np.ndarray, stamps_b: np.ndarray, tolerance: float) -> n
 
 
 def _candidates(stamps_a: np.ndarray, stamps_b: np.ndarray, tolerance: float) -> np.ndarray:
-    """All index pairs [C, 2] at most `tolerance` apart."""
+    """Return all index pairs [C, 2] of stamps at most `tolerance` apart."""
     order = np.argsort(stamps_b, kind="stable")
     sorted_b = stamps_b[order]
     first = np.searchsorted(sorted_b, stamps_a - tolerance, side="left")
@@ -45,8 +55,12 @@ def _candidates(stamps_a: np.ndarray, stamps_b: np.ndarray, tolerance: float) ->
 
 
 class Stamped(Protocol):
+    """Measurement with a time stamp."""
+
     @property
-    def stamp_ns(self) -> int: ...
+    def stamp_ns(self) -> int:
+        """Time stamp in nanoseconds."""
+        ...
 
 
 A = TypeVar("A", bound=Stamped)
@@ -55,47 +69,55 @@ B = TypeVar("B", bound=Stamped)
 
 @dataclass
 class StreamBuffer:
-    """One stream: what waits for its other half, the oldest first."""
+    """Buffer of the unpaired measurements of one stream."""
 
-    waiting: deque[Stamped] = field(default_factory=deque)
-    stamps_ns: deque[int] = field(
-        default_factory=lambda: deque(maxlen=REMEMBERED_INTERVALS + 1)  # the newest that came
-    )
-    lost: int = 0
+    waiting: deque[Stamped] = field(default_factory=deque)  # The oldest first.
+    # The newest stamps that were received.
+    stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_INTERVALS + 1))
+    lost: int = 0  # Number of measurements that were dropped without a partner.
 
     def add(self, half: Stamped) -> None:
+        """Add a measurement.
+
+        Raises:
+            FrameError: The stamp is not after the last one of the stream.
+        """
         if self.stamps_ns and half.stamp_ns <= self.stamps_ns[-1]:
             raise FrameError(
                 f"its stamp {half.stamp_ns} ns is not after the last one of its stream, "
-                f"{self.stamps_ns[-1]} ns. Send halves in the order of their exposure; after the "
-                "camera's clock was set back, start anew with `ldo control reset`."
+                f"{self.stamps_ns[-1]} ns. Send images in the order of their exposure; if the "
+                "camera's clock was set back, run `ldo control reset`."
             )
         self.stamps_ns.append(half.stamp_ns)
         self.waiting.append(half)
 
     def lose(self) -> None:
+        """Drop and count the oldest measurement."""
         self.waiting.popleft()
         self.lost += 1
 
     def period_ns(self) -> int | None:
-        """The smallest recent interval; None before there are two stamps."""
+        """Return the smallest recent interval, or None before the second stamp."""
         return min((b - a for a, b in pairwise(self.stamps_ns)), default=None)
 
 
 class StreamPairer(Generic[A, B]):
-    """Pairs each half with the nearest of the other stream, at most `max_skew_ns` away.
+    """Online pairing of the measurements ("halves") of two streams by nearest stamp.
 
-    Pairs keep the order of both streams, and each half is used once. A pair is given out as soon
-    as nothing nearer can come: at once when stamps are equal or differ by at most half the period
-    of the stream that is behind, else with that stream's next half. Before a stream's period is
-    known the first within reach is taken. No more than `buffer` halves of a stream wait: then the
-    oldest is paired with what there is, or lost. Equal input gives equal pairs: no clock is read.
+    The stamps of a pair differ by at most `max_skew_ns`. Pairs keep the order of both streams, and
+    each half is used at most once. The pairer returns a pair as soon as no nearer half can arrive.
+    It returns the pair at once if the stamps differ by at most half the period of the stream that
+    is behind. Otherwise it waits for the next half of that stream. While the period is unknown, it
+    takes the first half within `max_skew_ns`.
+
+    At most `buffer` halves of a stream wait; beyond that, the oldest one is paired with the best
+    available half or dropped. Equal input gives equal pairs, as no clock is read.
     """
 
     def __init__(self, max_skew_ns: int, buffer: int) -> None:
         if max_skew_ns < 0 or buffer < 1:
             raise ConfigError(
-                f"pairing within {max_skew_ns} ns, {buffer} waiting: must be at least 0 and 1."
+                f"max_skew_ns={max_skew_ns} must be at least 0 and buffer={buffer} at least 1."
             )
         self._max_skew_ns, self._buffer = max_skew_ns, buffer
         self._a, self._b = StreamBuffer(), StreamBuffer()
@@ -103,25 +125,35 @@ class StreamPairer(Generic[A, B]):
         self.pairs = 0
 
     def add_a(self, half: A) -> Iterator[tuple[A, B]]:
-        """The pairs that this half decides. Raises FrameError when its stamp goes back."""
+        """Add a half of the first stream, and return the pairs that it completes.
+
+        Raises:
+            FrameError: The stamp is not after the last one of the stream.
+        """
         self._a.add(half)
         return self._decided()
 
     def add_b(self, half: B) -> Iterator[tuple[A, B]]:
-        """The pairs that this half decides. Raises FrameError when its stamp goes back."""
+        """Add a half of the second stream, and return the pairs that it completes.
+
+        Raises:
+            FrameError: The stamp is not after the last one of the stream.
+        """
         self._b.add(half)
         return self._decided()
 
     @property
     def lost_a(self) -> int:
+        """Number of halves of the first stream that were dropped without a partner."""
         return self._a.lost
 
     @property
     def lost_b(self) -> int:
+        """Number of halves of the second stream that were dropped without a partner."""
         return self._b.lost
 
     def skews_ms(self) -> list[float]:
-        """Distances of the recent pairs' stamps."""
+        """Return the stamp differences of recent pairs in milliseconds."""
         return [skew * 1e-6 for skew in self._skews_ns]
 
     def _decided(self) -> Iterator[tuple[A, B]]:
@@ -144,12 +176,12 @@ class StreamPairer(Generic[A, B]):
 
     @staticmethod
     def _has_nearer(earlier: StreamBuffer, later: StreamBuffer, skew: int) -> bool:
-        """Whether the half after the earlier one is nearer to the later one."""
+        """Return whether the second half of the earlier stream is nearer to the later half."""
         target = later.waiting[0].stamp_ns
         return len(earlier.waiting) > 1 and abs(earlier.waiting[1].stamp_ns - target) < skew
 
     @staticmethod
     def _may_get_nearer(earlier: StreamBuffer, skew: int) -> bool:
-        """Whether a half that is still to come may be nearer than the earlier one."""
+        """Return whether the next half of the earlier stream may be nearer than its first one."""
         period = earlier.period_ns()
         return len(earlier.waiting) == 1 and period is not None and 2 * skew > period

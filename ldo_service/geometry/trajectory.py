@@ -12,28 +12,29 @@ from . import se3
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """stamps_s [K] float64, ascending; T_world_camera [K, 4, 4] float64.
+    """Camera poses with ascending stamps.
 
-    Raises DataError when the shapes disagree or the stamps descend.
+    Raises:
+        DataError: The shapes disagree, or the stamps descend.
     """
 
-    stamps_s: np.ndarray
-    T_world_camera: np.ndarray
+    stamps_s: np.ndarray  # [K] float64.
+    T_world_camera: np.ndarray  # [K, 4, 4] float64.
 
     def __post_init__(self) -> None:
         if self.T_world_camera.shape != (*self.stamps_s.shape, 4, 4):
             raise DataError(
-                f"trajectory of {self.stamps_s.shape} stamps and {self.T_world_camera.shape} "
-                "transforms: expected [K] and [K, 4, 4]."
+                f"trajectory has stamps of shape {self.stamps_s.shape} and transforms of shape "
+                f"{self.T_world_camera.shape}, expected [K] and [K, 4, 4]."
             )
         if np.any(np.diff(self.stamps_s) < 0):
-            raise DataError("the stamps of a trajectory must ascend: sort its poses by stamp.")
+            raise DataError("the stamps of a trajectory must ascend. Sort its poses by stamp.")
 
     def __len__(self) -> int:
         return len(self.stamps_s)
 
     def save(self, path: Path) -> None:
-        """Write `stamp tx ty tz qx qy qz qw` lines, quaternion last as the TUM format has it."""
+        """Write lines of `stamp tx ty tz qx qy qz qw`, the TUM format."""
         with path.open("w") as file:
             for stamp_s, T in zip(self.stamps_s, self.T_world_camera, strict=True):
                 w, x, y, z = se3.quaternion(T[:3, :3])
@@ -42,7 +43,11 @@ class Trajectory:
 
     @staticmethod
     def load(path: Path) -> "Trajectory":
-        """Read a TUM trajectory, sorted by stamp. Raises DataError with the line at fault."""
+        """Read a TUM trajectory, and sort it by stamp.
+
+        Raises:
+            DataError: The file cannot be read, or a line is invalid.
+        """
         try:
             lines = path.read_text().splitlines()
         except (OSError, UnicodeDecodeError) as error:
@@ -65,7 +70,7 @@ def _row(path: Path, number: int, line: str) -> list[float]:
         row = []
     if len(row) != 8 or not np.all(np.isfinite(row)) or not any(row[4:]):
         raise DataError(
-            f"{path}, line {number}: expected `stamp tx ty tz qx qy qz qw` in finite numbers "
-            f"and a quaternion that is not zero, found {line[:80]!r}."
+            f"{path}, line {number}: expected `stamp tx ty tz qx qy qz qw` with finite numbers "
+            f"and a nonzero quaternion, found {line[:80]!r}."
         )
     return row

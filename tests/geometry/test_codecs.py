@@ -63,7 +63,7 @@ def test_a_size_that_lies_is_refused() -> None:
 
 
 def test_a_truncated_image_is_refused() -> None:
-    with pytest.raises(FrameError, match="no readable jpeg"):
+    with pytest.raises(FrameError, match="not a readable jpeg"):
         codecs.decode_color("jpeg", 9, 6, memoryview(codecs.encode_jpeg(COLOR)[:20]))
 
 

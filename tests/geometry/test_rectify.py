@@ -94,15 +94,15 @@ def test_rectifier_follows_a_camera_that_changes() -> None:
 
 def test_color_of_another_size_than_depth_is_an_error() -> None:
     color = np.zeros((6, 8, 3), np.uint8)
-    with pytest.raises(FrameError, match=r"frame 3: colour is 8x6 and depth 4x3.*Register"):
+    with pytest.raises(FrameError, match=r"frame 3: color is 8x6 and depth 4x3.*Register"):
         RawFrame(3, 0, color, np.zeros((3, 4), np.uint16), 1000, SMALL)
 
 
 @pytest.mark.parametrize(
     ("changes", "word"),
     [
-        ({"color": np.zeros((3, 4), np.uint8)}, "colour"),
-        ({"color": np.zeros((3, 4, 3), np.float32)}, "colour"),
+        ({"color": np.zeros((3, 4), np.uint8)}, "color"),
+        ({"color": np.zeros((3, 4, 3), np.float32)}, "color"),
         ({"depth": np.zeros((3, 4), np.uint8)}, "depth is uint8"),
         ({"depth": np.zeros((3, 4, 1), np.uint16)}, "depth"),
         ({"camera": CAMERA}, "640x480"),

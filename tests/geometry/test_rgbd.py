@@ -15,8 +15,8 @@ def test_frame_with_holes_in_its_depth_is_accepted() -> None:
 @pytest.mark.parametrize(
     ("color", "depth_m", "word"),
     [
-        (COLOR[:2], DEPTH, "colour"),
-        (COLOR.astype(float), DEPTH, "colour is float64"),
+        (COLOR[:2], DEPTH, "color"),
+        (COLOR.astype(float), DEPTH, "color is float64"),
         (COLOR, DEPTH[:, :2], "depth"),
         (COLOR, DEPTH.astype(np.float64), "depth is float64"),
         (COLOR, DEPTH * np.float32("nan"), "finite"),
