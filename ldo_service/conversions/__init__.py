@@ -1,1 +1,1 @@
-"""Conversions between messages and numerics: the only package that knows both."""
+"""Conversions between messages and internal types, kept in one package."""

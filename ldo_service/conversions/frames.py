@@ -1,4 +1,4 @@
-"""Conversions between messages and numerics: cameras, frames, tracked frames and masks."""
+"""Conversions between messages and internal types: cameras, frames, keyframes and masks."""
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ from .poses import matrix6_to_message, pose_from_message, pose_to_message, relat
 
 
 def camera_to_message(camera: Camera) -> CameraModel:
+    """Return the message of a camera."""
     return CameraModel(
         width=camera.width,
         height=camera.height,
@@ -37,12 +38,14 @@ def camera_to_message(camera: Camera) -> CameraModel:
 
 
 def camera_from_message(model: CameraModel) -> Camera:
+    """Return the camera of a message."""
     return Camera(
         model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion
     )
 
 
 def frame_to_message(frame: RgbdFrame) -> FrameRgbd:
+    """Return the message of a rectified frame."""
     return FrameRgbd(
         stamp_ns=frame.stamp_ns,
         frame=frame.index,
@@ -53,7 +56,7 @@ def frame_to_message(frame: RgbdFrame) -> FrameRgbd:
 
 
 def frame_from_message(message: FrameRgbd | Keyframe) -> RgbdFrame:
-    """The frame of a message; its arrays are read-only views."""
+    """Return the rectified frame of a message; its arrays are read-only views."""
     return RgbdFrame(
         color=message.color.numpy(),
         depth_m=message.depth_m.numpy(),
@@ -66,7 +69,13 @@ def frame_from_message(message: FrameRgbd | Keyframe) -> RgbdFrame:
 def tracked_pose_message(
     frame: RgbdFrame, result: TrackingResult, T_base_camera: np.ndarray
 ) -> TrackedPose:
-    """Return the message of a tracked frame, with the camera on the robot [4, 4]."""
+    """Return the message of a tracked frame.
+
+    Args:
+        frame: The frame.
+        result: Its tracking result.
+        T_base_camera: Pose of the camera on the robot, [4, 4].
+    """
     keyframe = result.keyframe
     return TrackedPose(
         stamp_ns=frame.stamp_ns,
@@ -114,7 +123,7 @@ def keyframe_message(frame: RgbdFrame, result: TrackingResult, keyframe: NewKeyf
 
 
 def keyframe_from_message(message: Keyframe, config: PyramidConfig) -> ReferenceKeyframe:
-    """A keyframe that others can be aligned to, without what moves in it."""
+    """Return the keyframe of a message for alignment, with its dynamic pixels masked."""
     view = pyramid_of(frame_from_message(message), config)
     return ReferenceKeyframe(
         view,
@@ -126,7 +135,11 @@ def keyframe_from_message(message: Keyframe, config: PyramidConfig) -> Reference
 
 
 def mask_to_array(mask: np.ndarray | None, camera: Camera) -> Array:
-    """A mask [h, w] bool of any size as u1 [H, W] of the camera's; [0, 0] where nothing is set."""
+    """Return the array of a mask [h, w] bool, resized to the image of a camera.
+
+    Returns:
+        [H, W] u1, or the empty array `NO_MASK` if no pixel is set.
+    """
     if mask is None or not mask.any():
         return NO_MASK
     size = camera.width, camera.height
@@ -134,17 +147,21 @@ def mask_to_array(mask: np.ndarray | None, camera: Camera) -> Array:
 
 
 def mask_from_array(array: Array) -> np.ndarray | None:
-    """[H, W] bool; None where there is none."""
+    """Return the mask [H, W] bool of an array, or None if the array is empty."""
     return array.numpy() > 0 if array.data.nbytes else None
 
 
 def crops_from_request(request: LabelRequest) -> list[np.ndarray]:
-    """Each [h, w, 3] uint8 RGB. Raises FrameError for bytes that are no such image."""
+    """Return the decoded crops of a label request, [h, w, 3] uint8 RGB each.
+
+    Raises:
+        FrameError: A crop is not an image of its encoding and size.
+    """
     return [codecs.decode_color(c.encoding, c.width, c.height, c.data) for c in request.crops]
 
 
 def raw_frame_to_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgbd:
-    """A camera's frame for the wire: colour raw, depth raw or compressed with zstd."""
+    """Return the message of a camera's frame; color is raw, depth optionally zstd-compressed."""
     height, width = raw.depth.shape
     depth = np.asarray(raw.depth, np.float32) if raw.depth.dtype == np.float64 else raw.depth
     encoding: ImageEncoding = "z16" if depth.dtype == np.uint16 else "f32"
@@ -164,7 +181,15 @@ def raw_frame_to_message(raw: RawFrame, compress_depth: bool = True) -> CameraRg
 
 
 def raw_frame_from_message(message: CameraRgbd, index: int) -> RawFrame:
-    """The frame as the camera delivered it, decompressed. Raises DataError."""
+    """Return the decompressed frame of a message, as the camera delivered it.
+
+    Args:
+        message: The message.
+        index: Number of the frame.
+
+    Raises:
+        DataError: An image or the camera of the message is invalid.
+    """
     color, depth = message.color, message.depth
     return RawFrame(
         index=index,

@@ -1,4 +1,4 @@
-"""Conversions between messages and numerics: loop closures and candidates."""
+"""Conversions between messages and internal types: loop closures and loop candidates."""
 
 from ldo_service.loop_closing import LoopCandidateResult
 from ldo_service.schemas import (
@@ -10,10 +10,15 @@ from .poses import relative_pose_to_message
 
 
 def loop_closure_to_message(finding: LoopCandidateResult) -> LoopClosure:
-    """Raises ValueError for a candidate that was refused."""
+    """Return the message of the loop closure of an accepted candidate.
+
+    Raises:
+        ValueError: The candidate was rejected.
+    """
     if finding.closure is None:
         raise ValueError(
-            f"a candidate that was refused is no closure: {finding.check.rejected_reason}"
+            "the loop candidate was rejected and has no closure: "
+            f"rejected_reason={finding.check.rejected_reason!r}."
         )
     return LoopClosure(
         stamp_ns=finding.check.proposal.new.stamp_ns,
@@ -25,6 +30,7 @@ def loop_closure_to_message(finding: LoopCandidateResult) -> LoopClosure:
 
 
 def loop_candidate_to_message(finding: LoopCandidateResult) -> LoopCandidate:
+    """Return the message of a loop candidate, accepted or rejected."""
     check, old, new = finding.check, finding.likeness.subgraph, finding.new
     proposal = check.proposal
     return LoopCandidate(

@@ -1,4 +1,4 @@
-"""Conversions between messages and numerics: detections, regions, objects and distributions."""
+"""Conversions between messages and internal types: detections, regions, objects, distributions."""
 
 from collections.abc import Callable, Sequence
 
@@ -31,8 +31,14 @@ from .poses import pose_to_message
 def detections_to_message(
     keyframe: Keyframe, found: Detections | None, labels: Sequence[str], network: str
 ) -> DetectionBoxes:
-    """What a network found in a keyframe; `labels` are the names of its classes. None: it did not
-    look."""
+    """Return the message of the detections in a keyframe.
+
+    Args:
+        keyframe: The keyframe.
+        found: Detections; None if the network did not run.
+        labels: Names of the network's classes.
+        network: Name of the network.
+    """
     rows = () if found is None else zip(found.boxes_px, found.scores, found.class_ids, strict=True)
     return DetectionBoxes(
         stamp_ns=keyframe.stamp_ns,
@@ -50,7 +56,7 @@ def detections_to_message(
 
 
 def detections_from_message(message: DetectionBoxes, vocabulary: Vocabulary) -> RegionDetections:
-    """What the detector says; new names get an index."""
+    """Return the detections of a message; labels new to the vocabulary are added to it."""
     found = message.detections
     return RegionDetections.of_detector(
         np.array([one.box_px for one in found], np.float32).reshape(-1, 4),
@@ -60,7 +66,12 @@ def detections_from_message(message: DetectionBoxes, vocabulary: Vocabulary) -> 
 
 
 def label_request_to_message(region: Region, stamp_ns: int) -> LabelRequest:
-    """What is asked about a region; `stamp_ns` is that of its newest keyframe."""
+    """Return the label request of a region.
+
+    Args:
+        region: The region.
+        stamp_ns: Stamp of its newest keyframe.
+    """
     crops = (
         Image(encoding="jpeg", width=v.width, height=v.height, data=memoryview(v.jpeg))
         for v in region.views
@@ -79,7 +90,14 @@ def label_request_to_message(region: Region, stamp_ns: int) -> LabelRequest:
 def landmark_to_message(
     landmark: int, centroid: np.ndarray, p: np.ndarray, names: Sequence[str]
 ) -> GraphLandmark:
-    """`names` of the classes that have been seen; what `p` [C] gives to others is on none."""
+    """Return the message of a landmark of the pose graph.
+
+    Args:
+        landmark: Id of the object.
+        centroid: Its centroid in the map, [3] meters.
+        p: Distribution over the classes, [C]; the message contains those with a name only.
+        names: Names of the classes that have been observed, at most C.
+    """
     return GraphLandmark(
         object=landmark,
         centroid=_vector3(centroid),
@@ -91,7 +109,13 @@ def landmark_to_message(
 def dense_distribution(
     distribution: Distribution, index: Callable[[str], int], classes: int
 ) -> np.ndarray:
-    """[C], sums to one; `index` of a name. What is missing from one belongs to `other`."""
+    """Return the distribution of a message as a vector [C] that sums to 1.
+
+    Args:
+        distribution: Pairs of label and weight. What their sum lacks to 1 goes to `other`.
+        index: Function from a label to its class.
+        classes: Number of classes C.
+    """
     p = np.zeros(classes)
     for name, weight in (*distribution, ("other", 1 - sum(w for _, w in distribution))):
         p[index(name)] += max(weight, 0.0)
@@ -99,7 +123,7 @@ def dense_distribution(
 
 
 def map_objects(table: np.ndarray, names: Sequence[str]) -> tuple[MapObject, ...]:
-    """Of landmarks [K], in their order."""
+    """Return the messages of landmarks [K], in their order."""
     p = distributions(table)
     columns = zip(table, labels_of(table).tolist(), p, entropy(p).tolist(), strict=True)
     return tuple(_object_to_message(*column, names) for column in columns)
@@ -133,7 +157,7 @@ def _object_to_message(
 def observations_to_messages(
     observed: ObjectUpdate, names: Sequence[str], keyframe: int, stamp_ns: int
 ) -> list[ObjectObservation]:
-    """What a keyframe shows of objects, and what it misses."""
+    """Return the messages of the observations and misses of objects in a keyframe."""
     return [
         ObjectObservation(
             stamp_ns=stamp_ns,
@@ -165,7 +189,7 @@ def _box(box: np.ndarray) -> Box:
 
 
 def scale_boxes(detections: Sequence[Detection], times: float) -> list[MovableBox]:
-    """Detections as edges of pixels, in an image that is so many times smaller."""
+    """Return the boxes of detections in pixel-edge coordinates of an image `times` smaller."""
     return [
         MovableBox(one.label, *((edge + 0.5) / times for edge in one.box_px)) for one in detections
     ]

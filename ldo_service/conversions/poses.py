@@ -1,4 +1,4 @@
-"""Conversions between messages and numerics: poses, measurements and corrections."""
+"""Conversions between messages and internal types: poses, measurements and corrections."""
 
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -19,22 +19,24 @@ from ldo_service.tracking.map_frame import MapCorrection
 
 
 def pose_to_message(T: np.ndarray) -> Pose:
-    """T [4, 4] for the wire."""
+    """Return the message of a pose T [4, 4]."""
     x, y, z = (float(v) for v in T[:3, 3])
     qw, qx, qy, qz = (float(v) for v in se3.quaternion(T[:3, :3]))
     return Pose((x, y, z), (qw, qx, qy, qz))
 
 
 def pose_from_message(pose: Pose) -> np.ndarray:
-    """T [4, 4] of a pose from the wire."""
+    """Return the pose T [4, 4] of a message."""
     return se3.from_quaternion(np.array(pose.translation), np.array(pose.quaternion))
 
 
 def matrix6_to_message(matrix: np.ndarray) -> tuple[float, ...]:
+    """Return the 36 numbers of a matrix [6, 6] by rows."""
     return tuple(float(v) for v in np.asarray(matrix).ravel())
 
 
 def relative_pose_to_message(measured: RelativePose) -> MeasuredPose:
+    """Return the message of a relative-pose measurement."""
     return MeasuredPose(
         reference=measured.a,
         keyframe=measured.b,
@@ -44,6 +46,7 @@ def relative_pose_to_message(measured: RelativePose) -> MeasuredPose:
 
 
 def relative_pose_from_message(message: MeasuredPose) -> RelativePose:
+    """Return the relative-pose measurement of a message."""
     return RelativePose(
         message.reference,
         message.keyframe,
@@ -53,7 +56,10 @@ def relative_pose_from_message(message: MeasuredPose) -> RelativePose:
 
 
 def measurements_from_message(keyframe: Keyframe) -> list[RelativePose]:
-    """All that a keyframe was measured from, its reference first; none for the first keyframe."""
+    """Return all relative-pose measurements of a keyframe, the one from its reference first.
+
+    A keyframe without a reference has none from it.
+    """
     window = [relative_pose_from_message(pose) for pose in keyframe.window_measurements]
     if keyframe.reference is None:
         return window
@@ -74,6 +80,18 @@ def correction_to_message(
     not_believed: Iterable[tuple[int, int]] = (),
     landmarks: Iterable[GraphLandmark] = (),
 ) -> GraphCorrection:
+    """Return the message of a correction of the pose graph.
+
+    Args:
+        stamp_ns: Stamp of the correction.
+        graph_version: Version of the pose graph.
+        T_map_keyframe: Corrected poses [4, 4] by id of the keyframe.
+        refinements: Number of the last `keyframe/refinement` message in the correction.
+        joined: Oldest merged submap, by submap.
+        closures: Accepted loop closures, as pairs of keyframes.
+        not_believed: Rejected loop closures, as pairs of keyframes.
+        landmarks: Objects of the pose graph.
+    """
     T = np.array(list(T_map_keyframe.values())).reshape(-1, 4, 4)
     rows = np.concatenate([T[:, :3, 3], se3.quaternion(T[:, :3, :3])], axis=1)
     return GraphCorrection(
@@ -92,7 +110,12 @@ def correction_to_message(
 def keyframe_poses_from_correction(
     correction: GraphCorrection, only: Iterable[int] | None = None
 ) -> dict[int, np.ndarray]:
-    """T_map_keyframe [4, 4] by keyframe id; of `only` those and the newest one it names."""
+    """Return T_map_keyframe [4, 4] of a correction, by id of the keyframe.
+
+    Args:
+        correction: The message.
+        only: Ids to return in addition to the newest keyframe; None for all keyframes.
+    """
     keyframes = correction.keyframes.numpy()
     rows = correction.T_map_keyframe.numpy()
     if only is not None and len(keyframes):
@@ -105,7 +128,7 @@ def keyframe_poses_from_correction(
 
 
 def map_correction_of(correction: GraphCorrection) -> MapCorrection:
-    """Return a correction as tracking follows it; its poses are converted when asked for."""
+    """Return the correction for tracking; its poses are decoded on demand."""
     return MapCorrection(
         version=correction.graph_version,
         roots=dict(correction.merged_submaps),
