@@ -1,4 +1,4 @@
-"""Sequences of RGB-D frames: folders in the layouts of the field, and a synthetic room."""
+"""Sequences of RGB-D frames: folders in common data-set layouts, and synthetic scenes."""
 
 from pathlib import Path
 
@@ -23,11 +23,16 @@ LAYOUTS = (
 
 
 def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequence:
-    """The frames of a folder, recognised by its layout, or of `synthetic[:name]`.
+    """Open a sequence of frames.
 
-    `options` are for ScanNet and 7-Scenes, whose depth and colour come from two cameras.
-    Raises DataError naming the known layouts when there is nothing to read, and ConfigError for
-    options that the layout has no use for.
+    Args:
+        source: A folder, whose layout is detected, or `synthetic[:name]`.
+        options: Registration of depth to color, for ScanNet and 7-Scenes only, where depth and
+            color come from two cameras.
+
+    Raises:
+        DataError: The source does not exist or has no known layout.
+        ConfigError: The layout does not support the options.
     """
     options = options or SequenceOptions()
     scheme, _, name = source.partition(":")
@@ -53,7 +58,7 @@ def _open_folder(folder: Path, options: SequenceOptions) -> Sequence:
     if any(folder.glob("frame-*.color.*")):
         return SevenScenesSequence(folder, options)
     raise DataError(
-        f"{folder} is in no known layout: it has neither rgb.txt with depth.txt nor a folder "
+        f"{folder} has no known layout: it has neither rgb.txt with depth.txt nor a folder "
         "results/, nor the folders color/ and depth/, nor files frame-*.color.*. Known layouts: "
         f"{LAYOUTS}."
     )
@@ -62,6 +67,6 @@ def _open_folder(folder: Path, options: SequenceOptions) -> Sequence:
 def _refuse(options: SequenceOptions, source: str) -> None:
     if not options.is_default:
         raise ConfigError(
-            f"{source} has depth registered to colour already: leave out the options of "
-            "registration, which are for ScanNet and 7-Scenes."
+            f"the depth of {source} is registered to color already. Remove the registration "
+            "options, which are for ScanNet and 7-Scenes only."
         )

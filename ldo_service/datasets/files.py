@@ -1,4 +1,4 @@
-"""Files that several layouts share: numbered frames, matrices as text, intrinsics as JSON."""
+"""Readers of files common to several layouts: numbered frames, matrices, intrinsics as JSON."""
 
 import json
 import logging
@@ -15,37 +15,50 @@ from ldo_service.geometry import Camera, Trajectory, se3
 
 log = logging.getLogger(__name__)
 
-FRAME_RATE_HZ = 30  # without stamps, frame k is said to be taken at k / 30 s
+FRAME_RATE_HZ = 30  # Assumed rate of data sets without stamps: frame k is at k / 30 s.
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A camera and the units of its stored depth per metre."""
+    """Intrinsics of a camera, with the scale of its stored depth."""
 
     camera: Camera
-    depth_scale: float
+    depth_scale: float  # Units of the stored depth per meter.
 
     def __post_init__(self) -> None:
         if not (isfinite(self.depth_scale) and self.depth_scale > 0):
             raise DataError(
-                f"depth scale {self.depth_scale}: expected the positive number of depth units "
-                "per metre, such as 5000 (TUM) or 1000 (millimetres)."
+                f"the depth scale is {self.depth_scale}, expected the positive number of depth "
+                "units per meter, such as 5000 (TUM) or 1000 (millimeters)."
             )
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file. Raises DataError."""
+    """Read a JSON file that contains an object.
+
+    Raises:
+        DataError: The file cannot be read, or it contains another type.
+    """
     try:
         content = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path} cannot be read as JSON: {error}.") from error
     if not isinstance(content, dict):
-        raise DataError(f"{path} holds a {type(content).__name__}, expected a JSON object.")
+        raise DataError(f"{path} contains a {type(content).__name__}, expected a JSON object.")
     return content
 
 
 def number(fields: dict[str, Any], key: str, path: Path) -> float:
-    """The number under `key`. Raises DataError naming file and key."""
+    """Return the number under a key of a JSON object.
+
+    Args:
+        fields: The object.
+        key: The key.
+        path: File of the object, for the error.
+
+    Raises:
+        DataError: The value is missing or not a finite number.
+    """
     value = fields.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
         found = "it is missing" if key not in fields else f"it is {value!r}"
@@ -54,7 +67,17 @@ def number(fields: dict[str, Any], key: str, path: Path) -> float:
 
 
 def pinhole(fields: dict[str, Any], width: str, height: str, path: Path) -> Camera:
-    """The camera under fx, fy, cx, cy, `width`, `height` and optional distortion."""
+    """Return the camera that a JSON object describes.
+
+    Args:
+        fields: Object with the keys fx, fy, cx, cy and optionally distortion.
+        width: Key of the width.
+        height: Key of the height.
+        path: File of the object, for errors.
+
+    Raises:
+        DataError: A value is missing or invalid.
+    """
     distortion = fields.get("distortion", [])
     if not isinstance(distortion, list):
         raise DataError(f'{path}: "distortion" is {distortion!r}, expected a list [k1, k2, ...].')
@@ -69,7 +92,11 @@ def pinhole(fields: dict[str, Any], width: str, height: str, path: Path) -> Came
 
 
 def read_matrix(path: Path, size: int) -> np.ndarray:
-    """Matrix [size, size] float64, NaN and infinity included. Raises DataError with the line."""
+    """Read a matrix [size, size] float64 from a text file; it may contain NaN and infinity.
+
+    Raises:
+        DataError: The file cannot be read, or a line is invalid.
+    """
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -77,16 +104,20 @@ def read_matrix(path: Path, size: int) -> np.ndarray:
     rows = [_row(path, k, line, size) for k, line in enumerate(lines, 1) if line.strip()]
     if len(rows) != size:
         raise DataError(
-            f"{path}, line {len(lines)}: the file ends after {len(rows)} rows, expected a "
-            f"{size}x{size} matrix of one row a line. Export or copy it again."
+            f"{path}, line {len(lines)}: the file has {len(rows)} rows, expected a {size}x{size} "
+            "matrix with one row per line. Export or copy it again."
         )
     return np.array(rows)
 
 
 def read_transform(path: Path) -> np.ndarray | None:
-    """Rigid transform [4, 4]; None where the file holds NaN or infinity: not known.
+    """Read a rigid transform [4, 4] from a text file.
 
-    Raises DataError for anything else that is not a rigid transform.
+    Returns:
+        The transform, or None if the file contains NaN or infinity, which mean an unknown pose.
+
+    Raises:
+        DataError: The file cannot be read, or the matrix is not a rigid transform.
     """
     T = read_matrix(path, 4)
     if not np.all(np.isfinite(T)):
@@ -94,13 +125,22 @@ def read_transform(path: Path) -> np.ndarray | None:
     if not is_rigid(T):
         raise DataError(
             f"{path}, line 1: expected a rigid 4x4 transform by rows, found {T.tolist()}. "
-            "Check that it holds a rotation and a translation in metres."
+            "Check that it consists of a rotation and a translation in meters."
         )
     return se3.orthonormalize(T)
 
 
 def read_intrinsics(path: Path, size: int, image: tuple[int, int]) -> Camera:
-    """The pinhole camera of a matrix [size, size] for an image of (width, height) pixels."""
+    """Read a pinhole camera from an intrinsic matrix in a text file.
+
+    Args:
+        path: The file.
+        size: Number of rows and columns of the matrix, 3 or 4.
+        image: Width and height of the image in pixels.
+
+    Raises:
+        DataError: The file cannot be read, or the intrinsics are implausible.
+    """
     K = read_matrix(path, size)
     fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     try:
@@ -110,7 +150,10 @@ def read_intrinsics(path: Path, size: int, image: tuple[int, int]) -> Camera:
 
 
 def read_trajectory(stamps_ns: np.ndarray, paths: list[Path]) -> Trajectory | None:
-    """`T_world_camera` of the stamps [N] whose file exists and holds a pose; None without any."""
+    """Read `T_world_camera` from one file per stamp, [N]; None if no file has a pose.
+
+    Stamps without a file, or with an unknown pose, are skipped.
+    """
     poses = [read_transform(path) if path.is_file() else None for path in paths]
     known = [k for k, T in enumerate(poses) if T is not None]
     if not known:
@@ -119,7 +162,7 @@ def read_trajectory(stamps_ns: np.ndarray, paths: list[Path]) -> Trajectory | No
 
 
 def is_rigid(T: np.ndarray) -> bool:
-    """Whether T [4, 4] holds a rotation, to the digits that text files keep."""
+    """Return whether T [4, 4] is a rigid transform, within the precision of text files."""
     if T.shape != (4, 4) or not np.all(np.isfinite(T)):
         return False
     R = T[:3, :3]
@@ -143,44 +186,58 @@ def _row(path: Path, line_number: int, line: str, size: int) -> list[float]:
 
 
 def _number(word: str) -> float:
-    """As Python reads it, and -1.#INF or 1.#IND as Windows programs write what is no number."""
+    """Parse a number; -1.#INF and 1.#IND, as Windows programs write them, become NaN."""
     return float("nan") if ".#" in word else float(word)
 
 
 @dataclass(frozen=True, slots=True)
 class NumberedFrames:
-    """The frames that have both colour and depth, in order of their numbers.
+    """Frames with both color and depth, in the order of their numbers."""
 
-    numbers  [N] int64, ascending; gaps where files are missing
-    """
-
-    numbers: np.ndarray
+    numbers: np.ndarray  # [N] int64, ascending, with gaps where files are missing.
     color: list[Path]
     depth: list[Path]
 
     @property
     def stamps_ns(self) -> np.ndarray:
-        """[N] int64; a gap in the numbers is a gap in time."""
+        """Stamps [N] int64; a gap in the numbers is a gap in time."""
         return self.numbers * 10**9 // FRAME_RATE_HZ
 
 
 def numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """The files of a folder whose whole name matches; the pattern's group is the number."""
+    """Return the files of a folder by number.
+
+    Args:
+        folder: The folder.
+        pattern: Regular expression of the whole file name; its group is the number.
+    """
     matches = ((re.fullmatch(pattern, path.name), path) for path in sorted(folder.glob("*")))
     return {int(match[1]): path for match, path in matches if match}
 
 
 def pair_by_number(color: dict[int, Path], depth: dict[int, Path], folder: Path) -> NumberedFrames:
-    """Frames of equal numbers. Raises DataError, which names `folder`, when there are none."""
+    """Pair color and depth images of equal numbers.
+
+    Args:
+        color: Files of color images by number.
+        depth: Files of depth images by number.
+        folder: Folder of the files, for messages.
+
+    Raises:
+        DataError: No number has both images.
+    """
     numbers = sorted(color.keys() & depth.keys())
     if not numbers:
         raise DataError(
-            f"{folder} has {len(color)} images of colour and {len(depth)} of depth, and no number "
-            "that has both. Check the names of the files."
+            f"{folder} has {len(color)} color and {len(depth)} depth images, and no number has "
+            "both. Check the names of the files."
         )
     alone = len(color) + len(depth) - 2 * len(numbers)
     if alone:
-        log.info("%s: %d images have no partner of their number and are left out", folder, alone)
+        log.info(
+            "%s: skipping %d images, which have no color or depth image of the same number.",
+            *(folder, alone),
+        )
     return NumberedFrames(
         np.array(numbers, np.int64), [color[k] for k in numbers], [depth[k] for k in numbers]
     )

@@ -1,4 +1,4 @@
-"""Image files, read so that a damaged one is an error and never a half-grey picture."""
+"""Reading of image files; a truncated file is an error instead of a partly gray image."""
 
 from pathlib import Path
 
@@ -8,46 +8,63 @@ import numpy as np
 from ldo_service.errors import FrameError
 from ldo_service.geometry.codecs import read_image_size
 
-# The last bytes of a complete file. OpenCV decodes what is there of a cut one without complaint.
+# Last bytes of a complete file, by its first bytes. OpenCV decodes a truncated file without an
+# error.
 _ENDS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
-MAX_PIXELS = 1 << 25  # as of images in messages
-_TRAILING_BYTES = 64  # some writers pad their files
+MAX_PIXELS = 1 << 25  # The limit of images in messages.
+_TRAILING_BYTES = 64  # Maximum padding at the end of a file, as some programs write it.
 
 
 def read_color(path: Path) -> np.ndarray:
-    """Colour image [H, W, 3] uint8 RGB. Raises FrameError with the path."""
+    """Read a color image [H, W, 3] uint8 RGB.
+
+    Raises:
+        FrameError: The file cannot be read or decoded.
+    """
     image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def read_depth(path: Path) -> np.ndarray:
-    """Depth image [H, W] uint16 as stored. Raises FrameError with the path."""
+    """Read a depth image [H, W] uint16 in the stored unit.
+
+    Raises:
+        FrameError: The file cannot be read or decoded, or is not a 16-bit gray image.
+    """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise FrameError(
-            f"{path} is {image.dtype}{image.shape}: a depth image has one channel of 16 bits. "
-            "Export the depth again as 16-bit grey PNG."
+            f"{path} is {image.dtype}{image.shape}, expected one channel of 16 bits. "
+            "Export the depth again as 16-bit gray PNG."
         )
     return image
 
 
 def read_labels(path: Path, dtype: type[np.unsignedinteger]) -> np.ndarray:
-    """Numbers [H, W] of `dtype`, as stored. Raises FrameError with the path."""
+    """Read a label image [H, W] of a data type.
+
+    Raises:
+        FrameError: The file cannot be read or decoded, or has another data type.
+    """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != dtype or image.ndim != 2:
         raise FrameError(
-            f"{path} is {image.dtype}{image.shape}: expected one number a pixel, "
-            f"{np.dtype(dtype).itemsize * 8} bits. Export the labels again as grey PNG."
+            f"{path} is {image.dtype}{image.shape}, expected one channel of "
+            f"{np.dtype(dtype).itemsize * 8} bits. Export the labels again as gray PNG."
         )
     return image
 
 
 def first_size(paths: list[Path]) -> tuple[int, int]:
-    """Width and height of the first image that can be read. Raises the last one's FrameError."""
+    """Return width and height of the first readable image.
+
+    Raises:
+        FrameError: No image can be read.
+    """
     for path in paths[:-1]:
         try:
             return _size(path)
-        except FrameError:  # reading it later will say so
+        except FrameError:  # Reading this frame later raises the error again.
             continue
     return _size(paths[-1])
 
@@ -62,31 +79,36 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         data = path.read_bytes()
     except OSError as error:
         raise FrameError(
-            f"{path} cannot be read ({error.strerror}): restore the file or drop its line."
+            f"{path} cannot be read ({error.strerror}). Restore the file or remove its entry."
         ) from error
     if not _is_complete(data):
-        raise FrameError(f"{path} is cut short at {len(data)} bytes: copy or download it again.")
+        raise FrameError(f"{path} is truncated at {len(data)} bytes. Copy or download it again.")
     _require_size(path, data)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     if image is None:
-        raise FrameError(f"{path} is not a readable image: copy or download it again.")
+        raise FrameError(f"{path} is not a readable image. Copy or download it again.")
     return image
 
 
 def _require_size(path: Path, data: bytes) -> None:
-    """Before memory is taken for it."""
+    """Check the size in the header, before a decoder allocates memory."""
     size = read_image_size(memoryview(data))
     if size is None:
-        raise FrameError(f"{path} is not a readable image, PNG or JPEG: copy or download it again.")
+        raise FrameError(
+            f"{path} is not a readable image (PNG or JPEG). Copy or download it again."
+        )
     if size[0] * size[1] > MAX_PIXELS:
-        raise FrameError(f"{path} says that it has {size[0]}x{size[1]} pixels: no camera has that.")
+        raise FrameError(
+            f"{path} has {size[0]}x{size[1]} pixels by its header, expected at most {MAX_PIXELS} "
+            "in total. Copy or download it again."
+        )
 
 
 def _is_complete(data: bytes) -> bool:
-    """Whether a PNG or JPEG has its end."""
+    """Return whether a PNG or JPEG has its end marker."""
     if len(data) < 16:
         return False
     for start, end in _ENDS.items():

@@ -1,14 +1,14 @@
-"""Sequences in the layout that NICE-SLAM gave to Replica (Zhu et al., CVPR 2022).
+"""Sequences of Replica in the layout of NICE-SLAM (Zhu et al., CVPR 2022).
 
     results/frame*.jpg results/depth*.png    numbered images
-    traj.txt                                 optional: 16 numbers a line, camera to world by rows
+    traj.txt                                 optional: 16 numbers per line, camera to world by rows
     cam_params.json                          here or one folder up: {"camera": {"w", "h", "fx",
-                                             "fy", "cx", "cy", "scale"}}, scale in units per metre
+                                             "fy", "cx", "cy", "scale"}}, scale in units per meter
 
-Labels beside it are optional, as Habitat renders them:
+Optional labels, as Habitat renders them:
 
-    semantic_class/*.png                     8 bits a pixel: the class, by the number of the frame
-    instance/*.png                           16 bits a pixel: the object
+    semantic_class/*.png                     8 bits per pixel: the class; by number of the frame
+    instance/*.png                           16 bits per pixel: the object
     labels.json                              {"classes": {"<class>": name}}
 """
 
@@ -25,27 +25,42 @@ from ldo_service.geometry.sequence import FrameLabels, Sequence, TrueLabels
 from .files import Calibration, is_rigid, number, numbered, pair_by_number, pinhole, read_json
 from .images import read_color, read_depth, read_labels
 
-MAX_CLASSES = 256  # of images with 8 bits
+MAX_CLASSES = 256  # Limit of 8-bit images.
 
 
 class ReplicaLabels:
-    """`numbers` [N] are those of the frames."""
+    """Reader of the ground-truth labels of a Replica sequence."""
 
     def __init__(self, folder: Path, numbers: np.ndarray) -> None:
+        """Open the labels of a folder.
+
+        Args:
+            folder: The folder.
+            numbers: Numbers of the frames, [N].
+        """
         self._folder, self._numbers = folder, numbers
 
     def read(self) -> TrueLabels | None:
-        """None where there are none. Raises DataError for names that make no sense."""
+        """Return the labels, or None without a labels.json.
+
+        Raises:
+            DataError: The class names are invalid.
+        """
         path = self._folder / "labels.json"
         return TrueLabels(_class_names(path), self.frame) if path.is_file() else None
 
     def frame(self, index: int) -> FrameLabels:
-        """Raises DataError for a frame without labels, FrameError for an image that is none."""
+        """Read the labels of a frame.
+
+        Raises:
+            DataError: The frame has no labels.
+            FrameError: An image cannot be read.
+        """
         number = int(self._numbers[index])
         classes, instances = self._files
         if number not in classes or number not in instances:
             raise DataError(
-                f"{self._folder} has a labels.json and no labels of frame {number}: expected "
+                f"{self._folder} has a labels.json, but no labels of frame {number}: expected "
                 f"semantic_class/{number:06d}.png and instance/{number:06d}.png."
             )
         class_ids = read_labels(classes[number], np.uint8)
@@ -58,7 +73,7 @@ class ReplicaLabels:
 
 
 def _class_names(path: Path) -> tuple[str, ...]:
-    """By number; a number without a name is void."""
+    """Read the class names, indexed by class id; an id without a name gets the void name."""
     found: Any = read_json(path).get("classes")
     try:
         names = {int(number): str(name) for number, name in found.items()}
@@ -66,16 +81,17 @@ def _class_names(path: Path) -> tuple[str, ...]:
         names = {}
     if not names or not 0 <= min(names) <= max(names) < MAX_CLASSES:
         raise DataError(
-            f'{path}: expected "classes", an object of names by numbers from 0 to '
-            f"{MAX_CLASSES - 1}."
+            f'{path}: expected "classes", an object that maps numbers from 0 to '
+            f"{MAX_CLASSES - 1} to names."
         )
     return tuple(names.get(number, "") for number in range(max(names) + 1))
 
 
 class ReplicaSequence(Sequence):
-    """Frames that have both colour and depth, in order of their numbers."""
+    """Replica sequence: frames with both color and depth, in the order of their numbers."""
 
     def __init__(self, folder: Path) -> None:
+        """Open the sequence of a folder."""
         self._folder = folder
         color = numbered(folder / "results", r"frame(\d+)\.(?:jpg|jpeg|png)")
         depth = numbered(folder / "results", r"depth(\d+)\.png")
@@ -85,6 +101,7 @@ class ReplicaSequence(Sequence):
         super().__init__(folder.resolve().name, calibration.camera, self._files.stamps_ns)
 
     def read(self, index: int) -> RawFrame:
+        """Return a frame; see `Sequence.read`."""
         return RawFrame(
             index,
             int(self.stamps_ns[index]),
@@ -95,16 +112,18 @@ class ReplicaSequence(Sequence):
         )
 
     def truth(self) -> Trajectory | None:
+        """Return the trajectory of traj.txt, or None without that file."""
         path = self._folder / "traj.txt"
         if not path.is_file():
             return None
         poses = _poses(path)
-        # One line per frame here, or one per number where some frames were removed.
+        # traj.txt has one line per frame, or one per number if some frames were removed.
         lines = self._files.numbers if len(poses) > len(self) else np.arange(len(self))
         known = lines < len(poses)
         return Trajectory(self.stamps_ns[known] / 1e9, poses[lines[known]])
 
     def true_labels(self) -> TrueLabels | None:
+        """Return the ground-truth labels, or None without a labels.json."""
         return ReplicaLabels(self._folder, self._files.numbers).read()
 
 
@@ -113,8 +132,8 @@ def _calibration(folder: Path) -> Calibration:
     path = next((path for path in candidates if path.is_file()), None)
     if path is None:
         raise DataError(
-            f"no intrinsics: neither {candidates[0]} nor {candidates[1]} exists. Copy the "
-            "cam_params.json that came with the data set there."
+            f"the intrinsics are missing: neither {candidates[0]} nor {candidates[1]} exists. Copy "
+            "the cam_params.json of the data set there."
         )
     fields = read_json(path).get("camera")
     if not isinstance(fields, dict):
@@ -123,7 +142,11 @@ def _calibration(folder: Path) -> Calibration:
 
 
 def _poses(path: Path) -> np.ndarray:
-    """T_world_camera [K, 4, 4] of the lines. Raises DataError with the line at fault."""
+    """Read T_world_camera [K, 4, 4], one line each.
+
+    Raises:
+        DataError: The file cannot be read, or a line is invalid.
+    """
     try:
         lines = [line for line in path.read_text().splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:

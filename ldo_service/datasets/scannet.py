@@ -1,16 +1,16 @@
 """Sequences as ScanNet's SensReader exports them (Dai et al., CVPR 2017).
 
-color/*.jpg depth/*.png           numbered images of different size; depth in millimetres
+color/*.jpg depth/*.png           numbered images of different size; depth in millimeters
 pose/*.txt                        optional: 4x4 camera to world by rows, -inf where unknown
-intrinsic/intrinsic_color.txt     4x4 by rows, for colour images of their size
+intrinsic/intrinsic_color.txt     4x4 by rows, for the size of the color images
 intrinsic/intrinsic_depth.txt     the same for depth
 intrinsic/extrinsic_*.txt         optional: 4x4 from that camera to the sensor
 
-ScanNet's exports are aligned: their extrinsics are the identity, though colour is larger than
-depth (1296x968 and 640x480). Then colour is resampled to the depth image, whose every measurement
-stays as it is. With other extrinsics, or where `SequenceOptions.register_depth` asks for it, depth
-is registered into the colour camera. Poses are taken to be those of the depth camera; no aligned
-export can tell.
+ScanNet's exports are aligned: their extrinsics are the identity, although color is larger than
+depth (1296x968 and 640x480). In this case, color is resampled to the depth image, and depth does
+not change. With other extrinsics, or with `SequenceOptions.register_depth`, depth is registered to
+the color camera. Poses are assumed to be those of the depth camera; an aligned export does not
+distinguish both.
 """
 
 from dataclasses import replace
@@ -27,13 +27,14 @@ from .files import numbered, pair_by_number, read_intrinsics, read_trajectory, r
 from .images import first_size, read_color, read_depth
 from .rig import Rig, SequenceOptions
 
-DEPTH_SCALE = 1000.0  # units per metre in every export
+DEPTH_SCALE = 1000.0  # Units per meter in all exports.
 
 
 class ScanNetSequence(Sequence):
-    """Frames that have both colour and depth, in order of their numbers."""
+    """ScanNet sequence: frames with both color and depth, in the order of their numbers."""
 
     def __init__(self, folder: Path, options: SequenceOptions) -> None:
+        """Open the sequence of a folder."""
         self._folder = folder
         self._files = pair_by_number(
             numbered(folder / "color", r"(\d+)\.(?:jpg|jpeg|png)"),
@@ -47,6 +48,7 @@ class ScanNetSequence(Sequence):
         super().__init__(folder.resolve().name, camera, self._files.stamps_ns)
 
     def read(self, index: int) -> RawFrame:
+        """Return a frame; see `Sequence.read`."""
         color = read_color(self._files.color[index])
         depth = read_depth(self._files.depth[index])
         color, depth, depth_scale = self._on_one_grid(color, depth)
@@ -54,6 +56,7 @@ class ScanNetSequence(Sequence):
         return RawFrame(index, stamp_ns, color, depth, depth_scale, self.raw_camera)
 
     def truth(self) -> Trajectory | None:
+        """Return the trajectory of the camera of the frames, or None without poses."""
         paths = [self._folder / "pose" / f"{path.stem}.txt" for path in self._files.color]
         depth = read_trajectory(self.stamps_ns, paths)
         if depth is None or not self._is_registering:
@@ -63,11 +66,11 @@ class ScanNetSequence(Sequence):
     def _on_one_grid(
         self, color: np.ndarray, depth: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Colour, depth and depth scale in the camera of this sequence."""
+        """Return color, depth and depth scale in the camera of this sequence."""
         if self._is_registering:
             return color, self._rig.register(depth.astype(np.float32) / DEPTH_SCALE), 1.0
         color, is_seen = resample_color(color, self._rig.color_camera, self._rig.depth_camera)
-        if depth.shape == is_seen.shape:  # else RawFrame says what does not fit
+        if depth.shape == is_seen.shape:  # Otherwise RawFrame raises the error.
             depth = np.where(is_seen, depth, np.uint16(0))
         return color, depth, DEPTH_SCALE
 
@@ -84,5 +87,7 @@ def _rig(folder: Path, color_size: tuple[int, int], depth_size: tuple[int, int])
 def _extrinsics(path: Path) -> np.ndarray:
     T = read_transform(path) if path.is_file() else np.eye(4)
     if T is None:
-        raise DataError(f"{path} holds NaN or infinity, expected a rigid transform. Export again.")
+        raise DataError(
+            f"{path} contains NaN or infinity, expected a rigid transform. Export it again."
+        )
     return T

@@ -1,16 +1,16 @@
 """Sequences in the layout of 7-Scenes (Shotton et al., CVPR 2013), one `seq-XX` folder each.
 
 frame-000000.color.png            8 bits; also .jpg
-frame-000000.depth.png            millimetres; 0 and 65535 where not measured
+frame-000000.depth.png            millimeters; 0 and 65535 where not measured
 frame-000000.pose.txt             optional: 4x4 depth camera to world by rows
 camera-intrinsics.txt             optional, here or one folder up: 3x3 of the depth camera
 
-The files are what a Kinect delivers without registration: colour and depth come from cameras
-2.5 cm apart with different focal lengths. By default frames are read as the files are, with the
-intrinsics of the depth camera for both images; colour and depth then disagree by up to some
-thirty pixels. `SequenceOptions.register_depth` brings depth to the colour camera instead, and
-the poses with it. The published calibration has the depth camera alone (585, 585, 320, 240 px);
-the rest of RIG is the best known and can be replaced through the options.
+The files are unregistered images of a Kinect: color and depth come from cameras 2.5 cm apart with
+different focal lengths. By default, frames are read as they are, with the intrinsics of the depth
+camera for both images. Color and depth then disagree by up to about thirty pixels.
+`SequenceOptions.register_depth` registers depth to the color camera instead and transforms the
+poses accordingly. The published calibration covers the depth camera only (585, 585, 320, 240 px).
+The rest of RIG is the best known estimate; the options can replace it.
 """
 
 from dataclasses import replace
@@ -25,14 +25,15 @@ from .files import numbered, pair_by_number, read_intrinsics, read_trajectory
 from .images import first_size, read_color, read_depth
 from .rig import Rig, SequenceOptions
 
-DEPTH_SCALE = 1000.0  # units per metre
-NOT_MEASURED = 65535  # beside 0, as the data set's page says
+DEPTH_SCALE = 1000.0  # Units per meter.
+NOT_MEASURED = 65535  # Invalid like 0, by the data set's page.
 
-# Depth: the data set's page. Colour: 525 px is the Kinect's nominal focal length, also used for
-# 7-Scenes by Brachmann et al. (ICCV 2021). Baseline: two published calibrations of other Kinects
-# (25.4 mm, ROS kinect_calibration; 25.6 mm, LIRIS human activities data set) agree along x, and
-# on no other component above 2.2 mm; their rotations belong to their own principal points. Row
-# 238: with it and no rotation, edges of depth lie within a pixel of those of colour in RedKitchen.
+# The calibration of the depth camera is that of the data set's page. The color camera has the
+# Kinect's nominal focal length of 525 px, which Brachmann et al. (ICCV 2021) also use for 7-Scenes.
+# The baseline comes from two published calibrations of other Kinects (25.4 mm, ROS
+# kinect_calibration; 25.6 mm, LIRIS human activities data set). They agree along x, and on no other
+# component above 2.2 mm. Their rotations belong to their own principal points. With row 238 and no
+# rotation, edges of depth lie within a pixel of those of color in RedKitchen.
 DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 COLOR_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 238.0)
 T_COLOR_DEPTH = np.array([[1.0, 0, 0, -0.0254], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -41,9 +42,10 @@ RIG = Rig(COLOR_CAMERA, DEPTH_CAMERA, T_COLOR_DEPTH)
 
 
 class SevenScenesSequence(Sequence):
-    """Frames that have both colour and depth, in order of their numbers."""
+    """Sequence of 7-Scenes: frames with both color and depth, in the order of their numbers."""
 
     def __init__(self, folder: Path, options: SequenceOptions) -> None:
+        """Open the sequence of a folder."""
         self._files = pair_by_number(
             numbered(folder, r"frame-(\d+)\.color\.(?:png|jpg|jpeg)"),
             numbered(folder, r"frame-(\d+)\.depth\.png"),
@@ -55,6 +57,7 @@ class SevenScenesSequence(Sequence):
         super().__init__(folder.resolve().name, camera, self._files.stamps_ns)
 
     def read(self, index: int) -> RawFrame:
+        """Return a frame; see `Sequence.read`."""
         color = read_color(self._files.color[index])
         depth, depth_scale = read_depth(self._files.depth[index]), DEPTH_SCALE
         depth[depth == NOT_MEASURED] = 0
@@ -64,6 +67,7 @@ class SevenScenesSequence(Sequence):
         return RawFrame(index, stamp_ns, color, depth, depth_scale, self.raw_camera)
 
     def truth(self) -> Trajectory | None:
+        """Return the trajectory of the camera of the frames, or None without poses."""
         paths = [
             path.with_name(path.name.split(".")[0] + ".pose.txt") for path in self._files.depth
         ]

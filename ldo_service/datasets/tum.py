@@ -1,8 +1,8 @@
 """Sequences in the layout of the TUM RGB-D benchmark (Sturm et al., IROS 2012).
 
-rgb.txt depth.txt        lines of `stamp file`, stamps in seconds, `#` starts a comment
+rgb.txt depth.txt        lines of `stamp file`; stamps in seconds, `#` starts a comment
 groundtruth.txt          optional: lines of `stamp tx ty tz qx qy qz qw`, camera to world
-camera.json              optional for the original recordings, see CAMERA_JSON
+camera.json              optional for the original recordings; see CAMERA_JSON
 """
 
 import logging
@@ -26,11 +26,11 @@ CAMERA_JSON = (
     '{"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, '
     '"distortion": [k1, k2, p1, p2, k3], "depth_scale": 5000}, the last two optional'
 )
-ASSOCIATION_TOLERANCE_NS = 20_000_000  # as TUM's associate.py
-LAST_STAMP_NS = 2**63 - 1  # what an int64 holds, in the year 2262
-DEPTH_SCALE = 5000.0  # units per metre in every recording of the benchmark
+ASSOCIATION_TOLERANCE_NS = 20_000_000  # The value of TUM's associate.py.
+LAST_STAMP_NS = 2**63 - 1  # Maximum of int64, in the year 2262.
+DEPTH_SCALE = 5000.0  # Units per meter in all recordings of the benchmark.
 
-# The calibration of the colour cameras published with the benchmark. fr3 is rectified already.
+# Calibration of the color cameras as published with the benchmark; fr3 is rectified already.
 PUBLISHED_CAMERAS = {
     "freiburg1": Camera(
         *(640, 480, 517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
@@ -44,27 +44,28 @@ PUBLISHED_CAMERAS = {
 
 @dataclass(frozen=True, slots=True)
 class _Listing:
-    """A file list: stamps_ns [N] int64 ascending, and the files."""
+    """Contents of a list file."""
 
-    stamps_ns: np.ndarray
+    stamps_ns: np.ndarray  # [N] int64, ascending.
     files: list[str]
 
 
 class TumSequence(Sequence):
-    """Colour and depth paired by nearest stamp within 20 ms, each used once; stamped by colour."""
+    """TUM sequence: color and depth paired by nearest stamp within 20 ms, with color's stamps."""
 
     def __init__(self, folder: Path) -> None:
+        """Open the sequence of a folder."""
         self._folder = folder
         color, depth = _listing(folder / "rgb.txt"), _listing(folder / "depth.txt")
         pairs = associate(color.stamps_ns, depth.stamps_ns, ASSOCIATION_TOLERANCE_NS)
         if len(pairs) == 0:
             raise DataError(
-                f"{folder}: none of {len(color.files)} colour and {len(depth.files)} depth images "
+                f"{folder}: none of {len(color.files)} color and {len(depth.files)} depth images "
                 "are within 20 ms of each other. Check the stamps in rgb.txt and depth.txt."
             )
         if len(pairs) < len(color.files):
             log.info(
-                "%s: %d of %d colour images have no depth within 20 ms and are left out",
+                "%s: skipping %d of %d color images, which have no depth image within 20 ms.",
                 *(folder, len(color.files) - len(pairs), len(color.files)),
             )
         self._files = [(color.files[i], depth.files[j]) for i, j in pairs]
@@ -73,6 +74,7 @@ class TumSequence(Sequence):
         super().__init__(folder.resolve().name, calibration.camera, color.stamps_ns[pairs[:, 0]])
 
     def read(self, index: int) -> RawFrame:
+        """Return a frame; see `Sequence.read`."""
         color_file, depth_file = self._files[index]
         return RawFrame(
             index,
@@ -84,12 +86,17 @@ class TumSequence(Sequence):
         )
 
     def truth(self) -> Trajectory | None:
+        """Return the trajectory of groundtruth.txt, or None without that file."""
         path = self._folder / "groundtruth.txt"
         return Trajectory.load(path) if path.is_file() else None
 
 
 def _listing(path: Path) -> _Listing:
-    """Read `stamp file` lines, sorted by stamp. Raises DataError with the line at fault."""
+    """Read lines of `stamp file`, and sort them by stamp.
+
+    Raises:
+        DataError: The file cannot be read, or a line is invalid.
+    """
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -106,7 +113,8 @@ def _listing(path: Path) -> _Listing:
 def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
     words = line.split(maxsplit=1)
     try:
-        stamp_ns = int(Decimal(words[0]) * 10**9)  # a float has no room for nanoseconds since 1970
+        # A float cannot represent nanoseconds since 1970.
+        stamp_ns = int(Decimal(words[0]) * 10**9)
         name = words[1].strip()
         if abs(stamp_ns) > LAST_STAMP_NS or "\0" in name:
             raise ValueError(line)
@@ -116,7 +124,7 @@ def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
         ) from None
     if Path(name).is_absolute() or ".." in Path(name).parts:
         raise DataError(
-            f"{path}, line {line_number}: {name[:80]} lies outside of the folder. Copy or link the "
+            f"{path}, line {line_number}: {name[:80]} is outside the folder. Copy or link the "
             "images into it."
         )
     return stamp_ns, name
@@ -131,7 +139,7 @@ def _calibration(folder: Path) -> Calibration:
     recording = re.search(r"freiburg[123]", folder.resolve().name)
     if recording is None:
         raise DataError(
-            f"{folder} has no camera.json, and its name does not say freiburg1, 2 or 3, whose "
-            f"intrinsics are published. Write {path} such as {CAMERA_JSON}."
+            f"{folder} has no camera.json, and its name does not contain freiburg1, 2 or 3, for "
+            f"which intrinsics are published. Write {path} such as {CAMERA_JSON}."
         )
     return Calibration(PUBLISHED_CAMERAS[recording[0]], DEPTH_SCALE)

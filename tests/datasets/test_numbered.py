@@ -20,5 +20,5 @@ def test_frames_are_the_numbers_that_both_have(tmp_path: Path) -> None:
     assert frames.numbers.tolist() == [10, 30]
     assert (frames.color, frames.depth) == ([color[10], color[30]], [depth[10], depth[30]])
     assert frames.stamps_ns.tolist() == [333_333_333, 1_000_000_000]
-    with pytest.raises(DataError, match="1 images of colour and 1 of depth"):
+    with pytest.raises(DataError, match="1 color and 1 depth images"):
         pair_by_number({1: Path("c1")}, {2: Path("d2")}, tmp_path)

@@ -62,5 +62,5 @@ def test_registration_is_refused_where_depth_is_registered_already(
     tum_folder: Callable[..., Path], replica_folder: Callable[..., Path]
 ) -> None:
     for source in (tum_folder(["1"], ["1"]), replica_folder([0]), "synthetic:room"):
-        with pytest.raises(ConfigError, match="registered to colour already"):
+        with pytest.raises(ConfigError, match="registered to color already"):
             open_sequence(str(source), SequenceOptions(register_depth=True))

@@ -54,7 +54,7 @@ def test_an_image_of_another_kind_or_none_is_named(replica_folder: Writer) -> No
         labels.frame(0)
     path = folder / "semantic_class/000001.png"
     path.write_bytes(path.read_bytes()[:40])
-    with pytest.raises(FrameError, match=r"semantic_class/000001.png is cut short"):
+    with pytest.raises(FrameError, match=r"semantic_class/000001.png is truncated"):
         labels.frame(1)
 
 

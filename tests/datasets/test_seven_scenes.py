@@ -130,7 +130,7 @@ def test_depth_of_another_size_is_a_bad_frame(
 def test_color_without_any_depth_is_an_error(seven_scenes_folder: Writer) -> None:
     folder = seven_scenes_folder([0])
     (folder / "frame-000000.depth.png").unlink()
-    with pytest.raises(DataError, match="1 images of colour and 0 of depth"):
+    with pytest.raises(DataError, match="1 color and 0 depth images"):
         open_sequence(str(folder))
 
 

@@ -99,7 +99,7 @@ def test_color_without_depth_partner_is_left_out(
     sequence = open_sequence(str(folder))
     assert sequence.stamps_ns.tolist() == [1_000_000_000, 1_200_000_000]
     assert (sequence.read(1).depth == 3000).all()
-    assert "1 of 3 colour images" in caplog.text
+    assert "1 of 3 color images" in caplog.text
 
 
 def test_one_depth_image_serves_one_color_image(tum_folder: Writer) -> None:
@@ -115,12 +115,12 @@ def test_lists_out_of_order_are_sorted_by_stamp(tum_folder: Writer) -> None:
 
 
 def test_no_pair_at_all_is_a_data_error(tum_folder: Writer) -> None:
-    with pytest.raises(DataError, match="none of 1 colour and 1 depth"):
+    with pytest.raises(DataError, match="none of 1 color and 1 depth"):
         open_sequence(str(tum_folder(["1"], ["2"])))
 
 
 def test_empty_lists_are_a_data_error(tum_folder: Writer) -> None:
-    with pytest.raises(DataError, match="none of 0 colour"):
+    with pytest.raises(DataError, match="none of 0 color"):
         open_sequence(str(tum_folder([], [])))
 
 
@@ -139,7 +139,7 @@ def test_truncated_image_fails_alone(tum_folder: Writer, kind: str, kept: int) -
     path = folder / kind / "1.png"
     path.write_bytes(path.read_bytes()[:kept])
     sequence = open_sequence(str(folder))
-    with pytest.raises(FrameError, match=r"1\.png is cut short"):
+    with pytest.raises(FrameError, match=r"1\.png is truncated"):
         sequence.read(0)
     assert sequence[1].index == 1
 
