@@ -1,1 +1,1 @@
-"""Cameras that somebody else's software speaks to, as frames of `camera/rgbd`."""
+"""Adapters from third-party camera software to frames of `camera/rgbd`."""

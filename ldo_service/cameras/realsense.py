@@ -1,4 +1,4 @@
-"""A RealSense camera on USB: depth aligned to colour, intrinsics and units from the device."""
+"""RealSense camera on USB: depth aligned to color, intrinsics and units from the device."""
 
 import sys
 from collections.abc import Generator, Iterator
@@ -10,35 +10,44 @@ import numpy as np
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.schemas import CameraModel, CameraRgbd, Image
 
-WAIT_MS = 5000  # for a frame: the first may take two seconds
-GRID = 16, 12  # points over the image that the lens is fitted at
-MAX_FIT_PX = 0.5  # of OpenCV's lens against the device's own
+WAIT_MS = 5000  # Maximum time to wait for a frame; the first one may take two seconds.
+GRID = 16, 12  # Columns and rows of the image points that the lens distortion is fitted to.
+MAX_FIT_PX = 0.5  # Maximum error of OpenCV's distortion model relative to that of the device.
 
 
 @dataclass(frozen=True, slots=True)
 class RealSenseStream:
-    """serial: of the device; empty: the only one. Colour and depth have one size and rate."""
+    """Stream settings of a RealSense; color and depth have the same size and rate."""
 
-    serial: str = ""
+    serial: str = ""  # Serial number of the device; empty if there is only one.
     width: int = 640
     height: int = 480
     rate_hz: int = 30
 
 
 def library() -> Any:
-    """Raises ConfigError without the extra `realsense`."""
+    """Return the module pyrealsense2.
+
+    Raises:
+        ConfigError: The extra `realsense` is not installed.
+    """
     try:
         import pyrealsense2  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ConfigError(
-            "a RealSense needs the extra `realsense`: "
+            "a RealSense needs the extra `realsense`. Install it by "
             f"`{sys.executable} -m pip install 'ldo-slam[realsense]'`."
         ) from error
     return pyrealsense2
 
 
 def frames(stream: RealSenseStream) -> Generator[CameraRgbd, None, None]:
-    """For ever. Raises ConfigError when no camera has such a stream, DataError when it ends."""
+    """Open a RealSense, and iterate over its frames without end.
+
+    Raises:
+        ConfigError: No RealSense is connected, or it does not support the stream.
+        DataError: The camera stopped sending frames.
+    """
     rs = library()
     _require_device(rs, stream.serial)
     pipeline = rs.pipeline()
@@ -46,8 +55,9 @@ def frames(stream: RealSenseStream) -> Generator[CameraRgbd, None, None]:
         profile = pipeline.start(_config(rs, stream))
     except RuntimeError as error:
         raise ConfigError(
-            f"the RealSense does not send {stream.width}x{stream.height} at {stream.rate_hz} Hz "
-            f"({error}): does another program use it? `rs-enumerate-devices` lists what it can."
+            f"the RealSense does not start {stream.width}x{stream.height} at {stream.rate_hz} Hz "
+            f"({error}). Check that no other program uses it; `rs-enumerate-devices` lists the "
+            "supported streams."
         ) from error
     try:
         color = profile.get_stream(rs.stream.color).as_video_stream_profile()
@@ -57,14 +67,24 @@ def frames(stream: RealSenseStream) -> Generator[CameraRgbd, None, None]:
 
 
 def messages(rs: Any, source: Any, camera: CameraModel) -> Iterator[CameraRgbd]:
-    """Frames of a `pipeline`, or whatever has its `wait_for_frames`, with depth in the pixels of
-    `camera`, which is colour's. Raises DataError when no more come."""
+    """Iterate over the frames of a pipeline, with depth aligned to color.
+
+    Args:
+        rs: The module pyrealsense2.
+        source: A `pipeline`, or another object with its `wait_for_frames`.
+        camera: The color camera.
+
+    Raises:
+        DataError: The source stopped sending frames.
+    """
     align, frame = rs.align(rs.stream.color), 0
     while True:
         try:
             both = align.process(source.wait_for_frames(WAIT_MS))
         except RuntimeError as error:
-            raise DataError(f"the RealSense sends no more frames: {error}.") from error
+            raise DataError(
+                f"the RealSense sends no more frames: {error}. Check its USB connection."
+            ) from error
         color, depth = both.get_color_frame(), both.get_depth_frame()
         if color and depth:
             yield CameraRgbd(
@@ -73,19 +93,27 @@ def messages(rs: Any, source: Any, camera: CameraModel) -> Iterator[CameraRgbd]:
                 camera=camera,
                 color=Image.raw("rgb8", np.asanyarray(color.get_data())),
                 depth=Image.raw("z16", np.asanyarray(depth.get_data())),
-                depth_scale=1 / round(depth.get_units(), 9),  # a float32
+                # The units are a float32; rounding restores the decimal value.
+                depth_scale=1 / round(depth.get_units(), 9),
             )
             frame += 1
 
 
 def camera_model(rs: Any, intrinsics: Any) -> CameraModel:
-    """With OpenCV's lens, fitted to the device's own model, which may be another.
+    """Return the camera model with OpenCV's distortion, fitted to the model of the device.
 
-    A point of the undistorted image at (x, y), r^2 = x^2 + y^2, is seen at
+    A point of the undistorted image at (x, y), r^2 = x^2 + y^2, is imaged at
 
         x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and y likewise,
 
-    which is linear in the coefficients. Raises ConfigError where that misses by over half a pixel.
+    which is linear in the coefficients.
+
+    Args:
+        rs: The module pyrealsense2.
+        intrinsics: Intrinsics of the device.
+
+    Raises:
+        ConfigError: The error of the fit exceeds half a pixel.
     """
     fx, fy = intrinsics.fx, intrinsics.fy
     distortion: tuple[float, ...] = ()
@@ -95,7 +123,8 @@ def camera_model(rs: Any, intrinsics: Any) -> CameraModel:
         if error_px > MAX_FIT_PX:
             raise ConfigError(
                 f"the lens of this RealSense ({intrinsics.model}) differs from OpenCV's model by "
-                f"{error_px:.1f} px: it is too wide for this."
+                f"{error_px:.1f} px, expected at most {MAX_FIT_PX} px: it is too wide. Use a "
+                "camera with a narrower lens."
             )
     return CameraModel(
         width=intrinsics.width,
@@ -109,13 +138,14 @@ def camera_model(rs: Any, intrinsics: Any) -> CameraModel:
 
 
 def _require_device(rs: Any, serial: str) -> None:
-    """A pipeline would wait 15 s for it."""
+    """Raise ConfigError if the device is not connected; a pipeline would wait 15 s for it."""
     devices = rs.context().query_devices()
     found = [device.get_info(rs.camera_info.serial_number) for device in devices]
     if not found or (serial and serial not in found):
         raise ConfigError(
-            f"no RealSense {serial + ' ' if serial else ''}was found (there is "
-            f"{', '.join(found) or 'none'}): is it plugged in, and may you read USB devices?"
+            f"no RealSense {serial + ' ' if serial else ''}was found (connected: "
+            f"{', '.join(found) or 'none'}). Check the USB connection and the permission to read "
+            "USB devices."
         )
 
 
@@ -129,8 +159,13 @@ def _config(rs: Any, stream: RealSenseStream) -> Any:
 
 
 def _seen_through(rs: Any, intrinsics: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where points of a grid are seen, [N, 2] over the focal lengths, and their x and y [N]
-    without the lens. Each model is asked in the direction that it is defined in."""
+    """Sample the distortion model of the device on a grid of points.
+
+    A model is evaluated in the direction in which it is defined.
+
+    Returns:
+        Distorted coordinates [N, 2] in focal lengths, and undistorted coordinates x and y [N].
+    """
     columns = np.linspace(0, intrinsics.width - 1, GRID[0])
     rows = np.linspace(0, intrinsics.height - 1, GRID[1])
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
@@ -147,7 +182,17 @@ def _seen_through(rs: Any, intrinsics: Any) -> tuple[np.ndarray, np.ndarray, np.
 def _fitted(
     seen: np.ndarray, x: np.ndarray, y: np.ndarray, focal_px: float
 ) -> tuple[tuple[float, ...], float]:
-    """k1 k2 p1 p2 k3, and the largest error in pixels."""
+    """Fit OpenCV's distortion coefficients to samples.
+
+    Args:
+        seen: Distorted coordinates, [N, 2] in focal lengths.
+        x: Undistorted coordinates, [N].
+        y: Undistorted coordinates, [N].
+        focal_px: Focal length in pixels.
+
+    Returns:
+        The coefficients k1 k2 p1 p2 k3, and the maximum error in pixels.
+    """
     r2 = x * x + y * y
     of_x = np.stack([r2 * x, r2**2 * x, 2 * x * y, r2 + 2 * x * x, r2**3 * x], axis=1)
     of_y = np.stack([r2 * y, r2**2 * y, r2 + 2 * y * y, 2 * x * y, r2**3 * y], axis=1)

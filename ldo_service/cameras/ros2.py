@@ -1,6 +1,7 @@
-"""An RGB-D camera of ROS 2, as topics that a Zenoh bridge forwards.
+"""RGB-D camera of ROS 2, whose topics a Zenoh bridge forwards.
 
-zenoh-bridge-ros2dds puts the CDR of the topic `/a/b` on the key `a/b`, once somebody subscribes.
+zenoh-bridge-ros2dds publishes the CDR of the topic `/a/b` on the key `a/b` while that key has a
+subscriber.
 """
 
 import time
@@ -27,60 +28,64 @@ from .ros_messages import (
     typestore,
 )
 
-KEEP = 4  # samples of a topic that wait: a burst, as the service's own input keeps
-PAIR_BUFFER = 8  # halves that wait for the other: 0.27 s at 30 Hz
-RESTARTED_AFTER_NS = 1_000_000_000  # a stamp so much earlier is no jitter
-SILENT_AFTER_S = 5.0  # what does not come is said so often
-MAX_REASONS = 20  # that are said; a stream of garbage has a new one each time
+KEEP = 4  # Maximum waiting samples per topic: a burst, as in the service's own input.
+PAIR_BUFFER = 8  # Maximum images that wait for their counterpart: 0.27 s at 30 Hz.
+RESTARTED_AFTER_NS = 1_000_000_000  # A stamp this much earlier is not jitter.
+SILENT_AFTER_S = 5.0  # Interval of messages about silent topics.
+MAX_REASONS = 20  # Maximum reported reasons; a stream of garbage has a new one for each message.
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class RosTopics:
-    """Names as ROS has them. `info` of colour; empty: `camera_info` beside it.
-
-    max_skew_s     between the stamps of colour and depth: under half a period at 30 Hz
-    is_rectified   images without distortion: the camera is the info's P
-    is_registered  depth lies on the pixels of colour, though its frame_id is another
-    """
+    """ROS names of the topics of a camera, and properties of its images."""
 
     color: str
     depth: str
-    info: str = ""
+    info: str = ""  # Camera info of color; empty: `camera_info` in the namespace of color.
+    # Maximum difference of the stamps of color and depth: less than half a period at 30 Hz.
     max_skew_s: float = 0.015
-    is_rectified: bool = False
+    is_rectified: bool = False  # The images have no distortion; the intrinsics are P of the info.
+    # Depth is on the pixels of color, although its frame_id differs.
     is_registered: bool = False
 
     def __post_init__(self) -> None:
         for topic in (self.color, self.depth, self.camera_info):
             key_of(topic)
         if not 0 <= self.max_skew_s < 10:
-            raise ConfigError(f"--max-skew-s {self.max_skew_s:g}: must be within 0..10.")
+            raise ConfigError(f"--max-skew-s={self.max_skew_s:g} must be at least 0 and below 10.")
 
     @property
     def camera_info(self) -> str:
+        """Topic of the camera info of color."""
         base = self.color.rsplit("/", 1)[0] if is_compressed(self.color) else self.color
         return self.info or base.rpartition("/")[0] + "/camera_info"
 
 
 def key_of(topic: str) -> str:
-    """Where the bridge puts a topic. Raises ConfigError for what is no name of one."""
+    """Return the Zenoh key of a ROS topic.
+
+    Raises:
+        ConfigError: The name of the topic is invalid.
+    """
     parts = topic.strip("/").split("/")
     if not all(part.isidentifier() and part.isascii() for part in parts):
-        raise ConfigError(f"{topic!r} is no topic of ROS: write it like /camera/color/image_raw.")
+        raise ConfigError(
+            f"{topic!r} is not a valid ROS topic. Write it like /camera/color/image_raw."
+        )
     return "/".join(parts)
 
 
 @dataclass
 class Inbox:
-    """Samples in the order in which they came; of each topic the newest `KEEP`."""
+    """Queue of samples in the order of arrival, with the newest `KEEP` of each topic."""
 
-    dropped: int = 0
+    dropped: int = 0  # Number of samples dropped from a full queue.
     _waiting: deque[tuple[str, bytes]] = field(default_factory=deque)
     _changed: Condition = field(default_factory=Condition)
 
     def put(self, topic: str, sample: zenoh.Sample) -> None:
-        """On Zenoh's thread."""
+        """Add a sample; runs on Zenoh's thread."""
         body = sample.payload.to_bytes()
         with self._changed:
             of_topic = [entry for entry in self._waiting if entry[0] == topic]
@@ -91,15 +96,25 @@ class Inbox:
             self._changed.notify()
 
     def take(self, timeout_s: float) -> tuple[str, bytes] | None:
+        """Return topic and body of the oldest sample, or None if none arrives in time."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._waiting), timeout_s)
             return self._waiting.popleft() if self._waiting else None
 
 
 class RosCamera:
-    """Frames of three topics. What cannot be used is counted, and each reason is said once."""
+    """Frames of an RGB-D camera from three ROS topics.
+
+    Unusable messages are counted, and each reason is reported once.
+    """
 
     def __init__(self, topics: RosTopics, say: Say) -> None:
+        """Prepare to receive frames.
+
+        Args:
+            topics: The topics.
+            say: Function that reports a message to the user.
+        """
         typestore()
         self._topics, self._say = topics, say
         self._inbox = Inbox()
@@ -113,14 +128,14 @@ class RosCamera:
 
     @property
     def statistics(self) -> str:
+        """Summary of frames made, and of images rejected, unpaired and dropped."""
         return (
-            f"{self.frames_made} frames, {self.rejected} images refused, {self._pairing.lost_a} of "
-            f"colour and {self._pairing.lost_b} of depth without a partner, {self._inbox.dropped} "
-            "dropped"
+            f"{self.frames_made} frames, {self.rejected} images rejected, {self._pairing.lost_a} "
+            f"color and {self._pairing.lost_b} depth images unpaired, {self._inbox.dropped} dropped"
         )
 
     def frames(self, session: zenoh.Session) -> Iterator[CameraRgbd]:
-        """For ever."""
+        """Subscribe to the topics, and iterate over the frames without end."""
         with ExitStack() as stack:
             for topic in self._last_s:
                 handler = zenoh.handlers.Callback(partial(self._inbox.put, topic), indirect=False)
@@ -132,7 +147,7 @@ class RosCamera:
                 self._notice_silence()
 
     def take(self, topic: str, body: bytes) -> Iterator[CameraRgbd]:
-        """The frames that a sample completes."""
+        """Process a sample, and iterate over the frames that it completes."""
         self._last_s[topic] = time.monotonic()
         try:
             for color, depth in self._pairs(topic, body):
@@ -155,9 +170,12 @@ class RosCamera:
             yield from self._pairing_at(depth.stamp_ns).add_b(depth)
 
     def _pairing_at(self, stamp_ns: int) -> StreamPairer[RosImage, RosImage]:
-        """A new one where a driver that started again, or a bag, counts from an earlier time."""
+        """Return the pairer; after a restart of the driver or bag, a new one.
+
+        A stamp that is much earlier than the newest one indicates the restart.
+        """
         if stamp_ns < self._newest_ns - RESTARTED_AFTER_NS:
-            self._say("stamps went back: the camera has started again.")
+            self._say("The stamps went back: the camera has restarted. No action needed.")
             self._pairing, self._newest_ns = self._new_pairing(), 0
         self._newest_ns = max(self._newest_ns, stamp_ns)
         return self._pairing
@@ -167,7 +185,7 @@ class RosCamera:
 
     def _frame(self, color: RosImage, depth: RosImage) -> CameraRgbd:
         if self._camera is None:
-            raise FrameError(f"nothing has come on {self._topics.camera_info} yet.")
+            raise FrameError(f"no camera info was received on {self._topics.camera_info} yet.")
         frame = joined(color, depth, self._camera, self.frames_made, self._topics.is_registered)
         self.frames_made += 1
         return frame
@@ -181,6 +199,6 @@ class RosCamera:
         silent = [topic for topic, last_s in self._last_s.items() if last_s < since_s]
         if silent:
             self._say(
-                f"nothing comes on {', '.join(silent)}: does `ros2 topic hz` show it, and is the "
-                "bridge connected here?"
+                f"No messages on {', '.join(silent)} for {SILENT_AFTER_S:g} s. Check that `ros2 "
+                "topic hz` shows them and that the bridge is connected to this network."
             )

@@ -1,6 +1,6 @@
-"""Images and camera infos of ROS 2, out of the CDR that a bridge forwards.
+"""Decoding of ROS 2 images and camera infos from the CDR that a bridge forwards.
 
-Encodings are those of `sensor_msgs/image_encodings`; depth is in millimetres as 16UC1 and in metres
+Encodings are those of `sensor_msgs/image_encodings`; depth is in millimeters as 16UC1 and in meters
 as 32FC1 (REP 118).
 """
 
@@ -16,45 +16,55 @@ from ldo_service.geometry.codecs import read_image_size
 from ldo_service.schemas import CameraModel, CameraRgbd, Image
 from ldo_service.schemas.frames import MAX_PIXELS, ImageEncoding
 
+# Big and little endian; ROS 2 does not send the other versions.
 CDR_HEADERS = (
     b"\0\0",
     b"\0\1",
-)  # big and little endian; others are versions that ROS 2 does not send
+)
 COLOR_CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1}
-DEPTH_KINDS: dict[str, tuple[ImageEncoding, str, float]] = {  # ours, NumPy's, units per metre
+# Encoding in messages of the service, NumPy type and units per meter, by ROS encoding.
+DEPTH_KINDS: dict[str, tuple[ImageEncoding, str, float]] = {
     "16UC1": ("z16", "u2", 1000.0),
     "mono16": ("z16", "u2", 1000.0),
     "32FC1": ("f32", "f4", 1.0),
 }
-COMPRESSED_DEPTH_HEADER = 12  # bytes before the PNG: a format and two quantisation parameters
+# Bytes before the PNG: a format and two quantization parameters.
+COMPRESSED_DEPTH_HEADER = 12
 PLUMB_BOB, RATIONAL, UNDISTORTED = "plumb_bob", "rational_polynomial", ("", "none")
 
 
 @dataclass(frozen=True, slots=True)
 class RosImage:
-    """frame_id: of whose camera it is, as ROS names it; depth_scale: of depth, units per metre."""
+    """Image of a ROS message."""
 
     stamp_ns: int
-    frame_id: str
+    frame_id: str  # ROS name of the camera frame.
     image: Image
-    depth_scale: float = 1.0
+    depth_scale: float = 1.0  # Units of a depth image per meter.
 
 
 def is_compressed(topic: str) -> bool:
-    """As image_transport names topics."""
+    """Return whether a topic has compressed images, by the naming of image_transport."""
     return topic.endswith(("/compressed", "/compressedDepth"))
 
 
 def read_color(body: bytes, topic: str) -> RosImage:
-    """Of sensor_msgs/Image, or sensor_msgs/CompressedImage where the topic's name says so. Raises
-    FrameError."""
+    """Decode a color image from sensor_msgs/Image or sensor_msgs/CompressedImage.
+
+    Args:
+        body: The message in CDR.
+        topic: Name of its topic, which determines the type of the message.
+
+    Raises:
+        FrameError: The message is invalid, or its encoding is not supported.
+    """
     if is_compressed(topic):
         return _compressed(_message(body, "sensor_msgs/msg/CompressedImage"), 0)
     message = _message(body, "sensor_msgs/msg/Image")
     channels = COLOR_CHANNELS.get(message.encoding)
     if channels is None:
         raise FrameError(
-            f"colour cannot be encoded as {message.encoding[:40]!r}: only as "
+            f"color encoding {message.encoding[:40]!r} is not supported, expected one of "
             f"{', '.join(COLOR_CHANNELS)}."
         )
     pixels = _pixels(message, np.dtype("u1"), channels)
@@ -65,16 +75,26 @@ def read_color(body: bytes, topic: str) -> RosImage:
 
 
 def read_depth(body: bytes, topic: str) -> RosImage:
-    """The same of depth."""
+    """Decode a depth image from sensor_msgs/Image or sensor_msgs/CompressedImage.
+
+    Args:
+        body: The message in CDR.
+        topic: Name of its topic, which determines the type of the message.
+
+    Raises:
+        FrameError: The message is invalid, or its encoding is not supported.
+    """
     if is_compressed(topic):
         message = _message(body, "sensor_msgs/msg/CompressedImage")
         if not message.format.startswith("16UC1"):
-            raise FrameError(f"compressed depth is read as 16UC1, and this is {message.format!r}.")
+            raise FrameError(
+                f"compressed depth format {message.format[:40]!r} is not supported, expected 16UC1."
+            )
         return _compressed(message, COMPRESSED_DEPTH_HEADER, 1000.0)
     message = _message(body, "sensor_msgs/msg/Image")
     if message.encoding not in DEPTH_KINDS:
         raise FrameError(
-            f"depth cannot be encoded as {message.encoding[:40]!r}: only as "
+            f"depth encoding {message.encoding[:40]!r} is not supported, expected one of "
             f"{', '.join(DEPTH_KINDS)}."
         )
     encoding, kind, depth_scale = DEPTH_KINDS[message.encoding]
@@ -84,8 +104,15 @@ def read_depth(body: bytes, topic: str) -> RosImage:
 
 
 def read_camera(body: bytes, is_rectified: bool) -> CameraModel:
-    """Of sensor_msgs/CameraInfo: K and D, or of rectified images the left of P. Raises
-    FrameError."""
+    """Decode the camera model from sensor_msgs/CameraInfo.
+
+    Args:
+        body: The message in CDR.
+        is_rectified: Use the left 3x3 of P without distortion instead of K and D.
+
+    Raises:
+        FrameError: The message is invalid, or its distortion model is not supported.
+    """
     info = _message(body, "sensor_msgs/msg/CameraInfo")
     matrix = np.reshape(info.p, (3, 4)) if is_rectified else np.reshape(info.k, (3, 3))
     try:
@@ -99,26 +126,34 @@ def read_camera(body: bytes, is_rectified: bool) -> CameraModel:
             distortion=() if is_rectified else _distortion(info),
         )
     except ValueError as error:
-        raise FrameError(f"the camera info makes no camera: {error}.") from error
+        raise FrameError(f"the camera info is invalid: {error}.") from error
 
 
 def joined(
     color: RosImage, depth: RosImage, camera: CameraModel, frame: int, is_registered: bool
 ) -> CameraRgbd:
-    """One frame of both, stamped by colour. Raises FrameError for halves that do not fit.
+    """Combine a color and a depth image to a frame with the stamp of color.
 
-    is_registered  the user says that depth lies on the pixels of colour, whatever its frame_id
+    Args:
+        color: Color image.
+        depth: Depth image.
+        camera: The color camera.
+        frame: Number of the frame.
+        is_registered: Assume that depth is on the pixels of color, whatever its frame_id.
+
+    Raises:
+        FrameError: The images and the camera do not fit together.
     """
     if depth.frame_id != color.frame_id and not is_registered:
         raise FrameError(
-            f"depth is of frame {depth.frame_id!r} and colour of {color.frame_id!r}: subscribe to "
-            "depth that is registered to colour (realsense2_camera: align_depth.enable:=true; else "
-            "the node `register` of depth_image_proc), or say --registered where it is."
+            f"depth has frame_id {depth.frame_id!r} and color {color.frame_id!r}. Subscribe to "
+            "depth that is registered to color (realsense2_camera: align_depth.enable:=true; else "
+            "the node `register` of depth_image_proc), or give --registered if it is registered."
         )
     if (color.image.width, color.image.height) != (camera.width, camera.height):
         raise FrameError(
-            f"colour has {color.image.width}x{color.image.height} pixels and its camera info says "
-            f"{camera.width}x{camera.height}: is it the info of this topic?"
+            f"color has {color.image.width}x{color.image.height} pixels and its camera info "
+            f"{camera.width}x{camera.height}. Check that the info belongs to this topic."
         )
     try:
         return CameraRgbd(
@@ -130,31 +165,38 @@ def joined(
             depth_scale=depth.depth_scale,
         )
     except ValueError as error:
-        raise FrameError(f"colour and depth make no frame: {error}.") from error
+        raise FrameError(f"color and depth do not fit together: {error}.") from error
 
 
 # --- CDR ------------------------------------------------------------------------------------------
 @cache
 def typestore() -> Any:
-    """What reads CDR. Raises ConfigError without the extra `ros2`."""
+    """Return the type store of rosbags, which decodes CDR.
+
+    Raises:
+        ConfigError: The extra `ros2` is not installed.
+    """
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ConfigError(
-            "reading ROS 2 needs the extra `ros2`: "
+            "reading ROS 2 needs the extra `ros2`. Install it by "
             f"`{sys.executable} -m pip install 'ldo-slam[ros2]'`."
         ) from error
-    return get_typestore(Stores.ROS2_HUMBLE)  # these messages have not changed since
+    return get_typestore(Stores.ROS2_HUMBLE)  # Later versions did not change these messages.
 
 
 def _message(body: bytes, kind: str) -> Any:
     if body[:2] not in CDR_HEADERS:
-        raise FrameError(f"{len(body)} bytes that begin with {body[:4].hex()} are no CDR of ROS 2.")
+        raise FrameError(
+            f"{len(body)} bytes that begin with {body[:4].hex()} are not CDR of ROS 2. Check that "
+            "the bridge is zenoh-bridge-ros2dds."
+        )
     store = typestore()
     try:
         return store.deserialize_cdr(body, kind)
-    except Exception as error:  # rosbags has one of its own, and lets others through
-        raise FrameError(f"{len(body)} bytes are no {kind} in CDR: {error}.") from error
+    except Exception as error:  # rosbags raises its own exception, and passes on any other.
+        raise FrameError(f"{len(body)} bytes are not a valid {kind}: {error}.") from error
 
 
 def _ros_image(message: Any, image: Image, depth_scale: float = 1.0) -> RosImage:
@@ -164,44 +206,50 @@ def _ros_image(message: Any, image: Image, depth_scale: float = 1.0) -> RosImage
 
 
 def _pixels(message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
-    """[H, W, channels], without what pads the rows."""
+    """Return the pixels [H, W, channels] of a message, without the padding of rows."""
     height, width, step = message.height, message.width, message.step
     row_bytes = width * channels * dtype.itemsize
     if not 0 < width * height <= MAX_PIXELS:
-        raise FrameError(f"an image of {width}x{height} pixels is empty or over {MAX_PIXELS}.")
+        raise FrameError(
+            f"an image has {width}x{height} pixels, expected 1 to {MAX_PIXELS} in total."
+        )
     if step < row_bytes or len(message.data) != step * height:
         raise FrameError(
-            f"a {message.encoding} image of {width}x{height} has rows of {row_bytes} bytes; this "
-            f"one has {len(message.data)} bytes in steps of {step}."
+            f"a {message.encoding} image of {width}x{height} needs {height} rows of at least "
+            f"{row_bytes} bytes, but has {len(message.data)} bytes in rows of {step}."
         )
     rows = np.reshape(message.data, (height, step))[:, :row_bytes]
     return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
 
 
 def _compressed(message: Any, start: int, depth_scale: float = 1.0) -> RosImage:
-    """Passed on as it is: the service decompresses it."""
+    """Return a compressed image without decoding it; the service decodes it."""
     data = memoryview(message.data.tobytes())[start:]
     size = read_image_size(data)
     if size is None:
         raise FrameError(
-            f"{len(data)} bytes, said to be {message.format[:40]!r}, are neither PNG nor JPEG."
+            f"{len(data)} bytes of format {message.format[:40]!r} are neither PNG nor JPEG."
         )
     encoding: ImageEncoding = "jpeg" if bytes(data[:2]) == b"\xff\xd8" else "png"
     try:
         image = Image(encoding=encoding, width=size[0], height=size[1], data=data)
     except ValueError as error:
-        raise FrameError(f"a compressed image cannot be used: {error}.") from error
+        raise FrameError(f"a compressed image is invalid: {error}.") from error
     return _ros_image(message, image, depth_scale)
 
 
 def _distortion(info: Any) -> tuple[float, ...]:
-    """As OpenCV has it, which is ROS' own order."""
+    """Return the distortion coefficients in the order of OpenCV, which ROS uses too.
+
+    Raises:
+        FrameError: The distortion model is not supported.
+    """
     d = tuple(float(number) for number in info.d)
     if not any(d) or info.distortion_model in UNDISTORTED:
         return ()
     if info.distortion_model not in (PLUMB_BOB, RATIONAL):
         raise FrameError(
-            f"its lens is of the model {info.distortion_model!r}; {PLUMB_BOB} and {RATIONAL} are "
-            "known: subscribe to rectified images, with --rectified."
+            f"distortion model {info.distortion_model!r} is not supported, expected {PLUMB_BOB} or "
+            f"{RATIONAL}. Subscribe to rectified images, with --rectified."
         )
     return d

@@ -127,13 +127,19 @@ def test_a_camera_that_is_none_is_refused(info, says: str) -> None:
 @pytest.mark.parametrize(
     ("message", "says"),
     [
-        (image("bayer_rggb8", COLOR[..., 0]), "'bayer_rggb8': only as rgb8"),
-        (image("rgb8", COLOR, step=23), "rows of 24 bytes; this one has 144 bytes in steps of 23"),
+        (
+            image("bayer_rggb8", COLOR[..., 0]),
+            "'bayer_rggb8' is not supported, expected one of rgb8",
+        ),
+        (
+            image("rgb8", COLOR, step=23),
+            "rows of at least 24 bytes, but has 144 bytes in rows of 23",
+        ),
         (image("rgb8", COLOR, height=7), "has 144 bytes"),
         (image("rgb8", COLOR, data=np.zeros(3, np.uint8)), "has 3 bytes"),
-        (image("rgb8", COLOR, width=0), "empty"),
+        (image("rgb8", COLOR, width=0), "0x6 pixels, expected 1 to"),
         (image("rgb8", COLOR, width=2**31, height=2**31), "33554432"),
-        (camera_info(), "no sensor_msgs/msg/Image|only as rgb8|rows of|empty|pixels"),
+        (camera_info(), "not a valid sensor_msgs/msg/Image|is not supported|rows of|pixels"),
     ],
 )
 def test_color_that_does_not_fit_itself_is_refused(message, says: str) -> None:
@@ -152,7 +158,7 @@ def test_truncated_cdr_is_refused(length: int) -> None:
 
 
 def test_cdr_of_another_version_is_refused() -> None:
-    with pytest.raises(FrameError, match="no CDR of ROS 2"):
+    with pytest.raises(FrameError, match="not CDR of ROS 2"):
         read_color(b"\0\7\0\0" + cdr(image("rgb8", COLOR))[4:], "/image_raw")
 
 
@@ -195,7 +201,7 @@ def test_depth_of_another_frame_is_refused_unless_the_user_knows_better() -> Non
 def test_sizes_that_do_not_fit_are_refused() -> None:
     with pytest.raises(FrameError, match="differ in size"):
         frame_of(depth_of(pixels=DEPTH_MM[:4]))
-    with pytest.raises(FrameError, match="8x6 pixels and its camera info says 8x5"):
+    with pytest.raises(FrameError, match="8x6 pixels and its camera info 8x5"):
         frame_of(depth_of(), read_camera(cdr(camera_info(height=5)), False))
 
 
