@@ -1,1 +1,1 @@
-"""The boxes of the design: each joins what travels (`schemas`) to what computes (`ldo_service`)."""
+"""Actors of the design; each one connects messages (`schemas`) to algorithms (`ldo_service`)."""

@@ -1,9 +1,10 @@
-"""Objects of known classes in each keyframe.                                actors/detector.py
+"""Detection of objects of known classes in each keyframe.
 
-in   keyframe/new      Keyframe         Lossless(8)   a missing one has no labels from here
-out  detection/boxes   DetectionBoxes   one for every keyframe, also where nobody could look
+in   keyframe/new      Keyframe         Lossless(8)   a lost keyframe would get no detections
+out  detection/boxes   DetectionBoxes                 one for every keyframe, possibly empty
 
-A network that cannot be used never ends the service: it goes on without boxes, and health says so.
+A network that cannot be used never ends the service. The detector then publishes messages without
+boxes, and its metrics report the failure.
 """
 
 import logging
@@ -25,12 +26,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class DetectorConfig:
-    model: str = ""  # a name of `ldo models list`, or an ONNX file; empty: nothing is detected
+    """Network of the detector, and how it runs."""
+
+    model: str = ""  # A name of `ldo models list`, or an ONNX file; empty: no detections.
     network: NetworkConfig = field(default_factory=NetworkConfig)
 
 
 class Detector(Actor):
-    """Has no memory: the same keyframe, sent again, has the same boxes."""
+    """Stateless actor: a keyframe that is sent again gets the same boxes."""
 
     name = "detector"
     inputs = (In(KEYFRAME_NEW, Lossless(8)),)
@@ -46,9 +49,10 @@ class Detector(Actor):
             if self.config.model:
                 self._network = open_detector(self.config.model, self.config.network)
         except ConfigError as error:
-            log.error("nothing is detected: %s", error)
+            log.error('detector disabled: %s. Check detector.model with "ldo models list".', error)
 
     def handle(self, message: Keyframe) -> Iterator[DetectionBoxes]:
+        """Yield one message for the keyframe; it has no `network` if no network could be used."""
         if self._network is None:
             yield detections_to_message(message, None, (), "")
             return
@@ -56,13 +60,21 @@ class Detector(Actor):
         yield detections_to_message(message, found, self._network.labels, self._network.identity)
 
     def _find(self, image: np.ndarray) -> Detections | None:
-        """None when the network fails, which is logged once until it works again."""
+        """Return the detections in an image [H, W, 3], or None if the network fails.
+
+        The first failure is logged; further ones are logged only after a success.
+        """
         assert self._network is not None
         try:
             found = self._network.detect(image)
         except ModelError as error:
             if not self._is_failing:
-                log.error("keyframes stay without boxes: %s: %s", self._network.identity, error)
+                log.error(
+                    "detector: inference failed (%s: %s); keyframes get no detections until it "
+                    "succeeds. Try inference.providers=[cpu].",
+                    self._network.identity,
+                    error,
+                )
             self._is_failing = True
             self._failures += 1
             return None
@@ -71,7 +83,7 @@ class Detector(Actor):
         return found
 
     def metrics(self) -> dict[str, float]:
-        """`networks_missing`: named in the configuration, and cannot be used."""
+        """Return counters; `networks_missing` is 1 if the configured network cannot be used."""
         return {
             "networks": float(self._network is not None),
             "networks_missing": float(bool(self.config.model) and self._network is None),
@@ -81,7 +93,12 @@ class Detector(Actor):
 
 
 def require_detector(config: DetectorConfig) -> None:
-    """Raises ConfigError when its model cannot be used: a run over a file is asked for it, where a
-    service rather goes on without."""
+    """Check that the configured model can be used.
+
+    Offline runs call this before they start. A service starts without detections instead.
+
+    Raises:
+        ConfigError: The model is unknown or unusable.
+    """
     if config.model:
         open_detector(config.model, config.network)

@@ -1,10 +1,9 @@
-"""Camera frames, checked and rectified.                                 actors/frame_source.py
+"""Check and rectification of camera frames.
 
-in   camera/rgbd    CameraRgbd    Latest(4)   a burst is smoothed, an old frame is worth less than
-                                              the next one
-in   camera/color   CameraColor   Latest(4)   the same, for cameras that send two topics: halves
-in   camera/depth   CameraDepth   Latest(4)   are paired by stamp
-out  frame/rgbd     FrameRgbd                 a pair has the stamp and the number of its colour
+in   camera/rgbd    CameraRgbd    Latest(4)   buffers a burst; newer frames count more
+in   camera/color   CameraColor   Latest(4)   as camera/rgbd, for cameras with two topics;
+in   camera/depth   CameraDepth   Latest(4)   color and depth are paired by stamp
+out  frame/rgbd     FrameRgbd                 a pair has stamp and number of its color image
 """
 
 import logging
@@ -33,34 +32,42 @@ from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD, 
 log = logging.getLogger(__name__)
 
 Input = CameraRgbd | CameraColor | CameraDepth
-# halves without one pair: a second of frames, no start-up effect any more
+# Unpaired images before the warning: a second of frames, more than a start-up effect.
 UNPAIRED_WARNING_COUNT = 30
 
 
 @dataclass(frozen=True, slots=True)
 class FrameSourceConfig:
-    max_skew_s: float = 0.015  # between the halves of a pair: under half a period at 30 Hz, so
-    # that the first depth within it is the nearest; at 1 rad/s it is 0.9 deg of turn
-    pair_buffer: int = 8  # halves of a stream that wait for the other: 0.27 s at 30 Hz, 7 MB VGA
-    restart_after_s: float = 1.0  # a stamp so much earlier is no jitter: the camera started again
-    min_side_px: int = 32  # smaller images hold too little to track, and hint at a wrong header
+    """Limits for pairing, restarts and image sizes of a camera."""
+
+    # Maximum time between the color and depth image of a pair. Below half a period at 30 Hz, so
+    # that the first depth image within it is the nearest. At 1 rad/s it is 0.9 deg of rotation.
+    max_skew_s: float = 0.015
+    # Images per stream that wait for their partner: 0.27 s at 30 Hz, 7 MB for VGA.
+    pair_buffer: int = 8
+    # A stamp that is earlier by more than this means that the camera restarted; it is no jitter.
+    restart_after_s: float = 1.0
+    # Minimum image side. Smaller images hold too little to track and hint at a wrong header.
+    min_side_px: int = 32
 
     def __post_init__(self) -> None:
         if not 0 <= self.max_skew_s < 10:
-            raise ConfigError(f"frame_source.max_skew_s={self.max_skew_s:g}: must be within 0..10.")
+            raise ConfigError(
+                f"frame_source.max_skew_s={self.max_skew_s:g} must be at least 0 and below 10."
+            )
         if not self.restart_after_s > 0:
             raise ConfigError(
                 f"FrameSourceConfig.restart_after_s={self.restart_after_s:g} must be positive."
             )
         if min(self.pair_buffer, self.min_side_px) < 1:
-            raise ConfigError(
-                named(self, "pair_buffer", "min_side_px")
-                + ": pair_buffer and min_side_px must be at least 1."
-            )
+            raise ConfigError(named(self, "pair_buffer", "min_side_px") + " must be at least 1.")
 
 
 class FrameSource(Actor):
-    """A frame that cannot be used is counted, and the first of each episode is logged."""
+    """Actor that pairs, checks and rectifies camera frames.
+
+    It counts unusable frames and logs the first one of each series.
+    """
 
     name = "frame_source"
     inputs = (
@@ -77,12 +84,13 @@ class FrameSource(Actor):
         self._rectify = Rectifier()
         self._pairing = self._new_pairing()
         self._last_stamp_ns = -1
-        self._sessions = 1  # of the camera
+        self._sessions = 1  # Camera starts seen so far.
         self._rejected = 0
         self._is_rejecting = False
         self._has_warned_of_skew = False
 
     def handle(self, message: Input) -> Iterator[FrameRgbd]:
+        """Yield the rectified frame of a whole message, or of each pair that it completes."""
         self._notice_restart(message)
         if isinstance(message, CameraRgbd):
             yield from self._frame(message, partial(raw_frame_from_message, message, message.frame))
@@ -112,8 +120,9 @@ class FrameSource(Actor):
         ):
             self._has_warned_of_skew = True
             log.warning(
-                "%d colour and %d depth images found no partner within %g ms: do both cameras "
-                "stamp by one clock? frame_source.max_skew_s allows more.",
+                "frame_source: %d color and %d depth images found no partner within %g ms, so no "
+                "pair was published. Check that both cameras use one clock, or raise "
+                "frame_source.max_skew_s.",
                 self._pairing.lost_a, self._pairing.lost_b, 1e3 * self.config.max_skew_s,
             )  # fmt: skip
 
@@ -135,15 +144,19 @@ class FrameSource(Actor):
     def _require_later(self, message: CameraRgbd | CameraColor) -> None:
         if message.stamp_ns <= self._last_stamp_ns:
             raise DataError(
-                f"its stamp {message.stamp_ns} ns is not after the last one, "
+                f"stamp {message.stamp_ns} ns is not after the previous stamp "
                 f"{self._last_stamp_ns} ns. Send frames in the order of their exposure."
             )
 
     def _notice_restart(self, message: Input) -> None:
-        """A camera that starts again may count time from an earlier point."""
+        """Reset stamps and pairing if the stamp went back, as after a restart of the camera."""
         back_s = (self._last_stamp_ns - message.stamp_ns) * 1e-9
         if back_s > self.config.restart_after_s:
-            log.warning("stamps went back by %.1f s: the camera has started again", back_s)
+            log.warning(
+                "frame_source: stamps went back by %.1f s; assuming that the camera restarted. "
+                "No action needed.",
+                back_s,
+            )
             self._sessions += 1
             self._last_stamp_ns = -1
             self._pairing = self._new_pairing()
@@ -155,25 +168,30 @@ class FrameSource(Actor):
         width, height = message.camera.width, message.camera.height
         if min(width, height) < self.config.min_side_px:
             raise DataError(
-                f"{width}x{height} pixels are too few to track: a side needs "
-                f"{self.config.min_side_px}."
+                f"the image of {width}x{height} pixels is too small to track: each side must have "
+                f"at least {self.config.min_side_px} pixels (frame_source.min_side_px)."
             )
 
     def _reject(self, message: Input, error: DataError) -> None:
         self._rejected += 1
         if not self._is_rejecting:
-            log.warning("frame %d rejected: %s", message.frame, error)
+            log.warning("frame_source: frame %d rejected: %s", message.frame, error)
         self._is_rejecting = True
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, int]:
-        """Without halves that wait: after a crash one pair fewer is cheaper than saving images."""
+        """Return the last stamp; images that wait for a partner are not saved.
+
+        After a crash at most one pair is lost, which costs less than saving images.
+        """
         return {"last_stamp_ns": self._last_stamp_ns}
 
     def restore(self, state: dict[str, int]) -> None:  # type: ignore[override]
+        """Continue after the last stamp of a snapshot."""
         self._last_stamp_ns = state["last_stamp_ns"]
 
     def metrics(self) -> dict[str, float]:
+        """Return counters of frames and pairs, and the skew of the recent pairs in milliseconds."""
         skews_ms = self._pairing.skews_ms() or [0.0]
         return {
             "frames_rejected": self._rejected,
@@ -181,13 +199,17 @@ class FrameSource(Actor):
             "pairs": self._pairing.pairs,
             "color_unpaired": self._pairing.lost_a,
             "depth_unpaired": self._pairing.lost_b,
-            "skew_ms_p50": float(np.median(skews_ms)),  # of the recent pairs
+            "skew_ms_p50": float(np.median(skews_ms)),  # Median over the recent pairs.
             "skew_ms_max": max(skews_ms),
         }
 
 
 def join_halves(color: CameraColor, depth: CameraDepth) -> RawFrame:
-    """The depth in the colour image, with the colour's stamp, number and camera."""
+    """Return depth registered to the color image, with the stamp and camera of that image.
+
+    Raises:
+        DataError: An image cannot be decoded.
+    """
     image, scale = depth.image, depth.depth_scale
     values = codecs.decode_depth(image.encoding, image.width, image.height, image.data)
     if depth.camera != color.camera or depth.T_color_depth != IDENTITY:

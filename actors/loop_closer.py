@@ -1,12 +1,13 @@
-"""Places that are seen again.                                            actors/loop_closer.py
+"""Detection of loop closures between subgraphs of keyframes.
 
-in   keyframe/new       Keyframe         Lossless(8)   a missing one would be no place to come back
-in   detection/boxes    DetectionBoxes   Lossless(8)   what is there, for every keyframe
-in   graph/correction   GraphCorrection  Latest(1)     a versioned absolute state: the newest says
-out  loop/closure    LoopClosure
-out  loop/candidate  LoopCandidate
+in   keyframe/new       Keyframe         Lossless(8)   a lost keyframe could never close a loop
+in   detection/boxes    DetectionBoxes   Lossless(8)   semantics of every keyframe
+in   graph/correction   GraphCorrection  Latest(1)     complete and versioned; the newest suffices
+out  loop/closure       LoopClosure                    each accepted candidate
+out  loop/candidate     LoopCandidate                  each candidate, with its rejection reason
 
-A keyframe waits for its boxes. Without a detector these come too, and say that nobody looked.
+A keyframe waits for its detections. The detector publishes them for every keyframe, even without a
+network; the field `network` is then empty.
 """
 
 import logging
@@ -46,34 +47,37 @@ from ldo_service.tracking.keyframe_database import KeyframeRecord, make_keyframe
 
 log = logging.getLogger(__name__)
 
-MAX_PENDING_KEYFRAMES = 16  # keyframes: two windows of boxes; if these wait longer, they were lost
-RECENT_KEYFRAMES = 32  # that the optimizer may not have placed yet, as the tracker keeps
+MAX_PENDING_KEYFRAMES = 16  # Two windows of boxes; if more keyframes wait, the boxes were lost.
+# Newest keyframes, which the optimizer may not have placed yet; the tracker keeps as many.
+RECENT_KEYFRAMES = 32
 
 
 @dataclass(frozen=True, slots=True)
 class LoopCloserConfig:
-    is_on: bool = True  # False: no place is recognised, to see what closing loops is worth
+    """Parameters of the loop closer."""
+
+    is_on: bool = True  # False disables loop closing, to measure its benefit.
     loops: LoopsConfig = field(default_factory=LoopsConfig)
     movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PendingKeyframe:
-    """A keyframe whose boxes are under way."""
+    """Keyframe that waits for its detections."""
 
     place: KeyframeRecord
     frame: int
     stamp_ns: int
-    width_px: int  # of the image that the boxes are in
+    width_px: int  # Width of the image that the boxes refer to.
 
     @property
     def facts(self) -> tuple[int, int, int]:
-        """All but the place, which is a part of the state by itself."""
+        """Frame, stamp and image width; the record in `place` is a separate part of the state."""
         return self.frame, self.stamp_ns, self.width_px
 
 
 class LoopCloser(Actor):
-    """Only says what it found; the optimizer decides how far to believe it."""
+    """Actor that detects loop closures; the optimizer decides whether to accept them."""
 
     name = "loop_closer"
     inputs = (
@@ -88,18 +92,22 @@ class LoopCloser(Actor):
         self.config = config or LoopCloserConfig()
         self.recognizer = LoopDetector(self.config.loops)
         self._vocabulary = Vocabulary()
-        self.poses = KeyframePoses()  # of the keyframes kept, and the newest
-        self._joined: dict[int, int] = {}  # submaps placed in an older one
-        self._waiting: dict[int, PendingKeyframe] = {}  # by keyframe
-        self._boxes: dict[int, DetectionBoxes] = {}  # that came before their keyframe, or wait
-        self._newest = -1  # keyframe taken
+        self.poses = KeyframePoses()  # Poses of the stored keyframes and the newest ones.
+        # Merged submaps, each with the older one that it is merged into.
+        self._joined: dict[int, int] = {}
+        self._waiting: dict[int, PendingKeyframe] = {}  # Pending keyframes by id.
+        # Detections by keyframe that came before their keyframe or wait with it.
+        self._boxes: dict[int, DetectionBoxes] = {}
+        self._newest = -1  # Id of the newest received keyframe.
         self._accepted = self._refused = self._without_boxes = self._repeated = 0
-        self._parts: dict[str, Any] | None = None  # of the state
-        self._saved_poses: dict[str, Any] | None = None  # likewise; None: they have changed
+        self._parts: dict[str, Any] | None = None  # Cached parts of the state.
+        # Cached poses of the state; None after a change.
+        self._saved_poses: dict[str, Any] | None = None
 
     def handle(
         self, message: Keyframe | DetectionBoxes | GraphCorrection
     ) -> Iterator[LoopClosure | LoopCandidate]:
+        """Yield the candidates and closures of the keyframes that a message completes."""
         if not self.config.is_on:
             return
         self._parts = None
@@ -118,7 +126,7 @@ class LoopCloser(Actor):
 
     def _take(self, message: Keyframe) -> None:
         if message.keyframe <= self._newest:
-            self._repeated += 1  # sent again after a restart
+            self._repeated += 1  # Sent again after a restart.
             return
         self._newest = message.keyframe
         self._saved_poses = None
@@ -139,13 +147,16 @@ class LoopCloser(Actor):
         )
 
     def _ready(self) -> list[int]:
-        """Keyframes whose turn it is: boxes come in order, so those of older ones will not come."""
+        """Return the keyframes that need not wait any longer.
+
+        Detections arrive in order, so those of keyframes before the newest match will not come.
+        """
         newest = max(self._boxes.keys() & self._waiting.keys(), default=-1)
         ready = [k for k in self._waiting if k <= newest]
         late = len(self._waiting) - len(ready) - MAX_PENDING_KEYFRAMES
         return ready or list(self._waiting)[: max(late, 0)]
 
-    # --- recognising ------------------------------------------------------------------------------
+    # --- loop detection ---------------------------------------------------------------------------
     def _recognize(self, keyframe: int) -> Iterator[LoopClosure | LoopCandidate]:
         waiting, boxes = self._waiting.pop(keyframe), self._boxes.pop(keyframe, None)
         self._boxes = {k: b for k, b in self._boxes.items() if k > keyframe}
@@ -162,7 +173,10 @@ class LoopCloser(Actor):
     def _masked_keyframe(
         self, waiting: PendingKeyframe, boxes: DetectionBoxes | None
     ) -> tuple[KeyframeRecord, DetectionPoints | None]:
-        """The place without what may move by itself, and what stands there."""
+        """Return the record without dynamic classes, and the 3D points of its static detections.
+
+        The points are None if no network ran.
+        """
         if boxes is None or not boxes.network:
             return waiting.place, None
         place, movable = waiting.place, self.config.movable
@@ -194,26 +208,31 @@ class LoopCloser(Actor):
                 self._refused += 1
             else:
                 self._accepted += 1
-                log.info("keyframe %d closes a loop with %d", closure.b, closure.a)
+                log.info(
+                    "loop_closer: keyframe %d closes a loop with keyframe %d", closure.b, closure.a
+                )
                 yield loop_closure_to_message(finding)
             yield loop_candidate_to_message(finding)
 
     def on_stop(self) -> Iterator[LoopClosure | LoopCandidate]:
-        """What waits, and the keyframes that a subgraph was begun with."""
+        """Process the pending keyframes and the unfinished subgraph."""
         self._parts = None
         for keyframe in list(self._waiting):
             yield from self._recognize(keyframe)
         yield from self._to_messages(self.recognizer.flush(self.poses, self._joined))
 
     def _needed(self) -> list[int]:
-        """Keyframes that are kept as views, and those that the optimizer may not have placed."""
+        """Return the keyframes that are stored as views or may not have a pose in the map yet."""
         views = {v.keyframe for s in self.recognizer.subgraphs for v in s.views}
         return [k for k in self.poses if k > self._newest - RECENT_KEYFRAMES or k in views]
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """A part for each subgraph and waiting keyframe, written once; the words, where some are
-        new; the poses, where some have changed; and one for the rest."""
+        """Return the state in parts that are written only when they change.
+
+        There is one part for each subgraph and each pending keyframe, one for the visual words, one
+        for the poses, and one for the rest.
+        """
         if self._parts is None:
             self._parts = self._all_parts()
         return self._parts
@@ -223,7 +242,7 @@ class LoopCloser(Actor):
         subgraphs = {f"subgraph_{s['keyframes'][0]}": s for s in state.pop("subgraphs")}
         views = {f"view_{view['place']['id']}": view for view in state.pop("views")}
         waiting = {f"waiting_{k}": w.place.pack() for k, w in self._waiting.items()}
-        words = {"words": state.pop("words")}  # the same array until one is learnt
+        words = {"words": state.pop("words")}  # The same array until a word is learned.
         now = {
             **state,
             "waiting": {k: w.facts for k, w in self._waiting.items()},
@@ -235,12 +254,16 @@ class LoopCloser(Actor):
         return {**subgraphs, **views, **waiting, **words, **self._poses_part(), "now": now}
 
     def _poses_part(self) -> dict[str, Any]:
-        """0.4 kB for each view that is kept: the largest part, and boxes do not change it."""
+        """Return the part of the poses, cached because detections do not change it.
+
+        It is the largest part: 0.4 kB for each stored view.
+        """
         if self._saved_poses is None:
             self._saved_poses = self.poses.snapshot()
         return {"poses": self._saved_poses}
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
+        """Continue from a snapshot."""
         now = state["now"]
 
         def parts(kind: str) -> list[Any]:
@@ -262,10 +285,12 @@ class LoopCloser(Actor):
         self._parts = self._saved_poses = None
 
     def metrics(self) -> dict[str, float]:
+        """Return counters of subgraphs, loops and keyframes."""
         return {
             "subgraphs": len(self.recognizer.subgraphs),
             "loops_accepted": self._accepted,
             "loops_rejected": self._refused,
-            "keyframes_without_detections": self._without_boxes,  # that never came
+            # Keyframes for which no detections came.
+            "keyframes_without_detections": self._without_boxes,
             "keyframes_repeated": self._repeated,
         }

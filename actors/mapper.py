@@ -1,17 +1,17 @@
-"""The map of Gaussians.                                                        actors/mapper.py
+"""Mapping with 3D Gaussians, their labels and the objects.
 
-in   keyframe/new          Keyframe             Lossless(8)       a missing one is a hole in the map
-in   detection/boxes       DetectionBoxes       Lossless(8)       without it there are no labels
-in   label/result          LabelResult          Latest(1 per key) the newest look at a region
-in   graph/correction      GraphCorrection      Latest(1)         a versioned absolute state
-in   map/refine            RefineMap            Latest(1)         what was asked last
-out  map/view              MapRendering         the map as rendered at the newest keyframe
-out  map/delta             MapDelta             what changed
-out  map/snapshot          MapSnapshot          the whole of it, in parts, now and then
-out  label/request         LabelRequest         what a labeller is to name, if there is one
-out  map/objects           MapObjects           what stands in it, once somebody looked
-out  object/observation    ObjectObservation    where a keyframe shows that, or ought to
-out  keyframe/refinement   KeyframeRefinement   where the renderer wants the keyframes
+in   keyframe/new          Keyframe             Lossless(8)        a lost one leaves a hole
+in   detection/boxes       DetectionBoxes       Lossless(8)        labels come from detections
+in   label/result          LabelResult          Latest(1 per key)  the newest label counts
+in   graph/correction      GraphCorrection      Latest(1)          the newest is complete
+in   map/refine            RefineMap            Latest(1)          only the newest request counts
+out  map/view              MapRendering         the map rendered at the newest keyframe
+out  map/delta             MapDelta             changes since the last version
+out  map/snapshot          MapSnapshot          the whole map, in parts, every few keyframes
+out  label/request         LabelRequest         unlabelled regions, for the labeller
+out  map/objects           MapObjects           all objects, after the first detections
+out  object/observation    ObjectObservation    objects that a keyframe shows or misses
+out  keyframe/refinement   KeyframeRefinement   keyframe poses refined by the renderer
 """
 
 import os
@@ -80,36 +80,41 @@ Output = MapOutput | LabelRequest | ObjectObservation | KeyframeRefinement
 
 @dataclass(frozen=True, slots=True)
 class MapperConfig:
+    """Parameters of the mapper."""
+
     builder: MapBuilderConfig = field(default_factory=MapBuilderConfig)
     semantics: SemanticMapConfig = field(default_factory=SemanticMapConfig)
-    iterations: int = 12  # of the optimiser per keyframe, fewer where the map is dense: 12 FPS on
-    # two cores at 640x480
-    least_iterations: int = 3  # however many keyframes wait: none is left as it was inserted
-    folder: str = ""  # for the images of keyframes; empty: a temporary one, or within the state
-    threads: int = 0  # of the renderer; 0: all cores but one, which the tracker needs
-    snapshot_keyframes: int = 10  # between snapshots on the network
-    snapshot_growth: float = 0.25  # and at least this share of new Gaussians: a large map is sent
-    # seldom, so that snapshots never cost more than a few times the deltas
-    snapshot_keyframes_max: int = 200  # but after so many in any case: who joined late, or missed a
-    # delta, waits no longer
-    part_gaussians: int = 16_384  # in one message: 1.2 MB, 1.8 MB with labels, so that none blocks
-    # the others long
-    changed_keyframes: int = 5  # between telling how old Gaussians changed: the optimiser touches
-    # all that is in view at every keyframe
-    measured_keyframes: int = 64  # the newest, of which each measurement is taken anew when the
-    # renderer moves them; of older ones, which the optimizer has condensed, that from the reference
-    checkpoint_keyframes: int = 5  # between saved maps: after a crash so many are mapped again
-    motion_min_m: float = 2e-4  # a correction that moves a keyframe less shows nowhere: 0.1 px.
-    motion_min_rad: float = 2e-4  # Equal to MapBuilderConfig.refined_rad
-    mending_min_m: float = 0.01  # a keyframe that a correction moves farther is mended: it may lie
-    mending_min_rad: float = 0.01  # over surface that the map holds already. Less is refined anyway
-    mended_keyframes: int = 2  # per new one: a closure that moves a hundred is mended in fifty
-    mended_at_end: int = 200  # when the stream ends, the newest: some seconds
-    mending_iterations: int = 3  # of the optimiser, as for a new keyframe when many wait
-    due_iterations: int = 12  # for a keyframe that a correction moves so far against the first one,
-    # half of them against others: as many as a new one gets
-    paid_iterations: int = 6  # of these, with each new keyframe while no other waits: it takes half
-    # as long again. A run over a file does the rest at its end, `map/refine` when asked
+    # Iterations per keyframe, fewer where the map is dense: 12 FPS on two cores at 640x480.
+    iterations: int = 12
+    least_iterations: int = 3  # Minimum, however many keyframes wait: new Gaussians need some.
+    folder: str = ""  # Keyframe images; empty: a temporary folder, or one within the state.
+    threads: int = 0  # Threads of the renderer; 0: all cores but one, which the tracker needs.
+    snapshot_keyframes: int = 10  # Minimum keyframes between published snapshots.
+    # Minimum fraction of new Gaussians, so that snapshots cost at most a few times the deltas.
+    snapshot_growth: float = 0.25
+    snapshot_keyframes_max: int = 200  # Longest wait of subscribers that missed a delta.
+    # Maximum Gaussians per message: 1.2 MB, 1.8 MB with labels, so that none blocks others long.
+    part_gaussians: int = 16_384
+    # Keyframes between deltas of changed Gaussians; all Gaussians in view change at every keyframe.
+    changed_keyframes: int = 5
+    # Newest keyframes for which every relative measurement is updated when the renderer moves them.
+    # The pose graph has condensed older ones; for those only the one to the reference is updated.
+    measured_keyframes: int = 64
+    checkpoint_keyframes: int = 5  # Keyframes between saved maps; a crash repeats at most so many.
+    motion_min_m: float = 2e-4  # A smaller motion by a correction is not visible: 0.1 px.
+    motion_min_rad: float = 2e-4  # Equal to MapBuilderConfig.refined_rad.
+    # A keyframe that moves farther is deduplicated: it may overlap surface that the map holds.
+    mending_min_m: float = 0.01
+    mending_min_rad: float = 0.01  # Normal iterations correct smaller motions.
+    mended_keyframes: int = 2  # Deduplicated per new keyframe; 100 moved ones take 50 keyframes.
+    mended_at_end: int = 200  # Newest keyframes deduplicated at the end; takes some seconds.
+    mending_iterations: int = 3  # Iterations of each, as for a new keyframe when many wait.
+    # Refit iterations for a keyframe that a correction moves against the first one, half of them on
+    # other keyframes; as many as for a new keyframe.
+    due_iterations: int = 12
+    # Pending refit iterations that run with each new keyframe while no other waits; mapping then
+    # takes 50 % longer. Offline runs do the rest at the end, `map/refine` does it on request.
+    paid_iterations: int = 6
 
     def __post_init__(self) -> None:
         amounts = (
@@ -118,32 +123,32 @@ class MapperConfig:
             *("due_iterations", "paid_iterations"),
         )
         if min(getattr(self, name) for name in amounts) < 0:
-            raise ConfigError(named(self, *amounts) + ": none may be negative.")
+            raise ConfigError(named(self, *amounts) + " must not be negative.")
         counts = (
             *("snapshot_keyframes", "part_gaussians", "checkpoint_keyframes"),
             *("changed_keyframes", "measured_keyframes"),
         )
         if min(getattr(self, name) for name in counts) < 1:
-            raise ConfigError(named(self, *counts) + ": each must be at least 1.")
+            raise ConfigError(named(self, *counts) + " must be at least 1.")
 
     def thread_count(self) -> int:
         return self.threads or max(1, (os.cpu_count() or 1) - 1)
 
     def pace(self) -> PublishConfig:
-        """Of telling others."""
+        """Return the settings of the map publisher."""
         return PublishConfig(**{f.name: getattr(self, f.name) for f in fields(PublishConfig)})
 
     def repair(self) -> LoopRefitConfig:
-        """After corrections."""
+        """Return the settings of the refit after corrections."""
         return LoopRefitConfig(**{f.name: getattr(self, f.name) for f in fields(LoopRefitConfig)})
 
 
 class Mapper(Actor):
-    """Maps a keyframe at once; corrections move each Gaussian with the keyframe that made it."""
+    """Actor that maps keyframes at once and moves Gaussians with their anchor keyframes."""
 
     name = "mapper"
-    lags = True  # it writes the whole map every few keyframes
-    finishes_last = True  # a closure of the last keyframes corrects the map
+    lags = True  # It writes the whole map only every few keyframes.
+    finishes_last = True  # A loop closure of the last keyframes still corrects the map.
     inputs = (
         In(KEYFRAME_NEW, Lossless(8)),
         In(DETECTION_BOXES, Lossless(8)),
@@ -162,7 +167,7 @@ class Mapper(Actor):
     )
 
     def __init__(self, config: MapperConfig | None = None, *, has_labeller: bool = False) -> None:
-        """`has_labeller`: there is an actor that answers label/request with names."""
+        """Prepare an empty map; `has_labeller` enables label requests."""
         super().__init__()
         self.config = config or MapperConfig()
         folder = Path(self.config.folder) if self.config.folder else None
@@ -175,7 +180,7 @@ class Mapper(Actor):
         self._poses = KeyframePoses()
         self._links = RelativeMeasurements(self._poses, self.config.measured_keyframes)
         self._publisher = MapPublisher(self._map, self.config.pace())
-        self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
+        self._newest: tuple[int, int] = (0, -1)  # Stamp in ns and id of the newest keyframe.
         self._repair = LoopRefit(self._map, self.config.repair())
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
@@ -193,13 +198,12 @@ class Mapper(Actor):
             case RefineMap():
                 yield from self._refine(message)
             case Keyframe() if message.keyframe in self._poses:
-                self._repeated += 1  # sent again after a restart
+                self._repeated += 1  # Sent again after a restart.
             case Keyframe():
                 yield from self._add(message)
 
     # --- keyframes --------------------------------------------------------------------------------
     def _add(self, message: Keyframe) -> Iterator[Output]:
-        # place it
         T_map_keyframe = self._poses.add(
             message.keyframe,
             message.reference,
@@ -209,13 +213,11 @@ class Mapper(Actor):
         )
         self._links.add(message)
         self._newest = (message.stamp_ns, message.keyframe)
-        # map it
         frame = frame_from_message(message)
         moving = mask_from_array(message.dynamic_mask)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
         learnt = self._semantics.on_keyframe_mapped(message.keyframe)
         self._repair.with_keyframe(is_behind=self._waiting() > 0)
-        # tell
         yield from self._refinement()
         yield from self._publisher.on_keyframe(self._message_context())
         yield self._view(message)
@@ -223,8 +225,10 @@ class Mapper(Actor):
         yield from self._publish_semantics(learnt, message.stamp_ns)
 
     def _iterations(self) -> int:
-        """Fewer, the more keyframes wait: then the map is behind, and each is optimised again as
-        the neighbour of the next. Those that are mended with it have their share."""
+        """Return the iterations for the next keyframe: the more keyframes wait, the fewer.
+
+        Later keyframes optimize it again as a neighbor. Deduplication shares the budget.
+        """
         config = self.config
         return max(
             config.iterations // (1 + self._waiting()) - self._repair.mending_iterations,
@@ -237,7 +241,7 @@ class Mapper(Actor):
     def _refine(self, message: RefineMap) -> Iterator[Output]:
         self._repair.refine(message.iterations, (message.initial_rate, message.final_rate))
         self._semantics.refresh()
-        self._checkpoint = {}  # is due: half a minute of work, and perhaps no keyframe follows
+        self._checkpoint = {}  # Saves the work, up to half a minute; no keyframe may follow.
         yield from self._refinement()
         yield from self._publisher.deltas(self._message_context(), with_changed=True)
         yield from self._objects()
@@ -249,8 +253,7 @@ class Mapper(Actor):
 
     # --- labels and objects -----------------------------------------------------------------------
     def _take_boxes(self, message: DetectionBoxes) -> Iterator[Output]:
-        """Followers are told of labels with what changes next. Where nobody looked, nothing was
-        missed."""
+        """Add detections; without a network no object is missed. The next delta has the labels."""
         vocabulary = self._semantics.vocabulary
         claims = detections_from_message(message, vocabulary) if message.network else None
         learnt = self._semantics.add_detections(message.keyframe, claims)
@@ -271,7 +274,7 @@ class Mapper(Actor):
             yield from self._objects()
 
     def _objects(self) -> Iterator[MapObjects]:
-        """All of them; nothing where nobody ever looked."""
+        """Yield all objects; nothing before the first detections."""
         semantics = self._semantics
         if semantics.is_used:
             now = self._publisher.version, self._poses.version, self._newest[0]
@@ -294,8 +297,7 @@ class Mapper(Actor):
             yield from self._objects()
 
     def _moved_keyframes(self) -> list[int]:
-        """Keyframes that are so far from where their Gaussians are that it shows; too little to
-        show adds up until it is enough."""
+        """Return keyframes that moved visibly against their Gaussians; small motions add up."""
         config, placed = self.config, self._map.views.poses
         T_now, T_gaussians = self._poses.of(placed), placed.of(placed)
         shows = se3.transforms_differ(
@@ -304,7 +306,7 @@ class Mapper(Actor):
         return np.array(list(placed), np.int64)[shows].tolist()
 
     def _motion(self, keyframe: int) -> AnchorMotion:
-        """From where its Gaussians are to where the keyframe is."""
+        """Return the motion from the pose that the Gaussians were moved to, to the current pose."""
         T_map_gaussians = self._map.views.poses[keyframe]
         T_new_old = pose_to_message(self._poses[keyframe] @ se3.inverse(T_map_gaussians))
         return AnchorMotion(keyframe=keyframe, T_new_old=T_new_old)
@@ -329,13 +331,13 @@ class Mapper(Actor):
         )
 
     def on_restored(self) -> Iterator[Output]:
-        """The whole map: followers may have missed deltas, and late joiners find nothing else."""
+        """Publish the whole map, as subscribers may have missed deltas and new ones need it."""
         if self._map.size():
             yield from self._publisher.publish_snapshot(self._message_context())
             yield from self._objects()
 
     def on_stop(self) -> Iterator[Output]:
-        """The whole map, so that whoever listens ends with it."""
+        """Publish the final map after removing duplicate Gaussians of the newest keyframes."""
         if self._map.size():
             self._repair.at_end()
             self._semantics.refresh()
@@ -344,7 +346,7 @@ class Mapper(Actor):
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """The map every few keyframes: between, the same object as before."""
+        """Return the last checkpoint, the same object until the next one."""
         newest = self._newest[1]
         saved = self._checkpoint["newest"][1] if self._checkpoint else None
         is_due = saved is None or newest - saved >= self.config.checkpoint_keyframes
@@ -353,7 +355,6 @@ class Mapper(Actor):
         return {"map": self._checkpoint} if self._checkpoint else {}
 
     def checkpoint(self) -> dict[str, Any]:
-        """With the map as it is now."""
         self._checkpoint = {}
         return self.snapshot()
 
@@ -393,5 +394,5 @@ class Mapper(Actor):
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
-    """0..1 float to 0..255 uint8."""
+    """Convert an image from 0..1 float to 0..255 uint8."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -1,12 +1,12 @@
-"""Keyframe poses that agree with every measurement.                       actors/optimizer.py
+"""Optimization of the pose graph of keyframes and objects.
 
-in   keyframe/new          Keyframe             Lossless(8)   a missing link would break the chain
-in   keyframe/refinement   KeyframeRefinement   Lossless(8)   the better measurement
-in   loop/closure          LoopClosure          Lossless(8)   seldom, and costly to find
-in   object/observation    ObjectObservation    Lossless(8)   evidence adds up
-out  graph/correction   GraphCorrection
+in   keyframe/new          Keyframe             Lossless(8)   a lost one would break the chain
+in   keyframe/refinement   KeyframeRefinement   Lossless(8)   better relative-pose measurements
+in   loop/closure          LoopClosure          Lossless(8)   rare, and costly to find
+in   object/observation    ObjectObservation    Lossless(8)   every observation adds information
+out  graph/correction      GraphCorrection                    all keyframe poses and landmarks
 
-gtsam holds the GIL during every call: by default this actor runs in a process of its own.
+gtsam holds the GIL during every call, so this actor runs in a process of its own by default.
 """
 
 import logging
@@ -60,22 +60,23 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class OptimizerConfig:
+    """Parameters of the pose-graph optimizer."""
+
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     landmarks: ObjectLandmarkConfig = field(default_factory=ObjectLandmarkConfig)
-    uses_objects: bool = True  # False: poses alone, to see what landmarks are worth
-    most_early: int = 512  # closures and observations that wait for their keyframe; it is under way
-    cameras: int = 64  # of the newest keyframes: observations come a few keyframes late
+    uses_objects: bool = True  # False optimizes poses alone, to measure the benefit of landmarks.
+    # Maximum closures and observations that wait for a keyframe that has not arrived yet.
+    most_early: int = 512
+    # Newest keyframes for which intrinsics are kept; observations come a few keyframes late.
+    cameras: int = 64
 
     def __post_init__(self) -> None:
         if min(self.most_early, self.cameras) < 1:
-            raise ConfigError(
-                named(self, "most_early", "cameras")
-                + ": most_early and cameras must be at least 1."
-            )
+            raise ConfigError(named(self, "most_early", "cameras") + " must be at least 1.")
 
 
 class Optimizer(Actor):
-    """The one owner of keyframe poses in the map, and of which submaps are joined."""
+    """Actor that owns the keyframe poses in the map and the merging of submaps."""
 
     name = "optimizer"
     inputs = (
@@ -91,22 +92,25 @@ class Optimizer(Actor):
         self.config = config or OptimizerConfig()
         self._graph = PoseGraph(self.config.graph)
         self._landmarks = ObjectLandmarks(self.config.landmarks, self.config.graph.noise)
-        self._classes: list[str] = ["other"]  # as they were first named
-        self._cameras: dict[int, Camera] = {}  # of the newest keyframes
+        self._classes: list[str] = ["other"]  # Class names in the order of their first observation.
+        self._cameras: dict[int, Camera] = {}  # Intrinsics of the newest keyframes by id.
         self._version = 0
-        self._stamp_ns = 0  # of the newest message
-        self._newest: dict[int, tuple[int, np.ndarray]] = {}  # by submap: id and T_odom_keyframe
-        self._first: dict[int, int] = {}  # keyframe of each submap
-        self._early: dict[tuple[int, int], MeasuredPose] = {}  # came before their keyframe
+        self._stamp_ns = 0  # Stamp of the newest message.
+        # Id and T_odom_keyframe of the newest keyframe, by submap.
+        self._newest: dict[int, tuple[int, np.ndarray]] = {}
+        self._first: dict[int, int] = {}  # First keyframe of each submap.
+        # Measurements that came before their keyframe.
+        self._early: dict[tuple[int, int], MeasuredPose] = {}
         self._early_closures: list[LoopClosure] = []
         self._early_observations: list[ObjectObservation] = []
-        self._waiting_number = 0  # of the last refinement that came
-        self._refinements = 0  # number of the last one that all poses agree with
+        self._waiting_number = 0  # Number of the last received refinement.
+        self._refinements = 0  # Number of the last refinement that all poses include.
         self._repeated = self._bridged = self._refined = self._too_early = self._too_late = 0
 
     def handle(
         self, message: Keyframe | KeyframeRefinement | LoopClosure | ObjectObservation
     ) -> Iterator[GraphCorrection]:
+        """Yield a correction if the message changes the pose graph."""
         self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
         match message:
             case ObjectObservation() if not self.config.uses_objects:
@@ -123,14 +127,14 @@ class Optimizer(Actor):
                 self._refine(message.poses)
                 self._waiting_number = message.number
             case Keyframe() if message.keyframe in self._graph:
-                self._repeated += 1  # sent again after a restart
+                self._repeated += 1  # Sent again after a restart.
                 return
             case Keyframe():
                 self._take(message)
         yield self._correction(message.stamp_ns)
 
     def on_restored(self) -> Iterator[GraphCorrection]:
-        """The last one may not have been sent."""
+        """Publish the correction again: the last one may not have been sent."""
         if len(self._graph):
             yield self._correction(self._stamp_ns)
 
@@ -152,7 +156,7 @@ class Optimizer(Actor):
 
     # --- keyframes --------------------------------------------------------------------------------
     def _take(self, message: Keyframe) -> None:
-        """Place it; then what waited for it."""
+        """Add a keyframe to the pose graph, then the messages that waited for it."""
         if self._landmarks.needs_update():
             self._landmarks.update_graph(self._graph)
         self._add(message)
@@ -164,7 +168,7 @@ class Optimizer(Actor):
         self._observe()
 
     def _refine(self, poses: tuple[MeasuredPose, ...]) -> None:
-        """Replace measurements; those of a keyframe that is still under way wait for it."""
+        """Replace measurements; those of a keyframe that has not arrived wait for it."""
         asked = self._early | {(p.reference, p.keyframe): p for p in poses}
         known = {pair: p for pair, p in asked.items() if set(pair) <= self._graph.keyframes}
         newest = max(self._graph.keyframes, default=-1)
@@ -188,7 +192,7 @@ class Optimizer(Actor):
             self._join(pose)
 
     def _add_first_keyframe(self, message: Keyframe, T_odom_keyframe: np.ndarray) -> None:
-        """The first keyframe of a submap; where it is among the others, nobody knows yet."""
+        """Add the first keyframe of a submap; its pose among the other submaps is unknown."""
         self._first[message.submap] = message.keyframe
         T_map_keyframe = T_map_submap(message.submap) @ T_odom_keyframe
         self._graph.add_first(message.keyframe, T_map_keyframe)
@@ -196,18 +200,34 @@ class Optimizer(Actor):
     def _add_odometry_fallback(
         self, newest: tuple[int, np.ndarray], keyframe: int, T_odom_keyframe: np.ndarray
     ) -> None:
-        """Nothing that it was measured from was received: odometry from the newest stands in."""
+        """Measure a keyframe by odometry if none of its reference keyframes was received.
+
+        Args:
+            newest: Id and T_odom_keyframe of the newest keyframe of the submap.
+            keyframe: Id of the new keyframe.
+            T_odom_keyframe: Pose of the new keyframe, [4, 4].
+        """
         self._bridged += 1
         known, T_odom_known = newest
-        log.warning("keyframe %d: its reference is missing, joined to %d", keyframe, known)
+        log.warning(
+            "optimizer: reference keyframe of keyframe %d was never received; using odometry from "
+            "keyframe %d instead. No action needed; many of these mean lost messages (see input "
+            'gaps in "ldo doctor").',
+            keyframe,
+            known,
+        )
         T_known_keyframe = se3.inverse(T_odom_known) @ T_odom_keyframe
         self._graph.add(self._graph.odometry_fallback(known, keyframe, T_known_keyframe))
 
     def _join(self, pose: MeasuredPose) -> None:
-        """A keyframe in one of another submap; where loops joined these by now, it is judged as a
-        closure is."""
+        """Add a submap measurement; if the submaps are merged already, check it as a closure."""
         if pose.reference not in self._graph:
-            log.warning("keyframe %d joins %d, which is missing", pose.keyframe, pose.reference)
+            log.warning(
+                "optimizer: keyframe %d has a submap measurement to unknown keyframe %d; "
+                "measurement discarded. No action needed.",
+                pose.keyframe,
+                pose.reference,
+            )
             return
         before = self._joined()
         self._graph.add_loop_closure(relative_pose_from_message(pose))
@@ -215,11 +235,11 @@ class Optimizer(Actor):
 
     def _log_merged(self, before: dict[int, int]) -> None:
         for submap, older in self._joined().items() - before.items():
-            log.info("submap %d is placed in %d now", submap, older)
+            log.info("optimizer: submap %d merged into submap %d", submap, older)
 
     # --- loops and objects ------------------------------------------------------------------------
     def _close(self) -> bool:
-        """Judge closures whose keyframes are known; False: there were none."""
+        """Check the closures between known keyframes; return whether there were any."""
         known = [c for c in self._early_closures if self._is_known(c.pose)]
         later = [c for c in self._early_closures if not self._is_known(c.pose)]
         self._early_closures = self._keep_newest(later)
@@ -238,13 +258,21 @@ class Optimizer(Actor):
             replace(measured, information=weight * measured.information)
         )
         pair = closure.pose.reference, closure.pose.keyframe
-        log.info("loop %d-%d is %s", *pair, "closed" if verdict.is_accepted else "not believed")
+        log.info(
+            "optimizer: loop closure %d-%d %s",
+            *pair,
+            "accepted" if verdict.is_accepted else "rejected",
+        )
         for reference, keyframe in verdict.dropped:
-            log.info("loop %d-%d is taken back: others refute it", reference, keyframe)
+            log.info(
+                "optimizer: loop closure %d-%d removed; later closures contradict it",
+                reference,
+                keyframe,
+            )
         self._log_merged(before)
 
     def _observe(self) -> None:
-        """Take note of objects in keyframes that are known; the graph learns of them later."""
+        """Store observations in known keyframes; the pose graph takes them in later."""
         later = []
         for seen in self._early_observations:
             camera = self._cameras.get(seen.keyframe)
@@ -268,13 +296,13 @@ class Optimizer(Actor):
         )
 
     def _class(self, name: str) -> int:
-        """Its index; of one too many that of `other`."""
+        """Return the index of a class; 0 (`other`) beyond the maximum number of classes."""
         if name not in self._classes and len(self._classes) < MAX_CLASSES:
             self._classes.append(name)
         return self._classes.index(name) if name in self._classes else 0
 
     def _keep_newest(self, waiting: list[Any]) -> list[Any]:
-        """The newest; what waits for a keyframe that was lost is given up in the end."""
+        """Return the newest `most_early` messages; the excess is counted and discarded."""
         excess = max(0, len(waiting) - self.config.most_early)
         self._too_early += excess
         return waiting[excess:]
@@ -288,15 +316,17 @@ class Optimizer(Actor):
 
     # --- submaps ---------------------------------------------------------------------------------
     def _joined(self) -> dict[int, int]:
-        """Submaps that are placed in an older one, and in which."""
+        """Return the merged submaps, each with the older one that it is merged into."""
         submaps = {first: submap for submap, first in self._first.items()}
         placed = {s: submaps[self._graph.component_root(first)] for s, first in self._first.items()}
         return {submap: older for submap, older in placed.items() if older < submap}
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """The graph at its last rebuild, which stays the same part for some keyframes; the changes
-        since; and the rest."""
+        """Return the pose graph at its last rebuild, the changes since, the landmarks and the rest.
+
+        The part of the last rebuild stays the same object for some keyframes.
+        """
         graph = self._graph.snapshot()
         rest = {
             "version": self._version,
@@ -317,6 +347,7 @@ class Optimizer(Actor):
         return {"graph": graph["base"], "landmarks": landmarks["known"], "rest": rest}
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
+        """Continue from a snapshot."""
         saved = state["rest"]
         self._version, self._stamp_ns = saved["version"], saved["stamp_ns"]
         self._first = {submap: first for submap, first, *_ in saved["submaps"]}
@@ -332,6 +363,7 @@ class Optimizer(Actor):
         self._classes = list(saved["classes"])
 
     def metrics(self) -> dict[str, float]:
+        """Return counters of the pose graph, closures, landmarks and submaps."""
         graph = self._graph
         return {
             "keyframes": len(graph),
@@ -346,6 +378,7 @@ class Optimizer(Actor):
             "keyframes_odometry_fallback": self._bridged,
             "keyframes_refined": self._refined,
             "early_messages_discarded": self._too_early,
-            "late_observations_discarded": self._too_late,  # Their keyframe was forgotten.
+            # Intrinsics of their keyframe were no longer kept.
+            "late_observations_discarded": self._too_late,
             "submaps_unmerged": len(self._first) - len(self._joined()),
         }

@@ -1,6 +1,6 @@
-"""The design card as data: every actor with its ports, and what it is made from.
+"""Graph of actors: every actor with its ports and its factory.
 
-The drawing and the table of topics in README are printed from here (`ldo topics --markdown`).
+README's diagram and topic table are generated from this module (`ldo topics --markdown`).
 """
 
 from collections.abc import Callable, Iterable
@@ -49,59 +49,64 @@ def _box(actor: type[Actor], does: str, make: Callable[[ActorParameters], Actor]
 GRAPH: tuple[ActorSpec, ...] = (
     _box(
         FrameSource,
-        "checks and rectifies camera frames",
+        "check and rectify camera frames",
         lambda parameters: FrameSource(parameters.frame_source),
     ),
     _box(
         Tracker,
-        "finds the camera's pose",
+        "track the camera pose",
         lambda parameters: Tracker(parameters.tracker),
     ),
     _box(
         Detector,
-        "finds objects of known classes",
+        "detect objects of known classes",
         lambda parameters: Detector(parameters.detector),
     ),
     _box(
         VlmLabeller,
-        "names what the detector does not know",
+        "label regions that the detector does not know",
         lambda parameters: VlmLabeller(parameters.vlm_labeller),
     ),
     _box(
         Mapper,
-        "keeps the map of Gaussians, and what stands in it",
+        "build the map of Gaussians and objects",
         lambda parameters: Mapper(
             parameters.mapper, has_labeller=parameters.vlm_labeller.is_chosen
         ),
     ),
     _box(
         LoopCloser,
-        "recognises places",
+        "detect loop closures",
         lambda parameters: LoopCloser(parameters.loop_closer),
     ),
     _box(
         Optimizer,
-        "makes keyframe poses agree",
+        "optimize the pose graph",
         lambda parameters: Optimizer(parameters.optimizer),
     ),
 )
 
 
 def actor_spec(name: str) -> ActorSpec:
-    """Raises ConfigError for a name that is not in the graph."""
+    """Return the actor of a name.
+
+    Raises:
+        ConfigError: There is no such actor.
+    """
     for box in GRAPH:
         if box.name == name:
             return box
     names = ", ".join(box.name for box in GRAPH)
-    raise ConfigError(f"there is no actor {name!r}. The actors are {names}.")
+    raise ConfigError(f"there is no actor {name!r}; it must be one of {names}.")
 
 
 def make_actors(parameters: ActorParameters) -> list[Actor]:
-    """All of them, producers first."""
+    """Return new instances of all actors, producers first."""
     return [box.make(parameters) for box in GRAPH]
 
 
 def producer_of(topic: t.Topic) -> str:
+    """Return the name of the actor that publishes a topic, or `outside` or `every stage`."""
     for box in GRAPH:
         if any(out.topic is topic for out in box.outputs):
             return box.name
@@ -114,7 +119,7 @@ def producer_of(topic: t.Topic) -> str:
 
 
 def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
-    """Name and policy of each consumer."""
+    """Return the name and policy of each consumer."""
     if topic is t.CONTROL:
         return [("the service", "one at a time")]
     return [
@@ -123,7 +128,7 @@ def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
 
 
 def topics_table() -> str:
-    """Markdown: who makes each topic, and who takes it with which policy."""
+    """Return a Markdown table of all topics with their producers, consumers and policies."""
     lines = ["| topic | says | made by | taken by |", "|---|---|---|---|"]
     for topic in t.TOPICS:
         name = f"{topic.name}/<actor>" if topic.is_per_actor else topic.name
@@ -134,7 +139,7 @@ def topics_table() -> str:
 
 
 def mermaid_diagram(boxes: Iterable[ActorSpec] = GRAPH) -> str:
-    """The graph in Mermaid: solid arrows are lossless, dashed ones keep the latest."""
+    """Return the graph in Mermaid: solid arrows for lossless inputs, dashed ones for the latest."""
     lines = ["flowchart LR", "    camera([camera])", "    odometry([other odometry])"]
     boxes = tuple(boxes)
     for box in boxes:

@@ -1,17 +1,17 @@
-"""Camera pose of each RGB-D frame.                                          actors/tracker.py
+"""Tracking of the camera pose in RGB-D frames.
 
-in   frame/rgbd         FrameRgbd     Latest(1)   a late frame is worth less than the next one
-in   graph/correction   GraphCorrection  Latest(1)  a versioned absolute state
-in   odometry/prior     OdometryPrior Latest(64)  0.3 s at 200 Hz, while a frame is tracked; older
-                                                  poses are worth less, and no robot waits for us
-in   detection/boxes    DetectionBoxes Latest(1)  dynamic objects are not tracked against
-out  pose/tracked       TrackedPose
-out  keyframe/new       Keyframe      made only when every consumer has room: never waited for
+in   frame/rgbd       FrameRgbd        Latest(1)    a late frame is worth less than the next one
+in   graph/correction GraphCorrection  Latest(1)    complete and versioned; the newest suffices
+in   odometry/prior   OdometryPrior    Latest(64)   0.3 s at 200 Hz, the time to track a frame;
+                                                    older poses matter less; producers never wait
+in   detection/boxes  DetectionBoxes   Latest(1)    dynamic objects are masked for tracking
+out  pose/tracked     TrackedPose                   one for every tracked frame
+out  keyframe/new     Keyframe                      made only when every consumer has credit
 
-The actor converts messages, and keeps the ports, the prior and the counters. What becomes of a
-frame is decided in one call: `Odometry.process`. When `TrackerConfig.localise` names a finished
-run, a `Localizer` stands in place of the odometry. It makes no keyframe, so the mapper and the
-optimizer are idle and the map stays as it is; subscribers of poses see no difference.
+The actor converts messages, and keeps the ports, the prior and the counters. `Odometry.process`
+does the tracking of a frame in one call. If `TrackerConfig.localise` names a finished run, a
+`Localizer` replaces the odometry. It makes no keyframes, so the mapper and the optimizer are idle
+and the map does not change. Subscribers of poses see no difference.
 """
 
 import logging
@@ -59,21 +59,26 @@ from ldo_service.tracking.tracking_result import TrackingResult
 
 log = logging.getLogger(__name__)
 
-UNIT_WITHIN = 1e-3  # Tolerance of a quaternion's norm: people copy four digits; it is normalized.
-MISSED_PRIOR_WARNING_COUNT = 30  # Frames in a row without a prior: a second is no hiccup.
-OWN_PARTS = "keyframe", "supporting"  # Entries of the odometry's state that are parts of their own.
+# Tolerance of a quaternion's norm. Configured values often have four digits; they are normalized.
+UNIT_WITHIN = 1e-3
+# Consecutive frames without a prior; a second of frames is no short gap.
+MISSED_PRIOR_WARNING_COUNT = 30
+# Entries of the odometry's state that are saved as separate parts.
+OWN_PARTS = "keyframe", "supporting"
 
 
 @dataclass(frozen=True, slots=True)
 class CameraExtrinsics:
     """Pose of the camera on the robot: T_base_camera.
 
-    `camera` has the optical axes of this project: x right, y down, z forward. For a base whose x
-    is forward and z up (REP-103) a camera that looks ahead has quaternion 0.5 -0.5 0.5 -0.5.
+    `camera` has the optical axes of this project: x right, y down, z forward. For a base with x
+    forward and z up (REP-103), a forward-looking camera has quaternion 0.5 -0.5 0.5 -0.5.
     """
 
-    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera's centre in base
-    quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # base is the camera
+    # Camera center in the base frame, meters.
+    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # The identity: base and camera coincide.
+    quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not np.isfinite((*self.translation_m, *self.quaternion_wxyz)).all():
@@ -85,7 +90,7 @@ class CameraExtrinsics:
         if abs(norm - 1.0) > UNIT_WITHIN:
             raise ConfigError(
                 f"tracker.T_base_camera.quaternion_wxyz={list(self.quaternion_wxyz)} has norm "
-                f"{norm:.4g}: a rotation has norm 1. The order is w x y z."
+                f"{norm:.4g}, must have norm 1. The order is w x y z."
             )
 
     def matrix(self) -> np.ndarray:
@@ -95,18 +100,21 @@ class CameraExtrinsics:
 
 @dataclass(frozen=True, slots=True)
 class TrackerConfig:
+    """Parameters of the tracker."""
+
     T_base_camera: CameraExtrinsics = field(default_factory=CameraExtrinsics)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
-    localise: str = ""  # folder of a finished run: track in its map, which stays as it is
-    hold_out: int = 0  # every n-th frame is tracked and never mapped, to judge the map by; 0: none
+    # Folder of a finished run: track in its map, which does not change; empty: map.
+    localise: str = ""
+    hold_out: int = 0  # Every n-th frame is tracked but not mapped, to evaluate the map; 0: none.
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.hold_out == 1:
-            raise ConfigError(f"tracker.hold_out={self.hold_out}: must be 0, or 2 and more.")
+            raise ConfigError(f"tracker.hold_out={self.hold_out} must be 0 or at least 2.")
 
 
 class Tracker(Actor):
-    """Odometry against the reference keyframe, placed in the map by the optimizer's poses."""
+    """Actor that tracks frames against the reference keyframe and follows graph corrections."""
 
     name = "tracker"
     inputs = (
@@ -123,18 +131,21 @@ class Tracker(Actor):
         self.config = config or TrackerConfig()
         self._T_base_camera = self.config.T_base_camera.matrix()
         self._odometry = _make_odometry(self.config, self._T_base_camera)
-        self._correction = b""  # The last one, encoded.
+        self._correction = b""  # The last correction, encoded.
         self._prior = OdometryPriorBuffer()
-        self._made = self._without_room = self._reused = 0  # Keyframes.
-        self._verdicts: Counter[PriorCheck] = Counter()  # On poses of the prior.
-        self._with_prior = self._without_prior = 0  # Frames, since the prior began.
-        self._missed = 0  # Frames in a row that the prior does not reach.
-        # Parts of the state, up to the prior, which alone changes between two frames.
+        self._made = self._without_room = self._reused = 0  # Numbers of keyframes.
+        # Numbers of prior poses by outcome of their check.
+        self._verdicts: Counter[PriorCheck] = Counter()
+        # Numbers of frames since the first pose of the prior.
+        self._with_prior = self._without_prior = 0
+        self._missed = 0  # Consecutive frames without a prior.
+        # Cached parts of the state except the prior, which also changes between frames.
         self._parts: dict[str, Any] | None = None
 
     def handle(
         self, message: FrameRgbd | GraphCorrection | OdometryPrior | DetectionBoxes
     ) -> Iterator[TrackedPose | Keyframe]:
+        """Yield the pose of a frame, and its keyframe if it becomes one."""
         if isinstance(message, OdometryPrior):
             self._take_prior(message)
             return
@@ -148,14 +159,14 @@ class Tracker(Actor):
             yield from self._track(frame_from_message(message))
 
     def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
-        """Track a frame, and publish its pose and the keyframe that was made of it."""
+        """Track a frame, and publish its pose and its keyframe, if it becomes one."""
         hold_out = self.config.hold_out
         is_held_out = hold_out > 0 and frame.index % hold_out == hold_out - 1
         may_map = not is_held_out and self.has_credit(KEYFRAME_NEW)
         result = self._odometry.process(frame, self._prior, may_map=may_map)
         self._count(frame, result, is_held_out)
         if result.awaits_mapping:
-            return  # Odometry begins with a later frame, which consumers have room for.
+            return  # Odometry starts with a later frame, when all consumers have credit.
         if result.keyframe is not None:
             yield keyframe_message(frame, result, result.keyframe)
         yield tracked_pose_message(frame, result, self._T_base_camera)
@@ -171,8 +182,8 @@ class Tracker(Actor):
         self._missed = 0 if result.has_prior else self._missed + 1
         if self._missed == MISSED_PRIOR_WARNING_COUNT:
             log.warning(
-                "odometry/prior: %d frames were tracked without it, and its newest pose is %.3f s "
-                "older than the last of them: does it still come, and do both stamp by one clock?",
+                "tracker: %d frames in a row had no odometry/prior; its newest pose is %.3f s "
+                "older than the last frame. Is it still published, and do both stamp by one clock?",
                 self._missed, 1e-9 * (frame.stamp_ns - self._prior.poses[-1].stamp_ns),
             )  # fmt: skip
 
@@ -183,7 +194,7 @@ class Tracker(Actor):
         self._verdicts[verdict] += 1
         if verdict is not PriorCheck.FOLLOWS and self._verdicts[verdict] == 1:
             log.warning(
-                "odometry/prior: the pose of stamp %d %s. Further such poses are only counted.",
+                "tracker: the odometry/prior of stamp %d %s. Further such poses are only counted.",
                 message.stamp_ns, verdict,
             )  # fmt: skip
 
@@ -194,7 +205,7 @@ class Tracker(Actor):
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return a part for each known keyframe, written once, and few parts that change."""
+        """Return one part for each known keyframe, written once, and a few parts that change."""
         if self._parts is None:
             self._parts = self._tracked_parts()
         return {**self._parts, "prior": self._prior.pack()}
@@ -220,13 +231,14 @@ class Tracker(Actor):
         """Continue from a snapshot.
 
         Raises:
-            ConfigError: The snapshot was taken with another map.
+            ConfigError: The snapshot belongs to another map.
         """
         now = state["now"]
         if now["localise"] != self.config.localise:
             raise ConfigError(
-                f"the saved state is of --localize {now['localise'] or '(none)'}, this service of "
-                f"{self.config.localise or '(none)'}. Choose another folder with --state."
+                f"the saved state belongs to --localize {now['localise'] or '(none)'}, but this "
+                f"service runs with {self.config.localise or '(none)'}. Choose another folder "
+                "with --state."
             )
         places = [state[f"place_{number}"] for number in now["odometry"]["order"]]
         own = {name: state[name] for name in (*OWN_PARTS, "fix") if name in state}
@@ -239,6 +251,7 @@ class Tracker(Actor):
         self._prior, self._parts = OdometryPriorBuffer.unpack(state["prior"]), None
 
     def metrics(self) -> dict[str, float]:
+        """Return counters of keyframes, frames and prior poses."""
         refused = self._verdicts[PriorCheck.LATE] + self._verdicts[PriorCheck.BROKEN]
         restarts = self._verdicts[PriorCheck.RESTARTED] + self._verdicts[PriorCheck.JUMPED]
         return {
@@ -253,7 +266,7 @@ class Tracker(Actor):
 
 
 def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry:
-    """Return odometry that maps, or one in the map of a finished run.
+    """Return odometry that maps, or a localizer in the map of a finished run.
 
     Raises:
         DataError: The run left no keyframe database.
@@ -264,6 +277,6 @@ def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry
 
 
 def _box(detection: Detection) -> Box:
-    """Convert from pixel centers at integers to the edges of pixels."""
+    """Convert a box from pixel centers at integer coordinates to pixel edges."""
     x0, y0, x1, y1 = (edge + 0.5 for edge in detection.box_px)
     return Box(detection.label, x0, y0, x1, y1)

@@ -1,17 +1,17 @@
-"""Names of regions that the detector does not know.                     actors/vlm_labeller.py
+"""Labelling of regions that the detector does not know.
 
-in   label/request   LabelRequest   Latest(1 per region)   a newer look at a region says more
-in   label/add       AddLabel       Latest(32)             asked by a person, now and then, who
-                                                           waits: it goes first
-out  label/result    LabelResult    one for every request, late by design
-out  label/names     LabelNames     one for every label/add
+in   label/request   LabelRequest   Latest(1 per region)   a newer view of a region shows more
+in   label/add       AddLabel       Latest(32)             a waiting user has priority
+out  label/result    LabelResult                           one for every request, with delay
+out  label/names     LabelNames                            one for every label/add
 
-One region at a time, however long that takes: nobody waits for it. A labeller that cannot be used,
-does not answer or talks nonsense never ends the service: regions stay unnamed, and health says so.
-Without one every request is answered at once with no opinion.
+The actor labels one region at a time. No other actor waits for it, however long a request takes. A
+labeller that fails or returns invalid answers never ends the service. Regions then stay without a
+label, and the metrics report the failure. Without a labeller, the actor answers every request at
+once with an empty label.
 
-A labeller behind a server asks what no journal has. A replay leaves such an actor out, and feeds
-the mapper what it took when it was recorded.
+The answers of a labelling server are not reproducible from a journal. A replay therefore skips this
+actor and feeds the recorded results to the mapper.
 """
 
 import logging
@@ -37,27 +37,31 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class VlmLabellerConfig:
-    model: str = ""  # a pair of encoders: a name of `ldo models list`, or a folder with its files
-    url: str = ""  # of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1
-    names: str = ""  # file with a name a line to choose from; empty: those that come with the pair,
-    # or the 80 of COCO; a server may answer any
+    """Choice and parameters of the labeller."""
+
+    model: str = ""  # Dual encoder: a name of `ldo models list`, or a folder; empty: none.
+    url: str = ""  # OpenAI-compatible server, such as http://127.0.0.1:8000/v1; empty: none.
+    # File with one name per line to choose from. Empty: the names of the dual encoder, or the 80
+    # classes of COCO; a server may return any name.
+    names: str = ""
     dual_encoder: DualEncoderConfig = field(default_factory=DualEncoderConfig)
     http: HttpConfig = field(default_factory=HttpConfig)
 
     def __post_init__(self) -> None:
         if self.model and self.url:
             raise ConfigError(
-                f"vlm_labeller has model={self.model} and url={self.url}: choose one of them."
+                f"vlm_labeller.model={self.model} and vlm_labeller.url={self.url} exclude each "
+                "other; choose one of them."
             )
 
     @property
     def is_chosen(self) -> bool:
-        """One is named: the mapper asks for names then."""
+        """True if a labeller is configured; the mapper then sends label requests."""
         return bool(self.model or self.url)
 
 
 class VlmLabeller(Actor):
-    """Remembers the names that were added, and nothing else."""
+    """Actor that labels regions; its only state is the tuple of added names."""
 
     name = "vlm_labeller"
     inputs = (
@@ -69,20 +73,21 @@ class VlmLabeller(Actor):
     def __init__(
         self, config: VlmLabellerConfig | None = None, labeller: Labeller | None = None
     ) -> None:
-        """`labeller` in place of the one that the configuration names."""
+        """Open the configured labeller, or use `labeller` instead."""
         super().__init__()
         self.config = config or VlmLabellerConfig()
         self.talks_outside = bool(self.config.url)
         self._labeller = labeller
-        self._state: State = {"added": ()}  # names, the same object until there is one more
+        self._state: State = {"added": ()}  # Added names; the same object until the next one.
         self._is_failing = False
         self._named = self._unnamed = self._failures = self._refusals = 0
         try:
             self._labeller = labeller or labeller_from_config(self.config)
         except ConfigError as error:
-            log.error("no region is named: %s", error)
+            log.error("vlm_labeller disabled: %s. Regions keep no open-vocabulary label.", error)
 
     def handle(self, message: LabelRequest | AddLabel) -> Iterator[LabelResult | LabelNames]:
+        """Yield the label of a region, or the names after one was added."""
         match message:
             case LabelRequest():
                 yield self._answer(message)
@@ -105,19 +110,27 @@ class VlmLabeller(Actor):
         )
 
     def _label_region(self, request: LabelRequest) -> list[Opinion] | None:
-        """None when nobody could look, which is logged once until somebody can again."""
+        """Return the labels of a region, the likeliest first, or None if no labeller answered.
+
+        The first failure is logged; further ones are logged only after a success.
+        """
         if self._labeller is None:
             return None
         try:
             opinions = self._labeller.label(crops_from_request(request))
         except (ModelError, EndpointError, FrameError) as error:
             if not self._is_failing:
-                log.error("regions stay unnamed: %s: %s", self._labeller.identity, error)
+                log.error(
+                    "vlm_labeller: request failed (%s: %s); regions keep no open-vocabulary label. "
+                    "Check vlm_labeller.model, or the server at vlm_labeller.url.",
+                    self._labeller.identity,
+                    error,
+                )
             self._is_failing = True
             self._failures += 1
             return None
         if self._is_failing:
-            log.info("regions are named again by %s", self._labeller.identity)
+            log.info("vlm_labeller: %s labels regions again", self._labeller.identity)
         self._is_failing = False
         return opinions
 
@@ -125,15 +138,15 @@ class VlmLabeller(Actor):
         refused = self._try_to_add(message.name)
         if refused:
             self._refusals += 1
-            log.error("%r is not added: %s", message.name, refused)
+            log.error("vlm_labeller: name %r not added: %s", message.name, refused)
         else:
-            log.info("%r is added to the names", message.name)
+            log.info("vlm_labeller: name %r added", message.name)
             self._state = {"added": tuple(dict.fromkeys((*self._state["added"], message.name)))}
         names = self._labeller.names[:MAX_NAMES] if self._labeller else ()
         return LabelNames(stamp_ns=message.stamp_ns, names=names, error=refused)
 
     def _try_to_add(self, name: str) -> str:
-        """Why not; empty when it is done."""
+        """Add a name; return the reason if that fails, else an empty string."""
         if self._labeller is None:
             return "there is no labeller: set vlm_labeller.model or vlm_labeller.url."
         if len(self._labeller.names) >= MAX_NAMES:
@@ -145,17 +158,18 @@ class VlmLabeller(Actor):
         return ""
 
     def snapshot(self) -> State:
+        """Return the added names."""
         return self._state
 
     def restore(self, state: State) -> None:
-        """A name that this labeller cannot place stays remembered: a later one may."""
+        """Add the saved names again; one that this labeller rejects stays saved for a later one."""
         self._state = {"added": tuple(state["added"])}
         for name in self._state["added"]:
             if refused := self._try_to_add(name):
-                log.error("%r, added before, is left out: %s", name, refused)
+                log.error("vlm_labeller: saved name %r not added: %s", name, refused)
 
     def metrics(self) -> dict[str, float]:
-        """`labellers_missing`: named in the configuration, and cannot be used."""
+        """Return counters; `labellers_missing` is 1 if the configured labeller cannot be used."""
         return {
             "labellers": float(self._labeller is not None),
             "labellers_missing": float(self.config.is_chosen and self._labeller is None),
@@ -170,7 +184,11 @@ class VlmLabeller(Actor):
 
 
 def labeller_from_config(config: VlmLabellerConfig) -> Labeller | None:
-    """The labeller that a configuration names; None where it names none. Raises ConfigError."""
+    """Return the configured labeller, or None if none is configured.
+
+    Raises:
+        ConfigError: The labeller or its names cannot be used.
+    """
     if not config.is_chosen:
         return None
     names = read_names(Path(config.names).expanduser()) if config.names else ()
@@ -180,6 +198,12 @@ def labeller_from_config(config: VlmLabellerConfig) -> Labeller | None:
 
 
 def require_labeller(config: VlmLabellerConfig) -> None:
-    """Raises ConfigError when it cannot be used: a run over a file is asked for it, where a service
-    rather goes on without. Whether a server answers is found out when it is asked."""
+    """Check that the configured labeller can be used.
+
+    Offline runs call this before they start. A service starts without a labeller instead. A server
+    is contacted only with the first request.
+
+    Raises:
+        ConfigError: The labeller cannot be used.
+    """
     labeller_from_config(config)

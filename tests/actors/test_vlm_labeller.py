@@ -252,7 +252,7 @@ def test_a_name_that_cannot_be_placed_is_refused_and_later_remembered(
     assert answer.names == ("red", "green", "blue")
     assert cached.metrics()["names_refused"] == 1
     cached.restore({"added": ["teapot"]})
-    assert "'teapot', added before, is left out" in caplog.text
+    assert "saved name 'teapot' not added" in caplog.text
     able = VlmLabeller(VlmLabellerConfig(model=str(pair)))
     able.restore(cached.snapshot())
     assert "teapot" in added(able, "samovar").names
