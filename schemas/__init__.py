@@ -1,8 +1,8 @@
-"""What travels between the actors and to other programs. Imports msgspec and numpy only.
+"""Messages between the actors and to other programs; imports msgspec and numpy only.
 
-A message is one frozen, tagged struct; its body is MessagePack, a map with the struct's field
-names and `type`, so any MessagePack library reads it. Fields are added at the end and with a
-default; what a field means never changes. Conventions of frames and units are those of
+A message is one frozen, tagged struct. Its body is MessagePack: a map with the struct's field names
+and `type`, so any MessagePack library can read it. New fields are added at the end and with a
+default; the meaning of a field never changes. Conventions of frames and units are those of
 `ldo_service.geometry`.
 """
 

@@ -1,4 +1,4 @@
-"""An array on the wire: its bytes, shape and dtype."""
+"""Array on the wire: bytes, shape and dtype."""
 
 from math import prod
 from typing import Literal, cast, get_args
@@ -9,11 +9,14 @@ import numpy as np
 DType = Literal["u1", "u2", "u4", "i4", "i8", "f4", "f8"]
 DTYPES = get_args(DType)
 MAX_DIMENSIONS = 8
-MAX_LENGTH = 1 << 32  # of one dimension: an empty array may not claim an absurd one either
+MAX_LENGTH = 1 << 32  # Maximum length of a dimension; it also limits the shape of empty arrays.
 
 
 class Array(msgspec.Struct, frozen=True):
-    """Little-endian, C-ordered. With NumPy: `np.frombuffer(data, dtype).reshape(shape)`."""
+    """Little-endian array in C order.
+
+    With NumPy: `np.frombuffer(data, dtype).reshape(shape)`.
+    """
 
     dtype: DType
     shape: tuple[int, ...]
@@ -21,7 +24,10 @@ class Array(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         if len(self.shape) > MAX_DIMENSIONS or any(not 0 <= n < MAX_LENGTH for n in self.shape):
-            raise ValueError(f"array shape {self.shape[:8]} is impossible")
+            raise ValueError(
+                f"array shape {self.shape[:8]} is impossible: it must have at most "
+                f"{MAX_DIMENSIONS} dimensions, each from 0 to 2^32 - 1"
+            )
         expected = prod(self.shape) * int(self.dtype[1])
         if self.data.nbytes != expected:
             raise ValueError(
@@ -31,21 +37,25 @@ class Array(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, values: np.ndarray) -> "Array":
-        """A copy of `values`, so that later changes to them do not reach the message."""
+        """Return an array with a copy of `values`: later changes to them do not affect the message.
+
+        Raises:
+            ValueError: The dtype is not one of `DTYPES`.
+        """
         dtype = values.dtype.str[1:]
         if dtype not in DTYPES:
-            raise ValueError(f"arrays of {values.dtype} do not travel: use one of {DTYPES}")
+            raise ValueError(f"arrays of {values.dtype} are not supported; use one of {DTYPES}")
         little = values.astype("<" + dtype, copy=False)
         return cls(cast(DType, dtype), values.shape, memoryview(little.tobytes()))
 
     def numpy(self) -> np.ndarray:
-        """A read-only view, without a copy; of a received message it need not be aligned."""
+        """Return a read-only view without a copy; in a received message it may be unaligned."""
         view = np.frombuffer(self.data, "<" + self.dtype).reshape(self.shape)
         view.flags.writeable = False
         return view
 
     def require(self, name: str, dtype: DType, shape: tuple[int | None, ...]) -> None:
-        """Raise ValueError unless dtype and shape are these; None stands for any length."""
+        """Raise ValueError unless dtype and shape match; None in `shape` allows any length."""
         fits = len(shape) == len(self.shape) and all(
             want is None or want == have for want, have in zip(shape, self.shape, strict=True)
         )
@@ -54,11 +64,12 @@ class Array(msgspec.Struct, frozen=True):
             raise ValueError(f"{name} is {self.dtype}{list(self.shape)}, must be {dtype}{want}")
 
     def require_finite(self, name: str) -> None:
+        """Raise ValueError if the array holds NaN or infinity."""
         if not np.isfinite(self.numpy()).all():
             raise ValueError(f"{name} holds NaN or infinity")
 
     def require_ascending(self, name: str) -> None:
-        """Raise ValueError unless this one-dimensional array of identifiers is 0 <= a < b < ..."""
+        """Raise ValueError unless this one-dimensional array of ids is 0 <= a < b < ..."""
         ids = self.numpy()
         if (ids.size and ids[0] < 0) or (ids[1:] <= ids[:-1]).any():
             raise ValueError(f"{name} must be ascending and at least 0")

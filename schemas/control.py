@@ -1,22 +1,27 @@
-"""What a person or a program asks of the whole service, and what it answers."""
+"""Commands to the whole service, and its replies."""
 
 from ldo_service.schemas.message import Message
 
 
 class ControlRequest(Message, frozen=True, kw_only=True):
-    """control: the payload of a query. stamp_ns is the asker's clock, or 0.
+    """Command to the service, sent as the payload of a query on control.
 
-    pause    frames are left out and counted from now on
-    resume   frames are taken again
-    save     every actor writes its whole state now
-    reset    every actor begins anew, with an empty state and a new epoch
+    stamp_ns is the clock of the sender, or 0. Commands:
+
+    pause    drop and count all frames from now on
+    resume   take frames again
+    save     every actor writes a checkpoint of its whole state now
+    reset    every actor restarts with an empty state and a new epoch
     """
 
-    command: str  # another one is answered with the list of those there are
+    command: str  # An unknown command is answered with the list of known commands.
 
 
 class ControlAnswer(Message, frozen=True, kw_only=True):
-    """The reply, sent when all actors have done it. stamp_ns is that of the request."""
+    """Reply to a command, sent after all actors have executed it.
+
+    stamp_ns is that of the request.
+    """
 
     ok: bool
-    message: str  # one paragraph for people: what was done, or what is wrong and what to do
+    message: str  # One paragraph for users: what was done, or what is wrong and what to do.

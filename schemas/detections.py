@@ -1,54 +1,63 @@
-"""What the detector found in a keyframe."""
+"""Detections in a keyframe."""
 
 import msgspec
 
 from ldo_service.schemas.frames import MAX_PIXELS
 from ldo_service.schemas.message import Message, require_count, require_finite
 
-MAX_LABEL_LENGTH = 100  # characters
+MAX_LABEL_LENGTH = 100  # Characters.
 MAX_DETECTIONS = 10_000
-TOLERANCE_PX = 1e-3  # of rounding, beyond the edge of the image
+TOLERANCE_PX = 1e-3  # Tolerance for rounding beyond the edge of the image.
 
 
 class Detection(msgspec.Struct, frozen=True, kw_only=True):
-    """One box. Pixel centres are at integer coordinates: a box around pixel (3, 5) alone is
-    2.5, 4.5, 3.5, 5.5."""
+    """Box of an object with label and score.
 
-    label: str  # in lower case, single spaces; words for the same class are one
-    score: float  # 0..1, as the network has it
-    box_px: tuple[float, float, float, float]  # x0, y0, x1, y1 in the image of the keyframe
+    Pixel centers are at integer coordinates: the box around pixel (3, 5) alone is 2.5, 4.5, 3.5,
+    5.5.
+    """
+
+    label: str  # Lower case, single spaces; synonyms of a class share one label.
+    score: float  # Score of the network, 0..1.
+    # Edges x0, y0, x1, y1 in the keyframe's image, pixels.
+    box_px: tuple[float, float, float, float]
 
     def __post_init__(self) -> None:
         if not 0 < len(self.label) <= MAX_LABEL_LENGTH:
-            raise ValueError(f"a label of {len(self.label)} characters: 1 to {MAX_LABEL_LENGTH}")
+            raise ValueError(
+                f"label has {len(self.label)} characters, must have 1 to {MAX_LABEL_LENGTH}"
+            )
         require_finite("score and box_px", (self.score, *self.box_px))
         if not 0 <= self.score <= 1:
-            raise ValueError(f"score {self.score:g} must be within 0..1")
+            raise ValueError(f"score is {self.score:g}, must be within 0..1")
         x0, y0, x1, y1 = self.box_px
         if not (x0 < x1 and y0 < y1):
-            raise ValueError(f"box {self.box_px} is empty")
+            raise ValueError(f"box_px {self.box_px} is empty: x0 < x1 and y0 < y1 are required")
 
 
 class DetectionBoxes(Message, frozen=True, kw_only=True):
-    """detection/boxes: one message for every keyframe. stamp_ns is that of the keyframe.
+    """Detections in a keyframe, published on detection/boxes once for every keyframe.
 
-    Without a network nobody looked, and that there are no boxes says nothing.
+    stamp_ns is that of the keyframe. If `network` is empty, no detector ran: the keyframe may show
+    objects although `detections` is empty.
     """
 
-    keyframe: int  # id
-    width: int  # of the image, pixels
-    height: int
-    detections: tuple[Detection, ...] = ()  # the most certain first
-    network: str = ""  # name and checksum of the network that looked; empty: nobody did
+    keyframe: int  # Id of the keyframe.
+    width: int  # Width of the keyframe's image, pixels.
+    height: int  # Height of the keyframe's image, pixels.
+    detections: tuple[Detection, ...] = ()  # Sorted by descending score.
+    network: str = ""  # Name and checksum of the network that ran; empty: none ran.
 
     def check(self) -> None:
         require_count("keyframe", self.keyframe)
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
             raise ValueError(f"image size {self.width}x{self.height} is empty or over {MAX_PIXELS}")
         if len(self.detections) > MAX_DETECTIONS:
-            raise ValueError(f"{len(self.detections)} detections are over {MAX_DETECTIONS}")
+            raise ValueError(
+                f"message has {len(self.detections)} detections, must have at most {MAX_DETECTIONS}"
+            )
         if self.detections and not self.network:
-            raise ValueError("there are detections, and no network that made them")
+            raise ValueError("message has detections but no network that made them")
         for detection in self.detections:
             self._require_inside(detection)
 
@@ -57,5 +66,5 @@ class DetectionBoxes(Message, frozen=True, kw_only=True):
         low, right, bottom = -0.5 - TOLERANCE_PX, self.width - 0.5, self.height - 0.5
         if min(x0, y0) < low or x1 > right + TOLERANCE_PX or y1 > bottom + TOLERANCE_PX:
             raise ValueError(
-                f"box {detection.box_px} leaves the image of {self.width}x{self.height}"
+                f"box_px {detection.box_px} leaves the image of {self.width}x{self.height} pixels"
             )

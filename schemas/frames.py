@@ -1,4 +1,4 @@
-"""RGB-D frames: as a camera sends them, whole or in halves, and rectified."""
+"""RGB-D frames: raw from a camera, as one message or as two, and rectified."""
 
 from typing import Literal
 
@@ -9,11 +9,12 @@ from ldo_service.schemas.array import Array
 from ldo_service.schemas.message import Message, require_count, require_finite
 from ldo_service.schemas.pose import IDENTITY, Pose
 
-MAX_PIXELS = 1 << 25  # 33 megapixels: no RGB-D camera has more, and a lying header could ask for TB
+# 33 megapixels. No RGB-D camera has more, and a corrupt header could demand terabytes.
+MAX_PIXELS = 1 << 25
 
 
 class CameraModel(msgspec.Struct, frozen=True, kw_only=True):
-    """Pinhole intrinsics in pixels, centres at integer coordinates."""
+    """Pinhole intrinsics in pixels, with pixel centers at integer coordinates."""
 
     width: int
     height: int
@@ -21,33 +22,38 @@ class CameraModel(msgspec.Struct, frozen=True, kw_only=True):
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, ...] = ()  # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty: rectified
+    distortion: tuple[float, ...] = ()  # OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty: rectified.
 
     def __post_init__(self) -> None:
         require_finite("camera intrinsics", (self.fx, self.fy, self.cx, self.cy, *self.distortion))
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
             raise ValueError(f"image size {self.width}x{self.height} is empty or over {MAX_PIXELS}")
         if self.fx <= 0 or self.fy <= 0:
-            raise ValueError(f"focal lengths {self.fx:g}, {self.fy:g} px must be positive")
+            raise ValueError(f"focal lengths are {self.fx:g}, {self.fy:g} px, must be positive")
         if len(self.distortion) not in (0, 4, 5, 8):
-            raise ValueError(f"{len(self.distortion)} distortion coefficients: must be 4, 5 or 8")
+            raise ValueError(
+                f"distortion has {len(self.distortion)} coefficients, must have 0, 4, 5 or 8"
+            )
 
 
 ImageEncoding = Literal[
-    "rgb8",  # 3 bytes a pixel
+    "rgb8",  # Color, 3 bytes per pixel.
     "bgr8",
     "jpeg",
-    "png",  # colour of 8 bits, or depth of 16 bits
-    "z16",  # depth, little-endian uint16
-    "z16+zstd",  # the same, compressed
-    "f32",  # depth, little-endian float32; NaN and infinity mean "not measured", as in ROS
+    "png",  # Color of 8 bits, or depth of 16 bits.
+    "z16",  # Depth, little-endian uint16.
+    "z16+zstd",  # The same, compressed.
+    "f32",  # Depth, little-endian float32; NaN and infinity mean "not measured", as in ROS.
     "f32+zstd",
 ]
 BYTES_PER_PIXEL: dict[str, int] = {"rgb8": 3, "bgr8": 3, "z16": 2, "f32": 4}
 
 
 class Image(msgspec.Struct, frozen=True, kw_only=True):
-    """One image, raw or compressed. A compressed one is checked where it is decompressed."""
+    """Image, raw or compressed.
+
+    The pixels of a compressed image are checked when it is decompressed.
+    """
 
     encoding: ImageEncoding
     width: int
@@ -68,33 +74,43 @@ class Image(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def raw(cls, encoding: ImageEncoding, pixels: np.ndarray) -> "Image":
-        """A copy of uncompressed pixels [H, W] or [H, W, 3]."""
+        """Return an image with a copy of uncompressed pixels [H, W] or [H, W, 3]."""
         height, width = pixels.shape[:2]
         data = memoryview(np.ascontiguousarray(pixels).tobytes())
         return cls(encoding=encoding, width=width, height=height, data=data)
 
 
 class CameraRgbd(Message, frozen=True, kw_only=True):
-    """camera/rgbd: one exposure as a camera program sends it, depth registered to colour."""
+    """Raw RGB-D frame of a camera program, published on camera/rgbd; depth is registered to color.
 
-    frame: int  # running number of the camera program; gaps are dropped frames
+    stamp_ns is the time of the exposure, by the clock of the camera.
+    """
+
+    frame: int  # Running number of the camera program; gaps are dropped frames.
     camera: CameraModel
     color: Image
     depth: Image
-    depth_scale: float  # depth units per metre: 1000 for millimetres, 5000 for TUM, 1 for metres
+    depth_scale: float  # Depth units per meter: 1000 for millimeters, 5000 for TUM, 1 for meters.
 
     def check(self) -> None:
         require_count("frame", self.frame)
         require_color(self.color, self.camera)
         if (self.depth.width, self.depth.height) != (self.color.width, self.color.height):
-            raise ValueError("depth and colour differ in size: it must be registered to colour")
+            raise ValueError(
+                f"depth of {self.depth.width}x{self.depth.height} and color of "
+                f"{self.color.width}x{self.color.height} pixels differ in size: depth must be "
+                "registered to color"
+            )
         require_depth(self.depth, self.camera, self.depth_scale)
 
 
 class CameraColor(Message, frozen=True, kw_only=True):
-    """camera/color: one colour exposure. Its stamp becomes that of the frame it is paired into."""
+    """Raw color image of a camera program, published on camera/color.
 
-    frame: int  # running number of the camera program, and of the frame it is paired into
+    The frame that it is paired into has its stamp.
+    """
+
+    frame: int  # Running number of the camera program, and of the paired frame.
     camera: CameraModel
     image: Image
 
@@ -104,17 +120,18 @@ class CameraColor(Message, frozen=True, kw_only=True):
 
 
 class CameraDepth(Message, frozen=True, kw_only=True):
-    """camera/depth: one depth exposure, with a stamp and a camera of its own.
+    """Raw depth image of a camera program, published on camera/depth; it has its own stamp.
 
-    Depth whose camera is the colour camera and whose T_color_depth is the identity is registered
-    already; any other is moved into the colour image.
+    Depth is already registered if its camera equals the color camera and T_color_depth is the
+    identity. Any other depth is registered to the color image.
     """
 
-    frame: int  # running number of the camera program; pairs are made by stamp, not by it
-    camera: CameraModel  # of the depth image
+    frame: int  # Running number of the camera program; pairing uses stamps instead.
+    camera: CameraModel  # Intrinsics of the depth image.
     image: Image
-    depth_scale: float  # as in camera/rgbd
-    T_color_depth: Pose = IDENTITY  # from coordinates of the depth camera to the colour camera's
+    depth_scale: float  # Depth units per meter, as in camera/rgbd.
+    # Transform from depth-camera coordinates to color-camera coordinates.
+    T_color_depth: Pose = IDENTITY
 
     def check(self) -> None:
         require_count("frame", self.frame)
@@ -122,12 +139,12 @@ class CameraDepth(Message, frozen=True, kw_only=True):
 
 
 class FrameRgbd(Message, frozen=True, kw_only=True):
-    """frame/rgbd: one rectified frame, colour and depth on the same pixel grid."""
+    """Rectified frame with color and depth on the same pixel grid, published on frame/rgbd."""
 
-    frame: int  # as in camera/rgbd
-    camera: CameraModel  # without distortion
-    color: Array  # u1 [H, W, 3] RGB
-    depth_m: Array  # f4 [H, W], z in metres, 0 = not measured
+    frame: int  # Frame number, as in camera/rgbd.
+    camera: CameraModel  # Intrinsics without distortion.
+    color: Array  # RGB, u1 [H, W, 3].
+    depth_m: Array  # Depth z in meters, f4 [H, W]; 0 where not measured.
 
     def check(self) -> None:
         require_count("frame", self.frame)
@@ -135,28 +152,41 @@ class FrameRgbd(Message, frozen=True, kw_only=True):
 
 
 def require_color(image: Image, camera: CameraModel) -> None:
+    """Raise ValueError unless a color image fits its camera and encoding."""
     if (image.width, image.height) != (camera.width, camera.height):
-        raise ValueError("colour and its camera differ in size")
+        raise ValueError(
+            f"color of {image.width}x{image.height} and its camera of "
+            f"{camera.width}x{camera.height} pixels differ in size"
+        )
     if image.encoding not in ("rgb8", "bgr8", "jpeg", "png"):
-        raise ValueError(f"colour cannot be encoded as {image.encoding}")
+        raise ValueError(
+            f"color cannot be encoded as {image.encoding}; use rgb8, bgr8, jpeg or png"
+        )
 
 
 def require_depth(image: Image, camera: CameraModel, depth_scale: float) -> None:
+    """Raise ValueError unless a depth image fits its camera, encoding and scale."""
     require_finite("depth_scale", (depth_scale,))
     if depth_scale <= 0:
-        raise ValueError(f"depth_scale {depth_scale:g} must be positive")
+        raise ValueError(f"depth_scale is {depth_scale:g}, must be positive")
     if (image.width, image.height) != (camera.width, camera.height):
-        raise ValueError("depth and its camera differ in size")
+        raise ValueError(
+            f"depth of {image.width}x{image.height} and its camera of "
+            f"{camera.width}x{camera.height} pixels differ in size"
+        )
     if image.encoding not in ("png", "z16", "z16+zstd", "f32", "f32+zstd"):
-        raise ValueError(f"depth cannot be encoded as {image.encoding}")
+        raise ValueError(
+            f"depth cannot be encoded as {image.encoding}; use png, z16, z16+zstd, f32 or f32+zstd"
+        )
 
 
 def require_rgbd(camera: CameraModel, color: Array, depth_m: Array) -> None:
+    """Raise ValueError unless color [H, W, 3] and depth [H, W] fit a rectified camera."""
     if camera.distortion:
-        raise ValueError("the camera of a rectified frame has no distortion")
+        raise ValueError("the camera of a rectified frame must have no distortion")
     size = (camera.height, camera.width)
     color.require("color", "u1", (*size, 3))
     depth_m.require("depth_m", "f4", size)
     depth = depth_m.numpy()
-    if not (depth.min() >= 0 and depth.max() < float("inf")):  # NaN fails both
+    if not (depth.min() >= 0 and depth.max() < float("inf")):  # NaN fails both comparisons.
         raise ValueError("depth_m must be finite and at least 0, where 0 means not measured")

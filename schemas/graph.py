@@ -1,4 +1,4 @@
-"""What the optimizer says: where the keyframes and landmarks are in the map."""
+"""Output of the optimizer: poses of keyframes and landmarks in the map."""
 
 import msgspec
 import numpy as np
@@ -17,12 +17,12 @@ Pair = tuple[int, int]
 
 
 class GraphLandmark(msgspec.Struct, frozen=True, kw_only=True):
-    """An object as the observations of all keyframes together place and name it."""
+    """Landmark of an object: its fused position and class distribution."""
 
-    object: int  # id, as in map/objects
-    centroid: Vector3  # map frame, metres
-    distribution: Distribution
-    entropy: float  # of it, nats, before it was cut to its heaviest classes
+    object: int  # Id of the object, as in map/objects.
+    centroid: Vector3  # Map frame, meters.
+    distribution: Distribution  # Fused over the observations of all keyframes.
+    entropy: float  # Entropy of the distribution before it was cut to its likeliest classes, nats.
 
     def __post_init__(self) -> None:
         require_count("object", self.object)
@@ -32,31 +32,39 @@ class GraphLandmark(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class GraphCorrection(Message, frozen=True, kw_only=True):
-    """graph/correction: absolute, so the newest one says it all. 56 bytes a keyframe."""
+    """Poses of all keyframes in the map, published on graph/correction.
 
-    graph_version: int  # ascending
-    keyframes: Array  # i8 [K], ids, ascending
-    T_map_keyframe: Array  # f8 [K, 7]: translation in metres, quaternion wxyz
-    last_refinement: int = 0  # number of the last keyframe/refinement that it takes into account
-    merged_submaps: tuple[Pair, ...] = ()  # submaps, each with the older one it is placed in
-    # Loop closures that it agrees with: reference and keyframe.
+    Poses are absolute, so the newest message replaces all earlier ones. It has 56 bytes per
+    keyframe.
+    """
+
+    graph_version: int  # Ascending.
+    keyframes: Array  # Keyframe ids, i8 [K], ascending.
+    T_map_keyframe: Array  # Translation in meters and quaternion wxyz, f8 [K, 7].
+    last_refinement: int = 0  # Number of the last keyframe/refinement that it includes.
+    # Merged submaps, each with the older one that it is merged into.
+    merged_submaps: tuple[Pair, ...] = ()
+    # Accepted loop closures as pairs of reference and keyframe.
     accepted_closures: tuple[Pair, ...] = ()
-    # Loop closures that were rejected or removed, the newest 512.
+    # Loop closures that were rejected or removed; the newest 512.
     rejected_closures: tuple[Pair, ...] = ()
-    landmarks: tuple[GraphLandmark, ...] = ()  # by id
+    landmarks: tuple[GraphLandmark, ...] = ()  # Ascending by object id.
 
     def check(self) -> None:
         require_count("graph_version", self.graph_version)
         require_count("last_refinement", self.last_refinement)
         if any(not 0 <= older < submap for submap, older in self.merged_submaps):
-            raise ValueError(f"merged_submaps={self.merged_submaps}: a submap joins an older one")
+            raise ValueError(
+                f"merged_submaps is {self.merged_submaps}; every submap must be merged into an "
+                "older one"
+            )
         self.keyframes.require("keyframes", "i8", (None,))
         count = self.keyframes.shape[0]
         self.T_map_keyframe.require("T_map_keyframe", "f8", (count, 7))
         self.T_map_keyframe.require_finite("T_map_keyframe")
         self.keyframes.require_ascending("keyframes")
         quaternions = self.T_map_keyframe.numpy()[:, 3:]
-        with np.errstate(over="ignore"):  # an absurd number is as wrong as any other
+        with np.errstate(over="ignore"):  # Overflow gives infinity, which fails below.
             norms = np.sqrt((quaternions**2).sum(axis=1))
         if (abs(norms - 1.0) > QUATERNION_TOLERANCE).any():
-            raise ValueError("T_map_keyframe holds a quaternion that is not of unit norm")
+            raise ValueError("T_map_keyframe holds a quaternion without unit norm")

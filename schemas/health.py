@@ -1,4 +1,4 @@
-"""How a stage is: sent twice a second, whether it works or waits."""
+"""Heartbeat of a stage, published twice a second, also while the stage waits."""
 
 from typing import Literal
 
@@ -8,47 +8,52 @@ from ldo_service.schemas.message import Message, require_count, require_finite
 
 
 class InputCount(msgspec.Struct, frozen=True, kw_only=True):
-    """Counted since the stage started."""
+    """Counters of an input since the stage started."""
 
     topic: str
-    delivered: int  # handled by the actor
-    dropped: int  # displaced by newer ones, by the input's policy
-    rejected: int  # did not decode or did not pass the checks
-    gaps: int  # lossless only: came out of order and was asked for again
-    queued: int  # in the mailbox now
-    peak_queued: int  # most that ever waited
-    dropped_paused: int = 0  # left out while the service was paused
-    lost: int = 0  # not lossless only: never came, by the numbers of those that did
+    delivered: int  # Messages handled by the actor.
+    dropped: int  # Messages dropped for newer ones by the policy of the input.
+    rejected: int  # Messages that failed to decode or to pass the checks.
+    gaps: int  # Lossless inputs only: gaps in the sequence, for which retransmission was requested.
+    queued: int  # Messages in the mailbox now.
+    peak_queued: int  # Maximum of `queued` so far.
+    dropped_paused: int = 0  # Messages dropped while the service was paused.
+    lost: int = 0  # Messages that never arrived, by gaps in the sequence; 0 for lossless inputs.
 
 
 class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
+    """Counters of an output since the stage started."""
+
     topic: str
     sent: int
-    backpressure_waits: int  # times the stage waited for a consumer's window
-    evicted_consumers: int  # consumers whose window stayed shut
-    retransmitted: int = 0  # lossless messages sent again, because they got lost
+    backpressure_waits: int  # Times that the stage waited for the window of a consumer.
+    evicted_consumers: int  # Consumers evicted because their window stayed closed.
+    retransmitted: int = 0  # Lossless messages sent again after a loss.
 
 
 class Health(Message, frozen=True, kw_only=True):
-    """health/<actor>. stamp_ns is that of the last message handled."""
+    """Heartbeat of an actor, published on health/<actor>.
+
+    stamp_ns is that of the last handled message.
+    """
 
     actor: str
     state: Literal["starting", "ready", "busy", "draining"]
     pid: int
-    epoch: int  # of the stage: changes when its process was restarted
-    steps: int  # messages handled
-    failures: int  # exceptions in the handler
-    restarts: int  # times the actor was rebuilt from its last state
-    dead_lettered: int  # messages that made it fail twice
-    step_age_s: float  # since the last step finished
-    current_step_s: float  # age of the step under way, 0 when waiting
-    step_ms_p50: float  # over the last steps, but those that only took note of a message
+    epoch: int  # Epoch of the stage; changes when its process restarts.
+    steps: int  # Handled messages.
+    failures: int  # Exceptions in the handler.
+    restarts: int  # Times that the actor was rebuilt from its last state.
+    dead_lettered: int  # Messages that failed twice.
+    step_age_s: float  # Time since the last step finished.
+    current_step_s: float  # Age of the current step; 0 while waiting.
+    step_ms_p50: float  # Median of the last steps, without steps that only store a message.
     step_ms_p95: float
-    rss_mb: float  # of the process
+    rss_mb: float  # Resident memory of the process.
     inputs: tuple[InputCount, ...]
     outputs: tuple[OutputCount, ...]
-    metrics: dict[str, float] = {}  # what the actor counts itself
-    paused: bool = False  # takes nothing, on request
+    metrics: dict[str, float] = {}  # Metrics of the actor by name.
+    paused: bool = False  # True while the stage takes no messages, on request.
 
     def check(self) -> None:
         for name in ("pid", "epoch", "steps", "failures", "restarts", "dead_lettered"):

@@ -1,4 +1,4 @@
-"""JSON Schema of every message, for programs that are not written in Python."""
+"""JSON Schema of every message, for programs in other languages than Python."""
 
 import msgspec
 
@@ -7,15 +7,17 @@ from ldo_service.schemas.topics import TOPICS
 
 
 def message_types() -> tuple[type[Message], ...]:
+    """Return the types of all messages and query answers, in the order of the topics."""
     both = [message for topic in TOPICS for message in (topic.message, topic.answer)]
     return tuple(message for message in both if message is not None)
 
 
 def json_schema() -> dict[str, object]:
-    """One document: `$defs` has each message by name, `topics` says which travels where, `answers`
-    what a query on a topic that is asked is answered with.
+    """Return one document with the schemas of all messages.
 
-    Binary fields, base64 strings in JSON Schema's terms, are MessagePack's `bin` on the wire.
+    `$defs` has each message by name, `topics` the message of each topic, and `answers` the reply to
+    a query on a topic that takes requests. Binary fields are base64 strings in terms of JSON
+    Schema; on the wire they are MessagePack's `bin`.
     """
     _, definitions = msgspec.json.schema_components(message_types())
     return {

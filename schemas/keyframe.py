@@ -1,4 +1,4 @@
-"""Keyframes, as the tracker makes them and the mapper places them better."""
+"""Keyframes from the tracker, and their refined poses from the mapper."""
 
 import msgspec
 import numpy as np
@@ -12,45 +12,49 @@ NO_MASK = Array.of(np.zeros((0, 0), np.uint8))
 
 
 class MeasuredPose(msgspec.Struct, frozen=True, kw_only=True):
-    """A measured pose of one keyframe in another."""
+    """Relative-pose measurement between two keyframes."""
 
-    reference: int
-    keyframe: int
+    reference: int  # Id of the keyframe that is the frame of the pose.
+    keyframe: int  # Id of the measured keyframe.
     T_reference_keyframe: Pose
-    information: Matrix6  # perturbed on the right
+    information: Matrix6  # Information matrix for a perturbation on the right.
 
     def __post_init__(self) -> None:
         require_count("reference", self.reference)
         require_count("keyframe", self.keyframe)
         require_matrix6("information", self.information)
         if self.reference == self.keyframe:
-            raise ValueError(f"keyframe {self.keyframe} is measured against itself")
+            raise ValueError(
+                f"keyframe {self.keyframe} is measured against itself; reference and keyframe "
+                "must differ"
+            )
 
 
 class Keyframe(Message, frozen=True, kw_only=True):
-    """keyframe/new: a frame that the map is made from, placed relative to its reference keyframe.
+    """Frame that is mapped, placed relative to its reference keyframe; published on keyframe/new.
 
-    The optimizer alone owns poses in the map; a receiver chains this one to the pose it knows of
-    `reference`. `T_odom_keyframe` lets a receiver that missed the reference chain to any other.
-    The first of a submap has no reference: tracking was lost, and where it is, is not known.
+    Only the optimizer owns poses in the map. A receiver computes T_map_keyframe = T_map_reference @
+    T_reference_keyframe. If it missed the reference, it uses T_odom_keyframe and any other keyframe
+    of the submap. The first keyframe of a submap has no reference: tracking was lost before it, and
+    its pose in other submaps is unknown.
     """
 
-    keyframe: int  # id, ascending
-    frame: int  # as in camera/rgbd
-    camera: CameraModel  # without distortion
-    color: Array  # u1 [H, W, 3] RGB
-    depth_m: Array  # f4 [H, W], z in metres, 0 = not measured
-    reference: int | None  # id of the reference keyframe; None for the first of a submap
+    keyframe: int  # Id, ascending.
+    frame: int  # Frame number, as in camera/rgbd.
+    camera: CameraModel  # Intrinsics without distortion.
+    color: Array  # RGB, u1 [H, W, 3].
+    depth_m: Array  # Depth z in meters, f4 [H, W]; 0 where not measured.
+    reference: int | None  # Id of the reference keyframe; None for the first of a submap.
     T_reference_keyframe: Pose
-    information: Matrix6  # of T_reference_keyframe, perturbed on the right
+    information: Matrix6  # Information of T_reference_keyframe for a perturbation on the right.
     T_odom_keyframe: Pose
-    overlap: float = 1.0  # share of the reference's surface that this keyframe sees
-    # This keyframe measured from others than the reference.
+    overlap: float = 1.0  # Fraction of the reference keyframe's surface that this keyframe sees.
+    # Poses of this keyframe in keyframes of its submap other than the reference.
     window_measurements: tuple[MeasuredPose, ...] = ()
-    # u1 [H, W], 1: shows what moves and is not mapped; [0, 0]: nothing moves.
+    # u1 [H, W]; 1 where pixels move and are not mapped. [0, 0] if nothing moves.
     dynamic_mask: Array = NO_MASK
-    submap: int = 0  # which of the stretches without a loss it was made in
-    # As window_measurements, in keyframes of submaps that this one joins.
+    submap: int = 0  # Number of the submap; each loss of tracking starts a new one.
+    # Poses of this keyframe in keyframes of submaps that its submap is merged with.
     submap_measurements: tuple[MeasuredPose, ...] = ()
 
     def check(self) -> None:
@@ -63,23 +67,31 @@ class Keyframe(Message, frozen=True, kw_only=True):
         if self.dynamic_mask.shape != (0, 0):
             self.dynamic_mask.require("dynamic_mask", "u1", (self.camera.height, self.camera.width))
         if any(pose.keyframe != self.keyframe for pose in self.submap_measurements):
-            raise ValueError(f"a join of keyframe {self.keyframe} measures another keyframe")
+            raise ValueError(
+                f"submap_measurements of keyframe {self.keyframe} must measure this keyframe, not "
+                "another one"
+            )
         if self.reference is not None and not 0 <= self.reference < self.keyframe:
             raise ValueError(
-                f"keyframe {self.keyframe} refers to {self.reference}, not an older one"
+                f"keyframe {self.keyframe} has reference {self.reference}, not an older one"
             )
         for pose in self.window_measurements:
             if not pose.reference < pose.keyframe == self.keyframe:
                 raise ValueError(
-                    f"keyframe {self.keyframe} comes with {pose.keyframe} from {pose.reference}"
+                    f"window_measurements of keyframe {self.keyframe} hold keyframe "
+                    f"{pose.keyframe} in {pose.reference}; they must measure keyframe "
+                    f"{self.keyframe} in older ones"
                 )
 
 
 class KeyframeRefinement(Message, frozen=True, kw_only=True):
-    """keyframe/refinement: measurements that replace earlier ones between the same keyframes."""
+    """Measurements that replace earlier ones of the same pairs of keyframes.
+
+    Published on keyframe/refinement.
+    """
 
     poses: tuple[MeasuredPose, ...]
-    number: int = 0  # ascending from 1; 0: not counted
+    number: int = 0  # Ascending from 1; 0 if not numbered.
 
     def check(self) -> None:
         require_count("number", self.number)

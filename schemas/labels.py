@@ -1,25 +1,28 @@
-"""Regions that are to be named from an open vocabulary, and their names."""
+"""Open-vocabulary labels of regions: requests, results and the list of names."""
 
 from ldo_service.schemas.detections import MAX_LABEL_LENGTH
 from ldo_service.schemas.frames import Image
 from ldo_service.schemas.message import Message, require_count, require_finite
 
 MAX_CROPS = 8
-MAX_ALTERNATIVES = 8  # guesses beside the label
-MAX_CROP_PX = 1 << 20  # of one crop: networks look at 0.1 megapixels
+MAX_ALTERNATIVES = 8  # Maximum labels in addition to the first one.
+MAX_CROP_PX = 1 << 20  # Maximum pixels of a crop; networks use 0.1 megapixels.
 MAX_NAMES = 10_000
 Box = tuple[float, float, float, float]
 
 
 class LabelRequest(Message, frozen=True, kw_only=True):
-    """label/request: what is this? stamp_ns is that of the keyframe."""
+    """Region that needs a label, published on label/request.
 
-    region: int  # id; a newer request of the same region replaces one that waits
-    keyframe: int  # id: the newest one that shows the region
-    box_px: Box  # x0, y0, x1, y1 in that keyframe's image, as in detection/boxes
-    crops: tuple[Image, ...]  # colour, of the region's best views, the best first
-    label: str = ""  # what the detector takes it for; empty: nothing
-    score: float = 0.0  # 0..1, the detector's
+    stamp_ns is that of the keyframe.
+    """
+
+    region: int  # Id of the region; a newer request for it replaces a waiting one.
+    keyframe: int  # Id of the newest keyframe that shows the region.
+    box_px: Box  # Edges x0, y0, x1, y1 in that keyframe's image, pixels, as in detection/boxes.
+    crops: tuple[Image, ...]  # Color crops of the best views, the best first.
+    label: str = ""  # Label from the detector; empty: none.
+    score: float = 0.0  # Score of the detector, 0..1.
 
     def check(self) -> None:
         require_count("region", self.region)
@@ -27,24 +30,26 @@ class LabelRequest(Message, frozen=True, kw_only=True):
         require_finite("box_px", self.box_px)
         x0, y0, x1, y1 = self.box_px
         if not (x0 < x1 and y0 < y1):
-            raise ValueError(f"box {self.box_px} is empty")
+            raise ValueError(f"box_px {self.box_px} is empty: x0 < x1 and y0 < y1 are required")
         if not 0 < len(self.crops) <= MAX_CROPS:
-            raise ValueError(f"{len(self.crops)} crops: 1 to {MAX_CROPS}")
+            raise ValueError(f"request has {len(self.crops)} crops, must have 1 to {MAX_CROPS}")
         for crop in self.crops:
             _require_crop(crop)
         _require_opinion(self.label, self.score)
 
 
 class LabelResult(Message, frozen=True, kw_only=True):
-    """label/result: the labels of a region. stamp_ns, region and keyframe are those of
-    the request, which may be long ago."""
+    """Label of a region, published on label/result.
+
+    stamp_ns, region and keyframe are those of the request, which may be much older than the result.
+    """
 
     region: int
     keyframe: int
-    label: str  # in lower case, single spaces; empty: it has no opinion, or could not look
-    confidence: float  # 0..1; 0 without a label
-    labeller: str = ""  # which one looked; empty: none could
-    # Other labels and their confidence 0..1, the likelier first.
+    label: str  # Lower case, single spaces; empty: no label, or no labeller ran.
+    confidence: float  # Confidence 0..1; 0 without a label.
+    labeller: str = ""  # Identity of the labeller; empty: none ran.
+    # Other labels with their confidence 0..1, the likeliest first.
     alternatives: tuple[tuple[str, float], ...] = ()
 
     def check(self) -> None:
@@ -52,52 +57,66 @@ class LabelResult(Message, frozen=True, kw_only=True):
         require_count("keyframe", self.keyframe)
         _require_opinion(self.label, self.confidence)
         if self.label and not self.labeller:
-            raise ValueError("there is a label, and no labeller that gave it")
+            raise ValueError("result has a label but no labeller that gave it")
         if len(self.alternatives) > MAX_ALTERNATIVES:
-            raise ValueError(f"{len(self.alternatives)} alternatives are over {MAX_ALTERNATIVES}")
+            raise ValueError(
+                f"result has {len(self.alternatives)} alternatives, must have at most "
+                f"{MAX_ALTERNATIVES}"
+            )
         for other in self.alternatives:
             _require_opinion(*other)
         names = [self.label, *(name for name, _ in self.alternatives)]
         if self.alternatives and (not all(names) or len(set(names)) < len(names)):
             raise ValueError(
-                f"label and alternatives are {names}: each is told once, and none is empty"
+                f"label and alternatives are {names}: each must appear once, and none is empty"
             )
 
 
 class AddLabel(Message, frozen=True, kw_only=True):
-    """label/add: asked of the labeller, to choose from one more name. stamp_ns tells requests
-    apart."""
+    """Request to the labeller to choose from one more name, published on label/add.
+
+    stamp_ns identifies the request.
+    """
 
     name: str
 
     def check(self) -> None:
         if not 0 < len(self.name.strip()) <= MAX_LABEL_LENGTH:
-            raise ValueError(f"a name of {len(self.name)} characters: 1 to {MAX_LABEL_LENGTH}")
+            raise ValueError(
+                f"name has {len(self.name)} characters, must have 1 to {MAX_LABEL_LENGTH}"
+            )
 
 
 class LabelNames(Message, frozen=True, kw_only=True):
-    """label/names: after each label/add, whose stamp_ns it has."""
+    """Reply to a label/add, published on label/names.
 
-    names: tuple[str, ...]  # that the labeller chooses from; empty: any, or there is none
-    error: str = ""  # why what was asked last was not done; empty: it was
+    stamp_ns is that of the request.
+    """
+
+    names: tuple[str, ...]  # Names that the labeller chooses from; empty: any name, or no labeller.
+    error: str = ""  # Reason why the request failed; empty: it succeeded.
 
     def check(self) -> None:
         if len(self.names) > MAX_NAMES:
-            raise ValueError(f"{len(self.names)} names are over {MAX_NAMES}")
+            raise ValueError(f"message has {len(self.names)} names, must have at most {MAX_NAMES}")
 
 
 def _require_crop(crop: Image) -> None:
     if crop.encoding not in ("rgb8", "bgr8", "jpeg", "png"):
-        raise ValueError(f"a crop cannot be encoded as {crop.encoding}")
+        raise ValueError(
+            f"a crop cannot be encoded as {crop.encoding}; use rgb8, bgr8, jpeg or png"
+        )
     if crop.width * crop.height > MAX_CROP_PX:
-        raise ValueError(f"a crop of {crop.width}x{crop.height} is over {MAX_CROP_PX} pixels")
+        raise ValueError(
+            f"crop has {crop.width}x{crop.height} pixels, must have at most {MAX_CROP_PX}"
+        )
 
 
 def _require_opinion(label: str, score: float) -> None:
     require_finite("confidence", (score,))
     if len(label) > MAX_LABEL_LENGTH:
-        raise ValueError(f"a label of {len(label)} characters: at most {MAX_LABEL_LENGTH}")
+        raise ValueError(f"label has {len(label)} characters, must have at most {MAX_LABEL_LENGTH}")
     if not 0 <= score <= 1:
-        raise ValueError(f"confidence {score:g} must be within 0..1")
+        raise ValueError(f"confidence is {score:g}, must be within 0..1")
     if score > 0 and not label:
-        raise ValueError(f"a confidence of {score:g}, and no label")
+        raise ValueError(f"confidence is {score:g} without a label, must be 0")

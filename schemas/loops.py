@@ -1,4 +1,4 @@
-"""What the loop closer says: pairs of keyframes that show one place."""
+"""Loop closures and loop candidates: pairs of keyframes that show one place."""
 
 from typing import Literal
 
@@ -6,25 +6,26 @@ from ldo_service.schemas.keyframe import MeasuredPose
 from ldo_service.schemas.message import Message, require_count, require_finite
 
 Evidence = Literal["", "landmarks", "features", "map"]
-MAX_REASON_LENGTH = 100  # characters
+MAX_REASON_LENGTH = 100  # Characters.
 
 
 class LoopClosure(Message, frozen=True, kw_only=True):
-    """loop/closure: an old keyframe and a new one, with the verified pose between them. stamp_ns is
-    that of the new one.
+    """Verified pose between an old and a new keyframe, published on loop/closure.
 
-    The optimizer believes it as far as the other measurements allow.
+    stamp_ns is that of the new keyframe. The optimizer accepts the closure if the other
+    measurements agree with it.
     """
 
-    pose: MeasuredPose  # the new keyframe in the old one, `reference`
-    overlap: float  # 0..1, share of the new keyframe's surface that the old one sees
-    rmse_m: float  # between the two surfaces, along their normals
-    entropy: float = 0.0  # nats, mean over the objects it rests on
+    pose: MeasuredPose  # Pose of the new keyframe in the old one, `reference`.
+    overlap: float  # Fraction of the new keyframe's surface that the old one sees, 0..1.
+    rmse_m: float  # Root mean square distance of the two surfaces along their normals, meters.
+    entropy: float = 0.0  # Mean entropy of the matched landmarks, nats.
 
     def check(self) -> None:
         if self.pose.reference > self.pose.keyframe:
             raise ValueError(
-                f"keyframe {self.pose.keyframe} closes a loop with the newer {self.pose.reference}"
+                f"closure of keyframe {self.pose.keyframe} has the newer {self.pose.reference} as "
+                "its reference, must have an older one"
             )
         require_fraction("overlap", self.overlap)
         require_not_negative("rmse_m", self.rmse_m)
@@ -32,22 +33,24 @@ class LoopClosure(Message, frozen=True, kw_only=True):
 
 
 class LoopCandidate(Message, frozen=True, kw_only=True):
-    """loop/candidate: two subgraphs that look alike, and what came of it. stamp_ns is that of the
-    newest keyframe. What was not reached is 0."""
+    """Pair of similar subgraphs and the result of their verification, published on loop/candidate.
 
-    keyframe: int  # the newest keyframe of the newer subgraph
-    reference: int  # that of the older one
-    keyframes: tuple[int, ...]  # of the newer subgraph
-    reference_keyframes: tuple[int, ...]  # of the older one
-    similarity: float  # cosine of what they hold (TF-IDF), 0..1
-    appearance: float  # how alike their images are, 0..1
-    evidence: Evidence = ""  # what the pose was found from; "": none was found
-    inliers: int = 0  # landmarks or features that agree on it
-    divergence: float = 0.0  # nats, mean KL between the landmarks that were matched
-    entropy: float = 0.0  # nats, their mean
-    overlap: float = 0.0  # as of a closure
-    rmse_m: float = 0.0
-    rejected_reason: str = ""  # why; "": it became a closure
+    stamp_ns is that of the newest keyframe. Values of steps that did not run are 0.
+    """
+
+    keyframe: int  # Newest keyframe of the newer subgraph.
+    reference: int  # Newest keyframe of the older subgraph.
+    keyframes: tuple[int, ...]  # Keyframes of the newer subgraph.
+    reference_keyframes: tuple[int, ...]  # Keyframes of the older subgraph.
+    similarity: float  # Cosine of the label histograms (TF-IDF), 0..1.
+    appearance: float  # Cosine of the visual-word histograms, 0..1.
+    evidence: Evidence = ""  # Source of the pose; "": no pose was found.
+    inliers: int = 0  # Landmarks or features that agree with the pose.
+    divergence: float = 0.0  # Mean KL divergence between matched landmarks, nats.
+    entropy: float = 0.0  # Mean entropy of the matched landmarks, nats.
+    overlap: float = 0.0  # Fraction 0..1, as in loop/closure.
+    rmse_m: float = 0.0  # Meters, as in loop/closure.
+    rejected_reason: str = ""  # Reason of the rejection; "": it became a loop closure.
 
     def check(self) -> None:
         for name in ("keyframe", "reference", "inliers"):
@@ -58,18 +61,21 @@ class LoopCandidate(Message, frozen=True, kw_only=True):
             require_not_negative(name, getattr(self, name))
         if len(self.rejected_reason) > MAX_REASON_LENGTH:
             raise ValueError(
-                f"a reason of {len(self.rejected_reason)} characters: at most {MAX_REASON_LENGTH}"
+                f"rejected_reason has {len(self.rejected_reason)} characters, must have at most "
+                f"{MAX_REASON_LENGTH}"
             )
         if not self.rejected_reason and not self.evidence:
             raise ValueError("a candidate without evidence cannot be accepted")
 
 
 def require_fraction(name: str, value: float) -> None:
-    if not 0 <= value <= 1:  # NaN is refused too
+    """Raise ValueError unless a value is within 0..1."""
+    if not 0 <= value <= 1:  # Rejects NaN too.
         raise ValueError(f"{name} is {value:g}, must be within 0..1")
 
 
 def require_not_negative(name: str, value: float) -> None:
+    """Raise ValueError unless a value is finite and at least 0."""
     require_finite(name, (value,))
     if value < 0:
         raise ValueError(f"{name} is {value:g}, must not be negative")

@@ -1,9 +1,11 @@
-"""The map of Gaussians: what it looks like, what changed in it, and the whole of it.
+"""Map of Gaussians: renderings, changes and snapshots.
 
-A follower keeps arrays equal to the mapper's like this: take a snapshot of version v (all its
-parts), then apply every delta with `base_version >= v` in order: first `motions`, then `removed`,
-then `changed`, then `added` at the end. A delta whose `base_version` is not the version held means
-one was missed: take a snapshot again.
+A map replica keeps arrays equal to the mapper's as follows:
+
+1. Take all parts of a snapshot of version v.
+2. Apply every delta with `base_version >= v` in order: first `motions`, then `removed`, then
+   `changed`; `added` is appended at the end.
+3. If the `base_version` of a delta is not the version held, a delta was missed: start again.
 """
 
 import msgspec
@@ -19,22 +21,27 @@ NO_LABELS = Array.of(np.zeros((0, 32), np.uint8))
 
 
 class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
-    """N Gaussians. A row of `params` is
+    """Batch of N Gaussians.
 
-    mean xyz (map, metres), log of the scales (metres), quaternion wxyz, logit of the opacity,
-    RGB 0..1, two unused numbers.
+    A row of `params` holds: mean xyz (map frame, meters), log of the scales (meters), quaternion
+    wxyz, logit of the opacity, RGB 0..1, two unused numbers.
 
-    A row of `labels` is what the Gaussian has been seen as, little-endian: bytes 0..19 five weights
-    (f4), heaviest first; 20..23 how much was seen (f4); 24..25 side of the object in mm (u2); 26
-    misses; 27..31 the labels that the weights belong to, indices into `label_names`. What the
-    weights lack of one is background, label 0: the likeliest label is byte 27 where the first
-    weight is more than that, else 0.
+    A row of `labels` holds the observed labels of a Gaussian, little-endian:
+
+    bytes  0..19  five weights (f4), the largest first
+    bytes 20..23  sum of the weights of all observations, older ones decayed (f4)
+    bytes 24..25  extent in mm of the object it was last observed as part of (u2)
+    byte  26      keyframes since then that should have observed it and did not
+    bytes 27..31  labels of the five weights, indices into `label_names`
+
+    The weights sum to at most 1; the rest is background, label 0. The likeliest label is byte 27 if
+    the first weight is larger than that rest, else 0.
     """
 
-    ids: Array  # i8 [N], unique, ascending
-    params: Array  # f4 [N, 16]
-    anchors: Array  # i4 [N], the keyframe that moves it
-    labels: Array = NO_LABELS  # u1 [N, 32]; [0, 32]: nobody has seen any of them, all zero
+    ids: Array  # Ids, i8 [N], unique, ascending.
+    params: Array  # Parameters, f4 [N, 16].
+    anchors: Array  # Anchor keyframe of each Gaussian, i4 [N].
+    labels: Array = NO_LABELS  # Labels, u1 [N, 32]; [0, 32] if all are zero: no label was observed.
 
     def __post_init__(self) -> None:
         self.ids.require("ids", "i8", (None,))
@@ -48,7 +55,7 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AnchorMotion(msgspec.Struct, frozen=True, kw_only=True):
-    """Every Gaussian anchored at `keyframe` moved by T_new_old: mean and rotation."""
+    """Rigid motion T_new_old of mean and rotation of all Gaussians with the anchor `keyframe`."""
 
     keyframe: int
     T_new_old: Pose
@@ -58,16 +65,17 @@ class AnchorMotion(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapDelta(Message, frozen=True, kw_only=True):
-    """map/delta: how version `base_version` becomes version `version`."""
+    """Changes from version `base_version` of the map to `version`, published on map/delta."""
 
     base_version: int
     version: int
-    graph_version: int  # of the keyframe poses that the means are expressed through
+    graph_version: int  # Version of the keyframe poses that the means refer to.
     motions: tuple[AnchorMotion, ...]
-    removed: Array  # i8 [R], ids, ascending
+    removed: Array  # Ids of removed Gaussians, i8 [R], ascending.
     changed: Gaussians
     added: Gaussians
-    label_names: tuple[str, ...] = ()  # by index, when there are new ones; indices never change
+    # Names by label index, if there are new ones; indices never change.
+    label_names: tuple[str, ...] = ()
 
     def check(self) -> None:
         require_version(self.version, self.graph_version)
@@ -75,7 +83,10 @@ class MapDelta(Message, frozen=True, kw_only=True):
         self.removed.require("removed", "i8", (None,))
         self.removed.require_ascending("removed")
         if not 0 <= self.base_version < self.version:
-            raise ValueError(f"delta from version {self.base_version} to {self.version} goes back")
+            raise ValueError(
+                f"delta from version {self.base_version} to {self.version} goes back; version "
+                "must be larger than base_version"
+            )
 
 
 NO_KEYFRAMES = Array.of(np.zeros(0, np.int64))
@@ -83,10 +94,10 @@ NO_EXPOSURES = Array.of(np.zeros((0, 2, 3), np.float32))
 
 
 class MapSnapshot(Message, frozen=True, kw_only=True):
-    """map/snapshot: one part of the whole map at `version`; parts 0 .. parts-1 make it complete.
+    """Part of the whole map at `version`, published on map/snapshot; there are parts 0 .. parts-1.
 
-    Part 0 names the exposure of each keyframe: its camera saw gain * color + bias, per channel, of
-    the map's colours in 0..1. It also has the names of the labels.
+    Part 0 also has the exposure of each keyframe and the names of the labels. The camera of a
+    keyframe saw gain * color + bias per channel, for colors 0..1 of the map.
     """
 
     version: int
@@ -94,9 +105,9 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
     part: int
     parts: int
     gaussians: Gaussians
-    keyframes: Array = NO_KEYFRAMES  # i8 [K], ids, ascending
-    exposures: Array = NO_EXPOSURES  # f4 [K, 2, 3], gains, then biases
-    label_names: tuple[str, ...] = ()  # by index; none where nobody looked for objects
+    keyframes: Array = NO_KEYFRAMES  # Keyframe ids, i8 [K], ascending.
+    exposures: Array = NO_EXPOSURES  # Gains, then biases of the RGB channels, f4 [K, 2, 3].
+    label_names: tuple[str, ...] = ()  # Names by label index; empty without detections.
 
     def check(self) -> None:
         require_version(self.version, self.graph_version)
@@ -106,20 +117,21 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
         self.exposures.require("exposures", "f4", (self.keyframes.shape[0], 2, 3))
         self.exposures.require_finite("exposures")
         if not 0 <= self.part < self.parts:
-            raise ValueError(f"part {self.part} of {self.parts} does not exist")
+            raise ValueError(f"part {self.part} of {self.parts} does not exist; parts count from 0")
 
 
 class MapRendering(Message, frozen=True, kw_only=True):
-    """map/view: the map as rendered at the pose of `keyframe`."""
+    """Rendering of the map at the pose of `keyframe`, published on map/view."""
 
     keyframe: int
-    version: int  # of the map
+    version: int  # Version of the map.
     graph_version: int
     camera: CameraModel
     T_map_camera: Pose
-    color: Array  # u1 [H, W, 3] RGB on black
-    depth_m: Array  # f4 [H, W], where half the light is absorbed; 0 = nothing there
-    opacity: Array  # u1 [H, W], 255 = opaque
+    color: Array  # RGB on black, u1 [H, W, 3].
+    # Depth in meters at which half the light is absorbed, f4 [H, W]; 0 where the map is empty.
+    depth_m: Array
+    opacity: Array  # Opacity, u1 [H, W]; 255 is opaque.
 
     def check(self) -> None:
         require_count("keyframe", self.keyframe)
@@ -131,45 +143,53 @@ class MapRendering(Message, frozen=True, kw_only=True):
         self.opacity.require("opacity", "u1", size)
 
 
-MAX_ITERATIONS = 500  # half a minute in which no keyframe is mapped
+MAX_ITERATIONS = 500  # Half a minute, in which no keyframe is mapped.
 
 
 class RefineMap(Message, frozen=True, kw_only=True):
-    """map/refine: asked of the mapper, to fit the map further to the keyframes it has."""
+    """Request to the mapper to refit the map to its keyframes, published on map/refine."""
 
     iterations: int
-    initial_rate: float = 1.0  # factor on the length of the first step
-    final_rate: float = 1.0  # and of the last one; geometric between
+    initial_rate: float = 1.0  # Factor on the length of the first step, in (0, 1].
+    # Factor on the length of the last step; geometric interpolation between.
+    final_rate: float = 1.0
 
     def check(self) -> None:
         require_count("iterations", self.iterations)
         if self.iterations > MAX_ITERATIONS:
-            raise ValueError(f"{self.iterations} iterations: ask for {MAX_ITERATIONS} at a time")
+            raise ValueError(
+                f"iterations is {self.iterations}, must be at most {MAX_ITERATIONS} per request"
+            )
         require_finite("rates", (self.initial_rate, self.final_rate))
         if not (0 < self.initial_rate <= 1 and 0 < self.final_rate <= 1):
-            raise ValueError(f"rates {self.initial_rate} and {self.final_rate} must be in (0, 1]")
+            raise ValueError(
+                f"initial_rate {self.initial_rate} and final_rate {self.final_rate} must be in "
+                "(0, 1]"
+            )
 
 
-MAX_NAMES = 256  # what one byte can number
+MAX_NAMES = 256  # Number of values of one byte.
 
 
 def require_names(names: tuple[str, ...]) -> None:
+    """Raise ValueError if there are too many label names or one is too long."""
     if len(names) > MAX_NAMES:
-        raise ValueError(f"{len(names)} label_names are over {MAX_NAMES}")
+        raise ValueError(f"{len(names)} label_names are too many, at most {MAX_NAMES} are allowed")
     longest = max(map(len, names), default=0)
     if longest > MAX_LABEL_LENGTH:
         raise ValueError(
-            f"a name of {longest} characters in label_names is over {MAX_LABEL_LENGTH}"
+            f"a name in label_names has {longest} characters, must have at most {MAX_LABEL_LENGTH}"
         )
 
 
 def require_weights(labels: Array) -> None:
-    """Raise ValueError unless the six numbers of each row [32] are finite and not negative."""
+    """Raise ValueError unless the first six numbers of each row are finite and not negative."""
     numbers = np.ascontiguousarray(labels.numpy()[:, :24]).view("<f4")
     if not (np.isfinite(numbers).all() and (numbers >= 0).all()):
-        raise ValueError("labels hold weights that are negative, NaN or infinite")
+        raise ValueError("labels hold negative, NaN or infinite weights")
 
 
 def require_version(version: int, graph_version: int) -> None:
+    """Raise ValueError unless both versions are valid counters."""
     require_count("version", version)
     require_count("graph_version", graph_version)

@@ -1,9 +1,9 @@
-"""The base of every message, and the checks that msgspec does not make.
+"""Base class of every message, and the checks that msgspec does not make.
 
-msgspec checks types while it decodes; it lets NaN pass and does not know that a buffer has to fit
-its shape. Those checks run in `__post_init__`, so a message that exists is a valid one, whether it
-was built or received. A failed check is a ValueError when built and a msgspec.ValidationError
-when decoded.
+msgspec checks types while it decodes. It accepts NaN and does not compare a buffer with its shape.
+Those checks run in `__post_init__`, so every message that exists is valid, built or received. A
+failed check raises ValueError when a message is built and msgspec.ValidationError when it is
+decoded.
 """
 
 from collections.abc import Iterable
@@ -12,47 +12,55 @@ from typing import TypeVar
 
 import msgspec
 
-LAST_INTEGER = 2**63 - 1  # what an int64 holds: most languages and array dtypes have no more
+LAST_INTEGER = 2**63 - 1  # Largest int64: most languages and array dtypes have no larger integer.
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
-    """stamp_ns: time of the sensor data it speaks of, the only clock that a handler sees."""
+    """Base class of all messages.
 
-    stamp_ns: int  # since the epoch of the camera's clock
+    stamp_ns is the time of the sensor data that the message refers to. Handlers use no other clock.
+    """
+
+    stamp_ns: int  # Nanoseconds since the epoch of the camera's clock.
 
     def __post_init__(self) -> None:
         require_count("stamp_ns", self.stamp_ns)
         self.check()
 
     def check(self) -> None:
-        """Raise ValueError when a field is impossible or fields contradict each other."""
+        """Raise ValueError if a field is impossible or fields contradict each other."""
 
 
 T = TypeVar("T")
 
 
 def decode(body: bytes | memoryview, kind: type[T]) -> T:
-    """The message in a MessagePack body. Raises msgspec.DecodeError, whatever the bytes are."""
+    """Return the message in a MessagePack body.
+
+    Raises:
+        msgspec.DecodeError: The bytes are no valid message of this type.
+    """
     try:
         return msgspec.msgpack.decode(body, type=kind)
     except msgspec.DecodeError:
         raise
-    except (RecursionError, ValueError) as error:  # nested too deeply; text that is not UTF-8
+    except (RecursionError, ValueError) as error:  # Nested too deeply, or text that is not UTF-8.
         raise msgspec.DecodeError(f"cannot be decoded: {error}") from None
 
 
 def encode(message: Message) -> bytes:
-    """The MessagePack body of a message."""
+    """Return the MessagePack body of a message."""
     return msgspec.msgpack.encode(message)
 
 
 def require_finite(name: str, numbers: Iterable[float]) -> None:
+    """Raise ValueError if a number is NaN or infinite."""
     values = tuple(numbers)
     if not all(isfinite(value) for value in values):
         raise ValueError(f"{name} holds NaN or infinity: {values[:8]}")
 
 
 def require_count(name: str, value: int) -> None:
-    """Identifiers, versions and counters are never negative, and fit an int64."""
+    """Raise ValueError unless an id, version or counter is at least 0 and fits an int64."""
     if not 0 <= value <= LAST_INTEGER:
         raise ValueError(f"{name} is {value}, must be in 0 .. 2^63 - 1")

@@ -1,4 +1,4 @@
-"""The objects of the map, and where a keyframe shows them."""
+"""Objects of the map, and their observations in keyframes."""
 
 import itertools
 
@@ -10,27 +10,29 @@ from ldo_service.schemas.message import Message, require_count, require_finite
 from ldo_service.schemas.pose import Pose
 
 MAX_OBJECTS = 10_000
-MAX_CLASSES = 32  # of one distribution
-ROUNDING = 1e-3  # of a sum of probabilities
+MAX_CLASSES = 32  # Maximum classes of one distribution.
+ROUNDING = 1e-3  # Tolerance of a sum of probabilities.
 
 Vector3 = tuple[float, float, float]
-Box = tuple[float, float, float, float]  # x0, y0, x1, y1 px, pixel centres at integers
-Distribution = tuple[
-    tuple[str, float], ...
-]  # name and probability, heaviest first; what is missing
-# from a sum of one belongs to `other`, and a class that is missing is not impossible
+Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in pixels; pixel centers at integers.
+# Names and probabilities, the likeliest first. The rest of the sum to 1 belongs to `other`; a class
+# that is not listed may still have a probability.
+Distribution = tuple[tuple[str, float], ...]
 
 
 class ObjectObservation(Message, frozen=True, kw_only=True):
-    """object/observation: an object that a keyframe shows, or ought to. stamp_ns is that of the
-    keyframe."""
+    """Object that a keyframe shows or should show, published on object/observation.
 
-    keyframe: int  # id
-    object: int  # id, as in map/objects
-    box_px: Box  # that was detected; of a miss where the object should be
-    distribution: Distribution  # of the Gaussians in that box; of a miss what was known before
-    entropy: float  # of it, nats, before it was cut to its heaviest classes
-    is_miss: bool = False  # in view, not hidden, and not detected
+    stamp_ns is that of the keyframe.
+    """
+
+    keyframe: int  # Id of the keyframe.
+    object: int  # Id of the object, as in map/objects.
+    box_px: Box  # Detected box, or for a miss the expected box.
+    # Classes of the Gaussians in the box, or for a miss the classes known before.
+    distribution: Distribution
+    entropy: float  # Entropy of the distribution before it was cut to its likeliest classes, nats.
+    is_miss: bool = False  # True if the object is in view and not occluded, but not detected.
 
     def check(self) -> None:
         require_count("keyframe", self.keyframe)
@@ -41,7 +43,7 @@ class ObjectObservation(Message, frozen=True, kw_only=True):
 
 
 class ObjectView(msgspec.Struct, frozen=True, kw_only=True):
-    """A keyframe that shows much of an object, and its box there."""
+    """Keyframe that shows much of an object, and the object's box there."""
 
     keyframe: int
     box_px: Box
@@ -52,79 +54,90 @@ class ObjectView(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapObject(msgspec.Struct, frozen=True, kw_only=True):
-    """An object, in the map frame. `id` stays, and is not given again after the object is gone."""
+    """Object in the map frame.
+
+    `id` never changes and is not reused after the object is removed.
+    """
 
     id: int
-    name: str  # the heaviest class but background
-    confidence: float  # 0..1, its probability
-    centroid: Vector3  # mean of its Gaussians, metres
-    covariance: tuple[float, ...]  # of their means: 9 numbers, row-major, m^2
-    T_map_object: Pose  # centre and axes of its box
-    size: Vector3  # of the box along these axes, metres
+    name: str  # The likeliest class except background.
+    confidence: float  # Probability of that class, 0..1.
+    centroid: Vector3  # Mean of its Gaussians, meters.
+    # Covariance of the means of its Gaussians: 9 numbers, row-major, m^2.
+    covariance: tuple[float, ...]
+    T_map_object: Pose  # Center and axes of its box.
+    size: Vector3  # Size of the box along these axes, meters.
     distribution: Distribution
-    entropy: float  # nats, see `ObjectObservation`
-    observation_count: int  # keyframes
-    miss_count: int  # keyframes that ought to have seen it
-    first_keyframe: int  # that saw it
-    last_keyframe: int
-    views: tuple[ObjectView, ...] = ()  # best first
+    entropy: float  # Nats, as in `ObjectObservation`.
+    observation_count: int  # Keyframes that observed it.
+    miss_count: int  # Keyframes that should have observed it and did not.
+    first_keyframe: int  # First keyframe that observed it.
+    last_keyframe: int  # Last keyframe that observed it.
+    views: tuple[ObjectView, ...] = ()  # Best views first.
 
     def __post_init__(self) -> None:
         for name in ("id", "observation_count", "miss_count", "first_keyframe", "last_keyframe"):
             require_count(name, getattr(self, name))
         if not 0 < len(self.name) <= MAX_LABEL_LENGTH:
-            raise ValueError(f"a name of {len(self.name)} characters: 1 to {MAX_LABEL_LENGTH}")
+            raise ValueError(
+                f"name has {len(self.name)} characters, must have 1 to {MAX_LABEL_LENGTH}"
+            )
         require_finite("object", (self.confidence, *self.centroid, *self.covariance, *self.size))
         if not 0 <= self.confidence <= 1:
-            raise ValueError(f"confidence {self.confidence:g} must be within 0..1")
+            raise ValueError(f"confidence is {self.confidence:g}, must be within 0..1")
         if len(self.covariance) != 9 or min(self.covariance[::4]) < 0:
             raise ValueError(
-                f"covariance {self.covariance} must be 9 numbers, variances at least 0"
+                f"covariance is {self.covariance}, must be 9 numbers with variances of at least 0"
             )
         if min(self.size) < 0:
-            raise ValueError(f"size {self.size} must not be negative")
+            raise ValueError(f"size is {self.size}, must not be negative")
         require_distribution(self.distribution)
         require_entropy(self.entropy)
 
 
 class MapObjects(Message, frozen=True, kw_only=True):
-    """map/objects: all of them, as of `version` of the map."""
+    """Objects of the map at `version`, published on map/objects; a message has all of them."""
 
     version: int
-    graph_version: int  # of the keyframe poses that they are expressed through
-    objects: tuple[MapObject, ...] = ()  # by id
+    graph_version: int  # Version of the keyframe poses that the objects refer to.
+    objects: tuple[MapObject, ...] = ()  # Ascending by id.
 
     def check(self) -> None:
         require_version(self.version, self.graph_version)
         ids = [one.id for one in self.objects]
         if len(ids) > MAX_OBJECTS:
-            raise ValueError(f"{len(ids)} objects are over {MAX_OBJECTS}")
+            raise ValueError(f"message has {len(ids)} objects, must have at most {MAX_OBJECTS}")
         if any(b <= a for a, b in itertools.pairwise(ids)):
             raise ValueError("ids of objects must be ascending")
 
 
 def require_box(box_px: Box) -> None:
+    """Raise ValueError unless a box is finite with x0 <= x1 and y0 <= y1."""
     require_finite("box_px", box_px)
     x0, y0, x1, y1 = box_px
     if not (x0 <= x1 and y0 <= y1):
-        raise ValueError(f"box {box_px} is turned inside out")
+        raise ValueError(f"box_px {box_px} is inverted: x0 <= x1 and y0 <= y1 are required")
 
 
 def require_distribution(distribution: Distribution) -> None:
+    """Raise ValueError unless names are unique and probabilities sum to at most 1."""
     weights = [weight for _, weight in distribution]
     require_finite("distribution", weights)
     if not 0 < len(weights) <= MAX_CLASSES:
-        raise ValueError(f"a distribution over {len(weights)} classes: 1 to {MAX_CLASSES}")
+        raise ValueError(
+            f"distribution is over {len(weights)} classes, must have 1 to {MAX_CLASSES}"
+        )
     if len({name for name, _ in distribution}) != len(weights):
-        raise ValueError("a distribution names a class twice")
+        raise ValueError("distribution names a class twice")
     if min(weights) < 0 or sum(weights) > 1 + ROUNDING:
-        raise ValueError(f"probabilities {weights} must not be negative, nor sum to more than 1")
+        raise ValueError(f"probabilities are {weights}, must not be negative or sum to more than 1")
     if any(not 0 < len(name) <= MAX_LABEL_LENGTH for name, _ in distribution):
-        raise ValueError(f"names of classes have 1 to {MAX_LABEL_LENGTH} characters")
+        raise ValueError(f"names of classes must have 1 to {MAX_LABEL_LENGTH} characters")
 
 
 def require_entropy(entropy: float) -> None:
-    if not 0 <= entropy < 100:  # nats; NaN is refused too
+    """Raise ValueError unless an entropy is within 0..100 nats."""
+    if not 0 <= entropy < 100:  # Nats; rejects NaN too.
         raise ValueError(
-            f"entropy {entropy:g} must be at least 0, and is at most log of the classes"
+            f"entropy is {entropy:g} nats, must be at least 0 and at most log of the class count"
         )

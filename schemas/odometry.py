@@ -1,10 +1,14 @@
-"""What another odometry of the robot says: of its wheels, an inertial unit or another camera."""
+"""Poses from another odometry of the robot: wheels, an inertial unit or another camera."""
 
 from ldo_service.schemas.message import Message
 from ldo_service.schemas.pose import Pose
 
 
 class OdometryPrior(Message, frozen=True, kw_only=True):
-    """odometry/prior: where the robot's base was at `stamp_ns`, by the clock that stamps frames."""
+    """Pose of the robot's base from another odometry, published on odometry/prior.
 
-    T_prior_base: Pose  # `odom` is the source's own: only the motion between two messages is used
+    stamp_ns is in the clock of the frames.
+    """
+
+    # Pose in the source's own odometry frame; only the motion between two messages is used.
+    T_prior_base: Pose

@@ -1,4 +1,4 @@
-"""Poses, and where the tracker says the camera is."""
+"""Poses, and the tracked pose of the camera."""
 
 from typing import Literal
 
@@ -6,14 +6,18 @@ import msgspec
 
 from ldo_service.schemas.message import Message, require_count, require_finite
 
-QUATERNION_TOLERANCE = 1e-6  # of the norm: float64 rounding, with room for a client's float32 maths
+# Tolerance of the norm: float64 rounding, with margin for float32 math in clients.
+QUATERNION_TOLERANCE = 1e-6
 
 
 class Pose(msgspec.Struct, frozen=True):
-    """T_a_b: maps coordinates in b to coordinates in a. The field that holds it names a and b."""
+    """Rigid transform T_a_b from coordinates in b to coordinates in a.
 
-    translation: tuple[float, float, float]  # of b's origin in a, metres
-    quaternion: tuple[float, float, float, float]  # w x y z, unit
+    The name of a field gives a and b.
+    """
+
+    translation: tuple[float, float, float]  # Origin of b in a, meters.
+    quaternion: tuple[float, float, float, float]  # Rotation w x y z, unit norm.
 
     def __post_init__(self) -> None:
         require_finite("pose", (*self.translation, *self.quaternion))
@@ -26,41 +30,45 @@ IDENTITY = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 TrackingStatus = Literal["OK", "WEAK", "LOST"]
 
-Matrix6 = tuple[float, ...]  # 36 numbers, row-major; rotation (rad), then translation (m)
+Matrix6 = tuple[float, ...]  # 36 numbers, row-major; rotation (rad), then translation (m).
 
 
 def require_matrix6(name: str, values: Matrix6) -> None:
+    """Raise ValueError unless a matrix has 36 finite numbers."""
     if len(values) != 36:
         raise ValueError(f"{name} has {len(values)} numbers, must have 36")
     require_finite(name, values)
 
 
 class TrackedPose(Message, frozen=True, kw_only=True):
-    """pose/tracked: where the camera was at `stamp_ns` (REP-105 frames).
+    """Camera pose at `stamp_ns`, published on pose/tracked (REP-105 frames).
 
-    WEAK: the pose is a best effort, nothing is mapped from it. LOST: the pose is the last that was
-    trusted.
+    WEAK: the pose is a best effort, and nothing is mapped from the frame. LOST: the pose is the
+    last one that was OK.
     """
 
-    frame: int  # as in camera/rgbd
+    frame: int  # Frame number, as in camera/rgbd.
     status: TrackingStatus
-    T_odom_camera: Pose  # continuous, but where a lost camera is found again
-    T_map_odom: Pose  # moves with corrections: T_map_camera = T_map_odom @ T_odom_camera
-    graph_version: int  # of the correction that T_map_odom is built on; 0 before the first
-    reference: int | None  # the keyframe it was aligned to; None before there is one
+    T_odom_camera: Pose  # Continuous except after relocalization.
+    T_map_odom: Pose  # Changes with corrections; T_map_camera = T_map_odom @ T_odom_camera.
+    graph_version: int  # Version of the correction that T_map_odom uses; 0 before the first.
+    reference: int | None  # Id of the reference keyframe; None before the first keyframe.
     T_reference_camera: Pose
-    keyframe: int | None = None  # the id it was given, when this frame became a keyframe
-    covariance: Matrix6 = (0.0,) * 36  # of T_reference_camera, perturbed on the right
-    inlier_fraction: float = 0.0  # of the residuals
-    residual_color: float = 0.0  # robust sigma, grey levels of 0..255
-    residual_depth: float = 0.0  # robust sigma over that of the sensor model
-    overlap: float = 0.0  # share of the reference's surface that this frame sees
+    keyframe: int | None = None  # Id as a keyframe if this frame became one.
+    # Covariance of T_reference_camera for a perturbation on the right.
+    covariance: Matrix6 = (0.0,) * 36
+    inlier_fraction: float = 0.0  # Fraction of the residuals that are inliers.
+    residual_color: float = 0.0  # Robust sigma, gray levels of 0..255.
+    residual_depth: float = 0.0  # Robust sigma relative to that of the sensor model.
+    overlap: float = 0.0  # Fraction of the reference keyframe's surface that this frame sees.
     iterations: int = 0
-    # the guess that won: direct, prior, features, gicp, relocalized, reused; first; none
+    # Initial guess that gave the pose: direct, prior, features, gicp, relocalized, reused; first
+    # for the first frame; none without a pose.
     pose_source: str = ""
-    hypothesis_spread_rad: float = 0.0  # between where several guesses led, rad of image motion
-    T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera)
-    submap: int = 0  # whose frame T_map_odom leads to: 0 is the map's; others are not joined yet
+    # Spread of the poses from several initial guesses, rad of image motion.
+    hypothesis_spread_rad: float = 0.0
+    T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera).
+    submap: int = 0  # Submap that T_map_odom leads to; 0 is the map, others are not merged yet.
 
     def check(self) -> None:
         require_count("frame", self.frame)

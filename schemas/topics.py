@@ -1,7 +1,7 @@
-"""Every topic, written once: `ldo/<robot>/<name>` on the network.
+"""Topics on the network; their key is `ldo/<robot>/<name>`.
 
-One producer each. A state topic also answers a query with its last value, for late joiners. A
-topic without a message type is declared, and has neither producer nor format yet.
+Each topic has one producer. A state topic also answers a query with its last value, for subscribers
+that join late.
 """
 
 from dataclasses import dataclass
@@ -25,65 +25,69 @@ ROBOT_PREFIX = "ldo"
 
 @dataclass(frozen=True, slots=True)
 class Topic:
+    """Topic with its message type."""
+
     name: str
     message: type[Message]
     description: str
-    is_state: bool = False
-    key: str | None = None  # field by which `Latest(per_key=True)` tells messages apart
-    answer: type[Message] | None = None  # where `message` is what a query asks
-    is_per_actor: bool = False  # each says it on a name of its own below this one
+    is_state: bool = False  # True if the topic also answers queries with its last value.
+    key: str | None = None  # Field that identifies a message for `Latest(per_key=True)`.
+    answer: type[Message] | None = None  # Type of the reply if `message` is the payload of a query.
+    is_per_actor: bool = False  # True if each actor publishes on its own name below this one.
 
     @property
     def subscription_key(self) -> str:
-        """The name of all that is said on it."""
+        """Name that matches all messages of the topic."""
         return f"{self.name}/*" if self.is_per_actor else self.name
 
     def expression(self, robot: str) -> str:
-        """The Zenoh key expression."""
+        """Return the Zenoh key expression of the topic."""
         return f"{ROBOT_PREFIX}/{robot}/{self.name}"
 
 
-CAMERA_RGBD = Topic("camera/rgbd", CameraRgbd, "one exposure, as the camera sends it")
-CAMERA_COLOR = Topic("camera/color", CameraColor, "its colour half, where colour comes apart")
-CAMERA_DEPTH = Topic("camera/depth", CameraDepth, "its depth half; paired with colour by stamp")
+CAMERA_RGBD = Topic("camera/rgbd", CameraRgbd, "RGB-D frame of the camera")
+CAMERA_COLOR = Topic("camera/color", CameraColor, "color image of a camera with two topics")
+CAMERA_DEPTH = Topic("camera/depth", CameraDepth, "depth image, paired with color by stamp")
 ODOMETRY_PRIOR = Topic(
-    "odometry/prior", OdometryPrior, "where another odometry has the robot's base"
+    "odometry/prior", OdometryPrior, "pose of the robot's base from another odometry"
 )
-FRAME_RGBD = Topic("frame/rgbd", FrameRgbd, "the frame, rectified, depth in metres")
-POSE_TRACKED = Topic("pose/tracked", TrackedPose, "where the camera is", is_state=True)
-KEYFRAME_NEW = Topic("keyframe/new", Keyframe, "a frame that the map is made from")
+FRAME_RGBD = Topic("frame/rgbd", FrameRgbd, "rectified frame, depth in meters")
+POSE_TRACKED = Topic("pose/tracked", TrackedPose, "camera pose of each frame", is_state=True)
+KEYFRAME_NEW = Topic("keyframe/new", Keyframe, "frame to be mapped, with its relative pose")
 KEYFRAME_REFINEMENT = Topic(
-    "keyframe/refinement", KeyframeRefinement, "better poses between keyframes"
+    "keyframe/refinement", KeyframeRefinement, "refined relative poses of keyframes"
 )
 DETECTION_BOXES = Topic(
-    "detection/boxes", DetectionBoxes, "boxes with class and score, per keyframe"
+    "detection/boxes", DetectionBoxes, "boxes with class and score for each keyframe"
 )
 LABEL_REQUEST = Topic(
-    "label/request", LabelRequest, "image crops of a region to be named", key="region"
+    "label/request", LabelRequest, "image crops of a region that needs a label", key="region"
 )
-LABEL_RESULT = Topic(
-    "label/result", LabelResult, "the name of a region, late by design", key="region"
+LABEL_RESULT = Topic("label/result", LabelResult, "label of a region, with delay", key="region")
+LABEL_ADD = Topic("label/add", AddLabel, "request to add a name for the labeller")
+LABEL_NAMES = Topic(
+    "label/names", LabelNames, "names that the labeller chooses from", is_state=True
 )
-LABEL_ADD = Topic("label/add", AddLabel, "asked: choose from this name too")
-LABEL_NAMES = Topic("label/names", LabelNames, "what the labeller chooses from", is_state=True)
-MAP_VIEW = Topic("map/view", MapRendering, "the map rendered at the newest keyframe")
-MAP_DELTA = Topic("map/delta", MapDelta, "what changed in the map since the last version")
-MAP_SNAPSHOT = Topic("map/snapshot", MapSnapshot, "the whole map, in parts", is_state=True)
-MAP_REFINE = Topic("map/refine", RefineMap, "asked: so many iterations more")
+MAP_VIEW = Topic("map/view", MapRendering, "map rendered at the newest keyframe")
+MAP_DELTA = Topic("map/delta", MapDelta, "changes of the map since the last version")
+MAP_SNAPSHOT = Topic("map/snapshot", MapSnapshot, "whole map, in parts", is_state=True)
+MAP_REFINE = Topic("map/refine", RefineMap, "request for more iterations on the map")
 GRAPH_CORRECTION = Topic("graph/correction", GraphCorrection, "all keyframe poses", is_state=True)
 HEALTH = Topic(
     "health", Health, "counters and latency of an actor (health/<actor>)", is_per_actor=True
 )
 CONTROL = Topic(
-    "control", ControlRequest, "asked: pause, resume, save or reset", answer=ControlAnswer
+    "control", ControlRequest, "request to pause, resume, save or reset", answer=ControlAnswer
 )
 
-MAP_OBJECTS = Topic("map/objects", MapObjects, "the named objects", is_state=True)
+MAP_OBJECTS = Topic("map/objects", MapObjects, "labelled objects of the map", is_state=True)
 OBJECT_OBSERVATION = Topic(
-    "object/observation", ObjectObservation, "an object seen from a keyframe"
+    "object/observation", ObjectObservation, "object that a keyframe shows or misses"
 )
-LOOP_CLOSURE = Topic("loop/closure", LoopClosure, "a verified pose between two distant keyframes")
-LOOP_CANDIDATE = Topic("loop/candidate", LoopCandidate, "every candidate, and why it was refused")
+LOOP_CLOSURE = Topic("loop/closure", LoopClosure, "verified pose between two distant keyframes")
+LOOP_CANDIDATE = Topic(
+    "loop/candidate", LoopCandidate, "every loop candidate, with its rejection reason"
+)
 
 TOPICS: tuple[Topic, ...] = (
     CAMERA_RGBD,
@@ -114,6 +118,7 @@ TOPICS: tuple[Topic, ...] = (
 
 BY_NAME = {topic.name: topic for topic in TOPICS}
 
-FROM_OUTSIDE = (CAMERA_RGBD, CAMERA_COLOR, CAMERA_DEPTH)  # made by camera programs
-FROM_ODOMETRY = (ODOMETRY_PRIOR,)  # made by the robot's wheels, inertial unit or other camera
+FROM_OUTSIDE = (CAMERA_RGBD, CAMERA_COLOR, CAMERA_DEPTH)  # Published by camera programs.
+# Published by wheel odometry, an inertial unit or another camera.
+FROM_ODOMETRY = (ODOMETRY_PRIOR,)
 FROM_OPERATORS = (MAP_REFINE, LABEL_ADD)
