@@ -1,8 +1,8 @@
-"""Which measurement between what were two components holds them together.
+"""Bridge edges: the measurements that connect merged components.
 
-The first is believed: there is nothing to judge it by. A later one is judged by it, and refused
-where the two contradict each other: one word stands against another. What is refused so is kept as
-a doubt, and once more closures agree with a doubt than with the join, it joins in its place.
+The first measurement between two components is accepted, since there is nothing to check it
+against. Later closures are checked against it and rejected if they contradict it. A rejected one is
+kept. It replaces the bridge edge once more closures agree with it than with the bridge edge.
 """
 
 from collections import defaultdict
@@ -24,19 +24,33 @@ Pose = Callable[[int], np.ndarray]  # T_map_keyframe [4, 4]
 
 @dataclass(frozen=True, slots=True)
 class BridgeEdge:
-    """A join, and the keyframes that it alone holds to the first of their component."""
+    """Bridge edge between two merged components.
+
+    Attributes:
+        pair: Keyframes of the edge.
+        connected_keyframes: Keyframes that only this edge connects to the first keyframe of their
+            component.
+    """
 
     pair: Pair
     connected_keyframes: Set[int]
 
     def is_across(self, pair: Pair) -> bool:
+        """Return whether the bridge edge separates the two keyframes."""
         return (pair[0] in self.connected_keyframes) != (pair[1] in self.connected_keyframes)
 
 
 def check_against_bridge(
     known: FactorStore, closure: RelativePose, start: Variables, initial: Variables
 ) -> tuple[ClosureDecision, Variables]:
-    """A closure among some measurements, and where everything is then."""
+    """Return the decision on a closure and the variables of the resulting solution.
+
+    Args:
+        known: Measurements to check the closure against.
+        closure: Closure between keyframes of one component.
+        start: Variables that the batch solver starts from.
+        initial: Values that the variables were inserted with.
+    """
     return known.closures.check(
         closure,
         lambda closures: solve_batch(known.with_closures(closures, initial), start),
@@ -45,20 +59,26 @@ def check_against_bridge(
 
 
 def T_new_old(measured: RelativePose, pose: Pose, *, moves_b: bool) -> np.ndarray:
-    """[4, 4] T_map_a T_a_b T_map_b^-1, which brings b to where it was measured, or the inverse,
-    which brings a there."""
+    """Return the motion [4, 4] that brings two keyframes to their measured relative pose.
+
+    It is T_map_a T_a_b T_map_b^-1, which moves b; if not `moves_b`, it is the inverse, which moves
+    a.
+    """
     T = pose(measured.a) @ measured.T_a_b @ se3.inverse(pose(measured.b))
     return se3.orthonormalize(T if moves_b else se3.inverse(T))
 
 
 def conflicting_bridges(known: FactorStore, closure: RelativePose) -> list[BridgeEdge]:
-    """The joins each of which alone says where the ends of a closure are to each other: several in
-    a row, of which one may be wrong."""
+    """Return the bridge edges that alone determine the relative pose of a closure's keyframes.
+
+    There are several if the components are merged in a row; one of them may be wrong.
+    """
     joins = (BridgeEdge(pair, _hanging_on(known, pair)) for pair in known.joins)
     return [joined for joined in joins if joined.is_across(pair_of(closure))]
 
 
 def _hanging_on(known: FactorStore, join: Pair) -> Set[int]:
+    """Return the keyframes that only this bridge edge connects to the first of their component."""
     first, links = known.first_of[join[0]], defaultdict[int, list[int]](list)
     for m in known.relative(without=join):
         links[m.a].append(m.b)
@@ -79,8 +99,11 @@ def best_bridge_removal(
     variables: Variables,
     initial: Variables,
 ) -> tuple[BridgeEdge, FactorStore, Variables] | None:
-    """The join that is outvoted, and what is known without it. Of several the one without which
-    most closures are believed; None where two are as good."""
+    """Return the bridge edge to remove, with the factors and variables after its replacement.
+
+    Of several candidates it is the one that leaves the most accepted closures. Return None if there
+    is no candidate or two are equally good.
+    """
     found = [
         (joined, *other)
         for joined in joins
@@ -100,9 +123,19 @@ def replace_bridge_by_consensus(
     variables: Variables,
     initial: Variables,
 ) -> tuple[FactorStore, Variables] | None:
-    """Joined by a closure instead, if more closures agree with that; None: the join stays.
+    """Return the factors and variables with a bridge edge replaced by a closure.
 
-    pose, variables   where everything is
+    Args:
+        known: All measurements; they stay unchanged.
+        joined: Bridge edge to replace.
+        closure: Rejected closure that would replace it.
+        pose: Current poses T_map_keyframe [4, 4].
+        variables: Current values of the variables.
+        initial: Values that the variables were inserted with.
+
+    Returns:
+        The new factors and variables, or None unless more closures agree with the new bridge edge
+        than with the old one.
     """
     across = [c for pair, c in known.closures.accepted.items() if joined.is_across(pair)]
     doubts = [c for pair, c in known.doubts.items() if joined.is_across(pair)]
@@ -123,8 +156,10 @@ def replace_bridge_by_consensus(
 
 
 def _exchanged(known: FactorStore, joined: BridgeEdge, closure: RelativePose) -> FactorStore:
-    """With a closure in place of the join; those between its sides are neither believed nor
-    refused there."""
+    """Return the factors with a closure in place of a bridge edge.
+
+    Closures between the two sides are neither accepted nor rejected in them.
+    """
     other, pair = copy(known), pair_of(closure)
     across = [p for p in known.closures.accepted if joined.is_across(p)]
     other.joins = {p: m for p, m in known.joins.items() if p != joined.pair} | {pair: closure}

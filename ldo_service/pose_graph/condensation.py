@@ -1,7 +1,7 @@
-"""Condensation: ten keyframes become one variable and a relative measurement to the next one.
+"""Condensation of ten keyframes into one variable and a relative measurement to the next one.
 
 After Grisetti, Kuemmerle and Ni, Robust Optimization of Factor Graphs by using Condensed
-Measurements (2012). Keyframes that are no longer variables keep their place between two that are.
+Measurements (2012). The poses of condensed keyframes are interpolated between two variables.
 """
 
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -26,13 +26,19 @@ from .solver import graph_of, values_of, variables_of
 
 @dataclass(frozen=True, slots=True)
 class CondensedKeyframes:
-    """F keyframes, each between the variables `heads` and `end_variables`, ids [F].
+    """F condensed keyframes, each between two variables: its head and its tail.
 
-    T_head [F, 4, 4] is T_head_keyframe and T_tail T_tail_keyframe, as measured; `fractions` [F] how
-    far along it is: what corrections change between head and tail is spread over them.
+    Attributes:
+        keyframes: Ids, [F], ascending within a group.
+        start_variables: Ids of the heads, [F].
+        end_variables: Ids of the tails, [F].
+        T_head: Measured T_head_keyframe, [F, 4, 4].
+        T_tail: Measured T_tail_keyframe, [F, 4, 4].
+        fractions: Position between head (0) and tail (1), [F]. A change of the relative pose of
+            head and tail is distributed by these fractions.
     """
 
-    keyframes: np.ndarray  # ascending within a group
+    keyframes: np.ndarray
     start_variables: np.ndarray
     end_variables: np.ndarray
     T_head: np.ndarray
@@ -41,34 +47,41 @@ class CondensedKeyframes:
 
     @staticmethod
     def none() -> "CondensedKeyframes":
+        """Return an empty instance."""
         ids, transforms = np.zeros(0, np.int64), np.zeros((0, 4, 4))
         return CondensedKeyframes(ids, ids, ids, transforms, transforms, np.zeros(0))
 
     def joined_by(self, more: "CondensedKeyframes") -> "CondensedKeyframes":
+        """Return these keyframes with others appended."""
         columns = (getattr(self, name) for name in self.__slots__)
         others = (getattr(more, name) for name in self.__slots__)
         return CondensedKeyframes(*map(np.concatenate, zip(columns, others, strict=True)))
 
     def only(self, row: int) -> "CondensedKeyframes":
+        """Return the keyframe of one row."""
         return CondensedKeyframes(*(getattr(self, name)[row : row + 1] for name in self.__slots__))
 
     def index(self) -> dict[int, int]:
-        """Row of each keyframe."""
+        """Return the row of each keyframe."""
         return {int(k): row for row, k in enumerate(self.keyframes)}
 
     def interpolated_poses(self, T_heads: np.ndarray, T_tails: np.ndarray) -> np.ndarray:
-        """T_map_keyframe [F, 4, 4], from where heads and tails [F, 4, 4] are in the map."""
+        """Return T_map_keyframe [F, 4, 4], given T_map of the heads and tails, [F, 4, 4]."""
         return interpolate(T_heads @ self.T_head, T_tails @ self.T_tail, self.fractions)
 
     def moved(self, row: int, T_head_keyframe: np.ndarray) -> "CondensedKeyframes":
-        """One measured anew."""
+        """Return the keyframes with a new measured pose for one row."""
         T_tail_head = self.T_tail[row] @ np.linalg.inv(self.T_head[row])
         T_head, T_tail = self.T_head.copy(), self.T_tail.copy()
         T_head[row], T_tail[row] = T_head_keyframe, T_tail_head @ T_head_keyframe
         return replace(self, T_head=T_head, T_tail=T_tail)
 
     def without_split(self, row: int) -> "CondensedKeyframes":
-        """Without one, which is a variable again: those of its group lie before or behind it."""
+        """Return the keyframes without one that becomes a variable again.
+
+        The others of its group then lie between the head and the new variable, or between it and
+        the tail.
+        """
         of_group = (self.start_variables == self.start_variables[row]) & (
             self.end_variables == self.end_variables[row]
         )
@@ -91,11 +104,13 @@ class CondensedKeyframes:
         return parted.without(row)
 
     def without(self, row: int) -> "CondensedKeyframes":
+        """Return the keyframes without one row."""
         return CondensedKeyframes(
             *(np.delete(getattr(self, name), row, 0) for name in self.__slots__)
         )
 
     def pack(self) -> dict[str, np.ndarray]:
+        """Return the arrays by name."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
@@ -106,7 +121,15 @@ def condense_between(
     T_head: np.ndarray,
     T_head_tail: np.ndarray,
 ) -> CondensedKeyframes:
-    """Those that were made between two, one after another, T_head [n, 4, 4]."""
+    """Return the condensed keyframes between two variables, evenly spaced.
+
+    Args:
+        head: Id of the first variable.
+        tail: Id of the second variable.
+        keyframes: Ids of the n keyframes between them, in order.
+        T_head: Measured T_head_keyframe, [n, 4, 4].
+        T_head_tail: Measured pose of the tail in the head, [4, 4].
+    """
     n = len(keyframes)
     return CondensedKeyframes(
         np.array(keyframes, np.int64),
@@ -120,7 +143,7 @@ def condense_between(
 
 @dataclass(frozen=True, slots=True)
 class Condensed:
-    """The first of a group in the first of the next, and where the others follow."""
+    """Condensed group: the measurement from its head to its tail, and the keyframes between."""
 
     edge: RelativePose
     followers: CondensedKeyframes
@@ -133,13 +156,23 @@ def group_to_condense(
     size: int,
     window: int,
 ) -> list[int]:
-    """The oldest `size` active keyframes that odometry connects one after another, and the next;
-    none of the newest `window`. One of `heads`, that others follow, is the first of its group, as
-    it cannot follow itself. Empty where there are none.
+    """Return the next group to condense, with its tail, or an empty list.
 
-    The next after a group, where odometry goes on, is measured from its last, or the group is
-    longer, up to twice: one that is measured from others of it would hang on an end of the group,
-    and take what a correction bends there alone."""
+    The group has the oldest `size` active keyframes that odometry connects one after another. The
+    tail is the next keyframe, which starts the next group. A head of another group can only be the
+    first of a group, as it must stay a variable.
+
+    The keyframe after a group should be measured from its last keyframe. Otherwise the group
+    becomes longer, up to twice the size. A keyframe measured from inside the group would depend on
+    one end of the group alone. A correction would then move it like that end.
+
+    Args:
+        active: Variables that are not condensed, ascending.
+        measured: Pairs of variables with an odometry measurement.
+        heads: Heads and tails of existing groups.
+        size: Number of keyframes in a group.
+        window: Number of newest keyframes that are never condensed.
+    """
     linked = {frozenset(pair) for pair in measured}
 
     def are_linked(run: Sequence[int], keyframe: int) -> bool:
@@ -165,11 +198,20 @@ def condense(
     T_map: Mapping[int, np.ndarray],
     noise: NoiseConfig,
 ) -> Condensed:
-    """What a group knows by itself: head, those that will follow, and the tail, the next head.
+    """Return the condensed form of a group: its head, the keyframes between, and its tail.
 
-    The measurements and closures within the group alone are solved, with the head held, so that
-    what other loops did to it is not counted twice and can be undone. Covariance is that of the
-    tail, marginal.
+    Only the measurements and closures within the group are solved, with the head fixed. So the
+    result does not count the effect of other loops twice, and it can be undone.
+
+    Args:
+        group: Ids of the keyframes, in order; the last one is the tail.
+        measured: Odometry measurements by pair of variables.
+        closures: Accepted loop closures within the group.
+        T_map: Present pose T_map_keyframe [4, 4] of each keyframe of the group.
+        noise: Noise of the measurements.
+
+    Returns:
+        The condensed group; the covariance of its edge is the marginal covariance of the tail.
     """
     head, *others, tail = group
     inside = set(group)
@@ -196,8 +238,12 @@ def condense(
 def connecting_measurements(
     gone: Iterable[RelativePose], stays: Iterable[tuple[int, int]]
 ) -> list[RelativePose]:
-    """The first measurements among `gone` without which variables would be held by nothing, when
-    the pairs `stays` are connected."""
+    """Return the first of the measurements `gone` that are needed to keep the variables connected.
+
+    Args:
+        gone: Measurements that are about to be removed.
+        stays: Pairs of variables that remain connected.
+    """
     root: dict[int, int] = {}
 
     def find(k: int) -> int:
@@ -218,8 +264,17 @@ def connecting_measurements(
 def transfer_measurement(
     measured: RelativePose, T_a_new: np.ndarray, T_b_new: np.ndarray, new: tuple[int, int]
 ) -> RelativePose:
-    """The same measurement between the keyframes `new`, which hang rigidly on its own: T_a_new and
-    T_b_new are where they are in these. What is perturbed at b is perturbed there."""
+    """Return the same measurement between other keyframes, which move rigidly with its own.
+
+    Args:
+        measured: Measurement of b in a.
+        T_a_new: Pose of the first new keyframe in a, [4, 4].
+        T_b_new: Pose of the second new keyframe in b, [4, 4].
+        new: Ids of the new keyframes.
+
+    Returns:
+        The measurement; its information is for a perturbation at the second new keyframe.
+    """
     T = se3.inverse(T_a_new) @ measured.T_a_b @ T_b_new
     adjoint = se3.adjoint(T_b_new)
     return RelativePose(*new, T, adjoint.T @ measured.information @ adjoint)

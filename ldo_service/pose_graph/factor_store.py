@@ -1,4 +1,4 @@
-"""All that is known of keyframes and landmarks, and the factors that say it."""
+"""Store of all measurements of keyframes and landmarks, and their factors."""
 
 from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Any
@@ -34,26 +34,35 @@ from .solver import Name, Variables, point_key
 
 
 class FactorStore:
-    """Between keyframes that are variables, and others that follow two of them: what is measured of
-    a follower is measured of the nearer one."""
+    """Measurements by kind, between keyframes that are variables.
+
+    A condensed keyframe is no variable. Its measurements are transferred to the nearer of the two
+    variables that it is interpolated between.
+    """
 
     def __init__(self, noise: NoiseConfig, closures: LoopClosureConfig) -> None:
+        """Create an empty store."""
         self._noise = noise
-        self.first_of: dict[int, int] = {}  # the first keyframe of each one's component
-        self.active: list[int] = []  # variables that are not condensed, ascending
-        self.odometry: dict[Pair, RelativePose] = {}  # between variables
-        self.condensed: dict[Pair, RelativePose] = {}  # heads, each in the one before
-        self.joins: dict[Pair, RelativePose] = {}  # between what were components
+        self.first_of: dict[int, int] = {}  # First keyframe of each keyframe's component.
+        self.active: list[int] = []  # Variables that are not condensed, ascending.
+        self.odometry: dict[Pair, RelativePose] = {}  # Measurements between variables.
+        # Edges, each from the head of a group to its tail.
+        self.condensed: dict[Pair, RelativePose] = {}
+        self.joins: dict[Pair, RelativePose] = {}  # Bridge edges between merged components.
         self.closures = LoopClosureSet(closures)
-        self.doubts: dict[Pair, RelativePose] = {}  # closures that contradict a join, the newest
-        self.sights: dict[Pair, BoxObservation] = {}  # by keyframe and landmark
+        # Closures that contradict a bridge edge; the newest.
+        self.doubts: dict[Pair, RelativePose] = {}
+        self.sights: dict[Pair, BoxObservation] = {}  # Observations by keyframe and landmark.
         self.followers = CondensedKeyframes.none()
-        self.rows: dict[int, int] = {}  # of followers
+        self.rows: dict[int, int] = {}  # Row of each condensed keyframe.
 
     # --- what changes -----------------------------------------------------------------------------
     def add_measurement(self, m: RelativePose) -> Name:
-        """The factor's name; in place of what was measured between the same variables, but what is
-        measured of followers in place of nothing that is."""
+        """Store an odometry measurement and return the name of its factor.
+
+        It replaces one between the same variables. A measurement transferred from condensed
+        keyframes replaces none.
+        """
         between = self.between_variables(m)
         pair = between.a, between.b
         if between is m or pair not in self.odometry:
@@ -63,8 +72,18 @@ class FactorStore:
     def replace_measurement(
         self, m: RelativePose, pose: Callable[[int], np.ndarray]
     ) -> Name | None:
-        """The name of the factor that is another one now; of a follower, which is placed where it
-        was measured, there is none. `pose` tells T_map_keyframe [4, 4]."""
+        """Replace a measurement and return the name of the factor that changed.
+
+        A condensed keyframe only gets a new pose between its variables; then there is no factor to
+        change.
+
+        Args:
+            m: New measurement.
+            pose: Function that returns T_map_keyframe [4, 4].
+
+        Returns:
+            Name of the changed factor, or None if a condensed keyframe moved.
+        """
         row = self.rows.get(m.b)
         if row is not None:
             self.followers = self.followers.moved(row, self._in_head_of_b(m, pose))
@@ -81,17 +100,19 @@ class FactorStore:
         return ("condensed", *pair)
 
     def _in_head_of_b(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> np.ndarray:
+        """Return the measured pose of b in the head of its group, [4, 4]."""
         (head_a, T_a), (head_b, _) = self.relative_to_start(m.a), self.relative_to_start(m.b)
         if head_a == head_b:
             return T_a @ m.T_a_b
         return se3.inverse(pose(head_b)) @ pose(m.a) @ m.T_a_b
 
     def condense(self, group: list[int], T_map: Mapping[int, np.ndarray]) -> None:
-        """All of a group but its head and tail follow from now on.
+        """Keep only the first and the last keyframe of a group as variables.
 
-        What was measured within it, closures too, is in the edge from head to tail. Later
-        keyframes that were measured against followers are measured against later ones too, and
-        that is given up, but where nothing else would hold them.
+        The edge from the first to the last one includes all measurements and closures within the
+        group. Measurements between a condensed keyframe and one outside the group are dropped,
+        except where nothing else connects the latter. Later keyframes usually have other
+        measurements too.
         """
         followers = set(group[1:-1])
         closed = {
@@ -112,8 +133,11 @@ class FactorStore:
             self.add_measurement(m)
 
     def restore_variable(self, keyframe: int) -> None:
-        """Make a follower a variable again, between the two that it lies between: what is known
-        from one to the other is spread over both parts, each by its share."""
+        """Make a condensed keyframe a variable again, between its head and its tail.
+
+        The information of the edge from head to tail is split over the two parts by their
+        fractions.
+        """
         row = self.rows[keyframe]
         head, tail = (
             int(self.followers.start_variables[row]),
@@ -131,8 +155,11 @@ class FactorStore:
         self.rows = self.followers.index()
 
     def interpolation_error_sigmas(self, keyframe: int, variables: Variables) -> float:
-        """How far apart the two ends say that a follower is, in sigmas of a closure; 0 of a
-        variable."""
+        """Return the pose difference of a condensed keyframe as seen from its two ends.
+
+        The unit is sigmas of a loop closure, weighted by the distance to the nearer end; 0 for a
+        variable.
+        """
         row = self.rows.get(keyframe)
         if row is None:
             return 0.0
@@ -147,44 +174,56 @@ class FactorStore:
         return min(share, 1 - share) * float((off / sigmas).max())
 
     def relative(self, without: Pair | None = None) -> Iterable[RelativePose]:
-        """All that holds variables together for good, or all but one join."""
+        """Yield all permanent measurements between variables, or all but one bridge edge."""
         yield from self.odometry.values()
         yield from self.condensed.values()
         joins = (m for pair, m in self.joins.items() if pair != without)
         yield from map(self.between_variables, joins)
 
-    # --- followers --------------------------------------------------------------------------------
+    # --- condensed keyframes ----------------------------------------------------------------------
     def relative_to_start(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """The first of its group, or itself, and T_head_keyframe [4, 4]."""
+        """Return the head of a keyframe's group and T_head_keyframe [4, 4].
+
+        A keyframe that is a variable is its own head.
+        """
         row = self.rows.get(keyframe)
         if row is None:
             return keyframe, np.eye(4)
         return int(self.followers.start_variables[row]), self.followers.T_head[row]
 
     def relative_to_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """The variable that stands for a keyframe, the nearer of the two that it lies between, and
-        T_variable_keyframe [4, 4]."""
+        """Return the variable nearest to a keyframe and T_variable_keyframe [4, 4].
+
+        For a condensed keyframe this is the nearer one of its head and its tail.
+        """
         row = self.rows.get(keyframe)
         if row is None or self.followers.fractions[row] <= 0.5:
             return self.relative_to_start(keyframe)
         return int(self.followers.end_variables[row]), self.followers.T_tail[row]
 
     def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
-        """The variables that stand for both: another one where that would be the same."""
+        """Return the variables for both ends of a measurement, with the poses of the ends in them.
+
+        If both nearest variables are the same, the heads are used instead.
+        """
         a, b = self.relative_to_variable(m.a), self.relative_to_variable(m.b)
         return (
             (a, b) if a[0] != b[0] else (self.relative_to_start(m.a), self.relative_to_start(m.b))
         )
 
     def between_variables(self, m: RelativePose) -> RelativePose:
+        """Return a measurement transferred to variables; unchanged if its ends are variables."""
         (a, T_a), (b, T_b) = self.ends(m)
         if (a, b) == (m.a, m.b):
             return m
         return transfer_measurement(m, se3.inverse(T_a), se3.inverse(T_b), (a, b))
 
     def _ends_covariance(self, m: RelativePose) -> np.ndarray:
-        """[6, 6] at b, of followers among its ends: their share of what their group is known by,
-        as far as they are from the variable that stands for them."""
+        """Return the covariance [6, 6] at b that the interpolation of condensed ends adds.
+
+        Each condensed end adds a fraction of its group's covariance, by its distance from the
+        variable.
+        """
         total = np.zeros((6, 6))
         T_b_end = se3.inverse(m.T_a_b), np.eye(4)
         for keyframe, (variable, _), T in zip((m.a, m.b), self.ends(m), T_b_end, strict=True):
@@ -193,14 +232,15 @@ class FactorStore:
             pair = int(self.followers.start_variables[row]), int(self.followers.end_variables[row])
             share = self.followers.fractions[row]
             away = share if variable == pair[0] else 1 - share
-            adjoint = se3.adjoint(T @ se3.inverse(self.followers.T_tail[row]))  # of T_b_tail
+            # Adjoint of T_b_tail.
+            adjoint = se3.adjoint(T @ se3.inverse(self.followers.T_tail[row]))
             covariance = np.linalg.inv(self.condensed[pair].information)
             total += away * adjoint @ covariance @ adjoint.T
         return total
 
     # --- factors ----------------------------------------------------------------------------------
     def names(self) -> Iterable[Name]:
-        """Of all factors, in a fixed order."""
+        """Yield the names of all factors in a fixed order."""
         yield from (("first", k) for k, first in self.first_of.items() if k == first)
         for kind in ("odometry", "condensed", "joins"):
             yield from ((kind.removesuffix("s"), *pair) for pair in getattr(self, kind))
@@ -208,6 +248,7 @@ class FactorStore:
         yield from (("sight", *pair) for pair in self.sights)
 
     def factor(self, name: Name, initial: Variables) -> gtsam.NonlinearFactor:
+        """Return the factor of a name; `initial` has the initial values of the variables."""
         kind, pair = name[0], name[1:]
         match kind:
             case "first":
@@ -227,13 +268,15 @@ class FactorStore:
     def with_closures(
         self, closures: Iterable[RelativePose], initial: Variables
     ) -> list[gtsam.NonlinearFactor]:
-        """All factors, but of closures these, without a robust kernel: what they cost is
-        compared."""
+        """Return all factors, with these closures instead of the accepted ones.
+
+        The closures have no robust kernel, so that their costs can be compared.
+        """
         others = [self.factor(name, initial) for name in self.names() if name[0] != "closure"]
         return [*others, *(self._closure_factor(closure, 0.0) for closure in closures)]
 
     def closure_sigmas(self, variables: Variables, closure: RelativePose) -> float:
-        """The largest of its six whitened residuals."""
+        """Return the largest of the six whitened residuals of a closure."""
         m = self._closure(closure)
         residual = closure_residual(variables[m.a], variables[m.b], m)
         return float(np.abs(np.linalg.cholesky(m.information).T @ residual).max())
@@ -246,7 +289,7 @@ class FactorStore:
         return between_factor(m.a, m.b, m.T_a_b, m.information, robust_sigmas)
 
     def _closure(self, m: RelativePose) -> RelativePose:
-        """Between variables, as much as it is believed."""
+        """Return a closure between variables, with the information that includes all noise."""
         own = closure_information(m, self._noise, self._ends_covariance(m))
         return self.between_variables(RelativePose(m.a, m.b, m.T_a_b, own))
 
@@ -254,25 +297,29 @@ class FactorStore:
     def move_component(
         self, younger: int, older: int, T_new_old: np.ndarray, variables: Variables
     ) -> Variables:
-        """All of a component into another: its variables and its landmarks."""
+        """Merge a component into an older one, and return the variables after its motion.
+
+        The motion applies to all keyframes of the younger component and their landmarks.
+        """
         theirs = {k for k, first in self.first_of.items() if first == younger}
         self.first_of.update(dict.fromkeys(theirs, older))
         return self.moved(theirs, T_new_old, variables)
 
     def moved(self, theirs: Set[int], T_new_old: np.ndarray, variables: Variables) -> Variables:
-        """With some keyframes, and the landmarks in their images, elsewhere."""
+        """Return the variables with some keyframes and their observed landmarks moved."""
         points = {point_key(s.landmark) for s in self.sights.values() if s.keyframe in theirs}
         moved = {k: T_new_old @ variables[k] for k in variables.keys() & theirs}
         moved |= {k: se3.transform(T_new_old, variables[k]) for k in variables.keys() & points}
         return {k: moved.get(k, value) for k, value in variables.items()}
 
     def keep_rejected(self, closure: RelativePose) -> None:
-        """Keep what contradicts a join."""
+        """Store a rejected closure that contradicts a bridge edge; only the newest are kept."""
         doubts = {**self.doubts, pair_of(closure): closure}
         self.doubts = dict(list(doubts.items())[-self.closures.config.doubts :])
 
     # --- state ------------------------------------------------------------------------------------
     def pack(self) -> dict[str, Any]:
+        """Return the state as arrays and plain values."""
         return {
             "keyframes": np.array(list(self.first_of), np.int64),
             "first_of": np.array(list(self.first_of.values()), np.int64),
@@ -287,6 +334,7 @@ class FactorStore:
         }
 
     def unpack(self, packed: Mapping[str, Any]) -> None:
+        """Restore the state that `pack` returned."""
         keyframes = packed["keyframes"].tolist()
         self.first_of = dict(zip(keyframes, packed["first_of"].tolist(), strict=True))
         self.active = packed["active"].tolist()

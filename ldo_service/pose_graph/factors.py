@@ -1,6 +1,6 @@
-"""Factors of the graph: what is measured, and the arrays that hold it in a saved state.
+"""Factors of the pose graph, their noise, and arrays of measurements for saved states.
 
-Packed measurements come back as the same bits.
+Unpacked measurements are bit-identical to the packed ones.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,49 +18,51 @@ from .solver import point_key
 
 @dataclass(frozen=True, slots=True)
 class NoiseConfig:
-    """What is believed of measurements, beside what they say of themselves."""
+    """Noise of measurements in addition to the information that they bring along."""
 
-    first_sigma: float = 1e-6  # rad and m: the first keyframe is the origin of its component
-    sigma_rotation_max_rad: float = 0.2  # a degenerate direction is believed no worse than this,
-    sigma_translation_max_m: float = 0.5  # or the linear system becomes singular
-    sigma_odometry_rad: float = 0.05  # of odometry over a missed keyframe
+    first_sigma: float = 1e-6  # rad and m; the first keyframe is the origin of its component.
+    # Upper bounds of the sigma in a degenerate direction, or the linear system becomes singular.
+    sigma_rotation_max_rad: float = 0.2
+    sigma_translation_max_m: float = 0.5
+    sigma_odometry_rad: float = 0.05  # Sigma of odometry over a missed keyframe.
     sigma_odometry_m: float = 0.1
-    # Alignment counts pixels as independent and knows no bias: on a handheld Kinect its links are
-    # off by 7 sigma in the median. A random walk beside it, of the size of 1 % and 0.5 deg/m after
-    # some metres: without it no chain could bend as far as a true loop closure asks for.
+    # Alignment counts pixels as independent and models no bias. On a handheld Kinect, its relative
+    # poses are off by 7 sigma in the median. So a random walk is added: about 1 % and 0.5 deg/m
+    # after some meters. Without it no chain could change as far as a true loop closure requires.
     drift_rad_per_sqrt_m: float = 0.02
     drift_m_per_sqrt_m: float = 0.02
-    turn_m_per_rad: float = 0.5  # a turn without a step drifts as a step of so much per radian
-    # Dense refinement counts pixels too; what it cannot see are calibration and exposure
+    turn_m_per_rad: float = 0.5  # Path length with the same drift as a rotation of 1 rad in place.
+    # Dense refinement also counts pixels as independent. It does not model errors of calibration
+    # and exposure.
     sigma_loop_rad: float = 0.01
     sigma_loop_m: float = 0.01
-    # The centre of a box is not where the mean of an object's Gaussians projects to: what hides
-    # part of it, and which side is seen, moves it by a share of its size; detectors add some px.
+    # The center of a box differs from the projected mean of an object's Gaussians. Occlusion and
+    # the visible side move it by a fraction of its size; the detector adds some pixels.
     sigma_box_px: float = 4.0
     sigma_box_share: float = 0.15
-    # That is the same error in all sights of an object from one side, and another from the next, so
-    # N of them inform less than N: as many as are kept of a landmark (`landmarks.most_sights`)
-    # count as a tenth of one. As one, they moved odometry right to 2 mm by 3 mm (RESULTS).
+    # Observations of an object from one side share that error, so N of them have less information
+    # than N independent ones. The maximum number per landmark (`landmarks.most_sights`) counts as a
+    # tenth of one. Counted as one, they moved odometry by 3 mm that was accurate to 2 mm (RESULTS).
     independent_sights: float = 1 / 320
-    robust_sigmas: float = 2.385  # of Cauchy's kernel: 95 % efficient on Gaussian noise
+    robust_sigmas: float = 2.385  # Cauchy kernel width: 95 % efficient on Gaussian noise.
 
     def __post_init__(self) -> None:
         optional = ("drift_rad_per_sqrt_m", "drift_m_per_sqrt_m", "turn_m_per_rad")
         sigmas = [name for name in self.__slots__ if name not in optional]
         if min(getattr(self, name) for name in sigmas) <= 0:
-            raise ConfigError(named(self, *sigmas) + ": every sigma must be positive.")
+            raise ConfigError(named(self, *sigmas) + " must be positive.")
         if min(getattr(self, name) for name in optional) < 0:
-            raise ConfigError(named(self, *optional) + ": drift must not be negative.")
+            raise ConfigError(named(self, *optional) + " must not be negative.")
         if self.independent_sights > 1:
-            raise ConfigError(f"independent_sights={self.independent_sights:g} must be at most 1.")
+            raise ConfigError(named(self, "independent_sights") + " must be at most 1.")
 
     @property
     def floor(self) -> np.ndarray:
-        """[6, 6] information that every relative pose has."""
+        """Minimum information [6, 6] of every relative pose."""
         return information(self.sigma_rotation_max_rad, self.sigma_translation_max_m)
 
     def drift(self, T: np.ndarray) -> np.ndarray:
-        """Covariance [6, 6] of a random walk over T [4, 4]."""
+        """Return the covariance [6, 6] of a random walk over a relative pose T [4, 4]."""
         path_m = np.linalg.norm(T[:3, 3]) + self.turn_m_per_rad * se3.rotation_angle(T)
         rates = [self.drift_rad_per_sqrt_m] * 3 + [self.drift_m_per_sqrt_m] * 3
         return np.diag(np.array(rates) ** 2 * path_m)
@@ -68,23 +70,23 @@ class NoiseConfig:
 
 @dataclass(frozen=True, slots=True)
 class BoxObservation:
-    """A landmark in the image of a keyframe."""
+    """Observation of a landmark as a box in the image of a keyframe."""
 
     keyframe: int
     landmark: int
-    center_px: np.ndarray  # [2] of its box
+    center_px: np.ndarray  # Center of the box, [2].
     sigma_px: float
-    intrinsics: np.ndarray  # [4] fx fy cx cy, px
-    weight: float = 1.0  # exp(-2 H) where it is vague
+    intrinsics: np.ndarray  # fx, fy, cx, cy in pixels, [4].
+    weight: float = 1.0  # exp(-2 H) if the entropy H is high, else 1.
 
 
 def information(sigma_rad: float, sigma_m: float) -> np.ndarray:
-    """[6, 6], rotation before translation."""
+    """Return a diagonal information matrix [6, 6], rotation before translation."""
     return np.diag([sigma_rad**-2] * 3 + [sigma_m**-2] * 3)
 
 
 def odometry_information(measured: RelativePose, noise: NoiseConfig) -> np.ndarray:
-    """[6, 6], drift and floor included."""
+    """Return the information [6, 6] of an odometry measurement, including drift and the minimum."""
     own = 0.5 * (measured.information + measured.information.T) + noise.floor
     return np.linalg.inv(np.linalg.inv(own) + noise.drift(measured.T_a_b))
 
@@ -92,14 +94,20 @@ def odometry_information(measured: RelativePose, noise: NoiseConfig) -> np.ndarr
 def closure_information(
     measured: RelativePose, noise: NoiseConfig, covariance: np.ndarray
 ) -> np.ndarray:
-    """[6, 6]; `covariance` [6, 6] is how well its ends are known in the variables that stand for
-    them."""
+    """Return the information [6, 6] of a loop closure.
+
+    Args:
+        measured: The closure.
+        noise: Noise of the measurements.
+        covariance: Uncertainty [6, 6] of the ends in the variables that they are transferred to.
+    """
     own = 0.5 * (measured.information + measured.information.T) + noise.floor
     least = np.linalg.inv(information(noise.sigma_loop_rad, noise.sigma_loop_m))
     return np.linalg.inv(np.linalg.inv(own) + least + covariance)
 
 
 def prior_factor(keyframe: int, T_map: np.ndarray, sigma: float) -> gtsam.NonlinearFactor:
+    """Return a factor that holds a keyframe at T_map [4, 4]; `sigma` in rad and m."""
     noise = gtsam.noiseModel.Isotropic.Sigma(6, sigma)
     return gtsam.PriorFactorPose3(keyframe, gtsam.Pose3(T_map), noise)
 
@@ -107,7 +115,7 @@ def prior_factor(keyframe: int, T_map: np.ndarray, sigma: float) -> gtsam.Nonlin
 def between_factor(
     a: int, b: int, T_a_b: np.ndarray, information: np.ndarray, robust_sigmas: float = 0.0
 ) -> gtsam.NonlinearFactor:
-    """`robust_sigmas` of Cauchy's kernel; 0: none."""
+    """Return a relative-pose factor; `robust_sigmas` is the Cauchy kernel width, 0 for none."""
     noise = gtsam.noiseModel.Gaussian.Information(information)
     return gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(T_a_b), _robust(noise, robust_sigmas))
 
@@ -115,10 +123,17 @@ def between_factor(
 def box_factor(
     sight: BoxObservation, variable: int, T_variable_keyframe: np.ndarray, noise: NoiseConfig
 ) -> gtsam.NonlinearFactor:
-    """s rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2) with s = `independent_sights`; `variable` is the
-    keyframe, or what it follows.
+    """Return the reprojection factor of an observation.
 
-    A point behind the camera costs a constant and pulls nowhere."""
+    Its cost is s rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2) with s = `independent_sights`. A point
+    behind the camera has a constant cost and no gradient.
+
+    Args:
+        sight: The observation.
+        variable: The keyframe, or the variable that a condensed keyframe is transferred to.
+        T_variable_keyframe: Pose of the keyframe in that variable, [4, 4].
+        noise: Noise of the measurements.
+    """
     share = np.sqrt(noise.independent_sights)
     sigma = sight.sigma_px / np.sqrt(sight.weight) / share
     model = _robust(gtsam.noiseModel.Isotropic.Sigma(2, sigma), share * noise.robust_sigmas)
@@ -141,7 +156,7 @@ def _robust(noise: gtsam.noiseModel.Base, robust_sigmas: float) -> gtsam.noiseMo
 
 
 def closure_residual(T_a: np.ndarray, T_b: np.ndarray, measured: RelativePose) -> np.ndarray:
-    """[6] log(T_ab^-1 T_a^-1 T_b)."""
+    """Return log(T_ab^-1 T_a^-1 T_b), [6]."""
     return se3.log(se3.inverse(measured.T_a_b) @ se3.inverse(T_a) @ T_b)
 
 
@@ -149,6 +164,7 @@ Packed = dict[str, np.ndarray]
 
 
 def pack_relative(measured: Iterable[RelativePose]) -> Packed:
+    """Return measurements as arrays."""
     measured = list(measured)
     return {
         "pairs": np.array([(m.a, m.b) for m in measured], np.int64).reshape(-1, 2),
@@ -158,6 +174,7 @@ def pack_relative(measured: Iterable[RelativePose]) -> Packed:
 
 
 def unpack_relative(packed: Mapping[str, np.ndarray]) -> list[RelativePose]:
+    """Return the measurements that `pack_relative` packed."""
     return [
         RelativePose(int(a), int(b), T_a_b, information)
         for (a, b), T_a_b, information in zip(
@@ -167,6 +184,7 @@ def unpack_relative(packed: Mapping[str, np.ndarray]) -> list[RelativePose]:
 
 
 def pack_sights(sights: Iterable[BoxObservation]) -> Packed:
+    """Return observations as arrays."""
     sights = list(sights)
     return {
         "pairs": np.array([(s.keyframe, s.landmark) for s in sights], np.int64).reshape(-1, 2),
@@ -178,6 +196,7 @@ def pack_sights(sights: Iterable[BoxObservation]) -> Packed:
 
 
 def unpack_sights(packed: Mapping[str, np.ndarray]) -> list[BoxObservation]:
+    """Return the observations that `pack_sights` packed."""
     columns = (packed[name] for name in ("centers_px", "sigmas_px", "intrinsics", "weights"))
     return [
         BoxObservation(

@@ -1,4 +1,4 @@
-"""What landmarks are, from what was observed of them: min G(p) of `ldo_service.pose_graph`."""
+"""Fusion of the observed labels of landmarks: min G(p) of `ldo_service.pose_graph`."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -6,26 +6,33 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import wrightomega
 
-FLOOR = 1e-6  # of a class that an observation does not name: rare, not impossible
-NEWTON_STEPS = 60  # it takes 5 to 15; monotone, so it cannot cycle
+# Minimum probability of a class that an observation does not name: rare, not impossible.
+FLOOR = 1e-6
+NEWTON_STEPS = 60  # It takes 5 to 15; the iteration is monotone, so it cannot cycle.
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """All observations of a landmark in two numbers per class: they enter G through these alone.
+    """Sum of all observations of a landmark; G depends on them through these values alone.
 
     sum_k w_k KL(p || q_k) = W sum_c p_c log p_c - sum_c p_c L_c,  W = sum w_k, L = sum w_k log q_k
     """
 
-    weight: float  # W
-    log_sum: np.ndarray  # L [C], nats
+    weight: float  # W.
+    log_sum: np.ndarray  # L [C], nats.
 
     @staticmethod
     def none(classes: int) -> "Evidence":
+        """Return the evidence of no observation."""
         return Evidence(0.0, np.zeros(classes))
 
     def with_observed(self, q: np.ndarray, weight: float) -> "Evidence":
-        """q [C] sums to one; classes below 1e-6 are raised to it."""
+        """Return the evidence with one more observation.
+
+        Args:
+            q: Distribution [C] that sums to one; classes below 1e-6 are raised to it.
+            weight: Weight w_k of the observation.
+        """
         floored = np.maximum(q, FLOOR)
         log_q = np.log(floored / floored.sum())
         return Evidence(self.weight + weight, self.log_sum + weight * log_q)
@@ -42,15 +49,23 @@ def fuse_labels(
     sweeps: int = 20,
     tolerance: float = 1e-9,
 ) -> dict[int, np.ndarray]:
-    """p_l [C] of every landmark, in the order of their ids.
+    """Return the distribution p_l [C] of every landmark, in the order of their ids.
 
         min_p  lambda sum_lk w_k KL(p_l || q_lk)
              + w_sem / 2 sum_ij (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j]
 
-    `covisible` pairs count once each. `start` are estimates from before, else the geometric means;
-    where `only` some are asked for, the others stay at their start.
-    Which pairs are of one argmax is decided anew before each sweep; sweeps end when no p changes by
-    `tolerance`. Deterministic: Gauss-Seidel in the order of the ids. Paper, III.C.
+    Before each sweep over the landmarks, the pairs with equal argmax are determined again. The
+    result is deterministic: Gauss-Seidel in the order of the ids. Paper, III.C.
+
+    Args:
+        evidence: Observations of each landmark.
+        covisible: Pairs of landmarks that a keyframe shows together; each pair counts once.
+        lambda_sem: Weight of the observations.
+        w_sem: Weight of the similarity.
+        start: Earlier estimates; the default are the geometric means.
+        only: Landmarks to optimize; the others keep their start values. None: all of them.
+        sweeps: Maximum number of sweeps.
+        tolerance: Sweeps end when no probability changes by more than this.
     """
     p = {k: geometric_mean(evidence[k]) for k in sorted(evidence)}
     p |= {k: v for k, v in (start or {}).items() if k in p}
@@ -70,7 +85,7 @@ def fuse_labels(
 
 
 def geometric_mean(evidence: Evidence) -> np.ndarray:
-    """argmin_p sum_k w_k KL(p || q_k) = prod q_k^(w_k / W), normalised."""
+    """Return argmin_p sum_k w_k KL(p || q_k) = prod q_k^(w_k / W), normalized."""
     mean = evidence.log_sum / max(evidence.weight, np.finfo(float).tiny)
     p = np.exp(mean - mean.max())
     return p / p.sum()
@@ -83,7 +98,7 @@ def objective(
     lambda_sem: float = 0.5,
     w_sem: float = 0.1,
 ) -> float:
-    """G(p) up to a constant, with the similarity of `pairs` whatever their argmax."""
+    """Return G(p) up to a constant, with the similarity of `pairs` whatever their argmax."""
     observed = sum(
         evidence[k].weight * np.sum(p_k * np.log(p_k)) - p_k @ evidence[k].log_sum
         for k, p_k in p.items()
@@ -106,15 +121,16 @@ def _neighbors(
 def _minimum(
     evidence: Evidence, alike: list[np.ndarray], lambda_sem: float, w_sem: float
 ) -> np.ndarray:
-    """Of one landmark's terms, its neighbours [C] held as they are.
+    """Return the minimum of one landmark's terms, with its neighbors [C] fixed.
 
-    With half of the similarity in each direction, n neighbours and the multiplier nu,
+    With half of the similarity in each direction, n neighbors and the multiplier nu,
 
         a (log p_c + 1) - g_c - b_c / p_c + nu = 0,    a = lambda W + n w / 2,
         g = lambda L + w / 2 sum_j log p_j,            b = w / 2 sum_j p_j
 
-    is solved by p_c = (b_c / a) / omega(log(b_c / a) + 1 + (nu - g_c) / a), omega of Wright:
-    omega + log omega = x. The sum over c falls with nu, which makes it one.
+    is solved by p_c = (b_c / a) / omega(log(b_c / a) + 1 + (nu - g_c) / a). omega is Wright's
+    function: omega + log omega = x. The sum over c decreases with nu; Newton's method finds the nu
+    for which it is one.
     """
     half = 0.5 * w_sem
     a = lambda_sem * evidence.weight + half * len(alike)
@@ -123,7 +139,7 @@ def _minimum(
     g = lambda_sem * evidence.log_sum + half * np.sum(np.log(alike), axis=0)
     log_b = np.log(half * np.sum(alike, axis=0) / a)
     x = 1 - g / a + log_b
-    # where sum_c p_c must exceed one, so that Newton comes from one side of a convex function
+    # Here sum_c p_c exceeds one, so that Newton approaches from one side of a convex function.
     nu = float(np.max(g / a)) - 1
     p = np.ones_like(g)
     for _ in range(NEWTON_STEPS):

@@ -1,4 +1,4 @@
-"""Landmarks: from what keyframes show of objects to variables of the graph, and out again."""
+"""Object landmarks: observations enter the pose graph as variables and factors, and leave it."""
 
 import itertools
 from collections.abc import Iterable, Mapping
@@ -16,16 +16,20 @@ from .loop_closures import Pair
 from .pose_graph import PoseGraph
 
 MAX_CLASSES = 256  # C_max of the paper, III.B
-BORDER_PX = 2.0  # a box so near to the border of the image is cut by it
+BORDER_PX = 2.0  # A box closer to the border of the image counts as cut off.
 
 
 def triangulate(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, float]:
-    """The point [3] nearest to all rays, and the widest angle in rad between two of them.
+    """Return the point [3] nearest to all rays, and the largest angle between two rays in rad.
 
         min_x sum_i |(I - d_i d_i^T) (x - o_i)|^2
 
-    origins [N, 3], in metres; rays [N, 3] of any length, N >= 2. Raises LinAlgError when all are
-    parallel.
+    Args:
+        origins: Origins of N >= 2 rays, [N, 3], meters.
+        rays: Directions of any length, [N, 3].
+
+    Raises:
+        LinAlgError: All rays are parallel.
     """
     d = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - d[:, :, None] * d[:, None, :]
@@ -35,21 +39,27 @@ def triangulate(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, floa
 
 @dataclass(frozen=True, slots=True)
 class ObjectLandmarkConfig:
-    lambda_sem: float = 0.5  # III.C
-    w_sem: float = 0.1  # III.C
-    vague_nats: float = 0.5  # III.C: above, what is observed weighs exp(-2 H), and leaves earlier
-    least_sights: int = 3  # III.C
-    least_parallax_rad: float = 0.09  # 5 deg: 12 px at 2 m and 525 px are 0.5 m in depth there
-    most_sights: int = 32  # of a landmark in the graph: the first half of them stays
-    misses: int = 10  # in a row, then it is gone (III.C)
-    vague_misses: int = 5
-    vague_keyframes: int = 20  # without a sight, then a vague one is gone
-    most: int = 1000  # landmarks; of more, those that were not seen for longest leave
-    # adaptive: the graph takes observations in once so much weight of them waits, a vague one
-    # weighing less; fixed: at every keyframe that has some
+    """Parameters of object landmarks; III.C refers to the paper."""
+
+    lambda_sem: float = 0.5  # Weight of the observed labels (III.C).
+    w_sem: float = 0.1  # Weight of the similarity (III.C).
+    # Entropy above which an observation has weight exp(-2 H) and a landmark is removed earlier
+    # (III.C).
+    vague_nats: float = 0.5
+    least_sights: int = 3  # Minimum observations of a landmark in the graph (III.C).
+    # Minimum parallax, 5 deg: an error of 12 px at 2 m and 525 px focal length is 0.5 m in depth.
+    least_parallax_rad: float = 0.09
+    # Maximum observations of a landmark in the graph; the first half of them is never replaced.
+    most_sights: int = 32
+    misses: int = 10  # Consecutive misses after which a landmark is removed (III.C).
+    vague_misses: int = 5  # The same for a landmark with high entropy.
+    vague_keyframes: int = 20  # Keyframes without observation after which such a one is removed.
+    most: int = 1000  # Maximum landmarks; beyond, the least recently observed ones are removed.
+    # adaptive: the graph takes observations in once their total weight reaches `due_weight`; fixed:
+    # at every keyframe with observations.
     schedule: Literal["adaptive", "fixed"] = "adaptive"
-    due_weight: float = 8.0
-    most_waiting: int = 256  # observations, however little they weigh
+    due_weight: float = 8.0  # Uncertain observations have less weight.
+    most_waiting: int = 256  # Maximum waiting observations, however small their weight.
 
     def __post_init__(self) -> None:
         counts = (self.most_sights, self.misses, self.vague_misses, self.most, self.most_waiting)
@@ -64,43 +74,47 @@ class ObjectLandmarkConfig:
                     "most",
                     "most_waiting",
                 )
-                + ": counts must be at least 1, least_sights at least 2."
+                + " must be at least 1, and least_sights at least 2."
             )
         if min(self.lambda_sem, self.due_weight, self.least_parallax_rad) <= 0 or self.w_sem < 0:
             raise ConfigError(
                 named(self, "lambda_sem", "w_sem", "least_parallax_rad", "due_weight")
-                + ": weights and angles must be positive."
+                + " must be positive, except w_sem, which must not be negative."
             )
 
 
 @dataclass(frozen=True, slots=True)
 class LandmarkObservation:
-    """An object in a keyframe, or missing there."""
+    """Observation or miss of an object in a keyframe."""
 
     keyframe: int
     landmark: int
-    box_px: np.ndarray  # [4] x0 y0 x1 y1
-    distribution: np.ndarray  # [C], sums to one
-    entropy: float  # nats
+    box_px: np.ndarray  # x0, y0, x1, y1 in pixels, [4].
+    distribution: np.ndarray  # Class distribution [C], sums to one.
+    entropy: float  # Nats.
     is_miss: bool
-    camera: np.ndarray  # [6] width height fx fy cx cy, px
+    camera: np.ndarray  # Width, height, fx, fy, cx, cy in pixels, [6].
 
     @property
     def is_whole(self) -> bool:
-        """Not cut by the border of the image, which would move the centre of its box."""
+        """True if the border of the image does not cut the box, which would move its center."""
         x0, y0, x1, y1 = self.box_px
         width, height = self.camera[:2]
         right, below = width - 1 - BORDER_PX, height - 1 - BORDER_PX
         return bool(min(x0, y0) > BORDER_PX and x1 < right and y1 < below)
 
     def pack(self) -> dict[str, Any]:
-        """Of its distribution only what is not zero: a few of 256."""
+        """Return the fields as plain values.
+
+        Of the distribution it has only the few nonzero of 256 entries.
+        """
         values = {name: getattr(self, name) for name in self.__slots__}
         labels = np.flatnonzero(self.distribution)
         return values | {"distribution": (labels, self.distribution[labels])}
 
     @staticmethod
     def unpack(packed: Mapping[str, Any]) -> "LandmarkObservation":
+        """Return the observation that `pack` packed."""
         labels, weights = packed["distribution"]
         distribution = np.zeros(MAX_CLASSES)
         distribution[labels] = weights
@@ -109,46 +123,52 @@ class LandmarkObservation:
 
 @dataclass(frozen=True, slots=True)
 class Landmark:
-    """What is known of one beside its place."""
+    """State of a landmark except its position, which is a variable of the pose graph."""
 
     evidence: Evidence
-    distribution: np.ndarray  # [C]
+    distribution: np.ndarray  # Fused class distribution, [C].
     sights: tuple[BoxObservation, ...] = ()
-    misses: int = 0  # in a row
-    last: int = -1  # keyframe that saw it
+    misses: int = 0  # Consecutive misses.
+    last: int = -1  # Id of the last keyframe that observed it.
 
     def knows(self, keyframe: int) -> bool:
+        """Return whether the landmark already has an observation in a keyframe."""
         return keyframe == self.last or any(sight.keyframe == keyframe for sight in self.sights)
 
     @property
     def entropy(self) -> float:
+        """Entropy of the fused distribution, nats."""
         p = self.distribution
         return float(-np.sum(p * np.log(np.where(p > 0, p, 1))))
 
 
 class ObjectLandmarks:
-    """Deterministic; bounded by `most` landmarks, each 4 kB and its sights, and the pairs of them
-    that a keyframe showed together."""
+    """Landmarks of the pose graph, with their observations and fused labels.
+
+    The result is deterministic. Memory is bounded by `most` landmarks, each with 4 kB and its
+    observations, and by the pairs of them that a keyframe showed together.
+    """
 
     def __init__(self, config: ObjectLandmarkConfig, noise: NoiseConfig) -> None:
+        """Create an empty set of landmarks."""
         self._config, self._noise = config, noise
         self.known: dict[int, Landmark] = {}
         self._waiting: list[LandmarkObservation] = []
-        self._pairs: set[Pair] = set()  # that a keyframe shows together
-        self._saved: dict[str, Any] = {}  # what is known, until it changes
-        self.skipped = 0  # keyframes at which the graph was left alone
+        self._pairs: set[Pair] = set()  # Pairs of landmarks that a keyframe shows together.
+        self._saved: dict[str, Any] = {}  # Cached part of the state.
+        self.skipped = 0  # Keyframes at which observations waited.
 
     def observe(self, seen: LandmarkObservation) -> None:
-        """To be taken in at the next `update_graph`."""
+        """Store an observation for the next `update_graph`."""
         self._waiting.append(seen)
 
     def weight(self, entropy: float) -> float:
-        """Of what was observed with so much entropy, in nats."""
+        """Return the weight of an observation with this entropy in nats."""
         return float(np.exp(-2 * entropy)) if entropy > self._config.vague_nats else 1.0
 
     # --- into the graph ---------------------------------------------------------------------------
     def needs_update(self) -> bool:
-        """Whether the graph is to take in what waits; to be asked once a keyframe."""
+        """Return whether the graph should take in observations now; call once per keyframe."""
         config = self._config
         if not self._waiting:
             return False
@@ -160,7 +180,7 @@ class ObjectLandmarks:
         return False
 
     def update_graph(self, graph: PoseGraph) -> None:
-        """What waits goes into the graph, what is gone leaves it, and distributions are fused."""
+        """Add the waiting observations, remove lost landmarks and fuse the distributions."""
         waiting, self._waiting, self._saved = self._waiting, [], {}
         for seen in waiting:
             self._take(seen)
@@ -176,7 +196,7 @@ class ObjectLandmarks:
                 self.known[seen.landmark] = replace(old, misses=old.misses + 1)
             return
         if old is not None and old.knows(seen.keyframe):
-            return  # sent again after a restart
+            return  # Sent again after a restart.
         old = old or Landmark(Evidence.none(MAX_CLASSES), np.full(MAX_CLASSES, 1 / MAX_CLASSES))
         evidence = old.evidence.with_observed(seen.distribution, self.weight(seen.entropy))
         sights = (*old.sights, self._sight(seen)) if seen.is_whole else old.sights
@@ -197,7 +217,7 @@ class ObjectLandmarks:
         )
 
     def _pair(self, waiting: Iterable[LandmarkObservation]) -> None:
-        """Those that a keyframe shows together."""
+        """Add the pairs of landmarks that a keyframe shows together."""
         shown: dict[int, set[int]] = {}
         for seen in waiting:
             if not seen.is_miss:
@@ -206,7 +226,7 @@ class ObjectLandmarks:
             self._pairs |= set(itertools.combinations(sorted(together), 2))
 
     def _see(self, graph: PoseGraph, waiting: set[Pair]) -> None:
-        """Sights of landmarks in the graph, and all of those that can be placed by now."""
+        """Add observations of landmarks in the graph, and landmarks that can be placed now."""
         new, placed, gone = [], {}, []
         for k in sorted({landmark for _, landmark in waiting}):
             sights = [s for s in self.known[k].sights if s.keyframe in graph]
@@ -224,7 +244,7 @@ class ObjectLandmarks:
         graph.remove_observations(gone)
 
     def _thinned(self, sights: list[BoxObservation]) -> tuple[BoxObservation, ...]:
-        """The first ones, which tie it to where it was, and the newest."""
+        """Return the first observations, which limit drift, and the newest."""
         half = self._config.most_sights // 2
         excess = len(sights) - self._config.most_sights
         return tuple(sights if excess <= 0 else sights[:half] + sights[half + excess :])
@@ -232,8 +252,11 @@ class ObjectLandmarks:
     def _triangulated(
         self, sights: Iterable[BoxObservation], graph: PoseGraph
     ) -> np.ndarray | None:
-        """Where the rays through the centres of boxes meet [3]; None where that says nothing: too
-        few, too small an angle, behind a camera, or not in the boxes."""
+        """Return the point [3] where the rays through the box centers meet, or None.
+
+        None means too few observations, too little parallax, a point behind a camera or one outside
+        the boxes.
+        """
         sights = list(sights)
         if len(sights) < self._config.least_sights:
             return None
@@ -254,9 +277,9 @@ class ObjectLandmarks:
         sigmas_px = np.array([s.sigma_px for s in sights])
         return point if np.all(off_px < 3 * sigmas_px) else None
 
-    # --- what they are ----------------------------------------------------------------------------
+    # --- labels -----------------------------------------------------------------------------------
     def _fuse(self, touched: set[int]) -> None:
-        """Of those observed anew; the others are as they were."""
+        """Compute the distributions of landmarks with new observations; others do not change."""
         pairs = [pair for pair in self._pairs if touched & set(pair)]
         near = touched | {k for pair in pairs for k in pair if k in self.known}
         p = fuse_labels(
@@ -269,10 +292,13 @@ class ObjectLandmarks:
         )
         self.known |= {k: replace(self.known[k], distribution=p[k]) for k in touched}
 
-    # --- out again --------------------------------------------------------------------------------
+    # --- removal ----------------------------------------------------------------------------------
     def _remove_lost(self, graph: PoseGraph) -> None:
-        """With their observations: a dense factor among all keyframes that saw one would cost more
-        than it says, and hold them where they are today."""
+        """Remove lost landmarks with their observations.
+
+        A dense factor among all keyframes that observed one would cost more than its information is
+        worth. It would also hold these keyframes at their present poses.
+        """
         newest = graph.newest or 0
         gone = [k for k, landmark in self.known.items() if self._is_gone(landmark, newest)]
         by_age = sorted(self.known.keys() - set(gone), key=lambda k: (self.known[k].last, k))
@@ -291,7 +317,7 @@ class ObjectLandmarks:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """`known` is the same object until the next `update_graph`."""
+        """Return the state; `known` is the same object until the next `update_graph`."""
         self._saved = self._saved or self._packed()
         waiting = [seen.pack() for seen in self._waiting]
         return {"known": self._saved, "waiting": waiting, "skipped": self.skipped}
@@ -309,6 +335,7 @@ class ObjectLandmarks:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a snapshot."""
         packed = state["known"]
         sights: dict[int, list[BoxObservation]] = {}
         for sight in unpack_sights(packed["sights"]):

@@ -1,4 +1,4 @@
-"""Which loop closures are believed: false ones are worse than missed ones."""
+"""Acceptance of loop closures; a false closure costs more than a missed one."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -19,43 +19,48 @@ Sigmas = Callable[[Variables, RelativePose], float]
 
 @dataclass(frozen=True, slots=True)
 class LoopClosureConfig:
-    # What a closure may add to the sum of squares: chi^2 of six numbers at 3 sigma (99.73 %). Its
-    # own residual would not do: a chain of a hundred links bends by a metre and leaves it 2 sigma.
+    """Limits for the acceptance of loop closures."""
+
+    # Maximum increase of the sum of squares by a closure: chi^2 of six numbers at 3 sigma
+    # (99.73 %). The residual of the closure alone is no criterion: a chain of 100 measurements
+    # moves by a meter and leaves a residual of 2 sigma.
     most_cost: float = 20.06
-    most_sigmas: float = 3.0  # of a residual that stays, in any direction (RTAB-Map's guard)
-    rivals: int = 3  # earlier closures that may leave in place of a new one, the least fitting
-    # believed at a time, 1 kB each and one more to solve with; beyond, the one goes that another is
-    # nearest to
+    # Maximum residual of an accepted closure in any direction, in sigmas (RTAB-Map's guard).
+    most_sigmas: float = 3.0
+    rivals: int = 3  # Earlier closures to test for removal instead of a new one; worst fit first.
+    # Maximum accepted closures, 1 kB each and one more factor to solve. Beyond, the older of the
+    # two most similar ones is removed.
     most: int = 500
-    doubts: int = 16  # refused ones kept that contradict a join: two that agree outvote it
-    remembered: int = 256  # refused ones, and ones that left, to tell
+    # Rejected closures kept that contradict a bridge edge; two that agree replace it.
+    doubts: int = 16
+    remembered: int = 256  # Rejected and removed closures kept, each, for publication.
 
     def __post_init__(self) -> None:
         if min(self.most_cost, self.most_sigmas) <= 0 or self.rivals < 0:
             raise ConfigError(
                 named(self, "most_cost", "most_sigmas", "rivals")
-                + ": gates must be positive, counts not negative."
+                + " must be positive, except rivals, which must not be negative."
             )
         if min(self.most, self.doubts, self.remembered) < 1:
-            raise ConfigError(
-                named(self, "most", "doubts", "remembered")
-                + ": most, doubts and remembered must be at least 1."
-            )
+            raise ConfigError(named(self, "most", "doubts", "remembered") + " must be at least 1.")
 
 
 @dataclass(frozen=True, slots=True)
 class ClosureDecision:
+    """Decision on a loop closure."""
+
     is_accepted: bool
-    dropped: tuple[Pair, ...] = ()  # accepted earlier, and refuted by now
+    dropped: tuple[Pair, ...] = ()  # Earlier accepted closures that are now removed.
 
     @property
     def changes(self) -> bool:
+        """True if the set of accepted closures changes."""
         return self.is_accepted or bool(self.dropped)
 
 
 @dataclass(frozen=True, slots=True)
 class LoopClosureSet:
-    """Those in the graph, and those that were refused or left it."""
+    """Immutable set of the accepted, rejected and removed loop closures."""
 
     config: LoopClosureConfig = field(default_factory=LoopClosureConfig)
     accepted: Mapping[Pair, RelativePose] = field(default_factory=dict)
@@ -65,12 +70,16 @@ class LoopClosureSet:
     def check(
         self, closure: RelativePose, solve: Solve, sigmas: Sigmas
     ) -> tuple[ClosureDecision, Variables]:
-        """Is it to be believed, and where is everything then.
+        """Return the decision on a new closure, and the variables after it.
 
-        `solve` gives the solution with some closures and its sum of squares; `sigmas` the largest
-        residual of one in a solution. A new closure that costs too much is refused, unless the
-        solution costs less without an earlier one: then that one was false. In the end whichever
-        is still off by too much leaves.
+        A new closure that costs too much is rejected, unless the solution costs less without an
+        earlier one: then the earlier one was false. In the end, closures with too large a residual
+        are removed.
+
+        Args:
+            closure: New closure.
+            solve: Function that returns the solution with some closures, and its sum of squares.
+            sigmas: Function that returns the largest whitened residual of a closure in a solution.
         """
         before = [c for pair, c in self.accepted.items() if pair != pair_of(closure)]
         _, cost_before = solve(before)
@@ -89,7 +98,7 @@ class LoopClosureSet:
             variables, cost = solve(chosen)
         kept = {pair_of(c) for c in chosen}
         if pair_of(closure) not in kept and pair_of(closure) in self.accepted:
-            return ClosureDecision(False), variables  # what it would have replaced stays
+            return ClosureDecision(False), variables  # The earlier closure of the pair stays.
         dropped = tuple(pair for pair in self.accepted if pair not in kept)
         return ClosureDecision(pair_of(closure) in kept, dropped), variables
 
@@ -102,7 +111,7 @@ class LoopClosureSet:
         variables: Variables,
         sigmas: Sigmas,
     ) -> RelativePose | None:
-        """The earlier closure without which the new one fits, and everything fits better."""
+        """Return the earlier closure without which the new one fits at the smallest total cost."""
         fitting = sorted(before, key=lambda c: sigmas(variables, c), reverse=True)
         best, best_cost = None, cost_before
         for rival in fitting[: self.config.rivals]:
@@ -114,7 +123,7 @@ class LoopClosureSet:
         return best
 
     def with_decision(self, closure: RelativePose, verdict: ClosureDecision) -> "LoopClosureSet":
-        """A pair is in one of the three, where it was put last."""
+        """Return the set after a decision; each pair is only in the group where it was put last."""
         pair = pair_of(closure)
         accepted = {p: c for p, c in self.accepted.items() if p not in verdict.dropped}
         if verdict.is_accepted:
@@ -130,7 +139,10 @@ class LoopClosureSet:
         )
 
     def _thinned(self, accepted: Mapping[Pair, RelativePose]) -> Mapping[Pair, RelativePose]:
-        """Without one too many: the older of the two that join the most alike keyframes."""
+        """Return at most `most` closures.
+
+        Beyond, the older of the two between the nearest keyframes is removed.
+        """
         if len(accepted) <= self.config.most:
             return accepted
         pairs = np.array(list(accepted))
@@ -140,20 +152,21 @@ class LoopClosureSet:
         return {p: c for place, (p, c) in enumerate(accepted.items()) if place != older}
 
     def without(self, pairs: Collection[Pair]) -> "LoopClosureSet":
-        """When other measurements hold what these say."""
+        """Return the set without some closures; other measurements now hold their information."""
         return replace(self, accepted={p: c for p, c in self.accepted.items() if p not in pairs})
 
     def with_replaced_bridge(self, join: Pair, closure: Pair) -> "LoopClosureSet":
-        """When a closure joins two components in place of another, which leaves."""
+        """Return the set after a closure replaced a bridge edge, which counts as removed."""
         refused = tuple(pair for pair in self.rejected if pair != closure)
         left = self._remembered((*(pair for pair in self.removed if pair != closure), join))
         return replace(self, rejected=refused, removed=left)
 
     def _remembered(self, pairs: Iterable[Pair]) -> tuple[Pair, ...]:
-        """The newest of them."""
+        """Return the newest pairs."""
         return tuple(dict.fromkeys(pairs))[-self.config.remembered :]
 
     def pack(self) -> dict[str, Any]:
+        """Return the set as arrays and plain values."""
         return {
             "accepted": pack_relative(self.accepted.values()),
             "refused": self.rejected,
@@ -162,10 +175,12 @@ class LoopClosureSet:
 
     @staticmethod
     def unpack(config: LoopClosureConfig, packed: Mapping[str, Any]) -> "LoopClosureSet":
+        """Return the set that `pack` packed."""
         accepted = {pair_of(c): c for c in unpack_relative(packed["accepted"])}
         refused, left = (tuple((a, b) for a, b in packed[name]) for name in ("refused", "left"))
         return LoopClosureSet(config, accepted, refused, left)
 
 
 def pair_of(measured: RelativePose) -> Pair:
+    """Return the two keyframes of a measurement."""
     return measured.a, measured.b

@@ -1,4 +1,4 @@
-"""Keyframe poses from relative measurements and landmarks, by incremental smoothing (iSAM2)."""
+"""Incremental smoothing (iSAM2) of keyframe poses from relative measurements and landmarks."""
 
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
@@ -32,15 +32,18 @@ from .solver import Name, Solver, Variables, point_key
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphConfig:
+    """Parameters of the pose graph."""
+
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     closures: LoopClosureConfig = field(default_factory=LoopClosureConfig)
-    condense_keyframes: int = 10  # of which one stays a variable (paper, III.C: every 10)
-    window_keyframes: int = 20  # the newest stay as they are: they are still measured anew
-    # An end of a closure that follows, and is bent by more sigmas of it, is a variable again, while
-    # there are so many keyframes for each: a solution takes time with the variables
+    # Keyframes per group; one stays a variable (paper, III.C: every 10).
+    condense_keyframes: int = 10
+    window_keyframes: int = 20  # Newest keyframes, not condensed: their measurements still change.
+    # A condensed keyframe becomes a variable again if a closure changes it by more sigmas than
+    # this. There is at most one group per `keyframes_each` keyframes, to bound the solver's time.
     most_bent: float = 0.1
     keyframes_each: int = 5
-    most_changes: int = 64  # between two rebuilds: what a successor repeats to hold the same bits
+    most_changes: int = 64  # Number between two rebuilds; a restored graph repeats them bit by bit.
 
     def __post_init__(self) -> None:
         counts = self.condense_keyframes, self.window_keyframes, self.most_changes
@@ -49,32 +52,32 @@ class PoseGraphConfig:
                 named(
                     self, "condense_keyframes", "window_keyframes", "keyframes_each", "most_changes"
                 )
-                + ": keyframes and changes must be at least 1."
+                + " must be at least 1."
             )
         if self.most_bent < 0:
-            raise ConfigError(f"most_bent={self.most_bent:g} must not be negative.")
+            raise ConfigError(named(self, "most_bent") + " must not be negative.")
 
 
 class PoseGraph:
-    """min F(T, mu) of `ldo_service.pose_graph`, over the keyframes that are variables.
+    """Minimizer of F(T, mu) of `ldo_service.pose_graph` over the keyframes that are variables.
 
-    Keyframes that measurements connect are a component, whose frame its first keyframe fixes; a
-    measurement between two components makes them one, in the frame of the older.
+    Keyframes that measurements connect are a component; its first keyframe fixes its frame. A
+    measurement between two components merges them into the frame of the older one.
 
-    iSAM2 relinearises what moved. It cannot be saved, and another one built from the same
-    measurements differs in the last digits. So what is saved is the state at the last rebuild, and
-    the changes since, which a successor repeats: it goes on with the same bits. Rebuilt every few
-    keyframes anyway, when old ones are condensed, and where an update throws, which has already
-    changed the object. Deterministic: the same measurements in the same order give the same bits.
+    iSAM2 relinearizes variables that moved. It cannot be saved, and a new one with the same
+    measurements differs in the last digits. So the saved state is the last rebuild and the changes
+    since then. A restored graph repeats them and continues bit by bit. The graph is also rebuilt
+    every few keyframes, when old ones are condensed, and when an update throws, which leaves iSAM2
+    changed. Deterministic: equal measurements in equal order give equal bits.
     """
 
     def __init__(self, config: PoseGraphConfig = PoseGraphConfig()) -> None:
         self._config = config
         self._known = FactorStore(config.noise, config.closures)
-        self._initial: Variables = {}  # the value each variable was inserted with
+        self._initial: Variables = {}  # The value each variable was inserted with.
         self._solver = Solver()
         self._base = self._packed()
-        self._changes: list[tuple[str, dict[str, Any]]] = []  # since the last rebuild
+        self._changes: list[tuple[str, dict[str, Any]]] = []  # Since the last rebuild.
         self.solved_times = 0
 
     def __contains__(self, keyframe: int) -> bool:
@@ -93,16 +96,17 @@ class PoseGraph:
 
     @property
     def variables(self) -> int:
-        """Keyframes that are variables; the others follow them."""
+        """Number of keyframes that are variables; the others are condensed."""
         return len(self) - len(self._known.rows)
 
     @property
     def closures(self) -> LoopClosureSet:
+        """Accepted, rejected and removed loop closures."""
         return self._known.closures
 
     # --- keyframes --------------------------------------------------------------------------------
     def add_first(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
-        """The keyframe that fixes the frame of a new component."""
+        """Add the first keyframe of a new component, which fixes its frame."""
         self._log_change("first", keyframe=keyframe, T_map=T_map_keyframe)
         self._initial[keyframe] = np.array(T_map_keyframe, float)
         self._known.first_of[keyframe] = keyframe
@@ -110,17 +114,22 @@ class PoseGraph:
         self._update([("first", keyframe)], [keyframe])
 
     def component_root(self, keyframe: int) -> int:
-        """The first keyframe of its component. Raises KeyError when it is not known."""
+        """Return the first keyframe of a component; raise KeyError for an unknown keyframe."""
         return self._known.first_of[keyframe]
 
     def add(self, measured: RelativePose, *more: RelativePose) -> None:
-        """A new keyframe `b`, measured from a known one, and from `more` of them.
+        """Add a new keyframe `b`, measured from one or more known keyframes.
 
-        Raises KeyError for an `a` that is not known, ValueError if they measure several keyframes.
+        Raises:
+            KeyError: A keyframe `a` is unknown.
+            ValueError: The measurements are of several keyframes.
         """
         every = (measured, *more)
         if any(m.b != measured.b for m in every):
-            raise ValueError(f"keyframes {sorted({m.b for m in every})} cannot be added at once.")
+            raise ValueError(
+                f"keyframes {sorted({m.b for m in every})} cannot be added at once: all "
+                "measurements must be of one keyframe."
+            )
         self._require(m.a for m in every)
         self._log_change("add", measured=pack_relative(every))
         self._initial[measured.b] = self.pose(measured.a) @ measured.T_a_b
@@ -130,10 +139,10 @@ class PoseGraph:
         self._condense()
 
     def replace(self, measured: Sequence[RelativePose]) -> None:
-        """Believe these in place of what was measured between the same keyframes before. One that
-        follows others is put where they say.
+        """Replace earlier measurements of the same keyframes; condensed ones move accordingly.
 
-        Raises KeyError for a keyframe that is not known.
+        Raises:
+            KeyError: A keyframe is unknown.
         """
         self._require(k for m in measured for k in (m.a, m.b))
         self._log_change("replace", measured=pack_relative(measured))
@@ -141,7 +150,7 @@ class PoseGraph:
         self._update([name for name in names if name], [])
 
     def odometry_fallback(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
-        """Odometry between keyframes of which those between were missed: believed less."""
+        """Return odometry over missed keyframes as a measurement with little information."""
         noise = self._config.noise
         own = information(noise.sigma_odometry_rad, noise.sigma_odometry_m)
         return RelativePose(a, b, T_a_b, own)
@@ -153,21 +162,23 @@ class PoseGraph:
 
     # --- components and loops ---------------------------------------------------------------------
     def add_loop_closure(self, closure: RelativePose) -> ClosureDecision:
-        """What somebody recognised, between known keyframes: is it believed, and what left for it.
+        """Check a closure between known keyframes; return the decision and the closures it removes.
 
-        See `loop_closures`; a refused one leaves no trace in any pose. Between two components there
-        is nothing to judge it by, and it joins them; where more of those that it refutes later
-        agree with each other than with it, one of them joins instead. Raises KeyError when a
-        keyframe is not known.
+        A rejected closure affects no pose (see `loop_closures`). Between two components there is no
+        way to check it: it merges them. It is replaced once more of the closures that it
+        contradicts agree with each other than with it.
+
+        Raises:
+            KeyError: A keyframe is unknown.
         """
         if self.component_root(closure.a) != self.component_root(closure.b):
             self._merge_components(closure)
             return ClosureDecision(True)
         if pair_of(closure) in self._known.joins:
-            return ClosureDecision(True)  # the same two images: told again they would count twice
+            return ClosureDecision(True)  # The same two images must not count twice.
         start, known = self._solver.variables(), self._known
         if known.relative_to_start(closure.a)[0] == known.relative_to_start(closure.b)[0]:
-            return self._reject(closure)  # too late: both hang on one variable by now
+            return self._reject(closure)  # Too late: both have the same head now.
         verdict, variables = check_against_bridge(known, closure, start, self._initial)
         self.solved_times += 1
         if not verdict.changes:
@@ -177,7 +188,7 @@ class PoseGraph:
         return verdict
 
     def _with_ends(self, closure: RelativePose, variables: Variables) -> Variables:
-        """Make ends that a closure bends too much to follow variables again."""
+        """Return the variables; condensed ends that a closure changes too much become variables."""
         known, config = self._known, self._config
         for keyframe in (closure.a, closure.b):
             is_room = len(known.condensed) * config.keyframes_each < len(self)
@@ -190,8 +201,7 @@ class PoseGraph:
         return variables
 
     def _merge_components(self, measured: RelativePose) -> None:
-        """Two components become one: the younger moves as a whole into the older one's frame,
-        before everything is solved again."""
+        """Move the younger component into the frame of the older one, and solve again."""
         first_a, first_b = self.component_root(measured.a), self.component_root(measured.b)
         moves = T_new_old(measured, self.pose, moves_b=first_a < first_b)
         younger, older = max(first_a, first_b), min(first_a, first_b)
@@ -200,8 +210,11 @@ class PoseGraph:
         self._restart_solver(moved)
 
     def _reject(self, closure: RelativePose) -> ClosureDecision:
-        """Unless more closures agree with it than with a join that it contradicts. Of several joins
-        the one falls that takes the fewest closures with it; where that is not one, all stay."""
+        """Reject a closure, unless more closures agree with it than with a bridge edge.
+
+        Of several such bridge edges, the one is replaced that leaves the most closures accepted. If
+        two are equal, all stay.
+        """
         known, variables = self._known, self._solver.variables()
         known.closures = known.closures.with_decision(closure, ClosureDecision(False))
         joins = conflicting_bridges(known, closure)
@@ -221,8 +234,11 @@ class PoseGraph:
     def add_observations(
         self, sights: Sequence[BoxObservation], placed: Mapping[int, np.ndarray]
     ) -> None:
-        """Landmarks in the images of known keyframes; `placed` [3], in the map, are those that are
-        new. Raises KeyError for a keyframe that is not known."""
+        """Add observations in known keyframes; `placed` are map points [3] of new landmarks.
+
+        Raises:
+            KeyError: A keyframe is unknown.
+        """
         self._require(s.keyframe for s in sights)
         self._log_change(
             "see", sights=pack_sights(sights), ids=list(placed), points=list(placed.values())
@@ -233,7 +249,7 @@ class PoseGraph:
         self._update(names, [point_key(k) for k in placed])
 
     def remove_observations(self, pairs: Iterable[Pair]) -> None:
-        """Forget sights, by keyframe and landmark; with its last sight a landmark is forgotten."""
+        """Remove observations by keyframe and landmark, and landmarks with their last one."""
         known = [pair for pair in pairs if pair in self._known.sights]
         if not known:
             return
@@ -246,16 +262,17 @@ class PoseGraph:
         self._update([], [], [("sight", *pair) for pair in known])
 
     def has_landmark(self, landmark: int) -> bool:
+        """Return whether a landmark is a variable of the graph."""
         return point_key(landmark) in self._initial
 
     def landmarks(self) -> dict[int, np.ndarray]:
-        """mu [3] in the map of each, by id."""
+        """Return the positions mu [3] in the map by landmark id."""
         variables = self._solver.variables()
         return {k: variables[point_key(k)] for k in sorted({k for _, k in self._known.sights})}
 
     # --- poses ------------------------------------------------------------------------------------
     def pose(self, keyframe: int) -> np.ndarray:
-        """T_map_keyframe [4, 4], as estimated now."""
+        """Return the current estimate of T_map_keyframe [4, 4]."""
         row = self._known.rows.get(keyframe)
         if row is None:
             return self._solver.pose(keyframe)
@@ -265,12 +282,12 @@ class PoseGraph:
         return follower.interpolated_poses(T_head, T_tail)[0]
 
     def poses(self) -> dict[int, np.ndarray]:
-        """T_map_keyframe of every keyframe, ascending by id."""
+        """Return T_map_keyframe of every keyframe, ascending by id."""
         keyframes, T_map = self.all_poses()
         return dict(zip(keyframes.tolist(), T_map, strict=True))
 
     def all_poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """All keyframes [K], ascending, and T_map_keyframe [K, 4, 4]."""
+        """Return the ids of all keyframes [K], ascending, and T_map_keyframe [K, 4, 4]."""
         variables, followers = self._solver.variables(), self._known.followers
         keys = np.array([k for k in variables if k in self], np.int64)
         T_map = np.array([variables[k] for k in keys.tolist()]).reshape(-1, 4, 4)
@@ -297,7 +314,7 @@ class PoseGraph:
             self._rebuild_or_forget_landmarks()
 
     def _rebuild_or_forget_landmarks(self) -> None:
-        """Keyframes hold each other; a landmark may have been placed where rays hardly cross."""
+        """Rebuild; without landmarks if that fails, as one may lie where its rays hardly cross."""
         try:
             self._rebuild()
         except RuntimeError:
@@ -306,14 +323,14 @@ class PoseGraph:
             self._rebuild()
 
     def _rebuild(self) -> None:
-        """All measurements into a new object. Raises RuntimeError when they cannot be solved."""
+        """Solve all measurements in a new solver; raise RuntimeError if that fails."""
         factors = {name: self._known.factor(name, self._initial) for name in self._known.names()}
         self._solver = Solver()
         if factors:
             self._solver.update(factors, self._initial)
 
     def _condense(self) -> None:
-        """What is due; and start anew from what is known now, often enough."""
+        """Condense the next group if there is one; rebuild after that or after many changes."""
         config, known = self._config, self._known
         heads = {k for pair in known.condensed for k in pair}
         group = group_to_condense(
@@ -327,7 +344,7 @@ class PoseGraph:
             self._restart_solver({k: v for k, v in variables.items() if k not in followers})
 
     def _restart_solver(self, variables: Variables) -> None:
-        """Start anew from here."""
+        """Rebuild from these values and clear the changes."""
         self._initial, self._changes = variables, []
         self._base = self._packed()
         self._rebuild_or_forget_landmarks()
@@ -341,11 +358,11 @@ class PoseGraph:
         return {"keys": initial[0], "values": initial[1], "known": self._known.pack()}
 
     def snapshot(self) -> dict[str, Any]:
-        """`base` is the same object until the next rebuild."""
+        """Return the state; `base` is the same object until the next rebuild."""
         return {"base": self._base, "changes": list(self._changes)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on with the same bits."""
+        """Continue from a snapshot with bit-identical results."""
         self._base, self._changes = state["base"], []
         values = [v.reshape(4, 4) if v.size == 16 else v for v in self._base["values"]]
         self._initial = dict(zip(self._base["keys"], values, strict=True))

@@ -1,4 +1,4 @@
-"""iSAM2 over named factors, and the same from scratch. Deterministic: equal calls, equal bits."""
+"""iSAM2 over named factors, and a batch solver; deterministic to the bit for equal calls."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -6,20 +6,22 @@ from typing import Any
 import gtsam
 import numpy as np
 
-Name = tuple[Any, ...]  # of a factor: its kind, then the ids of what it is between
-Variables = dict[int, np.ndarray]  # by key: T_map_keyframe [4, 4], or a point [3] in the map
+Name = tuple[Any, ...]  # Name of a factor: its kind, then the ids of its ends.
+# Keyframes as T_map_keyframe [4, 4] and points [3] in the map, by key.
+Variables = dict[int, np.ndarray]
 
 
 class Solver:
-    """min sum of factors, relinearising what moved; factors come and go by name."""
+    """Incremental minimization of a sum of named factors; moved variables are relinearized."""
 
     def __init__(self) -> None:
+        """Create a solver without variables."""
         solver = gtsam.ISAM2GaussNewtonParams()
-        solver.setWildfireThreshold(0.0)  # 0.001 by default: smaller changes would not be passed on
+        solver.setWildfireThreshold(0.0)  # The default 0.001 does not propagate smaller changes.
         parameters = gtsam.ISAM2Params()
         parameters.setOptimizationParams(solver)
-        parameters.findUnusedFactorSlots = True  # or the list grows with every replacement
-        parameters.setRelinearizeThreshold(0.01)  # rad and m, gtsam's advice for poses
+        parameters.findUnusedFactorSlots = True  # Otherwise the list grows with every replacement.
+        parameters.setRelinearizeThreshold(0.01)  # rad and m; gtsam's recommendation for poses.
         parameters.relinearizeSkip = 1
         self._isam = gtsam.ISAM2(parameters)
         self._places: dict[Name, int] = {}
@@ -30,11 +32,12 @@ class Solver:
         variables: Variables,
         gone: Iterable[Name] = (),
     ) -> None:
-        """New factors and variables in, factors of the names `gone` out, and with the last factor
-        of a variable the variable. A name that is known is replaced.
+        """Add factors and variables, and remove the factors named in `gone`.
 
-        Raises RuntimeError where they do not say where every variable is; the solver is of no use
-        then.
+        A factor with a known name replaces the old one. A variable is removed with its last factor.
+
+        Raises:
+            RuntimeError: The factors do not determine all variables; the solver is unusable then.
         """
         out = {*gone, *factors} & self._places.keys()
         places = sorted(self._places.pop(name) for name in out)
@@ -42,19 +45,24 @@ class Solver:
         self._places.update(zip(factors, result.getNewFactorsIndices(), strict=True))
 
     def pose(self, key: int) -> np.ndarray:
-        """T_map_keyframe [4, 4], as estimated now."""
+        """Return the current estimate of T_map_keyframe [4, 4]."""
         return self._isam.calculateEstimatePose3(key).matrix()
 
     def variables(self) -> Variables:
-        """All, as estimated now, ascending by key."""
+        """Return the current estimates of all variables, ascending by key."""
         return variables_of(self._isam.calculateEstimate())
 
 
 def solve_batch(
     factors: Iterable[gtsam.NonlinearFactor], start: Variables
 ) -> tuple[Variables, float]:
-    """From scratch, by Levenberg-Marquardt from `start`: the variables, and sum |error / sigma|^2
-    there. Raises RuntimeError as `update`."""
+    """Return the variables and sum |error / sigma|^2 of a batch solution.
+
+    It is computed by Levenberg-Marquardt from `start`.
+
+    Raises:
+        RuntimeError: The factors do not determine all variables.
+    """
     graph = graph_of(factors)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-7)
@@ -63,6 +71,7 @@ def solve_batch(
 
 
 def graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    """Return the factors as a graph of gtsam."""
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
         graph.add(factor)
@@ -70,6 +79,7 @@ def graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorG
 
 
 def values_of(variables: Variables) -> gtsam.Values:
+    """Return variables as values of gtsam."""
     values = gtsam.Values()
     for key, value in variables.items():
         values.insert(key, gtsam.Pose3(value) if value.ndim == 2 else value)
@@ -77,7 +87,10 @@ def values_of(variables: Variables) -> gtsam.Values:
 
 
 def variables_of(values: gtsam.Values) -> Variables:
-    """Keyframes have smaller keys than points, and both come in the order of their keys."""
+    """Return values of gtsam as variables.
+
+    Keyframes have smaller keys than points, and gtsam returns both in the order of their keys.
+    """
     rows = gtsam.utilities.extractPose3(values).reshape(-1, 12)
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
@@ -86,4 +99,5 @@ def variables_of(values: gtsam.Values) -> Variables:
 
 
 def point_key(landmark: int) -> int:
+    """Return the key of a landmark's variable."""
     return gtsam.symbol("o", landmark)
