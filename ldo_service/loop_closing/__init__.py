@@ -1,8 +1,8 @@
-"""Recognising places: subgraphs of keyframes, what they hold, and whether two of them are one.
+"""Loop closing: subgraphs of keyframes, their descriptors, and the verification of loop candidates.
 
-Coarse: `place_database` compares histograms of names, of their layout and of visual words.
-Fine: `verification` finds the pose between two keyframes and refuses it wherever anything speaks
-against it. Paper, III.C; a false closure costs more than a missed one.
+Coarse step: `place_database` compares histograms of labels, of their layout and of visual words.
+Fine step: `verification` estimates the pose between two keyframes and rejects it on any
+contradiction. Paper, III.C; a false closure costs more than a missed one.
 """
 
 from .loop_detector import LoopCandidateResult, LoopDetector, LoopsConfig

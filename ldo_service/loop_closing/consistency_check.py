@@ -1,7 +1,7 @@
-"""What the map says of a pose: how far odometry may have drifted, and whether a twin fits as well.
+"""Consistency of loop hypotheses with the map: plausible drift and perceptual aliasing.
 
-Rooms are furnished alike, and no image tells them apart; where the camera went does. Conventions:
-`ldo_service.geometry`.
+Rooms with the same furniture look alike in images; the path of the camera distinguishes them.
+Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,37 +20,47 @@ from .verification import LoopHypothesis
 
 @dataclass(frozen=True, slots=True)
 class ConsistencyCheckConfig:
-    drift_m: float = 0.5  # that a loop may close in any case, and
-    drift: float = 0.1  # m for each m of the way since: ten times what depth cameras drift
-    turn_rad: float = 0.35  # likewise of the heading, and
-    turn_rad_per_m: float = 0.02  # 1.1 degrees for each m
-    view_rad: float = 1.5  # between cameras that see one place, beyond the drift: a view's width
-    view_depths: float = 2.0  # median depths between them, likewise
-    rival_inliers: float = 0.5  # of the best: a candidate with more that says
-    rival_rad: float = 1.0  # the camera is this far elsewhere (57 degrees, or a median depth)
+    """Limits on drift, view change and ambiguity of loop hypotheses."""
+
+    drift_m: float = 0.5  # Allowed position drift on any path.
+    drift: float = 0.1  # Additional drift per meter of path; ten times the drift of depth cameras.
+    turn_rad: float = 0.35  # Allowed rotation drift on any path.
+    turn_rad_per_m: float = 0.02  # Additional rotation drift per meter of path; 1.1 degrees.
+    # Maximum rotation between cameras that see one place, beyond the drift: the width of a view.
+    view_rad: float = 1.5
+    view_depths: float = 2.0  # Maximum distance between them beyond the drift, in median depths.
+    # A hypothesis is ambiguous if another one has this fraction of its inliers and differs by more
+    # than rival_rad: 57 degrees, or one median depth.
+    rival_inliers: float = 0.5
+    rival_rad: float = 1.0
 
     def __post_init__(self) -> None:
         if min(getattr(self, name) for name in self.__slots__) < 0 or self.rival_inliers > 1:
             raise ConfigError(
-                named(self, *self.__slots__)
-                + ": each must be at least 0, and rival_inliers at most 1."
+                named(self, *self.__slots__) + " must be at least 0, and rival_inliers at most 1."
             )
 
 
 class ConsistencyChecker:
-    """Judges by poses of the keyframes that are known; `joined` are submaps, each with the older
-    one whose frame it is in. Of two submaps that are apart nothing is known."""
+    """Check of loop hypotheses against the known keyframe poses.
+
+    It cannot check hypotheses between submaps that are not merged, as their relative pose is
+    unknown.
+    """
 
     def __init__(
         self, poses: KeyframePoses, joined: Mapping[int, int], config: ConsistencyCheckConfig
     ) -> None:
+        """Check against `poses`; `joined` maps each merged submap to the older one."""
         self._poses, self._joined, self._config = poses, joined, config
 
     def possible_matches(
         self, old: Sequence[SubgraphKeyframe], new: SubgraphKeyframe
     ) -> np.ndarray:
-        """[S] bool: which of S views a keyframe may show again, wherever it looks: all but those
-        that are farther or turned more than drift and the width of a view explain."""
+        """Return which of S stored views a keyframe may show again, [S] bool.
+
+        A view is excluded if its distance or rotation exceeds the drift plus the width of a view.
+        """
         if new.keyframe not in self._poses:
             return np.ones(len(old), bool)
         root = self._root(new.place.submap)
@@ -72,7 +82,7 @@ class ConsistencyChecker:
         return may
 
     def check_drift(self, proposal: LoopHypothesis) -> LoopHypothesis:
-        """Refused where no drift since then explains it."""
+        """Return a hypothesis, rejected if the drift since then cannot explain it."""
         old, new = proposal.old, proposal.new
         if proposal.rejected_reason or not self._is_known(old, new):
             return proposal
@@ -87,7 +97,10 @@ class ConsistencyChecker:
         return proposal
 
     def reject_aliased(self, proposals: Sequence[LoopHypothesis]) -> list[LoopHypothesis]:
-        """Those refused whose view another place far elsewhere explains nearly as well."""
+        """Return the hypotheses; ambiguous ones are rejected.
+
+        One is ambiguous if another place far away explains the view nearly as well.
+        """
         return [
             replace(proposal, rejected_reason="ambiguous: another place fits as well")
             if not proposal.rejected_reason
@@ -107,19 +120,19 @@ class ConsistencyChecker:
         return apart_rad > self._config.rival_rad
 
     def _T_map(self, proposal: LoopHypothesis, new: SubgraphKeyframe) -> np.ndarray:
-        """Where a keyframe of the new subgraph is [4, 4], as a proposal says."""
+        """Return T_map_keyframe [4, 4] of a keyframe of the new subgraph by a hypothesis."""
         T_new_odom = se3.inverse(proposal.new.place.T_odom_keyframe)
         T_map_newodom = self._poses[proposal.old.keyframe] @ proposal.T_old_new @ T_new_odom
         return T_map_newodom @ new.place.T_odom_keyframe
 
     def T_old_new(self, old: SubgraphKeyframe, new: SubgraphKeyframe) -> np.ndarray | None:
-        """[4, 4] as the map has them; None where it does not say."""
+        """Return the relative pose [4, 4] of two keyframes in the map, or None if it is unknown."""
         if not self._is_known(old, new):
             return None
         return se3.inverse(self._poses[old.keyframe]) @ self._poses[new.keyframe]
 
     def _is_known(self, old: SubgraphKeyframe, new: SubgraphKeyframe) -> bool:
-        """Whether the map says where both are to each other."""
+        """Return whether the relative pose of two keyframes is known."""
         if old.keyframe not in self._poses or new.keyframe not in self._poses:
             return False
         return self._root(old.place.submap) == self._root(new.place.submap)
@@ -130,13 +143,13 @@ class ConsistencyChecker:
     def _drift(
         self, old: SubgraphKeyframe, new: SubgraphKeyframe, T_old_new: np.ndarray
     ) -> tuple[float, float]:
-        """m and rad between where a pose and the map have the new keyframe."""
+        """Return the difference in m and rad between a measured pose and the map."""
         T_map_new = self._poses[old.keyframe] @ T_old_new
         T_gap = se3.inverse(T_map_new) @ self._poses[new.keyframe]
         return float(np.linalg.norm(T_gap[:3, 3])), se3.rotation_angle(T_gap)
 
     def _limits(self, old: SubgraphKeyframe, new: SubgraphKeyframe) -> tuple[float, float]:
-        """m and rad of drift between them."""
+        """Return the maximum drift between two keyframes in m and rad."""
         way_m, config = abs(new.path_m - old.path_m), self._config
         return (
             config.drift_m + config.drift * way_m,

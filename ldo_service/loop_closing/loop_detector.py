@@ -1,6 +1,6 @@
-"""Loop detection: keyframes in, places that were seen before out.
+"""Loop detection: takes keyframes and returns verified loop candidates.
 
-Visual words are clusters of ORB features, learned from the first images on.
+Visual words are clusters of ORB features that are learned online, from the first image on.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -31,38 +31,46 @@ from .subgraph import (
 )
 from .verification import LoopHypothesis, VerificationConfig, VerificationResult, Verifier
 
-BYTES = 32  # of an ORB descriptor
-LOOP_MIN_INLIERS = 12  # The tracker needs 15: a closure is verified by surfaces and by the graph.
+BYTES = 32  # Length of an ORB descriptor.
+# The tracker needs 15; a closure is also verified by surfaces and by the pose graph.
+LOOP_MIN_INLIERS = 12
 BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class VisualWordsConfig:
-    count: int = 1024  # 4 kB of counts a subgraph; 512 find 2 % less on kitchen and flat, 2048 no
-    # more
-    apart_bits: int = 64  # of 256: a feature farther from every word becomes one
-    learned_at_once: int = 64  # of one image, so that many images have a part in the words
+    """Parameters of the visual words."""
+
+    # Maximum words: 4 kB of counts per subgraph. 512 find 2 % fewer loops on kitchen and flat, 2048
+    # no more.
+    count: int = 1024
+    # A feature that differs from every word in more of its 256 bits becomes a word.
+    apart_bits: int = 64
+    # Maximum new words per image, so that many images contribute words.
+    learned_at_once: int = 64
 
     def __post_init__(self) -> None:
         if min(self.count, self.learned_at_once) < 1 or not 0 <= self.apart_bits < 8 * BYTES:
             raise ConfigError(
                 named(self, "count", "apart_bits", "learned_at_once")
-                + ": counts must be at least 1, apart_bits within 0..255."
+                + ": count and learned_at_once must be at least 1, apart_bits must be within "
+                "0..255."
             )
 
 
 class VisualWords:
-    """Descriptors that stand for those nearest to them: leaders, that never change or go.
+    """Vocabulary of descriptors; each word represents the features that are nearest to it.
 
-    The same images in the same order give the same words.
+    Words never change and are never removed. The same images in the same order give the same words.
     """
 
     def __init__(self, config: VisualWordsConfig, words: np.ndarray | None = None) -> None:
+        """Start with `words` [n, 32], or without words."""
         self._config = config
         self.words = np.zeros((0, BYTES), np.uint8) if words is None else words
 
     def learn(self, descriptors: np.ndarray) -> None:
-        """Take what is far from every word among descriptors [N, 32], up to the limits."""
+        """Add descriptors [N, 32] that are far from every word, up to the limits."""
         room = min(self._config.count - len(self.words), self._config.learned_at_once)
         if room <= 0 or not len(descriptors):
             return
@@ -76,14 +84,14 @@ class VisualWords:
             self.words = np.concatenate([self.words, descriptors[fresh]])
 
     def histogram(self, descriptors: np.ndarray) -> np.ndarray:
-        """[count] float32: how many descriptors [N, 32] are nearest to each word."""
+        """Return how many descriptors [N, 32] are nearest to each word, [count] float32."""
         if not len(descriptors) or not len(self.words):
             return np.zeros(self._config.count, np.float32)
         nearest = [m.trainIdx for m in _matches(descriptors, self.words)]
         return np.bincount(nearest, minlength=self._config.count).astype(np.float32)
 
     def _distances(self, descriptors: np.ndarray) -> np.ndarray:
-        """[N] bits to the nearest word; 256 while there is none."""
+        """Return the distances [N] to the nearest word in bits; 256 while there is no word."""
         if not len(self.words):
             return np.full(len(descriptors), 8 * BYTES)
         return np.array([int(m.distance) for m in _matches(descriptors, self.words)])
@@ -95,8 +103,10 @@ def _matches(descriptors: np.ndarray, words: np.ndarray) -> tuple[cv2.DMatch, ..
 
 @dataclass(frozen=True, slots=True)
 class LoopsConfig:
-    # two_stage: names and images, then features or landmarks and the surfaces. The others are for
-    # comparison: geometric knows no names, semantic no images (III.C's landmarks alone).
+    """Parameters of loop detection."""
+
+    # two_stage: labels and images, then features or landmarks, and surfaces. The others are for
+    # comparison: geometric uses no labels, semantic no images (only the landmarks of III.C).
     stages: Stages = "two_stage"
     subgraphs: SubgraphConfig = field(default_factory=SubgraphConfig)
     words: VisualWordsConfig = field(default_factory=VisualWordsConfig)
@@ -113,13 +123,13 @@ class LoopsConfig:
     def __post_init__(self) -> None:
         if self.stages not in ("two_stage", "semantic", "geometric"):
             raise ConfigError(
-                f"stages={self.stages!r} must be 'two_stage', 'semantic' or 'geometric'."
+                f"{named(self, 'stages')} must be 'two_stage', 'semantic' or 'geometric'."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoopCandidateResult:
-    """A candidate, with all its scores; a closure unless it was refused."""
+    """Loop candidate with all its scores."""
 
     new: Subgraph
     likeness: RetrievalMatch
@@ -127,30 +137,33 @@ class LoopCandidateResult:
 
     @property
     def closure(self) -> RelativePose | None:
+        """The verified loop closure, or None if the candidate was rejected."""
         return self.check.closure
 
 
 class LoopDetector:
-    """Cuts keyframes into subgraphs and looks for each new one among the old."""
+    """Detector that groups keyframes into subgraphs and searches earlier ones for each new one."""
 
     def __init__(self, config: LoopsConfig) -> None:
+        """Start with an empty place database."""
         self._config = config
         self._words = VisualWords(config.words)
         self._memory = PlaceDatabase(config.words.count, config.stages, config.retrieval)
-        self._open: list[SubgraphKeyframe] = []  # of the subgraph that is not whole yet
+        self._open: list[SubgraphKeyframe] = []  # Keyframes of the unfinished subgraph.
         self._path_m = 0.0
-        self._last: tuple[int, np.ndarray] | None = None  # submap and T_odom_keyframe
+        self._last: tuple[int, np.ndarray] | None = None  # Submap and T_odom_keyframe.
         self._verifier = Verifier(
             config.pyramid, config.align, config.features, config.verification
         )
 
     @property
     def subgraphs(self) -> Sequence[Subgraph]:
+        """Stored subgraphs, in the order of their keyframes."""
         return self._memory.subgraphs
 
     @property
     def is_open(self) -> bool:
-        """Whether a subgraph was begun."""
+        """True if there is an unfinished subgraph."""
         return bool(self._open)
 
     def add(
@@ -162,11 +175,15 @@ class LoopDetector:
         poses: KeyframePoses,
         joined: Mapping[int, int],
     ) -> list[LoopCandidateResult]:
-        """Take a keyframe, and with it perhaps the last of a subgraph: then what it was like.
+        """Add a keyframe; return the loop candidates if it completes a subgraph.
 
-        sightings   None where no detector looked
-        poses       T_map_keyframe of the keyframes kept; those that are not known are not judged by
-        joined      submaps, each with the older one whose frame it is in
+        Args:
+            place: Record of the keyframe, without pixels of dynamic classes.
+            frame: Frame number of the camera.
+            stamp_ns: Stamp of the keyframe.
+            sightings: Detections as points; None if no detector ran.
+            poses: T_map_keyframe of the stored keyframes; unknown ones are not checked.
+            joined: Merged submaps, each with the older one.
         """
         findings: list[LoopCandidateResult] = []
         if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
@@ -178,8 +195,11 @@ class LoopDetector:
         return findings
 
     def flush(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[LoopCandidateResult]:
-        """As `add`, when no keyframe follows: what was begun is whole, if it is long enough. A walk
-        often ends where it began, and what was seen last is where a lost camera is."""
+        """Return the loop candidates of the unfinished subgraph if it is long enough.
+
+        It is called when no keyframe follows. A run often ends where it began, and after a loss the
+        newest keyframes are near the lost camera.
+        """
         if len(self._open) < self._config.subgraphs.least:
             return []
         return self._completed(poses, joined)
@@ -207,7 +227,7 @@ class LoopDetector:
         return SubgraphKeyframe(place, frame, stamp_ns, self._path_m, looked, sightings, words)
 
     def _step_m(self, place: KeyframeRecord) -> float:
-        """From the keyframe before; how far a lost camera went, nobody knows."""
+        """Return the distance from the previous keyframe; 0 after a loss, as it is unknown then."""
         if self._last is None or self._last[0] != place.submap:
             return 0.0
         return float(np.linalg.norm(place.T_odom_keyframe[:3, 3] - self._last[1][:3, 3]))
@@ -234,7 +254,7 @@ class LoopDetector:
     def _findings(
         self, new: Subgraph, poses: KeyframePoses, joined: Mapping[int, int]
     ) -> list[LoopCandidateResult]:
-        """Coarse, then fine: the surest candidate that nothing speaks against closes the loop."""
+        """Return all candidates; the first verified one, by number of inliers, closes the loop."""
         known = ConsistencyChecker(poses, joined, self._config.plausibility)
         is_possible = known.possible_matches(
             [old.views[0] for old in self.subgraphs], new.views[-1]
@@ -252,8 +272,11 @@ class LoopDetector:
         return [LoopCandidateResult(new, like, checks[index]) for index, like in enumerate(likely)]
 
     def _proposal(self, old: Subgraph, new: Subgraph, known: ConsistencyChecker) -> LoopHypothesis:
-        """Features first: they place a camera to centimetres, landmarks to decimetres. The map
-        last: what it says is judged by itself."""
+        """Return the hypothesis for a candidate, or a rejected one.
+
+        Features come first: their poses are accurate to centimeters, those of landmarks to
+        decimeters. The map comes last, as its poses also need to be confirmed by images.
+        """
         verifier, stages = self._verifier, self._config.stages
         if stages == "semantic":
             return verifier.hypothesis_from_landmarks(old, new)
@@ -277,7 +300,7 @@ class LoopDetector:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """`subgraphs` and `views` are lists of parts that never change; the rest is small."""
+        """Return the state; parts in `subgraphs` and `views` never change, the rest is small."""
         return {
             "subgraphs": [subgraph.pack() for subgraph in self._memory.subgraphs],
             "views": [view.pack() for view in self._open],
@@ -286,6 +309,7 @@ class LoopDetector:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a snapshot."""
         self.__init__(self._config)
         for packed in state["subgraphs"]:
             self._memory.add(Subgraph.unpack(packed))

@@ -1,4 +1,4 @@
-"""What a detector saw in a few keyframes, as points that have names. `ldo_service.geometry`."""
+"""Detections of a few keyframes as labelled points. Conventions: `ldo_service.geometry`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,25 +12,29 @@ from ldo_service.regions.foreground import ForegroundConfig, foreground, surface
 from ldo_service.semantics.distributions import dense, divergence, entropy, sparse
 from ldo_service.semantics.gaussian_labels import MAX_LABELS, OTHER
 
-LAYOUT_WORDS = 512  # pairs of names and their distances are spread over so many
-DISTANCE_BIN_M = 0.5  # of the distances; each counts in the two bins that it lies between
-HIDDEN_NAMES = OTHER + 1  # background and other say nothing of a place
+LAYOUT_WORDS = 512  # Bins that pairs of labels and their distances are hashed to.
+DISTANCE_BIN_M = 0.5  # Bin width of the distances; each one counts in its two nearest bins.
+HIDDEN_NAMES = OTHER + 1  # Background and other do not describe a place.
 
 
 @dataclass(frozen=True, slots=True)
 class LandmarkConfig:
+    """Parameters of the landmarks of a subgraph; III.C refers to the paper."""
+
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
-    same_m: float = 0.4  # sightings of one name nearer to each other are of one thing: half a chair
-    max_divergence: float = 0.3  # nats, either way, of landmarks that may be one (III.C)
-    reach_m: float = 0.25  # how far matched landmarks may be apart: boxes show another side
-    min_inliers: int = 4  # three points fix a pose and confirm nothing
-    iterations: int = 200  # of RANSAC
+    # Detections with the same label that are closer belong to one object: half a chair.
+    same_m: float = 0.4
+    # Maximum KL divergence of matching landmarks in both directions, nats (III.C).
+    max_divergence: float = 0.3
+    # Maximum distance of matched landmarks; the boxes may show different sides of an object.
+    reach_m: float = 0.25
+    min_inliers: int = 4  # Three points determine a pose but do not confirm it.
+    iterations: int = 200  # Iterations of RANSAC.
 
     def __post_init__(self) -> None:
         if min(self.same_m, self.reach_m, self.max_divergence) <= 0:
             raise ConfigError(
-                named(self, "same_m", "max_divergence", "reach_m")
-                + ": same_m, reach_m and max_divergence must be positive."
+                named(self, "same_m", "max_divergence", "reach_m") + " must be positive."
             )
         if self.min_inliers < 4 or self.iterations < 1:
             raise ConfigError(
@@ -41,8 +45,14 @@ class LandmarkConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DetectionPoints:
-    """What was detected in one keyframe: labels [K] uint8, scores [K] float32, 0..1, and p_camera
-    [K, 3] float32 m, NaN where no depth was measured."""
+    """Detections in one keyframe as points.
+
+    Attributes:
+        labels: Label indices, [K] uint8.
+        scores: Scores 0..1, [K] float32.
+        p_camera: Points in camera coordinates, [K, 3] float32, meters; NaN where no depth was
+            measured.
+    """
 
     labels: np.ndarray
     scores: np.ndarray
@@ -50,11 +60,12 @@ class DetectionPoints:
 
     @staticmethod
     def none() -> "DetectionPoints":
+        """Return no detections."""
         nowhere = np.zeros((0, 3), np.float32)
         return DetectionPoints(np.zeros(0, np.uint8), np.zeros(0, np.float32), nowhere)
 
     def histogram(self) -> np.ndarray:
-        """[C] float32: the scores of each name, added up."""
+        """Return the sum of the scores of each label, [C] float32."""
         counts = np.bincount(self.labels, self.scores, MAX_LABELS).astype(np.float32)
         counts[:HIDDEN_NAMES] = 0
         return counts
@@ -68,8 +79,16 @@ def locate_detections(
     camera: Camera,
     config: LandmarkConfig,
 ) -> DetectionPoints:
-    """Boxes [K, 4] (x0 y0 x1 y1, px) in a depth image [H, W]: where their foreground is, in the
-    median."""
+    """Return detections as points: the median of the foreground of each box.
+
+    Args:
+        labels: Label indices, [K].
+        scores: Scores 0..1, [K].
+        boxes: x0, y0, x1, y1 in pixels of the depth image, [K, 4].
+        depth_m: Depth, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of the depth image.
+        config: Parameters of the landmarks.
+    """
     if not len(labels):
         return DetectionPoints.none()
     pieces = surfaces(depth_m, camera, config.foreground)
@@ -85,8 +104,13 @@ def locate_detections(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SubgraphLandmarks:
-    """Points [K, 3] m in the odometry frame of a submap, with what they are: sparse distributions,
-    labels [K, 8] uint8 and weights [K, 8] float32."""
+    """Landmarks of a subgraph.
+
+    Attributes:
+        p_odom: Points in the odometry frame of the submap, [K, 3], meters.
+        labels: Labels of the sparse distributions, [K, 8] uint8.
+        weights: Weights of these labels, [K, 8] float32.
+    """
 
     p_odom: np.ndarray
     labels: np.ndarray
@@ -97,28 +121,34 @@ class SubgraphLandmarks:
 
     @property
     def distributions(self) -> np.ndarray:
-        """[K, C] float64."""
+        """Dense distributions, [K, C] float64."""
         return dense(self.labels, self.weights)
 
     @property
     def names(self) -> np.ndarray:
-        """[K] int64: what each was called, however unsure the detector was."""
+        """Likeliest detector label of each landmark, however small its score, [K] int64."""
         said = np.where(self.labels < HIDDEN_NAMES, -1, self.weights).argmax(axis=1)
         return self.labels[np.arange(len(self)), said].astype(np.int64)
 
     def pack(self) -> dict[str, Any]:
+        """Return the arrays by name."""
         return {"p_odom": self.p_odom, "labels": self.labels, "weights": self.weights}
 
 
 def cluster_landmarks(
     seen: Sequence[DetectionPoints], T_odom_camera: Sequence[np.ndarray], config: LandmarkConfig
 ) -> SubgraphLandmarks:
-    """The sightings of a few keyframes, those of one thing taken together.
+    """Return the landmarks of a few keyframes: detections of one object are merged.
 
-    A landmark's distribution is the mean over its sightings, each the score on its name and the
-    rest on `other`; its place is the mean.
+    The distribution of a landmark is the mean over its detections. Each has the score on its label
+    and the rest on `other`. The position is the mean, too.
+
+    Args:
+        seen: Detections of each keyframe.
+        T_odom_camera: Pose of each keyframe in the odometry frame, [4, 4].
+        config: Parameters of the landmarks.
     """
-    places: list[np.ndarray] = []  # sums
+    places: list[np.ndarray] = []  # Sums of the points.
     masses: list[np.ndarray] = []
     counts: list[int] = []
     names: list[int] = []
@@ -150,7 +180,7 @@ def _same(
     names: Sequence[int],
     limit_m: float,
 ) -> int:
-    """The nearest landmark of that name; the number of all where none is near."""
+    """Return the nearest landmark with this label, or the number of landmarks if none is near."""
     gaps_m = [
         float(np.linalg.norm(place / count - p_odom)) if name == label else np.inf
         for place, count, name in zip(places, counts, names, strict=True)
@@ -160,10 +190,10 @@ def _same(
 
 
 def layout_histogram(landmarks: SubgraphLandmarks) -> np.ndarray:
-    """[512] float32: which two names are how far apart, for each pair of landmarks.
+    """Return a histogram of pairs of labels and their distances, [512] float32.
 
-    Unlike the names alone it tells a row of chairs from chairs about a table; it knows no
-    directions, so that it is the same from every side.
+    Unlike the labels alone, it distinguishes a row of chairs from chairs around a table. It has no
+    directions, so it is the same from every viewpoint.
     """
     out = np.zeros(LAYOUT_WORDS, np.float32)
     first, second = np.triu_indices(len(landmarks), 1)
@@ -182,25 +212,28 @@ def layout_histogram(landmarks: SubgraphLandmarks) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LandmarkAgreement:
-    """How well landmarks of two subgraphs go together that lie in one place."""
+    """Agreement of the landmarks of two subgraphs that are at one place."""
 
-    count: int  # that are of one kind
-    contradicted: int  # of the new ones, those where only things of other names were
-    divergence: float  # nats, mean over those of one kind
-    entropy: float  # nats, likewise, of both
+    count: int  # Pairs with matching distributions.
+    contradicted: int  # New landmarks where all old ones nearby have other labels.
+    divergence: float  # Mean KL divergence over the matching pairs, nats.
+    entropy: float  # Mean entropy over both landmarks of the matching pairs, nats.
 
 
 def possible_pairs(
     old: SubgraphLandmarks, new: SubgraphLandmarks, config: LandmarkConfig
 ) -> np.ndarray:
-    """Indices [M, 2] of landmarks that may be one: KL below 0.3 nats both ways (III.C)."""
+    """Return the index pairs [M, 2] of landmarks with a KL divergence below the limit both ways.
+
+    The limit is 0.3 nats (III.C).
+    """
     return np.argwhere(_divergences(old, new) < config.max_divergence)
 
 
 def compare_landmarks(
     old: SubgraphLandmarks, new: SubgraphLandmarks, pairs: np.ndarray, contradicted: int = 0
 ) -> LandmarkAgreement:
-    """What is recorded of pairs [M, 2]."""
+    """Return the agreement of matched landmarks, given as index pairs [M, 2]."""
     if not len(pairs):
         return LandmarkAgreement(0, contradicted, 0.0, 0.0)
     gaps = _divergences(old, new)[pairs[:, 0], pairs[:, 1]]
@@ -212,7 +245,14 @@ def compare_landmarks(
 def compare_landmarks_at(
     old: SubgraphLandmarks, new: SubgraphLandmarks, T_old_new: np.ndarray, config: LandmarkConfig
 ) -> LandmarkAgreement:
-    """The landmarks that a motion between the two odometry frames [4, 4] brings together."""
+    """Return the agreement of landmarks that are near each other after a motion.
+
+    Args:
+        old: Landmarks of the old subgraph.
+        new: Landmarks of the new subgraph.
+        T_old_new: Transform from the new odometry frame to the old one, [4, 4].
+        config: Parameters of the landmarks.
+    """
     if not len(old) or not len(new):
         return LandmarkAgreement(0, 0, 0.0, 0.0)
     gaps_m = np.linalg.norm(old.p_odom[:, None] - se3.transform(T_old_new, new.p_odom), axis=2)
@@ -220,13 +260,13 @@ def compare_landmarks_at(
     alike = near & (_divergences(old, new) < config.max_divergence)
     both = np.flatnonzero(alike.any(axis=0))
     nearest = np.where(alike, gaps_m, np.inf)[:, both].argmin(axis=0)
-    # one name, said with less confidence, is no other thing
+    # The same label with a lower confidence is no contradiction.
     agrees = alike | (near & (old.names[:, None] == new.names))
     contradicted = int(np.count_nonzero(near.any(axis=0) & ~agrees.any(axis=0)))
     return compare_landmarks(old, new, np.column_stack([nearest, both]), contradicted)
 
 
 def _divergences(a: SubgraphLandmarks, b: SubgraphLandmarks) -> np.ndarray:
-    """[K, L] nats, the larger of both ways."""
+    """Return the larger KL divergence of both directions, [K, L] nats."""
     p, q = a.distributions[:, None], b.distributions[None]
     return np.maximum(divergence(p, q), divergence(q, p))

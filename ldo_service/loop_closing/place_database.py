@@ -1,6 +1,6 @@
-"""Place database: all subgraphs so far, and those that a new one may show again (coarse stage).
+"""Place database: all subgraphs so far, and the search for the place of a new one (coarse step).
 
-Histograms are compared by TF-IDF, with the weights of words learned from all that is known.
+Histograms are compared by TF-IDF, with weights of words learned from all stored subgraphs.
 """
 
 from dataclasses import dataclass
@@ -17,21 +17,22 @@ from .subgraph import Subgraph
 
 
 class Histograms:
-    """Rows [N, W] float32 of counts, in the order they came; the document frequencies go along.
+    """Table of count histograms [N, W] float32, with document frequencies.
 
     similarity of rows a, b = cos(a * idf, b * idf),  idf_w = log(1 + N / n_w)
 
-    n_w of the N rows hold word w (Sivic and Zisserman 2003; the 1 keeps a word that all of them
-    hold from counting nothing while there are few rows). Sums run in a fixed order, on one thread.
+    n_w of the N rows contain word w (Sivic and Zisserman 2003). The 1 keeps a positive weight for
+    words in all rows while there are few rows. Sums run in a fixed order, on one thread.
 
     >>> known = Histograms(2)
     >>> known.add(np.array([1.0, 0.0]))
     >>> known.add(np.array([1.0, 1.0]))
-    >>> known.idf().round(3).tolist()  # log(1 + 2 / 2), log(1 + 2 / 1)
+    >>> known.idf().astype(float).round(3).tolist()  # log(1 + 2 / 2), log(1 + 2 / 1)
     [0.693, 1.099]
     """
 
     def __init__(self, words: int) -> None:
+        """Create an empty table for histograms of a number of words."""
         self._rows = np.zeros((16, words), np.float32)
         self._count = 0
         self._frequency = np.zeros(words, np.int64)
@@ -41,10 +42,11 @@ class Histograms:
 
     @property
     def rows(self) -> np.ndarray:
+        """Histograms, [N, W]."""
         return self._rows[: self._count]
 
     def add(self, row: np.ndarray) -> None:
-        """Append a row [W]; capacity doubles."""
+        """Append a histogram [W]; the capacity doubles if needed."""
         if self._count == len(self._rows):
             self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
         self._rows[self._count] = row
@@ -52,16 +54,20 @@ class Histograms:
         self._frequency += row > 0
 
     def remove(self, index: int) -> None:
+        """Remove a row; later rows move up."""
         self._frequency -= self._rows[index] > 0
         self._rows[index : self._count - 1] = self._rows[index + 1 : self._count]
         self._count -= 1
 
     def idf(self) -> np.ndarray:
-        """[W] float32; words that nobody holds weigh most."""
+        """Return the weights of the words, [W] float32; words in no row weigh most."""
         return np.log1p(self._count / np.maximum(self._frequency, 1)).astype(np.float32)
 
     def cosines(self, row: np.ndarray) -> np.ndarray:
-        """[N] float32 in 0..1: how like each row a row [W] is; 0 where either is empty."""
+        """Return the similarity 0..1 of a histogram [W] with each row, [N] float32.
+
+        It is 0 if one of the two is empty.
+        """
         weight = self.idf() ** 2
         product = np.einsum("nw,w->n", self.rows, weight * row.astype(np.float32))
         squares = np.einsum("nw,w->n", self.rows**2, weight)
@@ -75,46 +81,50 @@ Stages = Literal["two_stage", "semantic", "geometric"]
 
 @dataclass(frozen=True, slots=True)
 class RetrievalConfig:
-    exclude_frames: int = 100  # camera frames, not keyframes: what is nearer is no loop (III.C)
-    candidates: int = 5  # K (III.C)
-    min_similarity: float = 0.75  # theta_loop (III.C), of the names
-    # Cosine of the visual words from which two places are compared whatever they hold: a detector
-    # that misses two things of five is below theta. Above 1: never, as the paper has it.
+    """Parameters of the search; III.C refers to the paper."""
+
+    exclude_frames: int = 100  # Camera frames, not keyframes; nearer subgraphs are no loop (III.C).
+    candidates: int = 5  # K, the maximum number of candidates (III.C).
+    min_similarity: float = 0.75  # theta_loop, the minimum cosine of the label histograms (III.C).
+    # Minimum cosine of the visual words at which labels are not required: a detector that misses
+    # two objects of five is below theta_loop. Above 1: always require labels, as in the paper.
     min_appearance: float = 0.35
-    count: int = 1000  # subgraphs kept; then the path is thinned
+    count: int = 1000  # Maximum stored subgraphs; beyond, the path is thinned.
 
     def __post_init__(self) -> None:
         if self.exclude_frames < 0 or self.candidates < 1 or self.count < 3:
             raise ConfigError(
                 named(self, "exclude_frames", "candidates", "count")
-                + ": exclude_frames must not be negative, candidates at least 1 and count 3."
+                + ": exclude_frames must not be negative, candidates must be at least 1 and count "
+                "at least 3."
             )
         if not (0 <= self.min_similarity <= 1 and self.min_appearance >= 0):
             raise ConfigError(
                 named(self, "min_similarity", "min_appearance")
-                + ": min_similarity must be within 0..1."
+                + ": min_similarity must be within 0..1, min_appearance must not be negative."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RetrievalMatch:
-    """An old subgraph that a new one is like."""
+    """Stored subgraph that is similar to a new one."""
 
     subgraph: Subgraph
-    similarity: float  # cosine of the names
-    layout: float  # cosine of which names are how far apart
-    appearance: float  # cosine of the visual words
-    score: float  # what candidates are ranked by
+    similarity: float  # Cosine of the label histograms.
+    layout: float  # Cosine of the layout histograms.
+    appearance: float  # Cosine of the visual-word histograms.
+    score: float  # Score that candidates are ranked by.
 
 
 class PlaceDatabase:
-    """Subgraphs in the order they came, with tables of their histograms.
+    """Stored subgraphs in the order of insertion, with tables of their histograms.
 
-    Beyond `count` the one goes whose neighbours along the path are nearest to each other: a month
-    in one building thins the path evenly, and no stretch of it is forgotten as a whole.
+    Beyond `count` subgraphs, the one with the nearest neighbors along the path is removed. So a
+    month in one building thins the path evenly, and no part of it is lost completely.
     """
 
     def __init__(self, words: int, stages: Stages, config: RetrievalConfig) -> None:
+        """Create an empty database for histograms of `words` visual words."""
         self._stages, self._config = stages, config
         self.subgraphs: list[Subgraph] = []
         self._names = Histograms(MAX_LABELS)
@@ -125,6 +135,7 @@ class PlaceDatabase:
         return len(self.subgraphs)
 
     def add(self, subgraph: Subgraph) -> None:
+        """Store a subgraph; remove one if there are too many."""
         self.subgraphs.append(subgraph)
         self._names.add(subgraph.names)
         self._layout.add(subgraph.layout)
@@ -140,8 +151,12 @@ class PlaceDatabase:
             table.remove(index)
 
     def query(self, new: Subgraph, is_possible: np.ndarray) -> list[RetrievalMatch]:
-        """At most K old subgraphs that may show the same place, the likeliest first, of those that
-        are possible [S] bool."""
+        """Return at most K stored subgraphs that may show the same place, the likeliest first.
+
+        Args:
+            new: Subgraph to search for.
+            is_possible: Subgraphs to consider, [S] bool.
+        """
         if not self.subgraphs:
             return []
         similarity = self._names.cosines(new.names)
@@ -165,10 +180,10 @@ class PlaceDatabase:
     def _scores(
         self, new: Subgraph, similarity: np.ndarray, layout: np.ndarray, appearance: np.ndarray
     ) -> np.ndarray:
-        """[S], 0 of those that are no candidates.
+        """Return the scores of all subgraphs, [S]; 0 for those that are no candidates.
 
-        Names decide first, how they lie and what the images look like among those alike in names;
-        images alone decide where nothing was detected.
+        Labels select the candidates; the layout and the images then rank them. Images alone decide
+        if one of the subgraphs has no detections. Similar images can also replace similar labels.
         """
         config = self._config
         looks_alike = appearance >= config.min_appearance
@@ -183,8 +198,11 @@ class PlaceDatabase:
         return np.where(tells, both, np.where(looks_alike, appearance, 0))
 
     def _are_far(self, new: Subgraph) -> np.ndarray:
-        """[S] bool: those more than `exclude_frames` before it, or after it where frames are
-        counted anew."""
+        """Return which subgraphs are more than `exclude_frames` before the new one, [S] bool.
+
+        Subgraphs more than `exclude_frames` after it also count: a restarted camera counts from 0
+        again.
+        """
         first = np.array([subgraph.first_frame for subgraph in self.subgraphs])
         last = np.array([subgraph.last_frame for subgraph in self.subgraphs])
         exclude = self._config.exclude_frames

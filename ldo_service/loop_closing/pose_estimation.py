@@ -1,4 +1,4 @@
-"""Pose estimation between two keyframes: RANSAC over correspondences, and agreement of surfaces.
+"""Pose estimation between two keyframes: RANSAC over correspondences, and consistency of depth.
 
 Conventions: `ldo_service.geometry`.
 """
@@ -11,12 +11,18 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.se3 import fit_rigid_transform
 
-SPREAD = 0.1  # m, of three points about their line: below, nothing fixes the turn about it
+# Meters; minimum spread of three points about a line, below which the rotation about it is free.
+SPREAD = 0.1
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RansacResult:
-    """T_a_b [4, 4], and which correspondences [M] agree with it."""
+    """Result of RANSAC.
+
+    Attributes:
+        T_a_b: Estimated transform, [4, 4].
+        inliers: Correspondences that agree with it, [M] bool.
+    """
 
     T_a_b: np.ndarray
     inliers: np.ndarray
@@ -30,11 +36,21 @@ def ransac_rigid(
     iterations: int,
     rng: np.random.Generator,
 ) -> RansacResult | None:
-    """The motion that most correspondences agree on, by RANSAC over triples of them.
+    """Return the rigid motion that most correspondences agree with, by RANSAC over triples.
 
-    p_a [K, 3] and p_b [L, 3] m; pairs [M, 2] of indices (a, b) that may belong together: one point
-    may be in many, and counts in the nearest alone. None where no triple is a triangle of the same
-    shape in both. The winner is fitted again to its inliers.
+    The result is fitted again to its inliers.
+
+    Args:
+        p_a: Points, [K, 3], meters.
+        p_b: Points, [L, 3], meters.
+        pairs: Indices (a, b) of possible correspondences, [M, 2]. A point may be in several pairs
+            and counts only in the nearest.
+        limit_m: Maximum distance of an inlier.
+        iterations: Number of triples.
+        rng: Source of random triples.
+
+    Returns:
+        The result, or None if no triple is a triangle of the same shape in both sets.
     """
     best: RansacResult | None = None
     if len(pairs) < 3:
@@ -53,7 +69,7 @@ def ransac_rigid(
 
 
 def _are_alike(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
-    """Whether two triangles [3, 3] have the same sides, and are no lines."""
+    """Return whether two triangles [3, 3] have the same side lengths and are not degenerate."""
     sides_a, sides_b = (np.linalg.norm(p - np.roll(p, 1, axis=0), axis=1) for p in (p_a, p_b))
     if np.abs(sides_a - sides_b).max() > 2 * limit_m:
         return False
@@ -64,6 +80,7 @@ def _are_alike(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
 def _supported(
     p_a: np.ndarray, p_b: np.ndarray, pairs: np.ndarray, T_a_b: np.ndarray, limit_m: float
 ) -> RansacResult:
+    """Return a transform with its inliers; each point counts once."""
     gaps_m = np.linalg.norm(p_a[pairs[:, 0]] - se3.transform(T_a_b, p_b[pairs[:, 1]]), axis=1)
     inliers = np.zeros(len(pairs), bool)
     used: tuple[set[int], set[int]] = set(), set()
@@ -78,32 +95,36 @@ def _supported(
 
 @dataclass(frozen=True, slots=True)
 class DepthConsistencyConfig:
-    gate_m: float = 0.1  # along the ray, beyond which two depths are of different surfaces
-    gate_share: float = 0.02  # of the depth, on top: the noise of structured light at 5 m
-    min_overlap: float = 0.2  # share of the new surface that the old keyframe sees too
-    max_rmse_m: float = 0.03  # along the normals
-    # Share of what falls into the old view and lies where that saw through: things come and go, a
-    # wrong pose puts walls into the air.
+    """Limits for the depth consistency of two keyframes."""
+
+    # Distance along the ray beyond which two depths belong to different surfaces.
+    gate_m: float = 0.1
+    # Added to gate_m as a fraction of the depth: the noise of structured light at 5 m.
+    gate_share: float = 0.02
+    # Minimum fraction of the new surface that the old keyframe also sees.
+    min_overlap: float = 0.2
+    max_rmse_m: float = 0.03  # Along the normals.
+    # Maximum fraction of the points in the old view that lie in its free space. Objects that moved
+    # cause some; a wrong pose puts walls into free space.
     max_conflict: float = 0.15
 
     def __post_init__(self) -> None:
         if min(self.gate_m, self.max_rmse_m) <= 0 or self.gate_share < 0:
             raise ConfigError(
                 named(self, "gate_m", "gate_share", "max_rmse_m")
-                + ": gate_m and max_rmse_m must be positive, gate_share not < 0."
+                + ": gate_m and max_rmse_m must be positive, gate_share must not be negative."
             )
         if not (0 <= self.min_overlap <= 1 and 0 <= self.max_conflict <= 1):
-            raise ConfigError(
-                named(self, "min_overlap", "max_conflict")
-                + ": min_overlap and max_conflict must be within 0..1."
-            )
+            raise ConfigError(named(self, "min_overlap", "max_conflict") + " must be within 0..1.")
 
 
 @dataclass(frozen=True, slots=True)
 class DepthConsistency:
-    overlap: float  # of the new surface's points, those that the old keyframe measured too
-    rmse_m: float  # of these along their normals
-    conflict: float  # of the points within the old view, those in its free space
+    """Comparison of a new surface with the depth of an old keyframe."""
+
+    overlap: float  # Fraction of the new surface's points that the old keyframe also measured.
+    rmse_m: float  # Root mean square distance of these points along their normals.
+    conflict: float  # Fraction of the points in the old view that lie in its free space.
 
 
 def check_depth_consistency(
@@ -113,13 +134,20 @@ def check_depth_consistency(
     camera: Camera,
     config: DepthConsistencyConfig,
 ) -> DepthConsistency:
-    """Points [7, N] of the new keyframe (see `Reference`) against the old depth [H, W].
+    """Compare the surface of a new keyframe with the depth of an old one.
 
-    A point p with normal n falls on a pixel whose depth makes the point q on the same ray:
+    A point p with normal n projects to a pixel whose depth gives the point q on the same ray:
 
-        |z_p - z_q| <= gate    one surface, residual n . (p - q)
-        z_p < z_q - gate       the old camera saw through it: conflict
-        z_p > z_q + gate       hidden, says nothing
+        |z_p - z_q| <= gate    same surface, residual n . (p - q)
+        z_p < z_q - gate       in the free space of the old camera: conflict
+        z_p > z_q + gate       occluded, no information
+
+    Args:
+        points: Points of the new keyframe (see `Reference`), [7, N].
+        T_old_new: Pose of the new keyframe in the old one, [4, 4].
+        old_depth_m: Depth of the old keyframe, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of the old keyframe.
+        config: Limits.
     """
     p = se3.transform(T_old_new, points[:3].T.astype(float))
     normals = points[4:7].T.astype(float) @ T_old_new[:3, :3].T

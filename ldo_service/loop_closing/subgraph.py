@@ -1,4 +1,4 @@
-"""Keyframes that follow each other, taken together: what is recognised. Paper, III.C."""
+"""Subgraphs: groups of consecutive keyframes, the unit of loop detection. Paper, III.C."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -17,45 +17,55 @@ from .object_points import DetectionPoints, SubgraphLandmarks
 
 @dataclass(frozen=True, slots=True)
 class SubgraphConfig:
-    least: int = 3  # keyframes (III.C)
-    most: int = 5  # keyframes (III.C)
-    turned_rad: float = 0.5  # rotation plus parallax from first to last, after which `least` are
-    # enough: half of what a depth camera sees is new then
-    gap_rad: float = 1.5  # likewise, from one to the next, after which a new one begins: keyframes
-    # that follow each other are 0.35 apart, unless frames were dropped
-    kept_views: int = (
-        2  # of each: 0.13 MB a view at 640x480. More found no more on flat and kitchen
-    )
+    """Size of subgraphs; III.C refers to the paper."""
+
+    least: int = 3  # Minimum keyframes (III.C).
+    most: int = 5  # Maximum keyframes (III.C).
+    # Rotation plus parallax from the first to the last keyframe that makes `least` keyframes
+    # enough. Half of the view of a depth camera is new then.
+    turned_rad: float = 0.5
+    # Rotation plus parallax between two keyframes above which a new subgraph begins. Consecutive
+    # keyframes are 0.35 rad apart, unless frames were dropped.
+    gap_rad: float = 1.5
+    # Stored keyframes per subgraph, 0.13 MB each at 640x480. More did not find more loops on flat
+    # and kitchen.
+    kept_views: int = 2
 
     def __post_init__(self) -> None:
         if not 1 <= self.kept_views <= self.most or not 1 <= self.least <= self.most:
             raise ConfigError(
                 named(self, "least", "most", "kept_views")
-                + ": 1 <= least <= most and 1 <= kept_views <= most are needed."
+                + " must satisfy 1 <= least <= most and 1 <= kept_views <= most."
             )
         if not (self.turned_rad > 0 and self.gap_rad > 0):
-            raise ConfigError(
-                named(self, "turned_rad", "gap_rad") + ": turned_rad and gap_rad must be positive."
-            )
+            raise ConfigError(named(self, "turned_rad", "gap_rad") + " must be positive.")
 
 
 @dataclass(frozen=True, eq=False)
 class SubgraphKeyframe:
-    """A keyframe as places are recognised by.
+    """Keyframe of a subgraph with its descriptors.
 
-    words [W] float32 counts of visual words; path_m how far the camera had come by then
+    Attributes:
+        place: Record of the keyframe.
+        frame: Frame number of the camera.
+        stamp_ns: Stamp of the keyframe.
+        path_m: Length of the camera path up to this keyframe.
+        has_detections: True if a detector ran.
+        sightings: Detections as points.
+        words: Counts of visual words, [W] float32.
     """
 
     place: KeyframeRecord
-    frame: int  # of the camera
+    frame: int
     stamp_ns: int
     path_m: float
-    has_detections: bool  # by a detector
+    has_detections: bool
     sightings: DetectionPoints
     words: np.ndarray
 
     @property
     def keyframe(self) -> int:
+        """Id of the keyframe."""
         return self.place.id
 
     def pack(self) -> dict[str, Any]:
@@ -69,7 +79,7 @@ class SubgraphKeyframe:
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "SubgraphKeyframe":
-        """The inverse of `pack`."""
+        """Return the keyframe that `pack` packed."""
         place, sightings = (
             KeyframeRecord.unpack(kept["place"]),
             DetectionPoints(**kept["sightings"]),
@@ -79,17 +89,28 @@ class SubgraphKeyframe:
 
 @dataclass(frozen=True, eq=False)
 class Subgraph:
-    """`views` are those kept, the oldest first.
+    """Group of consecutive keyframes of one submap, with landmarks and histograms.
 
-    names [C], layout [512] and words [W] float32 are its histograms
+    Attributes:
+        views: Stored keyframes, the oldest first.
+        keyframes: Ids of all keyframes.
+        first_frame: Smallest frame number.
+        last_frame: Largest frame number.
+        stamp_ns: Stamp of the newest keyframe.
+        path_m: Length of the camera path up to the newest keyframe.
+        has_detections: True if a detector ran on one of the keyframes.
+        landmarks: Landmarks in the odometry frame of the submap.
+        names: Histogram of labels, [C] float32.
+        layout: Histogram of pairs of labels and distances, [512] float32.
+        words: Histogram of visual words, [W] float32.
     """
 
     views: tuple[SubgraphKeyframe, ...]
     keyframes: tuple[int, ...]
     first_frame: int
     last_frame: int
-    stamp_ns: int  # of its newest keyframe
-    path_m: float  # likewise
+    stamp_ns: int
+    path_m: float
     has_detections: bool
     landmarks: SubgraphLandmarks
     names: np.ndarray
@@ -98,6 +119,7 @@ class Subgraph:
 
     @property
     def submap(self) -> int:
+        """Number of the submap."""
         return self.views[0].place.submap
 
     def pack(self) -> dict[str, Any]:
@@ -112,7 +134,7 @@ class Subgraph:
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "Subgraph":
-        """The inverse of `pack`."""
+        """Return the subgraph that `pack` packed."""
         changed = {
             "views": tuple(map(SubgraphKeyframe.unpack, kept["views"])),
             "keyframes": tuple(kept["keyframes"]),
@@ -122,15 +144,17 @@ class Subgraph:
 
 
 def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfig) -> bool:
-    """Whether a keyframe goes on where the one before was made: others may lie between that were
-    made long ago."""
+    """Return whether a keyframe continues from the previous one.
+
+    Keyframe reuse may have returned to old keyframes between the two.
+    """
     moved = se3.inverse(before.T_odom_keyframe) @ place.T_odom_keyframe
     is_near = image_motion_rad(moved, before.median_depth_m) <= config.gap_rad
     return is_near and before.submap == place.submap
 
 
 def is_complete(views: Sequence[SubgraphKeyframe], config: SubgraphConfig) -> bool:
-    """Whether keyframes of one submap make a subgraph: enough of them, or far enough apart."""
+    """Return whether keyframes are enough for a subgraph, by number or by motion."""
     if len(views) < config.least:
         return False
     first, last = views[0].place, views[-1].place
@@ -142,7 +166,7 @@ def is_complete(views: Sequence[SubgraphKeyframe], config: SubgraphConfig) -> bo
 
 
 def evenly_spaced(views: Sequence[SubgraphKeyframe], count: int) -> tuple[SubgraphKeyframe, ...]:
-    """So many of them, at equal steps, the first and the last included; the middle one of one."""
+    """Return `count` views at equal steps with the first and the last; for one, the middle view."""
     if count == 1:
         return (views[len(views) // 2],)
     at = np.rint(np.linspace(0, len(views) - 1, min(count, len(views)))).astype(int)

@@ -1,8 +1,8 @@
-"""Whether two subgraphs show one place, and the pose between two of their keyframes (fine stage).
+"""Verification of loop candidates: the pose between two keyframes of two subgraphs (fine step).
 
-A pose comes from ORB features, from landmarks or from the map, is refined on the images, and is
-believed when all of this agrees: two keyframes of the new subgraph, the refined pose, the surfaces,
-and what the detector named. Conventions: `ldo_service.geometry`.
+A pose comes from ORB features, from landmarks or from the map, and is refined on the images. It is
+accepted if all of these agree: two keyframes of the new subgraph, the refined pose, the surfaces,
+and the detections. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Callable, Iterator
@@ -39,39 +39,48 @@ from .subgraph import Subgraph, SubgraphKeyframe
 
 NOTHING = LandmarkAgreement(0, 0, 0.0, 0.0)
 Evidence = Literal["", "landmarks", "features", "map"]
-KnownPose = Callable[
-    [SubgraphKeyframe, SubgraphKeyframe], np.ndarray | None
-]  # T_old_new [4, 4]; None: not known
-OPENED = 12  # keyframes kept ready for alignment, 3 MB each: a query and some candidates
-FIT_LEVEL = 1  # of the pyramid, 160 pixels wide: 19,200 points say what overlaps
+# Function of an old and a new keyframe; it returns T_old_new [4, 4], or None if unknown.
+KnownPose = Callable[[SubgraphKeyframe, SubgraphKeyframe], np.ndarray | None]
+OPENED = 12  # Keyframes kept ready for alignment, 3 MB each: a query and some candidates.
+FIT_LEVEL = 1  # Pyramid level of 160 pixels width: 19,200 points suffice for the overlap.
 
 
 @dataclass(frozen=True, slots=True)
 class VerificationConfig:
+    """Parameters of the verification."""
+
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     fit: DepthConsistencyConfig = field(default_factory=DepthConsistencyConfig)
-    min_inliers: int = 20  # features that agree on the pose, of the best pair of keyframes; another
-    # keyframe of the new subgraph that says the same needs `features.min_inliers` alone
-    witness_landmarks: int = 3  # or landmarks of one kind that it brings together
-    witness_rad: float = 0.08  # rotation plus parallax between what the two say
-    pairs: int = 15  # of keyframes whose features are matched, at 3 ms each
-    map_pairs: int = 3  # of keyframes that are aligned where the map has them, at 15 ms each
-    blind_overlap: float = 0.35  # of either's surface, where no features vouch for the pose
-    map_witness_rad: float = 0.02  # between what two of these say: half a centimetre in a room
-    refined_rad: float = 0.1  # how far the images may move the pose of the features, or of the map,
-    refined_landmarks_rad: float = 0.4  # and that of landmarks, whose centres are vague
-    max_condition: float = 1e5  # of the information in median depths, as the tracker's
-    max_gain: float = 3.0  # of brightness, either way
-    max_contradictions: int = 3  # landmarks where others of another kind were, if they are most
+    # Minimum feature inliers of the best pair of keyframes. A confirming keyframe of the new
+    # subgraph only needs `features.min_inliers`.
+    min_inliers: int = 20
+    witness_landmarks: int = 3  # Matching landmarks that confirm a pose instead of a keyframe.
+    # Maximum rotation plus parallax between a pose and its confirmation.
+    witness_rad: float = 0.08
+    pairs: int = 15  # Maximum pairs of keyframes for feature matching, 3 ms each.
+    map_pairs: int = 3  # Maximum pairs of keyframes aligned at their poses in the map, 15 ms each.
+    # Minimum overlap of both surfaces if the pose does not come from features.
+    blind_overlap: float = 0.35
+    # Maximum difference of two poses from the map: half a centimeter in a room.
+    map_witness_rad: float = 0.02
+    # Maximum change of a pose from features or the map by the refinement on the images.
+    refined_rad: float = 0.1
+    # The same for a pose from landmarks; their centers are inaccurate.
+    refined_landmarks_rad: float = 0.4
+    # Maximum condition of the information in median depths, as in the tracker.
+    max_condition: float = 1e5
+    max_gain: float = 3.0  # Maximum ratio of brightness, either way.
+    # Maximum contradicting landmarks, unless more landmarks match.
+    max_contradictions: int = 3
 
     def __post_init__(self) -> None:
         if self.min_inliers < 6 or self.pairs < 1:
             raise ConfigError(
                 named(self, "min_inliers", "pairs")
-                + ": inliers must be at least 6, pairs at least 1."
+                + ": min_inliers must be at least 6, pairs at least 1."
             )
         if not 0 <= self.blind_overlap <= 1:
-            raise ConfigError(f"blind_overlap={self.blind_overlap:g} must be within 0..1.")
+            raise ConfigError(named(self, "blind_overlap") + " must be within 0..1.")
         angles = (self.witness_rad, self.refined_rad, self.refined_landmarks_rad)
         if min(*angles, self.map_witness_rad) <= 0 or self.map_pairs < 0:
             raise ConfigError(
@@ -83,18 +92,28 @@ class VerificationConfig:
                     "refined_rad",
                     "refined_landmarks_rad",
                 )
-                + ": angles must be positive, map_pairs not negative."
+                + ": angles must be positive, map_pairs must not be negative."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoopHypothesis:
-    """A pose between two keyframes, T_old_new [4, 4]; `refused` says why it goes no further."""
+    """Pose between two keyframes that is not yet verified.
+
+    Attributes:
+        old: Keyframe of the old subgraph.
+        new: Keyframe of the new subgraph.
+        T_old_new: Pose of the new keyframe in the old one, [4, 4].
+        evidence: Source of the pose; "" if there is none.
+        inliers: Features or landmarks that agree with the pose.
+        semantics: Agreement of the landmarks at this pose.
+        rejected_reason: Reason of a rejection; "" if there is none.
+    """
 
     old: SubgraphKeyframe
     new: SubgraphKeyframe
     T_old_new: np.ndarray
-    evidence: Evidence = ""  # "": there is no pose
+    evidence: Evidence = ""
     inliers: int = 0
     semantics: LandmarkAgreement = NOTHING
     rejected_reason: str = ""
@@ -102,7 +121,7 @@ class LoopHypothesis:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class VerificationResult:
-    """What came of a proposal; the closure if nothing speaks against it."""
+    """Result of verifying a hypothesis; `closure` is None if it was rejected."""
 
     proposal: LoopHypothesis
     overlap: float = 0.0
@@ -112,7 +131,10 @@ class VerificationResult:
 
 
 class Verifier:
-    """Deterministic: the same subgraphs give the same bits. Keeps what it decompressed last."""
+    """Verifier of loop candidates; deterministic, so equal subgraphs give equal bits.
+
+    It caches the keyframes that it decompressed last.
+    """
 
     def __init__(
         self,
@@ -121,12 +143,16 @@ class Verifier:
         features: FeatureConfig,
         config: VerificationConfig,
     ) -> None:
+        """Prepare a verifier with an empty cache."""
         self._align, self._features, self._config = align, features, config
         self._opened = lru_cache(OPENED)(lambda view: view.place.keyframe(pyramid))
 
-    # --- a pose -----------------------------------------------------------------------------------
+    # --- hypotheses -------------------------------------------------------------------------------
     def hypothesis_from_features(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
-        """The pose that features of two new keyframes agree on."""
+        """Return the pose from feature matches that a second new keyframe confirms.
+
+        If there is no confirmation by features, see `_from_single_keyframe`.
+        """
         found: list[LoopHypothesis] = []
         for a, b in islice(_likely_pairs(old, new), self._config.pairs):
             pose = estimate_pose(a.place.features, b.place.features, b.place.camera, self._features)
@@ -142,7 +168,10 @@ class Verifier:
     def _from_single_keyframe(
         self, found: list[LoopHypothesis], old: Subgraph, new: Subgraph
     ) -> LoopHypothesis:
-        """What a single keyframe says; images of another, or three landmarks, may vouch for it."""
+        """Return the pose with most inliers, rejected unless something else confirms it.
+
+        Three landmarks or the image of another keyframe can confirm it.
+        """
         best = max(found, key=lambda proposal: proposal.inliers, default=None)
         if best is None:
             return LoopHypothesis(
@@ -158,7 +187,7 @@ class Verifier:
         return replace(best, rejected_reason="not confirmed by a second keyframe")
 
     def _is_confirmed_by(self, best: LoopHypothesis, view: SubgraphKeyframe) -> bool:
-        """Whether the image and surface of another new keyframe are as a pose predicts."""
+        """Return whether image and surface of another new keyframe agree with a pose."""
         T_old_view = _between(best.old, view, _odometry_frames(best))
         check = self.verify(replace(best, new=view, T_old_new=T_old_view))
         return check.closure is not None
@@ -166,7 +195,7 @@ class Verifier:
     def _is_confirmed_by_any(
         self, best: LoopHypothesis, found: list[LoopHypothesis], within_rad: float
     ) -> bool:
-        """Whether another new keyframe says the same."""
+        """Return whether the hypothesis of another new keyframe gives the same pose."""
         return any(
             image_motion_rad(se3.inverse(best.T_old_new) @ _as_seen_by(best, other), _depth(best))
             < within_rad
@@ -175,7 +204,10 @@ class Verifier:
         )
 
     def hypothesis_from_landmarks(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
-        """The pose that most landmarks agree on, between the keyframes that then see most alike."""
+        """Return the pose that most landmarks agree with.
+
+        It is given between the keyframes that are nearest to each other at this pose.
+        """
         config = self._config.landmarks
         pairs = possible_pairs(old.landmarks, new.landmarks, config)
         points = old.landmarks.p_odom, new.landmarks.p_odom
@@ -193,10 +225,11 @@ class Verifier:
     def hypothesis_from_map(
         self, old: Subgraph, new: Subgraph, T_old_new: KnownPose
     ) -> LoopHypothesis:
-        """Where the map has them, if that brings them together, and the images of two new keyframes
-        refine it to one and the same pose: what sees a place from elsewhere shares few features.
+        """Return the pose in the map, if images of two new keyframes refine it to the same pose.
 
-        It finds no loop that drift tore open; it ties what was seen twice before it drifts apart.
+        Different viewpoints of a place share few features, so the map gives the initial guess. This
+        finds no loop after a large drift. It adds closures between nearby keyframes before they
+        drift apart.
         """
         found: list[LoopHypothesis] = []
         for a, b, T in islice(_nearest_pairs(old, new, T_old_new), self._config.map_pairs):
@@ -210,7 +243,7 @@ class Verifier:
         return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=refused)
 
     def _check_overlap(self, proposal: LoopHypothesis) -> VerificationResult | None:
-        """None, without an alignment, where either sees too little of what the other does."""
+        """Return the verification, or None without an alignment if an overlap is too small."""
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         T_old_new, least = proposal.T_old_new, self._config.blind_overlap
         if self._fit(old, new, T_old_new).overlap < least:
@@ -222,14 +255,14 @@ class Verifier:
     def _with_semantics(
         self, proposal: LoopHypothesis, old: Subgraph, new: Subgraph
     ) -> LoopHypothesis:
-        """What the landmarks say of a pose: those in one place should be of one kind."""
+        """Return a hypothesis with the agreement of the landmarks that it brings together."""
         T, config = _odometry_frames(proposal), self._config.landmarks
         semantics = compare_landmarks_at(old.landmarks, new.landmarks, T, config)
         return replace(proposal, semantics=semantics)
 
-    # --- its proof --------------------------------------------------------------------------------
+    # --- verification -----------------------------------------------------------------------------
     def verify(self, proposal: LoopHypothesis) -> VerificationResult:
-        """Refine a pose on the images, and see whether the surfaces meet."""
+        """Refine a pose on the images, and check the surfaces and landmarks at the result."""
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         alignment = align(old.reference, new.view, se3.inverse(proposal.T_old_new), self._align)
         fit = self._fit(old, new, alignment.T_reference_camera)
@@ -245,7 +278,10 @@ class Verifier:
         return VerificationResult(proposal, min(fit.overlap, 1.0), fit.rmse_m, refused, closure)
 
     def accept_unverified(self, proposal: LoopHypothesis) -> VerificationResult:
-        """A pose of landmarks as it is: what the paper's fine stage alone would close."""
+        """Return a closure with the pose of the landmarks, as it is.
+
+        The fine stage of the paper alone would accept it.
+        """
         sigma_m = self._config.landmarks.reach_m / np.sqrt(proposal.inliers)
         sigmas = np.repeat([sigma_m / _depth(proposal), sigma_m], 3)
         a, b = proposal.old.keyframe, proposal.new.keyframe
@@ -264,7 +300,10 @@ class Verifier:
     def _rejection_reason(
         self, proposal: LoopHypothesis, alignment: Alignment, fit: DepthConsistency, shared: float
     ) -> str:
-        """What speaks against a pose; nothing: "". `shared`: of either's surface, at least."""
+        """Return the reason to reject a pose, or "" to accept it.
+
+        `shared` is the smaller one of the overlaps of both surfaces.
+        """
         config, by_landmarks = self._config, proposal.evidence == "landmarks"
         moved = se3.inverse(proposal.T_old_new) @ alignment.T_reference_camera
         limit = config.refined_landmarks_rad if by_landmarks else config.refined_rad
@@ -290,7 +329,7 @@ class Verifier:
 def _likely_pairs(
     old: Subgraph, new: Subgraph
 ) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe]]:
-    """All pairs of keyframes, those with most visual words in common first."""
+    """Return all pairs of keyframes; those with most common visual words come first."""
     pairs = list(product(old.views, new.views))
     shared = [float(np.minimum(a.words, b.words).sum()) for a, b in pairs]
     return (pairs[index] for index in np.argsort(-np.array(shared), kind="stable"))
@@ -299,8 +338,10 @@ def _likely_pairs(
 def _nearest_pairs(
     old: Subgraph, new: Subgraph, T_old_new: KnownPose
 ) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe, np.ndarray]]:
-    """Each new keyframe with the old one that a pose brings nearest to it, the nearest first; with
-    T_old_new [4, 4]."""
+    """Yield each new keyframe with its nearest old keyframe and T_old_new [4, 4].
+
+    The nearest pairs come first. Keyframes without a known relative pose are skipped.
+    """
     nearest = []
     for b in new.views:
         known = [(a, b, T) for a in old.views if (T := T_old_new(a, b)) is not None]
@@ -315,21 +356,22 @@ def _nearest_pairs(
 def _between(
     old: SubgraphKeyframe, new: SubgraphKeyframe, T_oldodom_newodom: np.ndarray
 ) -> np.ndarray:
-    """T_old_new [4, 4]."""
+    """Return T_old_new [4, 4] of two keyframes."""
     T_odom_old, T_odom_new = old.place.T_odom_keyframe, new.place.T_odom_keyframe
     return se3.orthonormalize(se3.inverse(T_odom_old) @ T_oldodom_newodom @ T_odom_new)
 
 
 def _odometry_frames(proposal: LoopHypothesis) -> np.ndarray:
-    """T_oldodom_newodom [4, 4] that a proposal says."""
+    """Return T_oldodom_newodom [4, 4] of a hypothesis."""
     T_odom_old = proposal.old.place.T_odom_keyframe
     return T_odom_old @ proposal.T_old_new @ se3.inverse(proposal.new.place.T_odom_keyframe)
 
 
 def _as_seen_by(best: LoopHypothesis, other: LoopHypothesis) -> np.ndarray:
-    """T_old_new [4, 4] of the keyframes of `best`, as the other says it."""
+    """Return T_old_new [4, 4] between the keyframes of `best`, according to another hypothesis."""
     return _between(best.old, best.new, _odometry_frames(other))
 
 
 def _depth(proposal: LoopHypothesis) -> float:
+    """Return the median depth of the new keyframe in meters."""
     return proposal.new.place.median_depth_m
