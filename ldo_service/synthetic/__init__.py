@@ -1,14 +1,18 @@
-"""Synthetic scenes with exact poses and depth, the same bytes on every machine.
+"""Synthetic RGB-D sequences with exact poses and depth, bitwise equal on every machine.
 
-Rays are cast at solids, so depth is exact and views of the same point agree. Everything is built
-from + - * / and square roots of float64 in a fixed order, which IEEE 754 rounds alike everywhere:
-no sine, no logarithm, no matrix product.
+A ray caster renders scenes of simple solids, so depth is exact and consistent between views.
+Exact values use only + - * / and square roots of float64 in a fixed order. IEEE 754 rounds these
+operations identically everywhere; sines, logarithms and matrix products differ between machines.
 
-    room, tour    one furnished room, rendered when read; -noisy: with a Kinect's depth
-    person        the same room, and somebody walks through it; -noisy as above
-    flat          two rooms and a corridor, hard on purpose and labelled; -exact: without noise
+Sequences:
 
-A number behind @ is the seed of textures, of the hand's shaking and of the noise: `room@3`.
+- `room`, `tour`: One furnished room, rendered when read.
+- `person`: The same room, with a person who walks through it.
+- `room-noisy`, `tour-noisy`, `person-noisy`: The same, with the depth errors of a Kinect.
+- `flat`: Two rooms and a corridor with ground-truth labels, designed to be hard.
+- `flat-exact`: The same flat without sensor noise.
+
+A number after @ is the seed of textures, hand shake and noise: `room@3`.
 """
 
 from ldo_service.errors import DataError
@@ -22,17 +26,21 @@ __all__ = ["FlatConfig", "FlatSequence", "SyntheticConfig", "SyntheticSequence",
 
 
 def open_synthetic(name: str) -> SyntheticSequence | FlatSequence:
-    """The sequence `synthetic:name`, or `synthetic:name@seed`.
+    """Return the sequence `synthetic:name`, or `synthetic:name@seed`.
 
-    Raises DataError listing the known names, or when the seed is not a whole number.
+    Raises:
+        DataError: If the name is unknown (the message lists the known ones) or the seed is not
+            a whole number.
     """
     plain, at, seed = name.partition("@")
     if at and not (seed.isascii() and seed.isdigit()):
-        raise DataError(f"synthetic:{name}: behind @ stands a seed, such as synthetic:{plain}@3.")
+        raise DataError(
+            f"synthetic:{name}: the seed after @ must be a whole number, as in synthetic:{plain}@3."
+        )
     changes = {"seed": int(seed)} if at else {}
     if plain in room_sequence.NAMED:
         return SyntheticSequence.named(plain, **changes)
     if plain in flat.NAMED:
         return FlatSequence.named(plain, **changes)
     known = ", ".join(f"synthetic:{known}" for known in (*room_sequence.NAMED, *flat.NAMED))
-    raise DataError(f"there is no synthetic:{plain}. There is {known}.")
+    raise DataError(f"unknown sequence synthetic:{plain}; known are {known}.")

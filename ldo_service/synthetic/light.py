@@ -1,4 +1,4 @@
-"""Diffuse light of one ceiling lamp, and the soft shadows that furniture casts on the walls."""
+"""Diffuse light of one ceiling lamp, with soft shadows of the furniture on the walls."""
 
 from dataclasses import replace
 
@@ -7,17 +7,30 @@ import numpy as np
 from .room import Room
 from .solids import Solid, Vector, interval, vector
 
-LAMP_GRID = 4  # the lamp is an area of 4x4 points: its shadows are soft
+LAMP_GRID = 4  # The lamp is an area of 4x4 points, so its shadows are soft.
 LIGHT_CELL_M = 0.06
-AMBIENT = 0.42  # share of light that comes from everywhere
-LAMP = 0.55
-SIDE = 0.06  # of the ambient light: more from +x
+AMBIENT = 0.42  # Light that comes from all directions, 0..1.
+LAMP = 0.55  # Light of the lamp at normal incidence, before falloff.
+SIDE = 0.06  # Fraction of the ambient light that depends on direction; more from +x.
 
 
 def shade(
     lamp_m: Vector, point: Vector, normal: Vector, lit: np.ndarray | float, side: float = SIDE
 ) -> np.ndarray:
-    """Light [P] on a surface: from everywhere, more from above, and from a lamp of share `lit`."""
+    """Return the light on a surface: ambient light plus the light of the lamp.
+
+    Surfaces that face up or +x get more ambient light than others.
+
+    Args:
+        lamp_m: Center of the lamp, meters.
+        point: Points of the surface, [P], meters.
+        normal: Unit normals at the points.
+        lit: Visible fraction of the lamp, 0..1.
+        side: Fraction of the ambient light that depends on direction.
+
+    Returns:
+        Light [P]; 1 leaves the albedo unchanged.
+    """
     x, y, z = (a - b for a, b in zip(lamp_m, point, strict=True))
     distance_sq = x * x + y * y + z * z
     cosine = (x * normal[0] + y * normal[1] + z * normal[2]) / np.sqrt(distance_sq)
@@ -27,12 +40,20 @@ def shade(
 
 
 def plane_axes(axis: int) -> tuple[int, int]:
-    """The two axes that span a face across `axis`; the second is up on walls."""
+    """Return the two axes that span a face normal to `axis`; on walls the second one is z."""
     return ((1, 2), (0, 2), (0, 1))[axis]
 
 
 def light_on_face(room: Room, face: int) -> np.ndarray:
-    """Light [rows, columns] on a grid over a face of the room, with the shadows of furniture."""
+    """Return the light on a grid over a face of the room, with the shadows of the furniture.
+
+    Args:
+        room: The furnished room.
+        face: Index of the face, in the order -x, +x, -y, +y, -z, +z.
+
+    Returns:
+        Light [rows, columns] on cells of LIGHT_CELL_M.
+    """
     axis, sign = face // 2, 2 * (face % 2) - 1
     a, b = plane_axes(axis)
     center, size = room.shell.center_m, room.shell.size_m
@@ -59,11 +80,12 @@ def lit_share(
     solids: tuple[Solid, ...],
     point: Vector,
 ) -> np.ndarray:
-    """The share [P] of a square lamp that is seen from each point past the solids."""
+    """Return the fraction [P] of a square lamp that no solid hides from each point."""
     lamps = _lamp_points(lamp_center_m, lamp_side_m)
     is_hidden = np.zeros((LAMP_GRID**2, len(point[0])), bool)
     for solid in solids:
-        # a ray to any point of the lamp passes the solid where that to its middle passes a larger
+        # A ray to any point of the lamp can meet the solid only where the ray to the lamp's center
+        # meets the enlarged solid.
         larger = _enlarged(solid, lamp_side_m)
         near = np.flatnonzero(_is_between(larger, point, vector(lamp_center_m)))
         x, y, z = (component[near] for component in point)
@@ -72,7 +94,7 @@ def lit_share(
 
 
 def _lamp_points(center_m: tuple[float, float, float], side_m: float) -> Vector:
-    """Each component [K, 1], to be broadcast against points."""
+    """Return K points of the lamp; each component is [K, 1], to broadcast against points [P]."""
     x, y, z = center_m
     steps_m = np.array([((i + 0.5) / LAMP_GRID - 0.5) * side_m for i in range(LAMP_GRID)])
     dy, dx = (offsets.reshape(-1, 1) for offsets in np.meshgrid(steps_m, steps_m, indexing="ij"))
@@ -80,21 +102,30 @@ def _lamp_points(center_m: tuple[float, float, float], side_m: float) -> Vector:
 
 
 def _enlarged(solid: Solid, lamp_side_m: float) -> Solid:
-    """A box that holds the solid moved by half a lamp's diagonal any way level."""
+    """Return a box that contains the solid moved horizontally by up to half a lamp diagonal."""
     x, y, z = solid.size_m
     diagonal_m = 1.001 * np.sqrt(2) * lamp_side_m
     return replace(solid, shape="box", size_m=(x + diagonal_m, y + diagonal_m, z + 1e-6))
 
 
 def _is_between(solid: Solid, point: Vector, lamp_m: Vector) -> np.ndarray:
-    """Which points [P] a solid hides from a point of a lamp, or [K, P] from each of K."""
+    """Return whether a solid hides a lamp point from each point.
+
+    Args:
+        solid: The solid that may be in between.
+        point: Points [P], meters.
+        lamp_m: One point of the lamp, or K points with components [K, 1].
+
+    Returns:
+        A mask [P], or [K, P] for K points of the lamp.
+    """
     way = (lamp_m[0] - point[0], lamp_m[1] - point[1], lamp_m[2] - point[2])
     enter, leave = interval(solid.shape, solid.point_to_local(point), solid.direction_to_local(way))
     return (enter < leave) & (leave > 1e-4) & (enter < 0.999)
 
 
 def interpolated(grid: np.ndarray, u_m: np.ndarray, v_m: np.ndarray) -> np.ndarray:
-    """Bilinear value [P] of a grid with cells of LIGHT_CELL_M."""
+    """Return bilinearly interpolated values [P] of a grid with cells of LIGHT_CELL_M."""
     x, y = u_m / LIGHT_CELL_M, v_m / LIGHT_CELL_M
     column = np.clip(x.astype(np.int64), 0, grid.shape[1] - 2)
     row = np.clip(y.astype(np.int64), 0, grid.shape[0] - 2)

@@ -1,4 +1,4 @@
-"""A hand-held camera's way through the room."""
+"""Paths of a hand-held camera through the room."""
 
 from dataclasses import dataclass
 
@@ -7,13 +7,13 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Closed way through eyes_m [M, 3], looking at targets_m [M, 3]; world z is up."""
+    """Closed camera path through M knots; world z is up."""
 
-    eyes_m: np.ndarray
-    targets_m: np.ndarray
+    eyes_m: np.ndarray  # Camera positions [M, 3] in the world.
+    targets_m: np.ndarray  # Points [M, 3] in the world that the camera looks at.
 
 
-# Out over the room and back another way: every wall part is seen twice.
+# A sweep over the room and back on another path; the camera sees every part of the walls twice.
 LOOK_AROUND = Path(
     eyes_m=np.array(
         [
@@ -39,7 +39,7 @@ LOOK_AROUND = Path(
     ),
 )
 
-# Once around: all four walls, and the start again from close by.
+# One turn past all four walls that ends close to its start.
 TOUR = Path(
     eyes_m=np.array(
         [
@@ -67,7 +67,7 @@ TOUR = Path(
     ),
 )
 
-# Hardly anywhere: most of what is in view stays there.
+# Small motion; most surfaces stay in view.
 LINGER = Path(
     eyes_m=np.array(
         [
@@ -91,13 +91,13 @@ LINGER = Path(
     ),
 )
 
-SWAY_FRAMES = 8  # a hand moves in fractions of a second
+SWAY_FRAMES = 8  # Frames per knot of the sway; a hand moves in fractions of a second.
 SWAY_EYE_M = 0.008
 SWAY_TARGET_M = 0.03
 
 
 def poses(path: Path, count: int, seed: int) -> np.ndarray:
-    """T_world_camera [count, 4, 4]: cubic splines through the path, and the sway of a hand."""
+    """Return T_world_camera [count, 4, 4] on splines through the path, with the sway of a hand."""
     rng = np.random.default_rng(seed)
     along = np.arange(count) * (len(path.eyes_m) / count)
     eyes = closed_spline(path.eyes_m, along) + _sway(rng, count, SWAY_EYE_M)
@@ -106,7 +106,7 @@ def poses(path: Path, count: int, seed: int) -> np.ndarray:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """T_world_camera [4, 4] at `eye` with z towards `target` and the horizon level."""
+    """Return T_world_camera [4, 4] at `eye`, with z toward `target` and a level horizon."""
     z = _unit(target - eye)
     x = _unit(np.array([z[1], -z[0], 0.0]))
     y = np.array([z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0]])
@@ -125,7 +125,15 @@ def _sway(rng: np.random.Generator, count: int, amplitude_m: float) -> np.ndarra
 
 
 def closed_spline(knots: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Catmull-Rom spline [P, 3] through `knots` [M, 3] at `along` [P] in 0..M."""
+    """Return points of the closed Catmull-Rom spline through the knots.
+
+    Args:
+        knots: Knots [M, D].
+        along: Positions [P] on the spline in 0..M; whole numbers are knots.
+
+    Returns:
+        Points [P, D].
+    """
     cell = along.astype(np.int64)
     t = (along - cell)[:, None]
     a, b, c, d = (knots[(cell + i) % len(knots)] for i in (-1, 0, 1, 2))

@@ -1,4 +1,4 @@
-"""Somebody who walks through the room, built of upright solids that swing with the steps."""
+"""Person who walks through the room, built from upright solids that swing with the steps."""
 
 from dataclasses import dataclass
 
@@ -7,23 +7,23 @@ import numpy as np
 from .solids import Shape, Solid
 
 SPEED_M_S = 1.0
-STEP_M = 0.7  # from foot to foot
-SWING_M = 0.28  # of a foot, ahead of the hips and behind
+STEP_M = 0.7  # Distance between the feet of one step.
+SWING_M = 0.28  # Amplitude of a foot, ahead of the hips and behind them.
 ARM_SWING_M = 0.2
-# Feet on the floor, x y, in metres: in by the wall on the left, past the sofa, out on the right.
+# Path of the feet on the floor, x and y in meters: through the left wall, past the sofa, out
+# through the right wall.
 WAY_M = np.array([[-3.1, 0.9], [0.6, 0.9], [1.3, 0.25], [3.2, 0.0]])
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A solid of a body that looks along x: its middle and size in metres, and how it swings, as a
-    share of the foot's or hand's swing, on the left (1), on the right (-1) or not at all (0)."""
+    """One solid of a body that faces +x, with its feet at the origin."""
 
     shape: Shape
     center_m: tuple[float, float, float]
     size_m: tuple[float, float, float]
     texture: str
-    swing_m: float = 0.0
+    swing_m: float = 0.0  # Amplitude along x; negative in the opposite phase, 0 for no swing.
 
 
 def _both_sides(
@@ -54,14 +54,14 @@ BODY = (
 
 
 def person_at(time_s: float) -> tuple[Solid, ...]:
-    """The body after `time_s` on `WAY_M`; it waits at the end, behind the wall."""
+    """Return the body after `time_s` on `WAY_M`; at the end it stays behind the wall."""
     foot_m, heading, walked_m = _placed(time_s)
     swing = _swing(walked_m / STEP_M)
     return tuple(_in_world(part, foot_m, heading, swing) for part in BODY)
 
 
 def _placed(time_s: float) -> tuple[np.ndarray, tuple[float, float], float]:
-    """Where the person stands, where it looks, and how far it walked."""
+    """Return the position [2] on the floor, the heading and the walked distance in meters."""
     legs = np.diff(WAY_M, axis=0)
     lengths = np.sqrt(legs[:, 0] * legs[:, 0] + legs[:, 1] * legs[:, 1])
     ends = np.cumsum(lengths)
@@ -73,7 +73,10 @@ def _placed(time_s: float) -> tuple[np.ndarray, tuple[float, float], float]:
 
 
 def _swing(steps: float) -> float:
-    """-1..1..-1 over two steps: parabolas in place of a sine, which differs between machines."""
+    """Return the phase of the swing, -1..1, with a period of two steps.
+
+    It consists of parabolas, because the bits of a sine differ between machines.
+    """
     phase = steps % 2.0
     side, t = (1.0, phase) if phase < 1 else (-1.0, phase - 1.0)
     return side * 4 * t * (1 - t)

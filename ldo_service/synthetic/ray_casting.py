@@ -1,4 +1,4 @@
-"""Rays of a camera against solids within a shell: exact depth and which surface was met."""
+"""Ray casting of a camera against solids within a shell, with exact depth."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ NEAR_M = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """What P rays met: depth_m [P], surface [P] (0-5 faces of the shell, then solids)."""
+    """Nearest surfaces along P rays."""
 
-    depth_m: np.ndarray
-    surface: np.ndarray
+    depth_m: np.ndarray  # Depth [P], z in the camera.
+    surface: np.ndarray  # Index [P] of the surface: 0-5 for the faces of the shell, then solids.
 
     def by_surface(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Each surface that was met, with the indices of its rays."""
+        """Yield each surface that was hit, with the indices of its rays."""
         order = np.argsort(self.surface, kind="stable")
         met, starts = np.unique(self.surface[order], return_index=True)
         bounds = np.append(starts, len(order))
@@ -29,7 +29,10 @@ class Hits:
 
 
 class RayCaster:
-    """The rays of one camera pose, and what each solid within the shell can cover in its image."""
+    """Ray caster of one camera pose.
+
+    It projects each solid once, so that only rays within the solid's window are tested.
+    """
 
     def __init__(
         self,
@@ -45,7 +48,12 @@ class RayCaster:
         self._windows = [_window(solid, camera, T_world_camera) for solid in solids]
 
     def cast(self, u: np.ndarray, v: np.ndarray) -> Hits:
-        """The nearest surface along each ray; v ascends."""
+        """Return the nearest surface along the ray of each pixel.
+
+        Args:
+            u: Columns [P], pixels; fractions are allowed.
+            v: Rows [P], pixels, in ascending order.
+        """
         direction = self._directions(u, v)
         depth_m, surface = self._cast_at_shell(direction)
         for k, (solid, window) in enumerate(zip(self._solids, self._windows, strict=True)):
@@ -58,6 +66,7 @@ class RayCaster:
         return Hits(depth_m, surface)
 
     def points(self, u: np.ndarray, v: np.ndarray, depth_m: np.ndarray) -> Vector:
+        """Return the world points of pixels at a depth."""
         d, o = self._directions(u, v), self._origin()
         return o[0] + d[0] * depth_m, o[1] + d[1] * depth_m, o[2] + d[2] * depth_m
 
@@ -75,7 +84,7 @@ class RayCaster:
         return vector(self._T[:3, 3])
 
     def _directions(self, u: np.ndarray, v: np.ndarray) -> Vector:
-        """World directions with z = 1 in the camera, so that their parameter is depth."""
+        """Return ray directions in the world with z = 1 in the camera, so t of o + t d is depth."""
         x, y, _ = np.moveaxis(self.camera.rays_at(u, v), -1, 0)
         R = self._T
         return (
@@ -87,7 +96,7 @@ class RayCaster:
 
 @dataclass(frozen=True, slots=True)
 class _Window:
-    """The part of an image that a solid can cover, in pixels."""
+    """Part of an image that a solid can cover, in pixels."""
 
     left: float
     right: float
@@ -95,7 +104,7 @@ class _Window:
     bottom: float
 
     def covered(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Indices of the pixels in it; v ascends."""
+        """Return the indices of the pixels in the window; v must ascend."""
         first = int(np.searchsorted(v, self.top))
         stop = int(np.searchsorted(v, self.bottom, side="right"))
         u = u[first:stop]
@@ -103,7 +112,11 @@ class _Window:
 
 
 def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
-    """Bounds of the projected corners; the whole image for a solid beside the camera."""
+    """Return the bounds of the projected corners.
+
+    The window is empty for a solid outside the view, and the whole image for a solid in view that
+    reaches behind the camera.
+    """
     offset = solid.corners_m() - T[:3, 3]
     x, y, z = (
         offset[:, 0] * T[0, i] + offset[:, 1] * T[1, i] + offset[:, 2] * T[2, i] for i in range(3)
@@ -120,7 +133,7 @@ def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
 
 
 def outline(surface: np.ndarray) -> np.ndarray:
-    """Pixels [H, W] with a neighbour on another surface."""
+    """Return a mask [H, W] of the pixels with a neighbor on another surface."""
     edge = np.zeros(surface.shape, bool)
     across, down = surface[:, 1:] != surface[:, :-1], surface[1:] != surface[:-1]
     edge[:, 1:] |= across

@@ -1,6 +1,6 @@
 """The synthetic room and its furniture.
 
-World: x, y along the walls, z up; the origin is the middle of the floor.
+World frame: x and y along the walls, z up; the origin is the center of the floor.
 """
 
 from dataclasses import dataclass
@@ -17,13 +17,10 @@ LEFT, RIGHT, BACK, FRONT = -SIZE_M[0] / 2, SIZE_M[0] / 2, SIZE_M[1] / 2, -SIZE_M
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """A box seen from within, what stands in it, and one square lamp under the ceiling.
-
-    faces    texture names of the sides -x, +x, -y, +y, -z, +z
-    """
+    """Box seen from within, with furniture and one square lamp under the ceiling."""
 
     shell: Solid
-    faces: tuple[str, ...]
+    faces: tuple[str, ...]  # Texture names of the sides -x, +x, -y, +y, -z, +z.
     furniture: tuple[Solid, ...]
     textures: dict[str, Texture]
     lamp_center_m: tuple[float, float, float]
@@ -31,7 +28,7 @@ class Room:
 
 
 def furnished_room(seed: int) -> Room:
-    """A living room; `seed` paints its textures."""
+    """Return a living room; `seed` determines its textures."""
     return Room(
         shell=Solid("box", (0, 0, SIZE_M[2] / 2), SIZE_M, ""),
         faces=("sand", "wallpaper", "sand", "sage", "floor", "ceiling"),
@@ -133,7 +130,7 @@ def _textures(seed: int) -> dict[str, Texture]:
         "shade": (textures.fabric(rng, (0.95, 0.87, 0.68), (0.99, 0.95, 0.84)), 0.5),
         "leaves": (textures.leaves(rng, (0.1, 0.22, 0.1), (0.42, 0.6, 0.25)), 0.5),
         "ball": (textures.rug(rng, (0.9, 0.85, 0.75), (0.8, 0.25, 0.15)), 0.5),
-        # whoever visits; last, so that the room is painted the same without
+        # Textures of the person. They come last, so that the room looks the same without a person.
         "skin": (textures.plaster(rng, (0.8, 0.6, 0.48)), 0.5),
         "shirt": (textures.fabric(rng, (0.7, 0.2, 0.18), (0.9, 0.85, 0.8)), 0.4),
         "trousers": (textures.fabric(rng, (0.16, 0.2, 0.34), (0.3, 0.36, 0.52)), 0.5),

@@ -1,4 +1,4 @@
-"""Ray casting of a lit, furnished room: colour and exact depth per ray."""
+"""Ray casting of a lit, furnished room: color and exact depth per pixel."""
 
 from dataclasses import dataclass
 
@@ -11,23 +11,22 @@ from .ray_casting import Hits, RayCaster, outline
 from .room import Room
 from .solids import Solid, Vector, vector
 
-SHELL_FACES = 6  # number the first surfaces that a cast can meet
-# Four rays for a pixel on an outline, each in the middle of a quarter of it.
+SHELL_FACES = 6  # The faces of the shell are the surfaces 0-5 of a cast.
+# Offsets of the four rays of a pixel on an outline: the centers of its quarters.
 QUARTERS_PX = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 
 @dataclass(frozen=True, slots=True)
 class RoomRendering:
-    """color [H, W, 3] uint8; depth_m [H, W] float64, z, exact at pixel centres; is_visitor [H, W]
-    bool, whether the pixel shows a visitor."""
+    """One rendered frame of the room."""
 
-    color: np.ndarray
-    depth_m: np.ndarray
-    is_visitor: np.ndarray
+    color: np.ndarray  # Color [H, W, 3] uint8.
+    depth_m: np.ndarray  # Depth z [H, W] float64, exact at pixel centers.
+    is_visitor: np.ndarray  # Mask [H, W] of the pixels that show a visitor.
 
 
 class Renderer:
-    """Frames of one room. The light on its walls is computed once, when this is made."""
+    """Renderer of one room; it computes the light on the walls once, in the constructor."""
 
     def __init__(self, room: Room) -> None:
         self._room = room
@@ -36,8 +35,15 @@ class Renderer:
     def render(
         self, camera: Camera, T_world_camera: np.ndarray, visitors: tuple[Solid, ...] = ()
     ) -> RoomRendering:
-        """Pixels on an outline average four rays in colour; depth never mixes surfaces. `visitors`
-        are solids beside the furniture; they cast no shadow."""
+        """Render the room from one camera pose.
+
+        The color of a pixel on an outline is the mean of four rays; depth never mixes surfaces.
+
+        Args:
+            camera: Intrinsics.
+            T_world_camera: Camera pose [4, 4].
+            visitors: Solids in addition to the furniture; they cast no shadow.
+        """
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
         solids = (*self._room.furniture, *visitors)
         view = RayCaster(self._room.shell, solids, camera, T_world_camera)
@@ -63,7 +69,7 @@ class Renderer:
     def _color(
         self, view: RayCaster, solids: tuple[Solid, ...], u: np.ndarray, v: np.ndarray, hits: Hits
     ) -> np.ndarray:
-        """Reflected light [P, 3] in 0..1: albedo times diffuse shading."""
+        """Return the reflected light [P, 3] in 0..1: albedo times diffuse shading."""
         color = np.empty((len(u), 3))
         for surface, rays in hits.by_surface():
             point = view.points(u[rays], v[rays], hits.depth_m[rays])

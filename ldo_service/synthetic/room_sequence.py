@@ -1,4 +1,4 @@
-"""The synthetic room as a sequence, optionally with the depth errors of a Kinect."""
+"""Sequence of the synthetic room, optionally with the depth errors of a Kinect."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -15,21 +15,29 @@ from .room import furnished_room
 from .room_render import Renderer, RoomRendering
 
 # Khoshelham and Elberink, Sensors 2012: depth is 1 / (step * disparity), with disparity in whole
-# steps, so a step in depth is 2.85e-3 z^2 m; the matching errs by half a step.
+# steps. One step of disparity is therefore 2.85e-3 z^2 m of depth. The matching error is half a
+# step.
 DISPARITY_STEP_PER_M = 2.85e-3
 DISPARITY_SIGMA_STEPS = 0.5
 NEAREST_M, FARTHEST_M = 0.4, 8.0
 
 RATE_HZ = 30
-FOCAL_PER_WIDTH = 0.8125  # 63 degrees wide, as a Kinect's colour camera
+FOCAL_PER_WIDTH = 0.8125  # Horizontal field of view of 63 degrees, as a Kinect's color camera.
 
 PATHS = {"look_around": path.LOOK_AROUND, "tour": path.TOUR, "linger": path.LINGER}
 
 
 def kinect_depth(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Depth [H, W] in metres as a Kinect measures it; 0 outside its range and beside outlines.
+    """Return depth with the errors of a Kinect.
 
     The error grows with the square of depth: 3 mm steps at 1 m, 26 mm at 3 m.
+
+    Args:
+        depth_m: Exact depth [H, W], meters.
+        rng: Source of the matching noise.
+
+    Returns:
+        Measured depth [H, W], meters; 0 outside the range and in the projector's shadow.
     """
     disparity = 1 / (depth_m * DISPARITY_STEP_PER_M)
     disparity = disparity + DISPARITY_SIGMA_STEPS * rng.standard_normal(depth_m.shape)
@@ -39,31 +47,34 @@ def kinect_depth(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _is_shadowed(depth_m: np.ndarray) -> np.ndarray:
-    """The far side [H, W] of a jump in depth along the row, which the projector does not reach."""
+    """Return a mask [H, W] of the far side of depth jumps along a row.
+
+    The projector does not reach these pixels.
+    """
     jump = np.diff(depth_m, axis=1, prepend=depth_m[:, :1])
     return jump > 0.05 * depth_m
 
 
 @dataclass(frozen=True, slots=True)
 class SyntheticConfig:
-    """What is rendered. The same values give the same bytes."""
+    """Parameters of a rendered sequence; equal values give equal bytes."""
 
     frames: int = 120
     width_px: int = 320
     height_px: int = 240
     path: Literal["look_around", "tour", "linger"] = "look_around"
-    noise: bool = False  # Kinect-like depth; exact otherwise
-    person: bool = False  # somebody walks through
-    seed: int = 0  # of textures, of the hand's sway and of the noise
+    noise: bool = False  # Depth errors of a Kinect; exact depth otherwise.
+    person: bool = False  # A person walks through the room.
+    seed: int = 0  # Seed of the textures, the hand's sway and the noise.
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.width_px < 8 or self.height_px < 8:
             raise ConfigError(
                 f"synthetic sequence of {self.frames} frames of {self.width_px}x{self.height_px} "
-                "pixels: at least 1 frame of 8x8 is needed."
+                "pixels must have at least 1 frame of 8x8 pixels."
             )
         if self.path not in PATHS:
-            raise ConfigError(f"path {self.path!r} is not one of {', '.join(PATHS)}.")
+            raise ConfigError(f"path={self.path!r} must be one of {', '.join(PATHS)}.")
 
 
 NAMED = {
@@ -77,7 +88,7 @@ NAMED = {
 
 
 class SyntheticSequence(Sequence):
-    """Frames of the furnished room, rendered when they are read; depth is float32 in metres."""
+    """Sequence of the furnished room, rendered when read; depth is float32 in meters."""
 
     def __init__(self, config: SyntheticConfig | None = None, name: str = "synthetic") -> None:
         self.config = config = config or SyntheticConfig()
@@ -91,15 +102,20 @@ class SyntheticSequence(Sequence):
 
     @staticmethod
     def named(name: str, **changes: int | bool) -> "SyntheticSequence":
-        """The sequence `synthetic:name`, its config changed by keywords. Raises DataError."""
+        """Return the sequence `synthetic:name`, with fields of its config replaced by keywords.
+
+        Raises:
+            DataError: If the name is unknown.
+        """
         if name not in NAMED:
             known = ", ".join(f"synthetic:{known}" for known in NAMED)
-            raise DataError(f"there is no synthetic:{name}. There is {known}.")
+            raise DataError(f"unknown sequence synthetic:{name}; known are {known}.")
         config = replace(NAMED[name], **changes)
         seed = f"@{config.seed}" if config.seed else ""
         return SyntheticSequence(config, f"synthetic:{name}{seed}")
 
     def read(self, index: int) -> RawFrame:
+        """Render frame `index`."""
         exact = self._rendering(index)
         depth_m = exact.depth_m
         if self.config.noise:
@@ -109,7 +125,7 @@ class SyntheticSequence(Sequence):
         return RawFrame(index, stamp_ns, exact.color, depth, 1.0, self.raw_camera)
 
     def person(self, index: int) -> np.ndarray:
-        """Whether each pixel [H, W] of frame `index` shows the person, exact at pixel centres."""
+        """Return a mask [H, W] of the person in frame `index`, exact at pixel centers."""
         return self._rendering(index).is_visitor
 
     def _rendering(self, index: int) -> RoomRendering:
@@ -117,4 +133,5 @@ class SyntheticSequence(Sequence):
         return self._renderer.render(self.raw_camera, self._T_world_camera[index], visitors)
 
     def truth(self) -> Trajectory:
+        """Return the ground-truth trajectory."""
         return Trajectory(self.stamps_ns / 1e9, self._T_world_camera.copy())

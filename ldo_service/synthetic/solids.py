@@ -1,4 +1,7 @@
-"""Rays against convex shapes of the cube -1..1, stretched: boxes, ellipsoids, cylinders, cones."""
+"""Ray intersection with boxes, ellipsoids, cylinders and cones.
+
+Each shape fills the cube -1..1 in its local frame and is scaled to its size.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -6,39 +9,39 @@ from typing import Literal
 
 import numpy as np
 
-Vector = tuple[np.ndarray, np.ndarray, np.ndarray]  # x, y, z, each [P], or [] for one point
+Vector = tuple[np.ndarray, np.ndarray, np.ndarray]  # Components x, y, z: each [P], or [] for one.
 Shape = Literal["box", "ball", "cylinder", "wheel", "cone", "bucket", "lampshade"]
-# Round about z, with radius m + k z: a cone's apex is up, a bucket is wide above.
+# Parameters (m, k) of the shapes with radius m + k z. A cone's apex is up; a bucket widens upward.
 TAPERS = {"cone": (0.5, -0.5), "bucket": (0.8125, 0.1875), "lampshade": (0.75, -0.25)}
 
 
 def vector(components: Iterable[np.ndarray | float]) -> Vector:
-    """Three components as arrays."""
+    """Return three components as float arrays."""
     x, y, z = (np.asarray(component, float) for component in components)
     return x, y, z
 
 
 @dataclass(frozen=True, slots=True)
 class Solid:
-    """A convex solid standing upright in the world, z up.
+    """Convex solid that stands upright in the world, z up.
 
-    size_m   full extents along its own axes
-    heading  direction (x, y) of its own x axis, of length 1
+    Its local frame has the solid's axes, and the solid fills the cube -1..1 there.
     """
 
     shape: Shape
     center_m: tuple[float, float, float]
-    size_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]  # Full extents along the solid's axes.
     texture: str
-    heading: tuple[float, float] = (1.0, 0.0)
+    heading: tuple[float, float] = (1.0, 0.0)  # Unit vector (x, y) of the solid's x axis.
 
     def point_to_local(self, p: Vector) -> Vector:
-        """World point in the frame where the solid fills the cube -1..1."""
+        """Transform a world point to the local frame."""
         return self.direction_to_local(
             (p[0] - self.center_m[0], p[1] - self.center_m[1], p[2] - self.center_m[2])
         )
 
     def direction_to_local(self, d: Vector) -> Vector:
+        """Transform a world direction to the local frame, scale included."""
         (c, s), (sx, sy, sz) = self.heading, self.size_m
         return (
             (c * d[0] + s * d[1]) * (2 / sx),
@@ -47,7 +50,14 @@ class Solid:
         )
 
     def normal(self, q: Vector) -> tuple[Vector, np.ndarray]:
-        """Unit normals on the surface at local points q, in the world, and their own main axis."""
+        """Return surface normals at local points.
+
+        Args:
+            q: Points [P] on the surface, in the local frame.
+
+        Returns:
+            Unit normals in the world, and the index [P] of the solid's axis nearest to each.
+        """
         n = _NORMALS[self.shape](q)
         n = tuple(component * (2 / size) for component, size in zip(n, self.size_m, strict=True))
         length = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
@@ -57,7 +67,12 @@ class Solid:
         return (c * x - s * y, s * x + c * y, z), axis
 
     def surface(self, point: Vector) -> tuple[Vector, np.ndarray, np.ndarray]:
-        """Unit normals, and texture coordinates u_m, v_m along the two other own axes, v up."""
+        """Return normals and texture coordinates at world points on the surface.
+
+        Returns:
+            Unit normals in the world, and u_m [P] and v_m [P]. These run along the two axes of the
+            solid that the normal is not closest to; on sides v is up.
+        """
         local = self.point_to_local(point)
         normal, axis = self.normal(local)
         own = np.stack([q * (size / 2) for q, size in zip(local, self.size_m, strict=True)])
@@ -66,7 +81,7 @@ class Solid:
         return normal, u_m, v_m
 
     def corners_m(self) -> np.ndarray:
-        """The 8 corners [8, 3] of its bounding box in the world."""
+        """Return the corners [8, 3] of the solid's bounding box in the world."""
         (c, s), half = self.heading, np.array(self.size_m) / 2
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         x, y, z = (signs * half).T
@@ -74,7 +89,16 @@ class Solid:
 
 
 def interval(shape: Shape, o: Vector, d: Vector) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays o + t d enter and leave the unit shape; enter >= leave where they miss."""
+    """Return where rays o + t d enter and leave the shape in its local frame.
+
+    Args:
+        shape: The shape.
+        o: Origins of the rays in the local frame.
+        d: Directions of the rays in the local frame.
+
+    Returns:
+        Parameters t of entry and exit; entry >= exit for rays that miss.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         if shape == "ball":
             return _round(o, d, 3)
@@ -99,21 +123,21 @@ def _slab(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _round(o: Vector, d: Vector, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
-    """The unit sphere (3) or the endless upright cylinder (2)."""
+    """Intersect rays with the unit sphere (3 dimensions) or the infinite z cylinder (2)."""
     a = d[0] * d[0] + d[1] * d[1]
     b = o[0] * d[0] + o[1] * d[1]
     c = o[0] * o[0] + o[1] * o[1] - 1
     if dimensions == 3:
         a, b, c = a + d[2] * d[2], b + o[2] * d[2], c + o[2] * o[2]
-    root = np.sqrt(np.maximum(b * b - a * c, 0.0))  # a miss makes an empty interval
+    root = np.sqrt(np.maximum(b * b - a * c, 0.0))  # A miss gives an empty interval.
     return (-b - root) / a, (-b + root) / a
 
 
 def _taper(o: Vector, d: Vector, m: float, k: float) -> tuple[np.ndarray, np.ndarray]:
-    """The endless half cone x^2 + y^2 < (m + k z)^2 on the side of its apex where z = 0 lies.
+    """Intersect rays with the infinite half cone x^2 + y^2 < (m + k z)^2 that contains the origin.
 
-    A ray flatter than the cone cuts one half of the double cone between its two roots; a steeper
-    one lies in our half before the first root or after the second.
+    A ray flatter than the cone is inside one half of the double cone between its two roots. A
+    steeper ray is inside our half before the first root or after the second.
     """
     r, dr = m + k * o[2], k * d[2]
     a = d[0] * d[0] + d[1] * d[1] - dr * dr
@@ -130,7 +154,7 @@ def _taper(o: Vector, d: Vector, m: float, k: float) -> tuple[np.ndarray, np.nda
 
 
 def _upright(v: Vector) -> Vector:
-    """Own axes turned so that a wheel's axle, x, becomes z."""
+    """Permute the local axes so that a wheel's axle, x, becomes z."""
     return v[1], v[2], v[0]
 
 

@@ -1,4 +1,7 @@
-"""Procedural textures: tiles of natural-looking colour, sampled without aliasing."""
+"""Procedural textures: tiles of natural-looking color, sampled without aliasing.
+
+The painters below return tiles [TILE_TEXELS, TILE_TEXELS, 3] with values of about 0..1.
+"""
 
 from dataclasses import dataclass
 
@@ -11,17 +14,13 @@ TILE_TEXELS = 256
 
 @dataclass(frozen=True, slots=True)
 class Texture:
-    """A square tile that repeats, with its halvings ("mipmap") one after another.
+    """Square tile that repeats, with its mipmap levels."""
 
-    texels   [T, 3] float64 in 0..1, level 0 first
-    size_m   side of the tile
-    """
-
-    texels: np.ndarray
-    size_m: float
+    texels: np.ndarray  # Texels [T, 3] in 0..1 of all levels in sequence, level 0 first.
+    size_m: float  # Side of the tile.
 
     def sample(self, u_m: np.ndarray, v_m: np.ndarray, footprint_m: np.ndarray) -> np.ndarray:
-        """Colours [P, 3] at surface coordinates [P], averaged over `footprint_m` [P]."""
+        """Return colors [P, 3] at surface coordinates [P], averaged over `footprint_m` [P]."""
         level = _log2(footprint_m * (TILE_TEXELS / self.size_m))
         top = TILE_TEXELS.bit_length() - 1
         level = np.clip(level, 0.0, top)
@@ -31,9 +30,12 @@ class Texture:
         return (1 - weight) * self._at(u, v, lower) + weight * self._at(u, v, lower + 1)
 
     def _at(self, u: np.ndarray, v: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Bilinear interpolation [P, 3] in one level per point; u, v count tiles."""
+        """Return bilinearly interpolated colors [P, 3] in one level per point.
+
+        The coordinates u and v are in tiles.
+        """
         size = TILE_TEXELS >> level
-        start = (TILE_TEXELS**2 - size**2) // 3 * 4  # n^2 + (n/2)^2 + ... down to this level
+        start = (TILE_TEXELS**2 - size**2) // 3 * 4  # n^2 + (n/2)^2 + ... before this level.
         x, y = u * size - 0.5, v * size - 0.5
         x0, y0 = np.floor(x), np.floor(y)
         fx, fy = (x - x0)[:, None], (y - y0)[:, None]
@@ -47,13 +49,13 @@ class Texture:
 
 
 def _log2(x: np.ndarray) -> np.ndarray:
-    """Logarithm to base 2, exact at powers and linear between them."""
+    """Return the base-2 logarithm, exact at powers of two and linear between them."""
     mantissa, exponent = np.frexp(x)
     return exponent - 2.0 + 2.0 * mantissa
 
 
 def mipmapped(tile: np.ndarray, size_m: float) -> Texture:
-    """The texture of a tile [TILE_TEXELS, TILE_TEXELS, 3]."""
+    """Return the texture of a tile [TILE_TEXELS, TILE_TEXELS, 3], clipped to 0..1."""
     levels = [np.clip(tile, 0.0, 1.0)]
     while len(levels[-1]) > 1:
         a = levels[-1]
@@ -64,7 +66,16 @@ def mipmapped(tile: np.ndarray, size_m: float) -> Texture:
 def noise(
     rng: np.random.Generator, cells: tuple[int, int] = (4, 4), octaves: int = 6
 ) -> np.ndarray:
-    """Tile of noise in -1..1 whose octaves halve in amplitude, as the spectra of photographs do."""
+    """Return a tile of noise in -1..1, [TILE_TEXELS, TILE_TEXELS].
+
+    Each octave has half the amplitude of the one before, which resembles the spectra of
+    photographs.
+
+    Args:
+        rng: Source of the noise.
+        cells: Rows and columns of the coarsest octave.
+        octaves: Maximum number of octaves; octaves finer than a texel are omitted.
+    """
     total, amplitude = np.zeros((TILE_TEXELS, TILE_TEXELS)), 0.5
     rows, columns = cells
     for _ in range(octaves):
@@ -76,7 +87,7 @@ def noise(
 
 
 def _smooth_lattice(lattice: np.ndarray) -> np.ndarray:
-    """A periodic lattice, interpolated to a tile."""
+    """Return a periodic lattice interpolated smoothly to a tile."""
     for axis in (0, 1):
         n = lattice.shape[axis]
         x = np.arange(TILE_TEXELS) * (n / TILE_TEXELS)
@@ -90,19 +101,19 @@ def _smooth_lattice(lattice: np.ndarray) -> np.ndarray:
 
 
 def blend(a: Color, b: Color, weight: np.ndarray) -> np.ndarray:
-    """Colours [..., 3] between a (weight 0) and b (weight 1)."""
+    """Return colors [..., 3] between a (weight 0) and b (weight 1)."""
     weight = np.clip(weight, 0.0, 1.0)[..., None]
     return np.array(a) * (1 - weight) + np.array(b) * weight
 
 
 def plaster(rng: np.random.Generator, color: Color) -> np.ndarray:
-    """A painted wall: nearly flat, as walls are."""
+    """Draw a painted wall of nearly uniform color, like real walls."""
     tone = 1 + 0.05 * noise(rng, (2, 2)) + 0.03 * noise(rng, (64, 64), 2)
     return np.array(color) * tone[..., None]
 
 
 def wallpaper(rng: np.random.Generator, paper: Color, print_: Color) -> np.ndarray:
-    """Soft vertical stripes with a printed motif."""
+    """Draw soft vertical stripes with a printed motif."""
     column = np.arange(TILE_TEXELS) % 64
     stripe = np.where(column < 32, 0.0, 0.35)[None, :]
     y, x = np.mgrid[:TILE_TEXELS, :TILE_TEXELS] % 64
@@ -112,7 +123,7 @@ def wallpaper(rng: np.random.Generator, paper: Color, print_: Color) -> np.ndarr
 
 
 def planks(rng: np.random.Generator, light: Color, dark: Color) -> np.ndarray:
-    """Wooden boards along v: each its own tone, with grain and dark joints."""
+    """Draw wooden boards along v, each with its own tone, with grain and dark joints."""
     count, width = 8, TILE_TEXELS // 8
     board = np.arange(TILE_TEXELS) // width
     tone = rng.random(count)[board][None, :]
@@ -124,12 +135,12 @@ def planks(rng: np.random.Generator, light: Color, dark: Color) -> np.ndarray:
 
 
 def wood(rng: np.random.Generator, light: Color, dark: Color) -> np.ndarray:
-    """Veneer with long grain."""
+    """Draw veneer with long grain."""
     return blend(light, dark, 0.45 + 0.35 * noise(rng, (2, 16), 5) + 0.4 * noise(rng, (4, 64), 2))
 
 
 def fabric(rng: np.random.Generator, color: Color, thread: Color) -> np.ndarray:
-    """Woven cloth: a visible weave under large soft folds."""
+    """Draw woven cloth: a visible weave under large soft folds."""
     y, x = np.mgrid[:TILE_TEXELS, :TILE_TEXELS]
     weave = np.where(((x // 4) + (y // 4)) % 2 == 0, 0.12, 0.0)
     return blend(
@@ -138,14 +149,14 @@ def fabric(rng: np.random.Generator, color: Color, thread: Color) -> np.ndarray:
 
 
 def rug(rng: np.random.Generator, ground: Color, figure: Color) -> np.ndarray:
-    """Nested diamonds, worn by use."""
+    """Draw nested diamonds, worn by use."""
     y, x = np.mgrid[:TILE_TEXELS, :TILE_TEXELS]
     rings = (np.abs(x - 128) + np.abs(y - 128)) // 16 % 3 == 0
     return blend(ground, figure, 0.1 + 0.75 * rings + 0.35 * noise(rng, (16, 16)))
 
 
 def books(rng: np.random.Generator) -> np.ndarray:
-    """Spines of different width, height and colour, in two rows."""
+    """Draw book spines of different width, height and color in two rows."""
     tile = np.full((TILE_TEXELS, TILE_TEXELS, 3), 0.12)
     for bottom in (TILE_TEXELS // 2, TILE_TEXELS):
         left = 0
@@ -162,7 +173,7 @@ def books(rng: np.random.Generator) -> np.ndarray:
 
 
 def painting(rng: np.random.Generator, palette: tuple[Color, ...]) -> np.ndarray:
-    """An abstract picture: layers of paint bounded by contours of noise."""
+    """Draw an abstract picture: layers of paint bounded by contours of noise."""
     tile = np.tile(np.array(palette[0]), (TILE_TEXELS, TILE_TEXELS, 1))
     for color in palette[1:]:
         covered = noise(rng, (3, 3), 5) > 0.12
@@ -171,5 +182,5 @@ def painting(rng: np.random.Generator, palette: tuple[Color, ...]) -> np.ndarray
 
 
 def leaves(rng: np.random.Generator, dark: Color, light: Color) -> np.ndarray:
-    """Foliage: crisp light patches over dark ones."""
+    """Draw foliage: crisp light patches over dark ones."""
     return blend(dark, light, 0.5 + 2.0 * noise(rng, (16, 16), 4))

@@ -1,9 +1,9 @@
-"""Render the whole flat into the cache and print its statistics.
+"""Command that renders the whole flat into the cache and prints its statistics.
 
-python -m ldo_service.synthetic.flat [flat | flat-exact] [PROCESSES]
+    python -m ldo_service.synthetic.flat [flat | flat-exact] [PROCESSES]
 
-The statistics tell how hard the flat is: motion, bare walls, holes in depth, what is seen of which
-class.
+The statistics show how hard the flat is: motion, bare walls, missing depth and the number of
+visible objects per class.
 """
 
 import os
@@ -17,12 +17,12 @@ from .scene_object import CLASS_NAMES, COCO_COUNT, WALL
 from .sequence import FlatSequence, prerender
 from .walk import RATE_HZ
 
-VISIBLE_SHARE = 1e-3  # of the image: 300 pixels of 640x480
+VISIBLE_SHARE = 1e-3  # Minimum size of a visible object, fraction of the image: 307 of 640x480 px.
 
 
 @dataclass(frozen=True, slots=True)
 class MotionSpeeds:
-    """Between consecutive frames."""
+    """Camera speeds between consecutive frames."""
 
     speeds_m_s: np.ndarray  # [N - 1]
     turns_deg_s: np.ndarray  # [N - 1]
@@ -30,19 +30,20 @@ class MotionSpeeds:
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """Over the frames looked at."""
+    """Statistics of the labels and depth of several frames."""
 
-    wall_share: float  # of all pixels
-    missing_depth_share: float
-    objects_per_class: dict[str, int]  # those seen in at least one frame
+    wall_share: float  # Fraction of all pixels.
+    missing_depth_share: float  # Fraction of all pixels.
+    objects_per_class: dict[str, int]  # Number of objects visible in at least one frame.
 
     @property
     def coco_classes(self) -> int:
+        """Number of visible classes that COCO has."""
         return sum(name in CLASS_NAMES[:COCO_COUNT] for name in self.objects_per_class)
 
 
 def motion(T_world_camera: np.ndarray) -> MotionSpeeds:
-    """Speeds and turns of a trajectory [N, 4, 4] at the rate of the walk."""
+    """Return the speeds and turn rates of a trajectory [N, 4, 4] at the frame rate of the walk."""
     steps_m = np.diff(T_world_camera[:, :3, 3], axis=0)
     before, after = T_world_camera[:-1, :3, :3], T_world_camera[1:, :3, :3]
     cosines = (np.einsum("nij,nij->n", before, after) - 1) / 2
@@ -51,7 +52,7 @@ def motion(T_world_camera: np.ndarray) -> MotionSpeeds:
 
 
 def contents(sequence: FlatSequence, stride: int = 1) -> Contents:
-    """What every `stride`-th frame shows."""
+    """Return the statistics of every `stride`-th frame."""
     seen, walls, missing = set(), [], []
     for index in range(0, len(sequence), stride):
         labels = sequence.labels(index)
@@ -64,6 +65,7 @@ def contents(sequence: FlatSequence, stride: int = 1) -> Contents:
 
 
 def main() -> None:
+    """Run the command."""
     name = sys.argv[1] if len(sys.argv) > 1 else "flat"
     processes = int(sys.argv[2]) if len(sys.argv) > 2 else os.cpu_count() or 1
     sequence = FlatSequence.named(name)

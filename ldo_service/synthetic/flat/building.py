@@ -1,4 +1,4 @@
-"""Walls, floors and ceilings of the flat, and which lamp lights them."""
+"""Walls, floors and ceilings of the flat, each with the lamp that lights it."""
 
 from dataclasses import dataclass
 
@@ -6,16 +6,16 @@ from ldo_service.synthetic.solids import Solid
 
 from .scene_object import CEILING, FLOOR, WALL, Placement
 
-WALL_M = 0.06  # each room has its own layer; two make a wall
+WALL_M = 0.06  # Thickness of the layer that each room has; two layers make a wall.
 HEIGHT_M = 2.5
 DOOR_WIDTH_M, DOOR_HEIGHT_M = 0.9, 2.05
 ROOM_SIZE_M = (4.4, 3.8)
 CORRIDOR_SIZE_M = (6.4, 1.6)
-DOOR_X_M = -0.1  # in a room's frame, from the middle of its door wall
+DOOR_X_M = -0.1  # Center of the doorway in the room's frame, from the middle of its door wall.
 LAMP_SIDE_M = 0.5
-SHELL = Solid("box", (0.0, 0.0, 1.2), (8.0, 11.0, 4.0), "")  # around everything, never seen
+SHELL = Solid("box", (0.0, 0.0, 1.2), (8.0, 11.0, 4.0), "")  # Encloses the flat; never visible.
 
-# Frames of the rooms: origin on the floor below the middle of the door wall, y into the room.
+# Frames of the rooms: origin on the floor at the middle of the door wall, y into the room.
 ROOM_A = Placement((-1.0, CORRIDOR_SIZE_M[1] / 2 + 2 * WALL_M, 0.0))
 ROOM_B = Placement((1.0, -CORRIDOR_SIZE_M[1] / 2 - 2 * WALL_M, 0.0), (-1.0, 0.0))
 CORRIDOR = Placement((0.0, 0.0, 0.0))
@@ -23,27 +23,23 @@ CORRIDOR = Placement((0.0, 0.0, 0.0))
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A slab of the building; shadows fall on the one face that its room sees.
-
-    face   0-5 for the own sides -x, +x, -y, +y, -z, +z
-    room   0-2, index of the lamp that lights it
-    """
+    """Slab of the building; shadows are computed for the one face that its room sees."""
 
     solid: Solid
     class_id: int
-    face: int
-    room: int
+    face: int  # Face that the room sees: 0-5 for the slab's sides -x, +x, -y, +y, -z, +z.
+    room: int  # Index 0-2 of the room, and of the lamp that lights the slab.
 
 
 def lamp_centers_m() -> tuple[tuple[float, float, float], ...]:
-    """One lamp in the middle of room A, room B and the corridor."""
+    """Return the centers of the lamps in room A, room B and the corridor, in the world."""
     height_m = HEIGHT_M - 0.15
     middle = Solid("box", (0.0, ROOM_SIZE_M[1] / 2, height_m), (1, 1, 1), "")
     return ROOM_A(middle).center_m, ROOM_B(middle).center_m, (0.0, 0.0, height_m)
 
 
 def panels() -> tuple[Panel, ...]:
-    """All slabs of the building."""
+    """Return all slabs of the building."""
     return (
         *_room(ROOM_A, 0, "wall_a", "floor_a"),
         *_room(ROOM_B, 1, "wall_b", "floor_b"),
@@ -64,7 +60,7 @@ def _room(placed: Placement, room: int, paint: str, floor: str) -> list[Panel]:
 
 
 def _corridor() -> list[Panel]:
-    """A side with a door and an end; half a turn gives the other two."""
+    """Return one side with a doorway and one end wall; a half turn gives the other two."""
     length, width = CORRIDOR_SIZE_M
     door_m = ROOM_A.origin_m[0] + DOOR_X_M
     slabs = [
@@ -77,7 +73,7 @@ def _corridor() -> list[Panel]:
 
 
 def _door_wall(length_m: float, y_m: float, door_m: float, paint: str) -> list[Solid]:
-    """A wall along x with a doorway about x = door_m: what is left, right and above of it."""
+    """Return the slabs left of, right of and above a doorway at x = door_m in a wall along x."""
     left, right, end = door_m - DOOR_WIDTH_M / 2, door_m + DOOR_WIDTH_M / 2, length_m / 2
     lintel_m = HEIGHT_M - DOOR_HEIGHT_M
     above_m = (door_m, y_m, HEIGHT_M - lintel_m / 2)
@@ -99,7 +95,7 @@ def _level(
     size_m: tuple[float, float],
     floor: str,
 ) -> list[Panel]:
-    """Floor and ceiling, reaching under the walls so that doorways have them too."""
+    """Return the floor and ceiling; they extend under the walls to cover the doorways too."""
     extent = (size_m[0] + 2 * WALL_M, size_m[1] + 2 * WALL_M, 0.1)
     below = placed(Solid("box", (*center_m, -0.05), extent, floor))
     above = placed(Solid("box", (*center_m, HEIGHT_M + 0.05), extent, "ceiling"))

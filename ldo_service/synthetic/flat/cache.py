@@ -1,4 +1,4 @@
-"""Rendered frames kept on disk, so that a sequence is ray cast once per machine."""
+"""Disk cache of rendered frames, so that each machine renders a sequence once."""
 
 import hashlib
 import logging
@@ -18,33 +18,34 @@ from ldo_service.storage.atomic_write import write_atomically
 
 log = logging.getLogger(__name__)
 
-LIMIT_BYTES = 3 << 30  # of all sequences together; one of 640x480 takes 0.3-0.9 GB
-_HEADER = struct.Struct("<16s4I")  # digest of the rest, lengths of the four images
+LIMIT_BYTES = 3 << 30  # Maximum size of all sequences together; one of 640x480 takes 0.3-0.9 GB.
+_HEADER = struct.Struct("<16s4I")  # Digest of the body, then the lengths of its four images.
 _DIGEST_BYTES = 16
 
 
 @dataclass(frozen=True, slots=True)
 class CachedFrame:
-    """What is kept of a frame: color [H, W, 3], depth_m [H, W] float32, labels [H, W]."""
+    """Cached images of one frame."""
 
-    color: np.ndarray
-    depth_m: np.ndarray
-    class_ids: np.ndarray
-    instance_ids: np.ndarray
+    color: np.ndarray  # RGB [H, W, 3] uint8.
+    depth_m: np.ndarray  # Depth [H, W] float32; 0 where unknown.
+    class_ids: np.ndarray  # Class per pixel [H, W] uint8.
+    instance_ids: np.ndarray  # Object per pixel [H, W] uint16; 0 for the building.
 
 
 def cache_root() -> Path:
-    """LDO_CACHE, or ldo-slam in the user's cache folder."""
+    """Return the folder LDO_CACHE, or ldo-slam in the user's cache folder."""
     if folder := os.environ.get("LDO_CACHE"):
         return Path(folder).expanduser()
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ldo-slam"
 
 
 class FrameCache:
-    """The frames of one sequence, in a folder named by what determines their bytes.
+    """Disk cache of the frames of one sequence.
 
-    Older sequences make room when all together take more than LIMIT_BYTES. A cache that cannot be
-    written is not an error: frames are then rendered whenever they are read.
+    The folder's name is a hash of the identity, which determines the bytes of all frames. The cache
+    deletes the oldest sequences when all of them together exceed LIMIT_BYTES. A cache that cannot
+    be written is not an error: the sequence then renders each frame whenever it is read.
     """
 
     def __init__(self, identity: str, width: int, height: int) -> None:
@@ -53,7 +54,7 @@ class FrameCache:
         self._size = (height, width)
 
     def load(self, index: int) -> CachedFrame | None:
-        """The frame, or None where it is missing or damaged."""
+        """Return the frame, or None if it is missing or damaged."""
         try:
             data = self._path(index).read_bytes()
         except OSError:
@@ -61,28 +62,42 @@ class FrameCache:
         try:
             return self._unpacked(data)
         except (FrameError, struct.error, zstandard.ZstdError, ValueError) as error:
-            log.warning("cached frame %s is damaged and rendered again: %s", index, error)
+            log.warning(
+                "synthetic flat: cached frame %s is damaged (%s); it is rendered again, "
+                "no action needed.",
+                self._path(index),
+                error,
+            )
             return None
 
     def store(self, index: int, frame: CachedFrame) -> None:
-        """Keep the frame; a reader sees all of it or nothing."""
+        """Write the frame atomically; a failure is logged, not raised."""
         try:
             self._make_room()
             self.folder.mkdir(parents=True, exist_ok=True)
             write_atomically(self._path(index), _packed(frame), unique=True)
         except OSError as error:
-            log.warning("frame %s cannot be cached in %s: %s", index, self.folder, error)
+            log.warning(
+                "synthetic flat: cannot cache frame %s in %s (%s); it is rendered at each read. "
+                "Free disk space, or set LDO_CACHE to another folder.",
+                index,
+                self.folder,
+                error,
+            )
 
     def _path(self, index: int) -> Path:
         return self.folder / f"{index:04d}.frame"
 
     def _make_room(self) -> None:
-        """Once per sequence: drop the sequences written longest ago until the rest fits."""
+        """Delete the sequences written longest ago until the rest fits.
+
+        This runs once per sequence, before its folder exists.
+        """
         if self.folder.exists() or not self.folder.parent.exists():
             return
         others = sorted(self.folder.parent.iterdir(), key=lambda other: other.stat().st_mtime)
         sizes = [sum(file.stat().st_size for file in other.iterdir()) for other in others]
-        total = sum(sizes) + LIMIT_BYTES // 3  # what this one may need
+        total = sum(sizes) + LIMIT_BYTES // 3  # The last term is reserved for this sequence.
         for other, size in zip(others, sizes, strict=True):
             if total <= LIMIT_BYTES:
                 return
@@ -93,7 +108,7 @@ class FrameCache:
         digest, *lengths = _HEADER.unpack_from(data)
         body = data[_HEADER.size :]
         if len(body) != sum(lengths) or _digest(body) != digest:
-            raise FrameError(f"{len(data)} bytes do not match their digest.")
+            raise FrameError(f"the digest of {len(data)} bytes does not match.")
         parts, start = [], 0
         for length in lengths:
             parts.append(memoryview(body)[start : start + length])

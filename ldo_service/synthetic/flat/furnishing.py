@@ -1,4 +1,7 @@
-"""What stands where. Rows of: class, shape, place in the room's frame, which way it faces."""
+"""Furniture of the flat: one row per object with class, shape, position and heading.
+
+Positions and headings are in the frame of the room.
+"""
 
 import numpy as np
 
@@ -10,7 +13,8 @@ from .scene_object import Heading, Placement, SceneObject
 
 Row = tuple[str, int, tuple[float, float, float], Heading]
 
-# To the door wall (-y), away from it, and along the room's x axis.
+# Headings, named by the wall that an object's front (-y) faces in the room: the door wall (-y), the
+# back wall (+y), +x and -x.
 DOOR, BACK, RIGHT, LEFT = (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)
 ASKEW, TURNED = (0.96, 0.28), (0.8, -0.6)
 
@@ -114,7 +118,7 @@ HALL: tuple[Row, ...] = (
     ("cardboard box", 0, (-0.35, -0.6, 0), BACK),
 )
 
-# The frame of an end: origin below the middle of the end wall, y into the wall.
+# Rows in the frame of an end: origin on the floor at the middle of the end wall, y into the wall.
 CORRIDOR_END: tuple[Row, ...] = (
     ("cabinet", 0, (-0.22, -0.24, 0), DOOR),
     ("vase", 1, (-0.5, -0.24, 0.84), DOOR),
@@ -131,7 +135,7 @@ ENDS = (Placement((_HALF_M, 0, 0), LEFT), Placement((-_HALF_M, 0, 0), RIGHT))
 
 
 def things(seed: int) -> tuple[tuple[SceneObject, int], ...]:
-    """Every object of the flat, with the room (0, 1, or 2 for the corridor) it stands in."""
+    """Return every object of the flat in the world, with its room: 0, 1, or 2 for the corridor."""
     paint = Materials(np.random.default_rng([seed, 0]))
     rooms = ((LIVING_ROOM, ROOM_A, 0), (KITCHEN, ROOM_B, 1), (HALL, CORRIDOR, 2))
     furnished = [
@@ -145,7 +149,7 @@ def things(seed: int) -> tuple[tuple[SceneObject, int], ...]:
 
 
 def _built(rows: tuple[Row, ...], paint: Materials) -> list[SceneObject]:
-    """The rows' things in their room's frame."""
+    """Build the objects of the rows in the frame of their room."""
     made = [(label, CATALOG[label](paint, shape), at, way) for label, shape, at, way in rows]
     return [
         SceneObject(label, tuple(Placement(at, way)(solid) for solid in solids))

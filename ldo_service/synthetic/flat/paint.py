@@ -1,4 +1,4 @@
-"""The materials of the flat: a seeded pool per kind, drawn without regard to class."""
+"""Materials of the flat: one seeded pool per kind, independent of the object's class."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ KINDS |= {"books": 2, "picture": 5, "screen": 3}
 
 @dataclass
 class Materials:
-    """Draws material names of a kind, such as "wood 3"; what is drawn depends on the seed."""
+    """Random choice of material names of a kind, such as "wood 3"."""
 
     rng: np.random.Generator
 
@@ -22,14 +22,17 @@ class Materials:
 
 
 def materials(seed: int) -> dict[str, Texture]:
-    """Every texture of the flat by name."""
+    """Return every texture of the flat by name."""
     rng = np.random.default_rng([seed, 1])
     painted = {f"{kind} {i}": _PAINTERS[kind](rng) for kind, n in KINDS.items() for i in range(n)}
     return painted | _building(rng)
 
 
 def _building(rng: np.random.Generator) -> dict[str, Texture]:
-    """Weakly textured, as painted walls are: a few per cent about one tone."""
+    """Draw the textures of walls, ceiling and floors.
+
+    Walls have weak texture, like real painted walls: a few percent around one tone.
+    """
     tones: dict[str, Color] = {
         "wall_a": (0.84, 0.81, 0.75),
         "wall_b": (0.74, 0.79, 0.79),
@@ -45,20 +48,23 @@ def _building(rng: np.random.Generator) -> dict[str, Texture]:
 
 
 def _texture(tile: np.ndarray, size_m: float) -> Texture:
-    """Texels in single precision: half the memory traffic, and far finer than 8 bits."""
+    """Return the texture of a tile in single precision.
+
+    This halves the memory traffic and is far finer than 8 bits.
+    """
     texture = mipmapped(tile, size_m)
     return Texture(texture.texels.astype(np.float32), texture.size_m)
 
 
 def _wall(rng: np.random.Generator, tone: Color) -> np.ndarray:
-    """Emulsion paint: soft clouds, roller grain, a few scuffs."""
+    """Draw emulsion paint: soft clouds, roller grain and a few scuffs."""
     clouds = 0.045 * textures.noise(rng, (2, 2), 7) + 0.03 * textures.noise(rng, (64, 64), 2)
     scuffs = np.maximum(textures.noise(rng, (8, 8), 5) - 0.42, 0.0)
     return np.array(tone) * (1 + clouds - 0.35 * scuffs)[..., None]
 
 
 def _tiles(rng: np.random.Generator) -> np.ndarray:
-    """Stone tiles, four across, each its own tone, with pale joints."""
+    """Draw stone tiles, four across, each with its own tone, with pale joints."""
     side = TILE_TEXELS // 4
     place = np.arange(TILE_TEXELS) // side
     tone = rng.random((4, 4))[place][:, place]
@@ -69,7 +75,7 @@ def _tiles(rng: np.random.Generator) -> np.ndarray:
 
 
 def _color(rng: np.random.Generator, low: float = 0.08, high: float = 0.92) -> Color:
-    """Any hue; rarely vivid, as things indoors are."""
+    """Return a random color of any hue; vivid colors are rare, as they are indoors."""
     value, saturation = low + (high - low) * rng.random(), rng.random()
     weak = value * (1 - 0.7 * saturation * saturation)
     hue = 6 * rng.random()
@@ -83,20 +89,20 @@ def _plastic(rng: np.random.Generator) -> np.ndarray:
 
 
 def _metal(rng: np.random.Generator) -> np.ndarray:
-    """Brushed: fine lines along u."""
+    """Draw brushed metal with fine lines along u."""
     tone = 1 + 0.12 * textures.noise(rng, (64, 2), 3) + 0.12 * textures.noise(rng, (2, 2))
     return np.array(_color(rng, 0.3, 0.75)) * tone[..., None]
 
 
 def _ceramic(rng: np.random.Generator) -> np.ndarray:
-    """Glaze over bands."""
+    """Draw bands under glaze."""
     band = (np.arange(TILE_TEXELS) // 32 % 4 == 0)[:, None] * 0.8
     weight = band + 0.25 * textures.noise(rng, (4, 4))
     return textures.blend(_color(rng), _color(rng), weight)
 
 
 def _screen(rng: np.random.Generator) -> np.ndarray:
-    """A dark panel that mirrors the room a little."""
+    """Draw a dark panel with weak reflections."""
     return textures.blend((0.03, 0.03, 0.04), (0.16, 0.17, 0.2), textures.noise(rng, (2, 2), 6))
 
 

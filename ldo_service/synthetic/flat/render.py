@@ -14,15 +14,15 @@ from .building import LAMP_SIDE_M, SHELL, Panel, lamp_centers_m
 from .scene import Flat, surfaces
 from .scene_object import WALL
 
-EXPOSURE = 1.15  # a white wall near the lamp is just not saturated
-SHELL_FACES = 6  # number the first surfaces that a cast can meet
+EXPOSURE = 1.15  # A white wall near the lamp is just below saturation.
+SHELL_FACES = 6  # The faces of the shell are the surfaces 0-5 of a cast.
 
 
 Point = tuple[float, float, float]
 
 
 def light_on_panel(panel: Panel, lamp_center_m: Point, solids: tuple[Solid, ...]) -> np.ndarray:
-    """Light [rows, columns] on a grid over the face of the panel that its room sees."""
+    """Return the light [rows, columns] on a grid over the face of the panel that its room sees."""
     point, (rows, columns) = _grid_on_face(panel)
     lit = lit_share(lamp_center_m, LAMP_SIDE_M, _between(panel, lamp_center_m, solids), point)
     light = shade(vector(lamp_center_m), point, _normal(panel), lit, side=0.0)
@@ -30,14 +30,17 @@ def light_on_panel(panel: Panel, lamp_center_m: Point, solids: tuple[Solid, ...]
 
 
 def interpolated_on_panel(panel: Panel, grid: np.ndarray, local: Vector) -> np.ndarray:
-    """The grid's value [P] at points of the face, given in the solid's frame."""
+    """Return the grid's values [P] at points of the face in the solid's local frame."""
     a, b = plane_axes(panel.face // 2)
     u_m, v_m = ((local[i] + 1) * (panel.solid.size_m[i] / 2) for i in (a, b))
     return interpolated(grid, u_m, v_m)
 
 
 def is_on_face(panel: Panel, local: Vector) -> np.ndarray:
-    """Which points [P] of a panel's surface, in the solid's frame, lie on its seen face."""
+    """Return which points [P] of a panel lie on the face that its room sees.
+
+    The points are in the solid's local frame.
+    """
     return np.abs(local[panel.face // 2] - _side(panel)) < 1e-6
 
 
@@ -46,7 +49,10 @@ def _side(panel: Panel) -> float:
 
 
 def _between(panel: Panel, lamp_center_m: Point, solids: tuple[Solid, ...]) -> tuple[Solid, ...]:
-    """The solids that meet the box about panel and lamp: no other can throw a shadow on it."""
+    """Return the solids that intersect the bounding box of panel and lamp.
+
+    No other solid can cast a shadow on the panel.
+    """
     reach = np.array([LAMP_SIDE_M / 2, LAMP_SIDE_M / 2, 0.0])
     corners = [*panel.solid.corners_m(), lamp_center_m - reach, lamp_center_m + reach]
     low, high = np.min(corners, axis=0), np.max(corners, axis=0)
@@ -65,7 +71,7 @@ def _normal(panel: Panel) -> Vector:
 
 
 def _grid_on_face(panel: Panel) -> tuple[Vector, tuple[int, int]]:
-    """Points of the world [rows * columns], and the shape of their grid."""
+    """Return the grid's points in the world, [rows * columns], and its shape (rows, columns)."""
     solid, axis = panel.solid, panel.face // 2
     a, b = plane_axes(axis)
     columns, rows = (int(solid.size_m[i] / LIGHT_CELL_M) + 2 for i in (a, b))
@@ -81,21 +87,16 @@ def _grid_on_face(panel: Panel) -> tuple[Vector, tuple[int, int]]:
 
 @dataclass(frozen=True, slots=True)
 class FlatRendering:
-    """One frame before any sensor.
+    """Exact images of one frame, before the sensor model."""
 
-    light          [H, W, 3] float64 in 0..1
-    depth_m        [H, W] float64, z at pixel centres
-    instance_ids   [H, W] uint16
-    """
-
-    light: np.ndarray
-    depth_m: np.ndarray
-    class_ids: np.ndarray
-    instance_ids: np.ndarray
+    light: np.ndarray  # Light [H, W, 3] float64 in 0..1.
+    depth_m: np.ndarray  # Depth [H, W] float64, z at pixel centers.
+    class_ids: np.ndarray  # Class per pixel [H, W] uint8.
+    instance_ids: np.ndarray  # Object per pixel [H, W] uint16; 0 for the building.
 
 
 class FlatRenderer:
-    """Frames of one flat. The shadows on its walls are computed once, when this is made."""
+    """Renderer of one flat; it computes the shadows on the walls once, in the constructor."""
 
     def __init__(self, flat: Flat) -> None:
         self._flat = flat
@@ -108,7 +109,11 @@ class FlatRenderer:
         ]
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> FlatRendering:
-        """Pixels on an outline average four rays in light; depth and labels never mix surfaces."""
+        """Render the flat from one camera pose.
+
+        The light of a pixel on an outline is the mean of four rays. Depth and labels never mix
+        surfaces.
+        """
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
         view = RayCaster(SHELL, self._table.solids, camera, T_world_camera)
         hits = view.cast(u, v)
@@ -124,7 +129,7 @@ class FlatRenderer:
         )
 
     def _antialiased(self, view: RayCaster, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """The mean light [P, 3] of the quarters of pixels; all of them are cast at once."""
+        """Return the mean light [P, 3] of four rays per pixel, all in one cast."""
         du, dv = np.array(QUARTERS_PX).T
         u, v = (u[:, None] + du).ravel(), (v[:, None] + dv).ravel()
         order = np.argsort(v, kind="stable")
@@ -134,7 +139,7 @@ class FlatRenderer:
         return light.reshape(-1, len(du), 3).sum(axis=1) / len(du)
 
     def _reflected(self, view: RayCaster, u: np.ndarray, v: np.ndarray, hits: Hits) -> np.ndarray:
-        """Light [P, 3] in 0..1: albedo times diffuse shading."""
+        """Return the reflected light [P, 3] in 0..1: albedo times diffuse shading."""
         light = np.zeros((len(u), 3))
         for surface, rays in hits.by_surface():
             if surface >= SHELL_FACES:
@@ -147,7 +152,8 @@ class FlatRenderer:
         solid, lamp = self._table.solids[index], self._lamps[self._table.rooms[index]]
         normal, u_m, v_m = solid.surface(point)
         albedo = self._flat.textures[solid.texture].sample(u_m, v_m, footprint_m)
-        light = shade(vector(lamp), point, normal, 1.0, side=0.0)  # half a turn must not show
+        # Directional ambient light (side > 0) would break the symmetry of the half turn.
+        light = shade(vector(lamp), point, normal, 1.0, side=0.0)
         if index < len(self._flat.panels):
             panel, local = self._flat.panels[index], solid.point_to_local(point)
             shadowed = interpolated_on_panel(panel, self._panel_light[index], local)
@@ -155,7 +161,7 @@ class FlatRenderer:
         return albedo * (EXPOSURE * light)[:, None]
 
     def _with_shadows(self, room: int, index: int) -> np.ndarray:
-        """Light over a panel past the things of its room."""
+        """Return the light over a panel, with the shadows of the objects of its room."""
         table = self._table
         blockers = tuple(
             solid

@@ -1,4 +1,4 @@
-"""The whole flat: the building, the things in it, and a table of all their surfaces."""
+"""The whole flat: the building, its objects, and a table of all their solids."""
 
 from dataclasses import dataclass
 
@@ -15,37 +15,32 @@ from .scene_object import CLASS_NAMES, SceneObject
 
 @dataclass(frozen=True, slots=True)
 class Flat:
-    """The building, everything in it, and of each thing the room whose lamp lights it."""
+    """The building and its objects."""
 
     panels: tuple[Panel, ...]
     things: tuple[SceneObject, ...]
-    rooms: tuple[int, ...]
+    rooms: tuple[int, ...]  # Room of each object; the lamp of that room lights it.
     textures: dict[str, Texture]
 
 
 def furnished_flat(seed: int) -> Flat:
-    """The flat; `seed` paints its textures and chooses who wears which."""
+    """Return the flat; `seed` determines its textures and the material of each object."""
     placed = things(seed)
     return Flat(panels(), tuple(t for t, _ in placed), tuple(r for _, r in placed), materials(seed))
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceTable:
-    """Every solid of the flat, those of the panels first; all in one order, S of them.
-
-    rooms         [S] which lamp lights it
-    class_ids     [S] uint8
-    instance_ids  [S] uint16
-    """
+    """Table of all S solids of the flat, the panels first."""
 
     solids: tuple[Solid, ...]
-    rooms: np.ndarray
-    class_ids: np.ndarray
-    instance_ids: np.ndarray
+    rooms: np.ndarray  # Room [S]; its lamp lights the solid.
+    class_ids: np.ndarray  # Class [S] uint8.
+    instance_ids: np.ndarray  # Object [S] uint16; 0 for the building.
 
 
 def surfaces(flat: Flat) -> SurfaceTable:
-    """The table of a flat's solids."""
+    """Return the table of a flat's solids."""
     rows = [(panel.solid, panel.room, panel.class_id, 0) for panel in flat.panels]
     for number, (thing, room) in enumerate(zip(flat.things, flat.rooms, strict=True), 1):
         class_id = CLASS_NAMES.index(thing.label)

@@ -1,6 +1,6 @@
-"""One object of the flat: its class and the solids it is made of.
+"""Object of the flat: its class and its solids.
 
-Classes are those of COCO in their usual order, others, and the parts of the building.
+The classes are those of COCO in their usual order, then others, then the parts of the building.
 """
 
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ import numpy as np
 
 from ldo_service.synthetic.solids import Solid
 
-# Lin et al., ECCV 2014; numbered 0-79 as detectors number them.
+# Classes of COCO (Lin et al., ECCV 2014), with the ids 0-79 that detectors use.
 COCO = (
     "person bicycle car motorcycle airplane bus train truck boat traffic_light fire_hydrant "
     "stop_sign parking_meter bench bird cat dog horse sheep cow elephant bear zebra giraffe "
@@ -36,13 +36,13 @@ Heading = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """A frame standing upright in another: its origin there, and the direction of its x axis."""
+    """Pose of an upright frame in an outer frame, z up in both."""
 
-    origin_m: tuple[float, float, float]
-    heading: Heading = (1.0, 0.0)
+    origin_m: tuple[float, float, float]  # Origin in the outer frame.
+    heading: Heading = (1.0, 0.0)  # Unit vector (x, y) of its x axis in the outer frame.
 
     def __call__(self, solid: Solid) -> Solid:
-        """The solid, seen from the outer frame."""
+        """Return the solid in the outer frame."""
         (x, y, z), (px, py, pz) = solid.center_m, self.origin_m
         (c, s), (hx, hy) = self.heading, solid.heading
         center_m = (px + (c * x - s * y), py + (s * x + c * y), pz + z)
@@ -51,14 +51,14 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """An object of one class in the world."""
+    """Object of one class, as solids in one frame."""
 
     label: str
     solids: tuple[Solid, ...]
 
     @property
     def bounds_m(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centre [3] and size [3] of its box along the axes of the world."""
+        """Center [3] and size [3] of the bounding box along the axes of its frame, meters."""
         corners = np.concatenate([solid.corners_m() for solid in self.solids])
         low, high = corners.min(axis=0), corners.max(axis=0)
         return (low + high) / 2, high - low

@@ -1,4 +1,4 @@
-"""What a Kinect-like camera makes of an exact frame: blur, exposure and noise; a worse depth."""
+"""Sensor model of a Kinect-like camera: motion blur, exposure, noise and depth errors."""
 
 from dataclasses import dataclass
 
@@ -10,43 +10,44 @@ from ldo_service.synthetic.room_sequence import DISPARITY_SIGMA_STEPS, DISPARITY
 from .render import FlatRendering
 from .walk import FRAMES, RATE_HZ, CameraPath, closed_spline
 
-SHUTTER_S = 0.02  # indoors in the evening: 11 pixels of blur at 60 degrees per second
-BLUR_TAPS = 7
-EXPOSURE_S, EXPOSURE_SPREAD = 3.0, 0.2  # the gain drifts by +-20 % within seconds
-NOISE = 0.008  # of full scale: 2 grey levels
+SHUTTER_S = 0.02  # Indoors in the evening: 11 pixels of blur at 60 degrees per second.
+BLUR_TAPS = 7  # Samples per pixel along its motion.
+EXPOSURE_S, EXPOSURE_SPREAD = 3.0, 0.2  # The gain drifts by +-20 % within seconds.
+NOISE = 0.008  # Standard deviation as a fraction of full scale: 2 gray levels.
 
 NEAREST_M, FARTHEST_M = 0.4, 5.0
-BASELINE_PX_M = 0.075  # of projector and camera, times the focal length in pixels
-DARK = 0.12  # below this brightness the projected pattern begins to be lost
-PATCH_PX = 8  # holes on dark surfaces come in patches
-WINDOW_PX = 6  # the pattern is matched in windows: neighbours err alike
-SHARED_NOISE, OWN_NOISE = 0.8, 0.6  # of a disparity's noise; their squares add up to 1
+BASELINE_PX_M = 0.075  # Baseline of projector and camera, to be multiplied by the focal length.
+DARK = 0.12  # Brightness below which the camera begins to lose the projected pattern.
+PATCH_PX = 8  # Size of the holes on dark surfaces.
+WINDOW_PX = 6  # Size of the matching windows, in which neighbors have similar errors.
+# Shared and individual fractions of the disparity noise; their squares sum to 1.
+SHARED_NOISE, OWN_NOISE = 0.8, 0.6
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A camera on a walk; `seed` draws its gain and its noise."""
+    """Camera on a walk; `seed` determines the drift of its gain."""
 
     camera: Camera
     walk: CameraPath
     seed: int
 
     def color(self, frame: int, rendering: FlatRendering, rng: np.random.Generator) -> np.ndarray:
-        """Light [H, W, 3] as recorded: moved while the shutter is open, amplified, noisy.
+        """Return the recorded light [H, W, 3] with motion blur, gain and noise.
 
-        Motion during the exposure is taken as linear: a pixel averages the sharp image along the
-        way its surface takes. What is uncovered behind an edge meanwhile is not seen.
+        Motion during the exposure is approximated as linear: a pixel averages the sharp image
+        along the path of its surface. Surfaces that the motion uncovers are not modeled.
         """
         gain = 1 + EXPOSURE_SPREAD * self._drift(frame)
         blurred = blur(rendering.light, *self.motion_px(frame, rendering.depth_m))
         return gain * blurred + NOISE * normal(rng, blurred.shape)
 
     def depth_m(self, rendering: FlatRendering, rng: np.random.Generator) -> np.ndarray:
-        """Depth [H, W] as measured; 0 where nothing is."""
+        """Return the measured depth [H, W], meters; 0 where unknown."""
         return measured_depth_m(rendering, self.camera.fx, rng)
 
     def motion_px(self, frame: int, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far [H, W] the surface at each pixel moves in u and v while the shutter is open."""
+        """Return the image motion in u and v, each [H, W], while the shutter is open."""
         half = SHUTTER_S * RATE_HZ / 2
         T_world_camera = self.walk.pose(frame)
         opened, closed = (
@@ -56,7 +57,7 @@ class Sensor:
         return closed[0] - opened[0], closed[1] - opened[1]
 
     def _drift(self, frame: int) -> float:
-        """Slow, between -1 and 1."""
+        """Return a slowly varying value in -1..1."""
         count = int(FRAMES / RATE_HZ / EXPOSURE_S)
         knots = np.random.default_rng([self.seed, 3]).random((count, 1)) * 2 - 1
         drift = closed_spline(knots, np.array([frame / FRAMES * count]))[0, 0]
@@ -66,11 +67,19 @@ class Sensor:
 def measured_depth_m(
     rendering: FlatRendering, focal_px: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Depth [H, W] of a Kinect-like camera; 0 where it measures none.
+    """Return depth with the errors of a Kinect-like camera.
 
-    Steps of 2.85e-3 z^2 (Khoshelham and Elberink, Sensors 2012), noise of half a step that
-    neighbours share, ragged edges, no measurement in the projector's shadow, on dark patches
-    and outside 0.4-5 m.
+    The depth has steps of 2.85e-3 z^2 (Khoshelham and Elberink, Sensors 2012), noise of half a
+    step that neighbors share, and ragged edges. There is no measurement in the projector's shadow,
+    on dark patches and outside 0.4-5 m.
+
+    Args:
+        rendering: The exact frame.
+        focal_px: Focal length.
+        rng: Source of the noise.
+
+    Returns:
+        Depth [H, W], meters; 0 where unknown.
     """
     exact = rendering.depth_m
     disparity = 1 / (_ragged(exact, rng) * DISPARITY_STEP_PER_M)
@@ -82,13 +91,22 @@ def measured_depth_m(
 
 
 def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Nearly normal numbers of unit variance, by sums alone: the same bits on every machine."""
-    total = rng.random(shape) + rng.random(shape) + rng.random(shape)  # variance 3 / 12
+    """Return nearly normal numbers of unit variance, bitwise equal on every machine.
+
+    They are sums of uniform numbers, which need no logarithm.
+    """
+    total = rng.random(shape) + rng.random(shape) + rng.random(shape)  # Variance 3 / 12.
     return 2 * (total - 1.5)
 
 
 def blur(light: np.ndarray, du_px: np.ndarray, dv_px: np.ndarray) -> np.ndarray:
-    """The mean [H, W, 3] of the image along a segment about each pixel."""
+    """Return the mean [H, W, 3] of the image along a line centered at each pixel.
+
+    Args:
+        light: Image [H, W, 3].
+        du_px: Extent [H, W] of the line in u.
+        dv_px: Extent [H, W] of the line in v.
+    """
     v, u = np.mgrid[: light.shape[0], : light.shape[1]]
     total = np.zeros(light.shape)
     for tap in range(BLUR_TAPS):
@@ -98,9 +116,14 @@ def blur(light: np.ndarray, du_px: np.ndarray, dv_px: np.ndarray) -> np.ndarray:
 
 
 def is_shadowed(depth_m: np.ndarray, baseline_px_m: float) -> np.ndarray:
-    """Pixels [H, W] that the projector, to the left of the camera, does not reach.
+    """Return a mask [H, W] of the pixels that the projector does not reach.
 
-    It sees pixel u of depth z at u + b f / z; of all that it sees there, only the nearest is lit.
+    The projector is to the left of the camera. Pixel u with depth z lies at u + b f / z in its
+    image, and it lights only the nearest surface there.
+
+    Args:
+        depth_m: Exact depth [H, W], meters.
+        baseline_px_m: Baseline times focal length, b f.
     """
     height, width = depth_m.shape
     shift = baseline_px_m / np.maximum(depth_m, NEAREST_M)
@@ -112,23 +135,26 @@ def is_shadowed(depth_m: np.ndarray, baseline_px_m: float) -> np.ndarray:
 
 
 def _ragged(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Depth of a neighbour in the row, up to a pixel or two away: edges are not matched sharply."""
+    """Replace each depth by that of a pixel in the same row, at most two pixels away.
+
+    This models the inexact matching at edges.
+    """
     shift = np.floor(0.7 * normal(rng, depth_m.shape) + 0.5).astype(np.int64)
     column = np.clip(np.arange(depth_m.shape[1]) + shift, 0, depth_m.shape[1] - 1)
     return np.take_along_axis(depth_m, column, axis=1)
 
 
 def _is_too_dark(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Patches [H, W] that are lost, the more the darker the surface is."""
+    """Return a mask [H, W] of pixels without measurement, more of them on darker surfaces."""
     brightness = (light[..., 0] + light[..., 1] + light[..., 2]) / 3
     patches = _enlarged(rng.random(_coarse(brightness.shape, PATCH_PX)), PATCH_PX, brightness.shape)
     return brightness < DARK * patches * (0.5 + rng.random(brightness.shape))
 
 
 def _matching_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Unit variance [H, W], most of it shared within a window."""
+    """Return noise [H, W] of unit variance, most of it shared within a window."""
     shared = _enlarged(normal(rng, _coarse(shape, WINDOW_PX)), WINDOW_PX, shape)
-    # interpolation keeps 2/3 of the variance along each axis, hence 1.5
+    # Interpolation keeps 2/3 of the variance along each axis, hence the factor 1.5.
     return SHARED_NOISE * 1.5 * shared + OWN_NOISE * normal(rng, shape)
 
 
@@ -137,7 +163,7 @@ def _coarse(shape: tuple[int, ...], cell_px: int) -> tuple[int, int]:
 
 
 def _enlarged(coarse: np.ndarray, cell_px: int, shape: tuple[int, ...]) -> np.ndarray:
-    """A coarse grid, interpolated to an image [H, W] with cells of `cell_px`."""
+    """Return a coarse grid with cells of `cell_px`, interpolated to an image [H, W]."""
     v, u = np.mgrid[: shape[0], : shape[1]] / cell_px
     return _sampled(coarse[..., None], u, v)[..., 0]
 
@@ -145,7 +171,19 @@ def _enlarged(coarse: np.ndarray, cell_px: int, shape: tuple[int, ...]) -> np.nd
 def _projected(
     camera: Camera, T_world_other: np.ndarray, T_world_camera: np.ndarray, depth_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where [H, W] another pose sees the surfaces of this one. Sums in a fixed order."""
+    """Project the pixels of one camera pose into another.
+
+    Sums have a fixed order, so that the result is bitwise equal on every machine.
+
+    Args:
+        camera: Intrinsics of both poses.
+        T_world_other: Pose to project into, [4, 4].
+        T_world_camera: Pose of the depth image, [4, 4].
+        depth_m: Depth [H, W], meters.
+
+    Returns:
+        Pixel coordinates u and v in the other image, each [H, W].
+    """
     ray = np.moveaxis(camera.rays(), -1, 0)
     T, S = T_world_camera, T_world_other
     world = [depth_m * _dot(T[i, :3], ray) + (T[i, 3] - S[i, 3]) for i in range(3)]
@@ -158,7 +196,7 @@ def _dot(a: np.ndarray, b: np.ndarray | list) -> np.ndarray:
 
 
 def _sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Bilinear values [H, W, C] of an image at pixels, those beyond its border taken from it."""
+    """Return bilinear values [H, W, C] at pixels, clamped to the border of the image."""
     height, width = image.shape[:2]
     u, v = np.clip(u, 0, width - 1.001), np.clip(v, 0, height - 1.001)
     left, top = u.astype(np.int64), v.astype(np.int64)

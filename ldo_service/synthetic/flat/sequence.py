@@ -1,4 +1,4 @@
-"""The flat as a sequence, and all of its frames rendered into the cache by several processes."""
+"""Sequence of the flat, with a parallel renderer that fills its cache."""
 
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -20,40 +20,36 @@ from .scene_object import CLASS_NAMES, SceneObject
 from .sensor import Sensor
 from .walk import FRAMES, RATE_HZ, hand_held
 
-VERSION = 1  # raise it with every change that alters a byte of any frame
-FOCAL_PER_WIDTH = 0.8125  # 63 degrees wide, as a Kinect's colour camera
+VERSION = 1  # Increase it with every change that alters a byte of any frame.
+FOCAL_PER_WIDTH = 0.8125  # Horizontal field of view of 63 degrees, as a Kinect's color camera.
 
 
 @dataclass(frozen=True, slots=True)
 class FlatConfig:
-    """What is rendered. The same values give the same bytes."""
+    """Parameters of a rendered sequence; equal values give equal bytes."""
 
     width_px: int = 640
     height_px: int = 480
-    noise: bool = True  # blur, exposure and a Kinect's depth; sharp and exact otherwise
-    seed: int = 0  # of textures and paints, of the hand's shaking and of the noise
+    noise: bool = True  # Blur, exposure drift and a Kinect's depth; sharp and exact otherwise.
+    seed: int = 0  # Seed of textures, materials, hand shake and noise.
 
     def __post_init__(self) -> None:
         if self.width_px < 16 or self.height_px < 16:
             raise ConfigError(
-                f"synthetic flat of {self.width_px}x{self.height_px} pixels: at least 16x16 is "
-                "needed."
+                f"synthetic flat of {self.width_px}x{self.height_px} pixels must have at least "
+                "16x16 pixels."
             )
         if self.seed < 0:
-            raise ConfigError(f"seed {self.seed} of a synthetic flat: 0 or more is needed.")
+            raise ConfigError(f"synthetic flat: seed={self.seed} must be at least 0.")
 
 
 NAMED = {"flat": FlatConfig(), "flat-exact": FlatConfig(noise=False)}
 
 
 class FlatSequence(Sequence):
-    """A walk through the flat, 43 s at 15 Hz; frames are rendered once, then come from the disk.
+    """Walk through the flat, 43 s at 15 Hz; each frame is rendered once and cached on disk."""
 
-    class_names   names of the class ids
-    things        objects; instance id i is things[i - 1], id 0 the building
-    """
-
-    class_names = CLASS_NAMES
+    class_names = CLASS_NAMES  # Names of the class ids.
 
     def __init__(self, config: FlatConfig | None = None, name: str = "flat") -> None:
         self.config = config = config or FlatConfig()
@@ -68,37 +64,47 @@ class FlatSequence(Sequence):
 
     @staticmethod
     def named(name: str, **changes: int | bool) -> "FlatSequence":
-        """The sequence `synthetic:name`, its config changed by keywords. Raises DataError."""
+        """Return the sequence `synthetic:name`, with fields of its config replaced by keywords.
+
+        Raises:
+            DataError: If the name is unknown.
+        """
         if name not in NAMED:
-            raise DataError(f"there is no synthetic:{name} among the flats {', '.join(NAMED)}.")
+            raise DataError(f"unknown flat synthetic:{name}; known are {', '.join(NAMED)}.")
         config = replace(NAMED[name], **changes)
         seed = f"@{config.seed}" if config.seed else ""
         return FlatSequence(config, f"synthetic:{name}{seed}")
 
     @property
     def cache_folder(self) -> Path:
-        """Where its rendered frames are kept."""
+        """Folder of the cached frames."""
         return self._cache.folder
 
     @cached_property
     def things(self) -> tuple[SceneObject, ...]:
-        """The objects in the world."""
+        """Objects in the world; instance id i is `things[i - 1]`, id 0 the building."""
         return self._flat.things
 
     def read(self, index: int) -> RawFrame:
+        """Return frame `index` from the cache, or render and cache it."""
         frame = self._frame(index)
         stamp_ns = int(self.stamps_ns[index])
         return RawFrame(index, stamp_ns, frame.color, frame.depth_m, 1.0, self.raw_camera)
 
     def labels(self, index: int) -> FrameLabels:
-        """True class and instance per pixel of frame `index`, exact even where depth is not."""
+        """Return the ground-truth class and instance per pixel of frame `index`.
+
+        Labels are exact even where depth is noisy or missing.
+        """
         frame = self._frame(index)
         return FrameLabels(frame.class_ids, frame.instance_ids)
 
     def true_labels(self) -> TrueLabels:
+        """Return the class names and the function `labels`."""
         return TrueLabels(CLASS_NAMES, self.labels)
 
     def truth(self) -> Trajectory:
+        """Return the ground-truth trajectory."""
         return Trajectory(self.stamps_ns / 1e9, self._T_world_camera.copy())
 
     @cached_property
@@ -133,8 +139,16 @@ def prerender(
     frames: range | None = None,
     advance: Callable[[int], None] | None = None,
 ) -> None:
-    """Render those of `frames` (None: all) that are not cached yet: about a second per frame of
-    640x480 and process. `advance` is called with the number of frames done."""
+    """Render the frames that are not cached yet in several processes.
+
+    A frame of 640x480 pixels takes a process about one second.
+
+    Args:
+        config: Parameters of the sequence.
+        processes: Number of processes.
+        frames: Indices of the frames; None for all.
+        advance: Callback that receives the number of finished frames.
+    """
     indices = range(len(FlatSequence(config))) if frames is None else frames
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         for done, _ in enumerate(pool.map(partial(_read, config), indices), 1):
@@ -148,5 +162,5 @@ def _read(config: FlatConfig, index: int) -> None:
 
 @lru_cache(maxsize=1)
 def _sequence(config: FlatConfig) -> FlatSequence:
-    """Made once in a process: its furniture takes a second."""
+    """Return the sequence, built once per process because its furniture takes a second."""
     return FlatSequence(config)

@@ -1,4 +1,4 @@
-"""A walk with a hand-held camera: each room twice, by way of the corridor, and back."""
+"""Walk with a hand-held camera that visits each room twice through the corridor."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,11 @@ from ldo_service.synthetic.path import closed_spline
 RATE_HZ = 15
 FRAMES = 640
 
-# Eye x, y, z in metres and gaze x, y, z; from room A's door to room B's. Half a turn about the
-# world's z axis makes the way back from B to A of them.
+# Knots from room A's door to room B's: camera position x, y, z in meters and gaze x, y, z. A half
+# turn about the world's z axis gives the way back from B to A.
 FIRST_HALF = np.array(
     [
-        # room A, from left to right
+        # Room A, from left to right.
         [-1.15, 1.00, 1.42, -0.72, 0.69, -0.12],
         [-1.34, 1.55, 1.45, -0.42, 0.91, -0.16],
         [-1.30, 2.10, 1.48, 0.10, 0.99, -0.20],
@@ -21,7 +21,7 @@ FIRST_HALF = np.array(
         [-0.48, 2.25, 1.42, 0.95, 0.31, -0.18],
         [-0.55, 1.70, 1.42, 0.97, -0.26, -0.16],
         [-0.92, 1.20, 1.45, 0.62, -0.78, -0.12],
-        # corridor
+        # Corridor.
         [-1.02, 0.60, 1.48, 0.50, -0.86, -0.10],
         [-0.72, 0.12, 1.50, 0.87, -0.50, -0.08],
         [-0.15, -0.03, 1.46, 0.99, -0.10, -0.08],
@@ -31,7 +31,7 @@ FIRST_HALF = np.array(
 )
 SECOND_HALF = np.array(
     [
-        # room A, from right to left
+        # Room A, from right to left.
         [-1.05, 1.05, 1.40, -0.18, 0.98, -0.16],
         [-0.80, 1.55, 1.38, -0.10, 0.99, -0.20],
         [-0.82, 2.10, 1.42, -0.50, 0.86, -0.20],
@@ -39,7 +39,7 @@ SECOND_HALF = np.array(
         [-1.58, 2.15, 1.48, -0.99, -0.10, -0.16],
         [-1.50, 1.60, 1.50, -0.72, -0.68, -0.16],
         [-1.22, 1.10, 1.46, -0.10, -0.98, -0.14],
-        # corridor
+        # Corridor.
         [-1.00, 0.55, 1.42, 0.22, -0.97, -0.08],
         [-0.66, 0.10, 1.44, 0.78, -0.62, -0.10],
         [-0.10, 0.05, 1.48, 0.98, -0.20, -0.08],
@@ -50,26 +50,24 @@ SECOND_HALF = np.array(
 HALF_TURN = np.array([-1, -1, 1, -1, -1, 1])
 KNOTS = np.concatenate([FIRST_HALF, FIRST_HALF * HALF_TURN, SECOND_HALF, SECOND_HALF * HALF_TURN])
 
-WALK_M_S, TURN_RAD_S = 0.63, 1.02  # paces: walking or turning, what is slower sets the time
-STEPS_PER_KNOT = 64  # of the table that turns time into a place on the way
+# Speeds of walking and turning; their times per step are combined as a root sum of squares.
+WALK_M_S, TURN_RAD_S = 0.63, 1.02
+STEPS_PER_KNOT = 64  # Resolution of the table that maps time to a position on the path.
 
-SWAY_S, SWAY_EYE_M, SWAY_GAZE = 0.6, 0.012, 0.022  # a hand's drift, and
-TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE = 0.2, 0.0015, 0.004  # its quick tremor
+# Period and amplitudes of the hand's slow drift and of its quick tremor.
+SWAY_S, SWAY_EYE_M, SWAY_GAZE = 0.6, 0.012, 0.022
+TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE = 0.2, 0.0015, 0.004
 
 
 @dataclass(frozen=True, slots=True)
 class CameraPath:
-    """The camera's motion as a function of time, a closed curve that `FRAMES` frames sample.
+    """Camera motion as a function of time, a closed curve with `FRAMES` frames."""
 
-    along   [M + 1] place on the knots at times of equal steps
-    shakes  closed splines [K, 7] of eye, gaze and roll
-    """
-
-    along: np.ndarray
-    shakes: tuple[np.ndarray, ...]
+    along: np.ndarray  # Positions [M + 1] on the knots at equal time steps.
+    shakes: tuple[np.ndarray, ...]  # Knots [K, 7] of closed splines added to eye, gaze and roll.
 
     def pose(self, frame: float) -> np.ndarray:
-        """T_world_camera [4, 4] at `frame`, which may lie between two."""
+        """Return T_world_camera [4, 4] at `frame`, which may be fractional."""
         turn = frame / FRAMES % 1.0
         x = turn * (len(self.along) - 1)
         cell = int(x)
@@ -81,7 +79,7 @@ class CameraPath:
 
 
 def hand_held(seed: int) -> CameraPath:
-    """The walk with the sway and tremor of a hand drawn from `seed`."""
+    """Return the walk with the sway and tremor of a hand; `seed` determines both."""
     rng = np.random.default_rng([seed, 2])
     sway = _shake(rng, SWAY_S, SWAY_EYE_M, SWAY_GAZE)
     tremor = _shake(rng, TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE)
@@ -94,7 +92,10 @@ def _shake(rng: np.random.Generator, period_s: float, eye_m: float, gaze: float)
 
 
 def _timed() -> np.ndarray:
-    """Place on the knots at equal steps of time, so that no pace is exceeded for long."""
+    """Return positions on the knots at equal time steps.
+
+    Neither the walking speed nor the turn rate is exceeded for long.
+    """
     place = np.arange(len(KNOTS) * STEPS_PER_KNOT + 1) / STEPS_PER_KNOT
     state = closed_spline(KNOTS, place[:-1])
     state = np.concatenate([state, state[:1]])
@@ -118,7 +119,7 @@ def _at(knots: np.ndarray, place: float) -> np.ndarray:
 
 
 def _looking(eye: np.ndarray, gaze: np.ndarray, roll: float) -> np.ndarray:
-    """T_world_camera [4, 4] with z along the gaze, rolled by a small angle off the horizon."""
+    """Return T_world_camera [4, 4] with z along the gaze, rolled by a small angle."""
     z = gaze / _length(gaze[None])[0]
     level = np.array([z[1], -z[0], 0.0])
     level = level / _length(level[None])[0]

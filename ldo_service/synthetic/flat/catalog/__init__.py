@@ -1,7 +1,8 @@
-"""How things look: builders by class name, several shapes for many classes.
+"""Catalog of object builders by class name; many classes have several shapes.
 
-A builder takes the paints and a shape number and gives solids in the thing's own frame: the origin
-is the middle of its underside (of its back, for what hangs on a wall) and its front looks along -y.
+A builder takes the materials and a shape number. It returns solids in the object's own frame: the
+front faces -y, and the origin is the center of the underside. For objects on a wall, the origin is
+the center of the back.
 """
 
 from . import machines, rooms, small

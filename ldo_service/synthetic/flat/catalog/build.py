@@ -1,4 +1,4 @@
-"""Words for building things."""
+"""Helper functions of the object builders."""
 
 from collections.abc import Callable
 
@@ -14,25 +14,28 @@ Triple = tuple[float, float, float]
 def solid(
     shape: Shape, foot_m: Triple, size_m: Triple, paint: str, heading: Heading = (1.0, 0.0)
 ) -> Solid:
-    """A solid standing on `foot_m`, the middle of its underside."""
+    """Return a solid with the center of its underside at `foot_m`."""
     x, y, z = foot_m
     return Solid(shape, (x, y, z + size_m[2] / 2), size_m, paint, heading)
 
 
 def box(foot_m: Triple, size_m: Triple, paint: str, heading: Heading = (1.0, 0.0)) -> Solid:
+    """Return a box on `foot_m`."""
     return solid("box", foot_m, size_m, paint, heading)
 
 
 def ball(foot_m: Triple, size_m: Triple, paint: str) -> Solid:
+    """Return an ellipsoid on `foot_m`."""
     return solid("ball", foot_m, size_m, paint)
 
 
 def cylinder(foot_m: Triple, width_m: float, height_m: float, paint: str) -> Solid:
+    """Return an upright cylinder on `foot_m`."""
     return solid("cylinder", foot_m, (width_m, width_m, height_m), paint)
 
 
 def legs(width_m: float, depth_m: float, height_m: float, thick_m: float, paint: str) -> Solids:
-    """Four legs at the corners of a rectangle about the origin."""
+    """Return four legs at the corners of a rectangle centered at the origin."""
     x, y = (width_m - thick_m) / 2, (depth_m - thick_m) / 2
     size_m = (thick_m, thick_m, height_m)
     return tuple(box((sx * x, sy * y, 0), size_m, paint) for sx in (-1, 1) for sy in (-1, 1))

@@ -1,4 +1,4 @@
-"""Builders of machines of kitchen, bath and living room, and of things on desks and walls."""
+"""Builders of appliances, and of objects on desks and walls."""
 
 from ldo_service.synthetic.flat.paint import Materials
 
@@ -6,7 +6,7 @@ from .build import Builder, Solids, ball, box, cylinder, legs, solid
 
 
 def tv(paint: Materials, shape: int) -> Solids:
-    """A wide one on a foot, or a flat one to hang up."""
+    """Build a wide TV on a foot, or a flat one for the wall."""
     case, width = paint("plastic"), 1.0 if shape == 0 else 0.8
     height = 0.56 * width
     z = 0.06 if shape == 0 else 0.0
@@ -52,7 +52,7 @@ def toaster(paint: Materials, _: int) -> Solids:
 
 
 def sink(paint: Materials, _: int) -> Solids:
-    """A basin on a column, with its tap."""
+    """Build a basin on a column, with a tap."""
     glaze, metal = paint("ceramic"), paint("metal")
     return (
         cylinder((0, 0.05, 0), 0.18, 0.7, glaze),
@@ -73,7 +73,7 @@ def toilet(paint: Materials, _: int) -> Solids:
 
 
 def speaker(paint: Materials, shape: int) -> Solids:
-    """A tower, or a small box for a shelf."""
+    """Build a tower speaker, or a small one for a shelf."""
     case, cone = paint("wood"), paint("screen")
     height, width = (0.8, 0.22) if shape == 0 else (0.3, 0.18)
     at = [(0.3 * height, 0.16), (0.68 * height, 0.12)]
@@ -98,7 +98,7 @@ def radiator(paint: Materials, _: int) -> Solids:
 
 
 def projector(paint: Materials, _: int) -> Solids:
-    """On a stand of its own."""
+    """Build a projector on a stand."""
     case, metal = paint("plastic"), paint("metal")
     lens = solid("wheel", (-0.07, -0.14, 0.93), (0.06, 0.09, 0.09), paint("screen"), (0.0, 1.0))
     table = box((0, 0, 0.86), (0.42, 0.34, 0.02), metal)
@@ -169,7 +169,7 @@ def cell_phone(paint: Materials, _: int) -> Solids:
 
 
 def book(paint: Materials, shape: int) -> Solids:
-    """One lying, a stack, or a row standing."""
+    """Build one flat book, a stack, or a standing row."""
     if shape == 0:
         return (box((0, 0, 0), (0.17, 0.24, 0.035), paint("print"), (0.96, 0.28)),)
     if shape == 1:
@@ -181,7 +181,7 @@ def book(paint: Materials, shape: int) -> Solids:
 
 
 def clock(paint: Materials, shape: int) -> Solids:
-    """Round or square, to hang up; the face is pale, the hands are dark."""
+    """Build a round or square wall clock with a pale face and dark hands."""
     rim, hand = paint("plastic"), paint("screen")
     body = solid("wheel", (0, -0.02, -0.16), (0.04, 0.32, 0.32), rim, (0.0, 1.0))
     if shape == 1:
@@ -194,7 +194,7 @@ def clock(paint: Materials, shape: int) -> Solids:
 
 
 def picture_frame(paint: Materials, shape: int) -> Solids:
-    """Upright or wide, to hang up; the origin is the middle of its back."""
+    """Build an upright, wide or square picture frame for the wall."""
     width, height = ((0.5, 0.64), (0.9, 0.6), (0.34, 0.34))[shape]
     rim = box((0, -0.015, -height / 2), (width, 0.03, height), paint("wood"))
     inner = (width - 0.08, 0.004, height - 0.08)

@@ -6,14 +6,14 @@ from .build import Builder, Solids, ball, box, cylinder, legs, solid
 
 
 def door(paint: Materials, _: int) -> Solids:
-    """A leaf standing open; the hinge is at the origin, the leaf along -y."""
+    """Build an open door with its hinge at the origin and its leaf along -y."""
     wood = paint("wood")
     knob = ball((0.045, -0.78, 1.0), (0.06, 0.06, 0.06), paint("metal"))
     return box((0, -0.425, 0.01), (0.04, 0.85, 2.02), wood), knob
 
 
 def window(paint: Materials, _: int) -> Solids:
-    """To hang up: two panes, a frame, a sill; the origin is the middle of its back."""
+    """Build a window with two panes, a frame and a sill; the origin is the center of its back."""
     frame = paint("wood")
     bars = [box((x, -0.025, -0.55), (0.06, 0.05, 1.1), frame) for x in (-0.62, 0.0, 0.62)]
     beams = [box((0, -0.025, z), (1.24, 0.05, 0.06), frame) for z in (-0.58, 0.52)]
@@ -40,7 +40,7 @@ FIXTURES: dict[str, Builder] = {"door": door, "window": window, "coat rack": coa
 
 
 def chair(paint: Materials, shape: int) -> Solids:
-    """A kitchen chair, a stool with a back, or an office chair."""
+    """Build a kitchen chair, a stool with a back, or an office chair."""
     seat, frame = paint("fabric"), paint("wood")
     if shape == 0:
         posts = [box((x, 0.19, 0.47), (0.04, 0.04, 0.45), frame) for x in (-0.18, 0.18)]
@@ -66,7 +66,7 @@ def chair(paint: Materials, shape: int) -> Solids:
 
 
 def couch(paint: Materials, shape: int) -> Solids:
-    """Two seats with arms, or a long one without."""
+    """Build a couch of two seats with arms, or a longer one without arms."""
     cover, seat = paint("fabric"), paint("fabric")
     width = 1.5 if shape == 0 else 1.8
     body = box((0, 0, 0.08), (width, 0.8, 0.3), cover)
@@ -91,7 +91,7 @@ def bed(paint: Materials, _: int) -> Solids:
 
 
 def dining_table(paint: Materials, shape: int) -> Solids:
-    """On four legs, round on a foot, or a long desk on two sides."""
+    """Build a table on four legs, a round one on a foot, or a long desk on two side panels."""
     top = paint("wood")
     if shape == 0:
         return (*legs(1.1, 0.66, 0.7, 0.06, top), box((0, 0, 0.7), (1.16, 0.72, 0.04), top))
@@ -110,7 +110,7 @@ def bench(paint: Materials, _: int) -> Solids:
 
 
 def shelf(paint: Materials, shape: int) -> Solids:
-    """A bookcase with boards, or a low open one."""
+    """Build a tall bookcase, or a low one."""
     wood = paint("wood")
     height, width = (1.8, 0.9) if shape == 0 else (0.8, 0.7)
     sides = [box((s * width / 2, 0, 0), (0.03, 0.3, height), wood) for s in (-1, 1)]
@@ -120,7 +120,7 @@ def shelf(paint: Materials, shape: int) -> Solids:
 
 
 def cabinet(paint: Materials, shape: int) -> Solids:
-    """A sideboard, or a kitchen unit with a worktop."""
+    """Build a sideboard, or a kitchen unit with a worktop."""
     front, metal = paint("wood" if shape == 0 else "plastic"), paint("metal")
     width = 1.1 if shape == 0 else 1.2
     body = box((0, 0, 0.05), (width, 0.44, 0.75), front)
@@ -144,7 +144,7 @@ def rug(paint: Materials, shape: int) -> Solids:
 
 
 def lamp(paint: Materials, shape: int) -> Solids:
-    """A floor lamp, a table lamp with a cone, or a ball on a rod."""
+    """Build a floor lamp, a table lamp with a cone shade, or a ball on a rod."""
     metal, shade = paint("metal"), paint("fabric")
     if shape == 0:
         foot = (cylinder((0, 0, 0), 0.3, 0.03, metal), cylinder((0, 0, 0.03), 0.03, 1.3, metal))
@@ -157,7 +157,7 @@ def lamp(paint: Materials, shape: int) -> Solids:
 
 
 def potted_plant(paint: Materials, shape: int) -> Solids:
-    """A bush, a tree of three balls, or a cone-shaped conifer."""
+    """Build a bush, a tree of three balls, or a conifer of cones, each in a pot."""
     leaves, pot = paint("leaves"), solid("bucket", (0, 0, 0), (0.3, 0.3, 0.28), paint("ceramic"))
     if shape == 0:
         return pot, ball((0, 0, 0.22), (0.5, 0.5, 0.52), leaves)

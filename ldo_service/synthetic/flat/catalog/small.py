@@ -1,4 +1,4 @@
-"""Builders of small things: vessels, fruit, bags, toys and tools."""
+"""Builders of small objects: vessels, fruit, bags, toys and tools."""
 
 from ldo_service.synthetic.flat.paint import Materials
 
@@ -6,7 +6,7 @@ from .build import Builder, Solids, ball, box, cylinder, solid
 
 
 def bottle(paint: Materials, shape: int) -> Solids:
-    """Slim with a neck, or wide with a cone for a shoulder."""
+    """Build a slim bottle with a neck, or a wide one with a cone as its shoulder."""
     glass = paint("ceramic")
     if shape == 0:
         return cylinder((0, 0, 0), 0.075, 0.2, glass), cylinder((0, 0, 0.2), 0.03, 0.1, glass)
@@ -19,7 +19,7 @@ def bottle(paint: Materials, shape: int) -> Solids:
 
 
 def cup(paint: Materials, shape: int) -> Solids:
-    """A mug with an ear, or a tapered beaker."""
+    """Build a mug with a handle, or a tapered beaker."""
     glaze = paint("ceramic")
     if shape == 0:
         ear = box((0.06, 0, 0.02), (0.035, 0.015, 0.06), glaze)
@@ -38,7 +38,7 @@ def bowl(paint: Materials, _: int) -> Solids:
 
 
 def vase(paint: Materials, shape: int) -> Solids:
-    """A belly with a neck, or a tall taper."""
+    """Build a round vase with a neck, or a tall tapered one."""
     glaze = paint("ceramic")
     if shape == 0:
         neck = solid("bucket", (0, 0, 0.2), (0.1, 0.1, 0.12), glaze)
@@ -79,7 +79,7 @@ def backpack(paint: Materials, _: int) -> Solids:
 
 
 def suitcase(paint: Materials, shape: int) -> Solids:
-    """Upright on wheels with its handle out, or a flat old one."""
+    """Build an upright suitcase with its handle extended, or a flat old one."""
     shell, metal = paint("plastic"), paint("metal")
     if shape == 1:
         return box((0, 0, 0), (0.6, 0.4, 0.2), paint("wood")), box(
@@ -101,7 +101,7 @@ def handbag(paint: Materials, _: int) -> Solids:
 
 
 def umbrella(paint: Materials, _: int) -> Solids:
-    """Folded, standing on its tip."""
+    """Build a folded umbrella that stands on its tip."""
     rod = cylinder((0, 0, 0), 0.014, 0.88, paint("metal"))
     return (
         rod,
@@ -115,7 +115,7 @@ def sports_ball(paint: Materials, _: int) -> Solids:
 
 
 def skateboard(paint: Materials, _: int) -> Solids:
-    """Leaning flat against the wall, on its tail."""
+    """Build a skateboard that stands on its tail, flat against the wall."""
     wheels = [
         solid("wheel", (s * 0.09, -0.05, z), (0.04, 0.06, 0.06), paint("plastic"))
         for s in (-1, 1)
@@ -170,7 +170,7 @@ def bucket(paint: Materials, _: int) -> Solids:
 
 
 def cardboard_box(paint: Materials, shape: int) -> Solids:
-    """One, or a small one on a large one."""
+    """Build one box, or a small one on a large one."""
     first = box((0, 0, 0), (0.46, 0.36, 0.32), paint("plastic"))
     tape = box((0, 0, 0.32), (0.06, 0.36, 0.003), paint("wood"))
     if shape == 0:
@@ -188,7 +188,7 @@ def toolbox(paint: Materials, _: int) -> Solids:
 
 
 def trash_can(paint: Materials, shape: int) -> Solids:
-    """Wide above, or a cylinder with a dome."""
+    """Build a bin that widens upward, or a cylinder with a dome."""
     if shape == 0:
         return (solid("bucket", (0, 0, 0), (0.28, 0.28, 0.36), paint("plastic")),)
     case = paint("metal")
