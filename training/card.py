@@ -1,4 +1,4 @@
-"""The model card: what the networks are, what they score, what they cannot do."""
+"""Model card of the built-in networks: description, scores and limits."""
 
 import textwrap
 from pathlib import Path
@@ -14,12 +14,12 @@ from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES, COCO_
 OTHERS = tuple(
     name for name in encoder.NAMES if name not in (*CLASS_NAMES[:COCO_COUNT], *BUILDING.split())
 )
-SURE = 0.5  # confidence that an answer is counted from, beside counting all
-LARGE_SHARE = 0.01  # of the image, of crops that are counted apart
+SURE = 0.5  # Minimum confidence of the predictions that are also counted separately.
+LARGE_SHARE = 0.01  # Minimum size of crops that are counted separately, as a fraction of the image.
 
 
 def naming_report(naming: Naming, is_large: np.ndarray) -> dict:
-    """Accuracies of one set of crops; `is_large` [N] chooses those counted apart."""
+    """Return the accuracies of one set of crops; the mask `is_large` [N] selects the large ones."""
     large = Naming(naming.truth[is_large], naming.told[is_large], naming.confidence[is_large])
     coco = [name for name in encoder.NAMES if name in CLASS_NAMES[:COCO_COUNT]]
     per_name = {name: naming.accuracy([name]) for name in encoder.NAMES}
@@ -41,7 +41,10 @@ def naming_report(naming: Naming, is_large: np.ndarray) -> dict:
 
 
 def regions_report(naming: Naming) -> dict:
-    """What is said of regions; those that show no thing are right with any name of no thing."""
+    """Return the accuracies on regions.
+
+    For a region without an object, every name without an object is correct.
+    """
     no_things = [k for k, name in enumerate((*encoder.NAMES, NO_NAME)) if name in NO_THINGS]
     is_thing, is_named = naming.truth < len(encoder.NAMES), ~np.isin(naming.told, no_things)
     is_right, is_sure = naming.told == naming.truth, is_named & (naming.confidence >= SURE)
@@ -57,7 +60,12 @@ def regions_report(naming: Naming) -> dict:
 
 
 def written(report: dict, folder: Path) -> str:
-    """The card in Markdown."""
+    """Return the card in Markdown.
+
+    Args:
+        report: The scores.
+        folder: Folder of the networks' files.
+    """
     sizes = {
         file.name: file.stat().st_size
         for file in sorted(folder.glob("*.*"))
@@ -81,7 +89,7 @@ def written(report: dict, folder: Path) -> str:
 
 
 def _filled(names: tuple[str, ...]) -> str:
-    """A list of names in lines within an item."""
+    """Return a list of names as wrapped lines of a Markdown list item."""
     return "\n  ".join(textwrap.wrap(", ".join(names), 98))
 
 
@@ -91,7 +99,7 @@ def _totals(report: dict) -> str:
         "mAP50": "detector: mAP50",
     }
     named = {
-        "crops": "crops of true boxes",
+        "crops": "crops of ground-truth boxes",
         "top1": "names: top-1, all",
         "top1_coco": "names: top-1, COCO's",
         "top1_others": "names: top-1, others",
@@ -99,7 +107,7 @@ def _totals(report: dict) -> str:
         "large": f"crops of {LARGE_SHARE:.0%} of the image or more",
         "large_coco": "names: top-1 of those, COCO's",
         "large_others": "names: top-1 of those, others",
-        "sure_share": f"names: told with {SURE:g} or more, all",
+        "sure_share": f"names: fraction with confidence of {SURE:g} or more",
         "sure_top1": "names: top-1 of those",
         "calibration_error": "names: calibration error",
     }
@@ -112,12 +120,12 @@ def _totals(report: dict) -> str:
 def _of_regions(regions: dict) -> str:
     rows = {
         "regions": "regions",
-        "things": "of which a thing, or a part of one",
-        "things_right": "things: named right",
-        "things_sure_right": f"things: named right, with {SURE:g} or more",
-        "things_sure_wrong": f"things: named wrong, with {SURE:g} or more",
-        "no_things_unnamed": "no things: told to be none",
-        "no_things_sure": f"no things: named with {SURE:g} or more",
+        "things": "fraction with an object or a part of one",
+        "things_right": "object: correct name",
+        "things_sure_right": f"object: correct name with confidence of {SURE:g} or more",
+        "things_sure_wrong": f"object: wrong name with confidence of {SURE:g} or more",
+        "no_things_unnamed": "no object: recognized as none",
+        "no_things_sure": f"no object: name with confidence of {SURE:g} or more",
     }
     return "\n".join(_row(label, regions[key]) for key, label in rows.items())
 
@@ -144,83 +152,86 @@ def _row(name: str, *values: float | str) -> str:
 TEXT = """\
 # The built-in demo networks
 
-Small networks for the synthetic scenes of this package, so that `ldo demo` shows the whole
-semantic path without a download. They know nothing of the real world: register a detector trained
-on COCO (`ldo models add`) and an image-text model for that.
+Small networks for the synthetic scenes of this package. With them, `ldo demo` shows the whole
+semantic path without a download. They do not work on real images: for these, register a detector
+trained on COCO (`ldo models add`) and an image-text model.
 
 {note}| file | size |
 |---|---|
 {files}
 
-Apache-2.0, like the rest. Written by `python training/train_demo.py`, which also wrote this card.
+License: Apache-2.0, like the rest of the package. `python training/train_demo.py` writes the files
+and this card.
 
 ## What they are
-- `detector.onnx`: the layout of YOLOv8. `images` [1, 3, 256, 320], RGB 0..1, the image centred on
-  grey 114; `output0` [1, 4 + C, 1680]. A first look at the whole image proposes boxes; the best 64
-  are looked at again by a copy of the image encoder, and have scores. Classes of COCO that the
-  catalogue of the synthetic scenes has, named in its metadata:
+- `detector.onnx`: the layout of YOLOv8. Input `images` [1, 3, 256, 320], RGB 0..1, the image
+  centered on gray 114; output `output0` [1, 4 + C, 1680]. A proposal network predicts boxes from
+  the whole image. A copy of the image encoder rescores the best 64; all others have score 0. The
+  classes are those of COCO in the catalog of the synthetic scenes, named in the file's metadata:
   {coco}.
-- `image_encoder.onnx`: the layout of CLIP. `pixel_values` [N, 3, 64, 64], RGB with CLIP's mean
-  and deviation: a region's box and 0.15 of its sides around, in proportion, in the middle of a
-  square of CLIP's mean. `image_embeds` [N, D] of length 1, of the crop and its mirror image. It has
-  learned from regions as the service sets them apart, a third of them no thing, a third a part.
-- `text_embeddings.npz`: `names` [T], `embeddings` [T, D] of length 1 and `logit_scale` (also in the
-  encoder's metadata) of softmax(logit_scale * image . text) over all T names. It suits the regions
-  that a labeller is asked about. The names: those of the detector;
+- `image_encoder.onnx`: the layout of CLIP. Input `pixel_values` [N, 3, 64, 64], RGB with CLIP's
+  mean and deviation: a region's box with a margin of 0.15 of its sides, in proportion, centered in
+  a square of CLIP's mean. Output `image_embeds` [N, D], unit vectors of the crop together with its
+  mirror image. The encoder is trained on regions as the service proposes them: a third of them
+  show no object, and a third show a part of one.
+- `text_embeddings.npz`: `names` [T], unit vectors `embeddings` [T, D] and `logit_scale` (also in
+  the encoder's metadata). Confidences are softmax(logit_scale * image . text) over all T names,
+  calibrated for the regions that a labeller receives. The names are those of the detector;
   {others};
-  and {building} and background, which say that there is no object.
+  and {building} and background, which mean that there is no object.
 
-There is no text encoder. A name of the table can be added to a shorter list while the service runs
-(`ldo control add-label`), with its synonyms; any other name is refused.
+There is no text encoder. A name of the table, or one of its synonyms, can be added to a shorter
+list while the service runs (`ldo control add-label`); any other name is rejected.
 
-## What they learned from
-Renders at 320x240 of random furnished rooms with the flat's catalogue, pools of paints and lens,
-but other sizes, layouts and seeds, made worse by exposure, tint, motion blur and noise. The flat
-was used for the scores below and for nothing else; but since its catalogue is theirs, these
-scores are those of known shapes in new arrangements and paints, not of new shapes.
+## Training data
+Renders at 320x240 of random furnished rooms, with random exposure, tint, motion blur and noise. The
+rooms have the flat's catalog, pools of paints and lens, but other sizes, layouts and seeds. The
+flat is used only for the scores below. Because its catalog is the same, these scores are for known
+shapes in new arrangements and paints, not for new shapes.
 
-Rendering took {rendering} minutes of CPU time, {detector} steps of the detector's first look and
-{encoder} of the encoder {training}, the last half of these on regions too. Seed {seed}.
+Rendering took {rendering} minutes of CPU time. Training took {training} minutes of CPU time for
+{detector} steps of the detector's proposal network and {encoder} steps of the encoder. The second
+round of the encoder includes regions. The seed is {seed}.
 
 ## Scores
-Of the files as shipped. `rooms`: rooms kept apart; `flat`: every 8th frame of `synthetic:flat`.
-Objects of less than 0.1 % of the image count neither way for the detector; crops are of all
-objects of at least 0.04 % that fill an eighth of their box.
+These are scores of the shipped files. `rooms` are held-out rooms; `flat` is every 8th frame of
+`synthetic:flat`. For the detector, objects smaller than 0.1 % of the image count neither as objects
+nor as false detections. Crops are of all objects of at least 0.04 % that fill an eighth of their
+box.
 
 | | rooms | flat |
 |---|---|---|
 {totals}
 
-Regions of the rooms kept apart, as `regions/geometric_segmentation.py` finds them:
+Regions of the held-out rooms, as `regions/geometric_segmentation.py` proposes them:
 
 | | rooms |
 |---|---|
 {regions}
 
-Detector by class: objects, average precision at IoU 0.5, recall and precision of boxes with a
-score of at least 0.25.
+Detector by class: number of objects, average precision at IoU 0.5, and recall and precision of
+boxes with a score of at least 0.25.
 
 | | rooms: objects | AP50 | recall | precision | flat: objects | AP50 | recall | precision |
 |---|---|---|---|---|---|---|---|---|
 {detected}
 
-Names of crops by true name: share named right, among all names.
+Fraction of crops with the correct name, by true name, among all names:
 
 | | rooms | flat |
 |---|---|---|
 {named}
 
 ## Limits
-- Large things seen in part (the corner of a bed, a couch's side, a table under what lies on it) are
-  often boxed or named wrong; so are a cabinet and a suitcase, and a shelf from the side. Where a
-  thing is seen well, from its best views, names are far better than the table says, which counts
-  every view.
-- An apple, an orange, a sports ball and a mouse are a ball each here, in any colour: what tells
-  them apart is size, which a crop does not show, and what lies about them. A door is a bare board,
-  and can be taken for wall.
-- Things of a few pixels (mouse, remote, cell phone, fruit) are mostly missed.
-- Scores of the detector are not probabilities: sure boxes (0.6 or more) are right more often than
-  that. Confidences of the names suit regions of rooms of the same kind, over the whole table, and
-  mean nothing for pictures of anything else.
-- Training is short, by intent: with more steps both networks still improve.
+- Large objects in partial view (the corner of a bed, a couch's side, a table under other objects)
+  often get a wrong box or name. So do cabinets, suitcases, and shelves from the side. The table
+  counts every view; in good views of an object, names are far better.
+- Apples, oranges, sports balls and mice are all balls of any color here. Only size and
+  surroundings distinguish them, and a crop does not show size. A door is a bare board, which can be
+  mistaken for a wall.
+- Objects of a few pixels (mouse, remote, cell phone, fruit) are mostly missed.
+- Scores of the detector are not probabilities: more than 60 % of the boxes with a score of 0.6 or
+  more are correct. Confidences of the names are calibrated for regions of similar rooms and for the
+  whole table. They mean nothing for other images.
+- Training is deliberately short: with more steps both networks still improve.
 """

@@ -1,4 +1,4 @@
-"""The detector's grids, and what each of their cells is to tell about a frame."""
+"""The detector's grids, and the training targets of their cells."""
 
 from dataclasses import dataclass
 
@@ -8,24 +8,27 @@ from scipy import ndimage
 from ldo_service.synthetic.flat.catalog import CATALOG
 from ldo_service.synthetic.flat.scene_object import CLASS_NAMES, COCO_COUNT
 
-INPUT_PX = (320, 256)  # width, height
+INPUT_PX = (320, 256)  # Width and height.
 STRIDES_PX = (8, 16, 32)
 CELL_COUNT = sum(INPUT_PX[1] // s * (INPUT_PX[0] // s) for s in STRIDES_PX)
 THINGS = tuple(name for name in CLASS_NAMES if name in CATALOG)
-NAMES = tuple(name for name in CLASS_NAMES[:COCO_COUNT] if name in CATALOG)  # those first
-NOTHING = len(THINGS)
+NAMES = tuple(name for name in CLASS_NAMES[:COCO_COUNT] if name in CATALOG)  # The first of THINGS.
+NOTHING = len(THINGS)  # Index of the background.
 
-SIDES_PX = ((0, 56), (40, 130), (96, 1000))  # root of the boxes' area that each grid is for
-BOXES_CELLS = 1.5  # from the middle of a cell to each side of its box, at first
-COVERED, OF_OBJECT = 0.4, 0.25  # of a cell, or of an object, so that the cell tells of the object
-UNCLEAR = 0.3  # of a cell covered by things of which none is told: it learns nothing
-NOTHING_WEIGHT = 0.1  # of a cell of the finest grid without a thing
-MIN_PX = 20  # visible of an object that is told
-ID_COUNT = 256
+SIDES_PX = ((0, 56), (40, 130), (96, 1000))  # Square root of the box area that each grid predicts.
+BOXES_CELLS = 1.5  # Initial distance from the center of a cell to each side of its box, in cells.
+# A cell belongs to an object that covers this fraction of the cell, or if the cell contains this
+# fraction of the object.
+COVERED, OF_OBJECT = 0.4, 0.25
+# A cell without an object has weight 0 if objects cover more than this fraction of it.
+UNCLEAR = 0.3
+NOTHING_WEIGHT = 0.1  # Weight of a background cell of the finest grid.
+MIN_PX = 20  # Minimum visible pixels of an object in the targets.
+ID_COUNT = 256  # Number of instance ids in a frame.
 
 
 def grid(size_px: tuple[int, int] = INPUT_PX) -> tuple[np.ndarray, np.ndarray]:
-    """Middles [N, 2] and sides [N, 1] of all cells of an image, in pixels, the finest first."""
+    """Return the centers [N, 2] and sides [N, 1] of all cells in pixels, finest grid first."""
     middles, sides = [], []
     for stride in STRIDES_PX:
         columns, rows = (side // stride for side in size_px)
@@ -37,16 +40,21 @@ def grid(size_px: tuple[int, int] = INPUT_PX) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, slots=True)
 class Visible:
-    """The M objects of a frame: ids in its plane, names, boxes [M, 4] in pixels, pixels."""
+    """The M visible objects of a frame."""
 
-    ids: np.ndarray
-    names: np.ndarray
-    boxes_px: np.ndarray
-    pixels: np.ndarray
+    ids: np.ndarray  # Instance ids [M].
+    names: np.ndarray  # Indices [M] into THINGS.
+    boxes_px: np.ndarray  # Boxes [M, 4], x0, y0, x1, y1.
+    pixels: np.ndarray  # Number of visible pixels [M].
 
 
 def visible(plane: np.ndarray, names: np.ndarray) -> Visible:
-    """What a plane of ids [H, W] shows; `names` [256] are those of the ids, -1 for none."""
+    """Return the visible objects of a frame.
+
+    Args:
+        plane: Instance ids [H, W].
+        names: Index into THINGS of each instance id, [256]; -1 for none.
+    """
     pixels = np.bincount(plane.ravel(), minlength=ID_COUNT)
     ids = np.flatnonzero((pixels >= MIN_PX) & (names >= 0))
     extents = ndimage.find_objects(plane)
@@ -58,9 +66,18 @@ def visible(plane: np.ndarray, names: np.ndarray) -> Visible:
 
 
 def make_targets(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
-    """Names [N], weights [N], boxes [N, 4] and whether to tell them [N], of all cells.
+    """Return the training targets of all N cells.
 
-    A cell tells of the smallest object that covers enough of it, or that it covers enough of.
+    A cell predicts the smallest object that covers enough of the cell, or that the cell covers
+    enough of.
+
+    Args:
+        plane: Instance ids [H, W].
+        objects: The visible objects of the frame.
+
+    Returns:
+        Names [N], weights [N], boxes [N, 4] in pixels, and a mask [N] of the cells that predict
+        a box.
     """
     order = np.argsort(objects.pixels, kind="stable")
     place = np.full(ID_COUNT, len(order))
@@ -78,7 +95,7 @@ def make_targets(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
 
 
 def _counts(plane: np.ndarray, kinds: int) -> list[np.ndarray]:
-    """Pixels of each object in each cell [cells, kinds], grid by grid."""
+    """Return the pixels of each object in each cell, one array [cells, kinds] per grid."""
     stride = STRIDES_PX[0]
     rows, columns = (side // stride for side in plane.shape)
     v, u = np.divmod(np.arange(plane.size), plane.shape[1])
@@ -94,11 +111,11 @@ def _counts(plane: np.ndarray, kinds: int) -> list[np.ndarray]:
 def _of_grid(
     counts: np.ndarray, stride_px: int, pixels: np.ndarray, is_for: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Owner (M for none), weight, and whether it tells a box, of each cell."""
+    """Return the object (M for none), the weight and whether to predict a box, of each cell."""
     things = counts[:, :-1]
     is_owned = (things >= COVERED * stride_px**2) | (things >= OF_OBJECT * pixels)
     is_owned = np.column_stack((is_owned, np.ones(len(counts), bool)))
-    owners = is_owned.argmax(axis=1)  # the smallest comes first
+    owners = is_owned.argmax(axis=1)  # The smallest object comes first.
     sizes = np.bincount(owners, minlength=counts.shape[1])
     weights = 1 / np.sqrt(np.maximum(sizes, 1))
     weights[-1] = NOTHING_WEIGHT * stride_px / STRIDES_PX[0]

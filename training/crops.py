@@ -1,4 +1,4 @@
-"""Crops as the image encoder takes them."""
+"""Crops in the format of the image encoder."""
 
 import cv2
 import numpy as np
@@ -6,16 +6,16 @@ import numpy as np
 INPUT_PX = 64
 MEAN = np.array([0.48145466, 0.4578275, 0.40821073], np.float32)  # Radford et al., ICML 2021
 DEVIATION = np.array([0.26862954, 0.26130258, 0.27577711], np.float32)
-MARGIN = 0.1  # of a box's sides, that a crop has around it
+MARGIN = 0.1  # Margin of a crop around a box, as a fraction of the box's sides.
 
 
 def crop(image: np.ndarray, box_px: np.ndarray, side_px: int = INPUT_PX) -> np.ndarray:
-    """A box of an image [H, W, 3] in the middle of a square of CLIP's mean."""
+    """Return a box of an image [H, W, 3], centered in a square of CLIP's mean color."""
     return framed(resized(cut(image, box_px), side_px), side_px)
 
 
 def cut(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
-    """The part [h, w, ...] of an image [H, W, ...] that a box holds."""
+    """Return the part [h, w, ...] of an image [H, W, ...] inside a box."""
     last_px = np.array(image.shape[1::-1]) - 1
     x0, y0 = np.floor(np.clip(box_px[:2], 0, last_px)).astype(int)
     x1, y1 = np.ceil(np.minimum(box_px[2:], image.shape[1::-1])).astype(int)
@@ -23,7 +23,7 @@ def cut(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
 
 
 def resized(part: np.ndarray, side_px: int, is_ids: bool = False) -> np.ndarray:
-    """In proportion, with its longer side so long; ids are not mixed."""
+    """Resize an image in proportion to `side_px` on its longer side; ids are not interpolated."""
     scale = side_px / max(part.shape[:2])
     width, height = (max(1, round(side * scale)) for side in part.shape[1::-1])
     mixed = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -31,7 +31,7 @@ def resized(part: np.ndarray, side_px: int, is_ids: bool = False) -> np.ndarray:
 
 
 def framed(part: np.ndarray, side_px: int) -> np.ndarray:
-    """In the middle of a square of CLIP's mean."""
+    """Return the image centered in a square of CLIP's mean color."""
     canvas = np.full((side_px, side_px, 3), np.round(MEAN * 255), np.uint8)
     height, width = part.shape[:2]
     left, top = (side_px - width) // 2, (side_px - height) // 2
@@ -40,11 +40,12 @@ def framed(part: np.ndarray, side_px: int) -> np.ndarray:
 
 
 def enlarged(box_px: np.ndarray, margin: float) -> np.ndarray:
+    """Return the box with a margin on each side, as a fraction of its sides."""
     sides = box_px[2:] - box_px[:2]
     return box_px + np.concatenate((-margin * sides, margin * sides))
 
 
 def planes(crops: np.ndarray) -> np.ndarray:
-    """`pixel_values` [N, 3, 64, 64] of crops [N, 64, 64, 3] uint8."""
+    """Return the network's input [N, 3, 64, 64] for crops [N, 64, 64, 3] uint8."""
     values = ((crops / np.float32(255) - MEAN) / DEVIATION).astype(np.float32)
     return np.ascontiguousarray(values.transpose(0, 3, 1, 2))

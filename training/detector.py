@@ -1,8 +1,8 @@
-"""The first look of the detector: every cell of three grids says what covers it.
+"""Proposal network of the detector: every cell of three grids predicts the object that covers it.
 
-As in semantic segmentation, and beside that where the box of that object lies, and how well the box
-fits. So every cell has something to learn in every frame, and a network that sees few frames learns
-from all of each. It learns all names of the catalogue.
+The names are dense, as in semantic segmentation. In addition, a cell predicts the box of its object
+and how well the box fits. Every cell therefore has a target in every frame, so that few frames are
+enough. The network learns all names of the catalog.
 """
 
 from collections.abc import Sequence
@@ -18,14 +18,18 @@ from views import Views
 import training
 from examples import SMALL, batches
 
-WIDE, TOLD_BY = 48, 64  # channels of the neck and of the heads
+WIDE, TOLD_BY = 48, 64  # Channels of the neck and of the heads.
 RATE = 1e-2
-BOX_WEIGHT, FIT_WEIGHT = 1.5, 1.0  # beside the names' entropy
-TOLD = (4, 1, len(THINGS) + 1)  # sides of the box, fit of the box, names and nothing
+BOX_WEIGHT, FIT_WEIGHT = 1.5, 1.0  # Weights relative to the cross entropy of the names.
+TOLD = (4, 1, len(THINGS) + 1)  # Output channels: sides of the box, fit, names and background.
 
 
 def network(net: JaxNetwork | Graph, image) -> list:
-    """For each grid: 4 distances in cells from a cell's middle, a logit of the fit, and names'."""
+    """Return the raw outputs of each grid.
+
+    The channels are four distances in cells from the cell's center, the logit of the fit, and the
+    logits of names and background.
+    """
     fine, middle, coarse = _trunk(net, image)
     return [
         _head(net, x, s) for x, s in zip(_neck(net, fine, middle, coarse), STRIDES_PX, strict=True)
@@ -33,7 +37,7 @@ def network(net: JaxNetwork | Graph, image) -> list:
 
 
 def _trunk(net: JaxNetwork | Graph, image) -> tuple:
-    """What is seen, on each grid."""
+    """Return the features on each grid, finest first."""
     x = residual(net, merged(net, image, "stem", 32, side=4), "stage4", 32)
     fine = merged(net, x, "down8", 64)
     for k in range(2):
@@ -48,7 +52,7 @@ def _trunk(net: JaxNetwork | Graph, image) -> tuple:
 
 
 def _neck(net: JaxNetwork | Graph, fine, middle, coarse) -> list:
-    """What is seen at large helps at small: pooled, enlarged and added."""
+    """Add pooled and enlarged features of coarse grids to those of finer grids."""
     x = net.conv(coarse, "pool.in", WIDE, size=1)
     wide = net.widest(x)
     c = net.conv(net.join([x, wide, net.widest(wide)]), "pool.out", WIDE, size=1)
@@ -64,9 +68,15 @@ def _head(net: JaxNetwork | Graph, x, stride_px: int):
 
 
 def predicted(net: JaxNetwork, images):
-    """Corners [B, N, 4] in pixels, logits of the fit [B, N] and of names and nothing [B, N, T + 1].
+    """Run the network.
 
-    images  [B, H, W, 3] in 0..1
+    Args:
+        net: Reader of the network.
+        images: Images [B, H, W, 3] in 0..1.
+
+    Returns:
+        Corners [B, N, 4] in pixels, logits of the fit [B, N], and logits of the names and the
+        background [B, N, T + 1].
     """
     levels = network(net, images)
     flat = [level.reshape(level.shape[0], -1, level.shape[-1]) for level in levels]
@@ -78,10 +88,12 @@ def predicted(net: JaxNetwork, images):
 
 
 def loss(weights: Weights, batch: tuple):
-    """Cross entropies of names and fits, and GIoU of boxes.
+    """Return the sum of the cross entropies of names and fits and the GIoU loss of boxes.
 
-    batch  images [B, H, W, 3] uint8, and of each cell what it is to tell: names [B, N], weights
-           [B, N], boxes [B, N, 4] in pixels, and whether it is to tell the box [B, N]
+    Args:
+        weights: Weights of the network.
+        batch: Images [B, H, W, 3] uint8 and the targets of their cells: names [B, N], weights
+            [B, N], boxes [B, N, 4] in pixels, and the mask [B, N] of cells that predict a box.
     """
     images, names, shares, boxes, tells_box = batch
     corners, fit, logits = predicted(JaxNetwork(weights), images.astype(jnp.float32) / 255)
@@ -96,7 +108,7 @@ def loss(weights: Weights, batch: tuple):
 
 
 def overlaps(a, b):
-    """IoU of corners [..., 4], and GIoU: Rezatofighi et al., CVPR 2019."""
+    """Return IoU and GIoU of corners [..., 4] (Rezatofighi et al., CVPR 2019)."""
     low, high = jnp.maximum(a[..., :2], b[..., :2]), jnp.minimum(a[..., 2:], b[..., 2:])
     common = jnp.maximum(high - low, 0).prod(-1)
     union = jnp.maximum(_area(a) + _area(b) - common, 1e-6)
@@ -111,20 +123,26 @@ def _area(boxes):
 
 @dataclass(frozen=True, slots=True)
 class FirstStage:
-    """A trained first look: weights, and the statistics of its normalised layers."""
+    """Trained proposal network."""
 
     weights: Weights
-    statistics: Statistics
+    statistics: Statistics  # Means and variances of the normalized layers.
 
     def look(self, images: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Corners, fits and logits as `predicted`, of images [B, H, W, 3] uint8."""
+        """Return corners, fits and logits, as `predicted`, for images [B, H, W, 3] uint8."""
         live = JaxNetwork(self.weights, self.statistics)
         told = predicted(live, jnp.asarray(images, jnp.float32) / 255)
         return tuple(map(np.asarray, told))
 
 
 def train(material: Views, steps: Sequence[int], seed: int) -> FirstStage:
-    """In rounds of so many steps: `training.ROUND_RATES`."""
+    """Train the proposal network.
+
+    Args:
+        material: Training frames.
+        steps: Steps of each round; see `training.ROUND_RATES`.
+        seed: Seed of weights and batches.
+    """
     rng = np.random.default_rng([seed, 1])
     live = JaxNetwork({}, rng=rng)
     network(live, jnp.zeros((1, *INPUT_PX[::-1], 3)))
@@ -136,7 +154,12 @@ def train(material: Views, steps: Sequence[int], seed: int) -> FirstStage:
 
 
 def looked(graph: Graph) -> tuple[str, str, str]:
-    """The same as names in a graph: corners [1, N, 4], the fit [1, 1, N], logits [1, T + 1, N]."""
+    """Add the network to an ONNX graph.
+
+    Returns:
+        Names of the tensors: corners [1, N, 4], logits of the fit [1, 1, N], and logits of the
+        names and the background [1, T + 1, N].
+    """
     rows = []
     for level in network(graph, "images"):
         rows.append(graph.node("Reshape", level, graph.integers(1, sum(TOLD), -1)))

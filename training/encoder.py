@@ -1,11 +1,14 @@
-"""A small dual encoder in the layout of CLIP: crops and names become vectors that can be compared.
+"""Small dual encoder in the layout of CLIP, which embeds crops and names in one space.
 
-in   pixel_values  [N, 3, 64, 64]   RGB with CLIP's mean and deviation; the crop in the middle of a
-                                    square of that mean
-out  image_embeds  [N, 96]          of length 1
+Input:
+    pixel_values: RGB [N, 3, 64, 64] with CLIP's mean and deviation; the crop is centered in a
+        square of that mean.
 
-The names' vectors are a table, learned together with the image encoder: there is no text encoder.
-It is trained in `pair`.
+Output:
+    image_embeds: Unit vectors [N, 96].
+
+There is no text encoder. The names' vectors are a table that is trained with the image encoder, in
+`pair`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,31 +29,32 @@ from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES
 DIMENSIONS = 96
 NAMES = tuple(name for name in CLASS_NAMES if name in CATALOG or name in BUILDING.split())
 
-SIDE_MIN_PX, FILLED_MIN = 6, 0.12  # of a box that is learned from, and its share that is the object
-CUT_MOST = 0.5  # of a box, without so much of one side
-OCCLUDED_SHARE, OCCLUDER = 0.3, (0.3, 0.7)  # of crops, by things of that share of their side
-BLUR_PX = 0.06  # of the crop's longer side
+# Minimum side of a box for training, and minimum fraction of the box that its object fills.
+SIDE_MIN_PX, FILLED_MIN = 6, 0.12
+CUT_MOST = 0.5  # Maximum fraction of a box that is cut off at one side.
+# Fraction of the crops with an occluder, and the occluder's size as a fraction of the crop's side.
+OCCLUDED_SHARE, OCCLUDER = 0.3, (0.3, 0.7)
+BLUR_PX = 0.06  # Maximum blur as a fraction of the crop's longer side.
 
 BATCH, RATE = 32, 1e-2
-SCALE = 16.0  # of cosines while training; what is told is fitted afterwards
-SMOOTHING = 0.05  # of the right answer, over all names
+SCALE = 16.0  # Scale of the cosines in training; the exported scale is fitted afterwards.
+SMOOTHING = 0.05  # Label smoothing over all names.
 
 
 @dataclass(frozen=True, slots=True)
 class Framing:
-    """How a crop is taken about a box: margins, share of its sides; how far each side may be off;
-    share of crops that lack a part of one side."""
+    """Random variation of a crop around its box."""
 
-    margins: tuple[float, float]
-    jitter: float
-    cut_share: float
+    margins: tuple[float, float]  # Range of the margin, as a fraction of the box's sides.
+    jitter: float  # Maximum offset of each side, as a fraction of the box's sides.
+    cut_share: float  # Fraction of the crops that lack a part of one side.
 
 
 ABOUT_THINGS = Framing((0.0, 0.25), 0.08, 0.3)
 
 
 def network(net: JaxNetwork | Graph, image) -> list:
-    """[N, 1, 1, D], before it is brought to length 1."""
+    """Return vectors [N, 1, 1, D] before normalization to unit length."""
     x = residual(net, merged(net, image, "stem", 64, side=4), "stage4", 64)
     x = net.conv(x, "down8", 128, stride=2)
     for k in range(2):
@@ -63,30 +67,40 @@ def network(net: JaxNetwork | Graph, image) -> list:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Both encoders: the image encoder's weights, and a vector for each name [T, D]."""
+    """Trained dual encoder: an image encoder and a table of the names' vectors."""
 
     weights: Weights
-    statistics: Statistics
-    texts: np.ndarray
-    names: tuple[str, ...]
+    statistics: Statistics  # Means and variances of the normalized layers.
+    texts: np.ndarray  # Unit vector of each name [T, D].
+    names: tuple[str, ...]  # The T names.
 
     def images(self, crops: np.ndarray, with_mirror: bool = True) -> np.ndarray:
-        """Vectors [N, D] of crops [N, 64, 64, 3] uint8, each seen from both sides of a mirror."""
+        """Return unit vectors [N, D] of crops [N, 64, 64, 3] uint8.
+
+        With `with_mirror`, a vector is the normalized sum for the crop and its mirror image.
+        """
         live = JaxNetwork(self.weights, self.statistics)
         sides = (crops, crops[:, :, ::-1])[: 1 + with_mirror]
         return np.asarray(unit(sum(network(live, normalized(side))[:, 0, 0] for side in sides)))
 
 
 def unit(x):
+    """Return vectors scaled to unit length."""
     return x / jnp.sqrt((x * x).sum(-1, keepdims=True) + 1e-12)
 
 
 def normalized(crops):
+    """Return uint8 crops with CLIP's mean and deviation."""
     return (jnp.asarray(crops, jnp.float32) / 255 - MEAN) / DEVIATION
 
 
 def loss(weights: Weights, batch: tuple):
-    """Cross entropy of the names, of crops [N, 64, 64, 3] uint8 and their names' indices [N]."""
+    """Return the cross entropy of the names with label smoothing.
+
+    Args:
+        weights: Weights of the network and the table of names.
+        batch: Crops [N, 64, 64, 3] uint8 and the indices [N] of their names.
+    """
     crops, names = batch
     images = unit(network(JaxNetwork(weights), normalized(crops))[:, 0, 0])
     logits = SCALE * images @ unit(weights["texts.kernel"]).T
@@ -96,7 +110,7 @@ def loss(weights: Weights, batch: tuple):
 
 
 def learnable(seen: VisibleBoxes) -> tuple[VisibleBoxes, np.ndarray]:
-    """The boxes that show enough of their object, and their indices into NAMES."""
+    """Return the boxes that show enough of their object, and their indices into NAMES."""
     sides = seen.boxes_px[:, 2:] - seen.boxes_px[:, :2]
     chosen = seen.chosen(
         (sides.min(axis=1) >= SIDE_MIN_PX) & (seen.pixels >= FILLED_MIN * sides.prod(axis=1))
@@ -108,7 +122,19 @@ def learnable(seen: VisibleBoxes) -> tuple[VisibleBoxes, np.ndarray]:
 def batches(
     material: Views, rng: np.random.Generator, side_px: int = INPUT_PX, size: int = BATCH
 ) -> Iterator[tuple]:
-    """Crops about true boxes, made worse; each name as often as the root of its number of boxes."""
+    """Yield batches of augmented crops around ground-truth boxes, without end.
+
+    The frequency of a name is proportional to the square root of its number of boxes.
+
+    Args:
+        material: Training frames.
+        rng: Source of the choice and the augmentation.
+        side_px: Side of the crops.
+        size: Number of crops in a batch.
+
+    Yields:
+        Crops [size, side_px, side_px, 3] and the indices [size] of their names.
+    """
     seen, names = learnable(material.seen)
     counts = np.bincount(names, minlength=len(NAMES))
     odds = 1 / np.sqrt(counts[names])
@@ -130,11 +156,11 @@ def batches(
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """A box of a frame: color [h, w, 3], ids of objects [h, w], and that of the one it is about."""
+    """Part of a frame around one object."""
 
-    color: np.ndarray
-    plane: np.ndarray
-    instance: int
+    color: np.ndarray  # RGB [h, w, 3].
+    plane: np.ndarray  # Instance ids [h, w].
+    instance: int  # Instance id of the object.
 
 
 def shown_in(
@@ -145,7 +171,16 @@ def shown_in(
     rng: np.random.Generator,
     framing: Framing,
 ) -> Shown:
-    """With its longer side so long; not quite about the object, and often without a side of it."""
+    """Cut one box out of its frame, with random margins, offsets and missing sides.
+
+    Args:
+        material: Training frames.
+        seen: Boxes of the frames.
+        row: Index of the box.
+        side_px: Longer side of the result.
+        rng: Source of the variation.
+        framing: Bounds of the variation.
+    """
     box_px = seen.boxes_px[row]
     sides = box_px[2:] - box_px[:2]
     off = rng.uniform(-framing.jitter, framing.jitter, 4) * np.tile(sides, 2)
@@ -164,6 +199,7 @@ def shown_in(
 def example(
     shown: Shown, before: Shown | None, side_px: int, rng: np.random.Generator
 ) -> np.ndarray:
+    """Return an augmented crop of `shown`, occluded by `before` unless that is None."""
     color = recolor(shown.color, shown.plane, rng)
     if before is not None:
         _cover(color, before, rng)
@@ -172,7 +208,7 @@ def example(
 
 
 def _cover(color: np.ndarray, by: Shown, rng: np.random.Generator) -> None:
-    """Put another object before a part of what is shown."""
+    """Paste another object over a part of the crop."""
     place = rng.integers(0, np.array(color.shape[:2])) - np.array(by.plane.shape) // 2
     low = np.maximum(place, 0)
     high = np.minimum(place + by.plane.shape, color.shape[:2])
@@ -183,15 +219,22 @@ def _cover(color: np.ndarray, by: Shown, rng: np.random.Generator) -> None:
 
 
 def crops_of(seen: VisibleBoxes, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Crops of what frames show, and their names' indices."""
+    """Return crops of the visible objects of frames, and the indices of their names."""
     seen, names = learnable(seen)
     rows = zip(seen.frames, seen.boxes_px, strict=True)
     return np.array([crop(colors[f], enlarged(box, MARGIN)) for f, box in rows]), names
 
 
 def fitted_scale(images: np.ndarray, texts: np.ndarray, is_right: np.ndarray) -> float:
-    """The scale of cosines whose softmax is least surprised by the truth, of N images one or more
-    of T names, is_right [N, T] bool: Guo et al., ICML 2017."""
+    """Return the scale of the cosines that minimizes the negative log-likelihood.
+
+    This is temperature scaling (Guo et al., ICML 2017).
+
+    Args:
+        images: Vectors [N, D] of images.
+        texts: Vectors [T, D] of names.
+        is_right: Mask [N, T] of the correct names; an image may have several.
+    """
     scales = np.geomspace(2, 200, 200)
     cosines = images @ texts.T
 
@@ -205,7 +248,12 @@ def fitted_scale(images: np.ndarray, texts: np.ndarray, is_right: np.ndarray) ->
 
 
 def embedded(graph: Graph, crops: str, output: str = "", with_mirror: bool = True) -> str:
-    """Vectors [N, D] of length 1, in a graph: of each crop, together with its mirror image."""
+    """Add the image encoder to an ONNX graph.
+
+    Returns:
+        Name of the tensor of unit vectors [N, D]. With `with_mirror`, a vector is the normalized
+        sum for the crop and its mirror image.
+    """
     both = graph.node("Concat", crops, graph.mirrored(crops), axis=0) if with_mirror else crops
     raw = graph.node("Flatten", network(graph, both), axis=1)
     if with_mirror:
@@ -214,7 +262,7 @@ def embedded(graph: Graph, crops: str, output: str = "", with_mirror: bool = Tru
 
 
 def export(pair: Pair, scale: float, folder: Path) -> None:
-    """image_encoder.onnx and text_embeddings.npz."""
+    """Write image_encoder.onnx and text_embeddings.npz into a folder."""
     graph = Graph(pair.weights, pair.statistics)
     embedded(graph, "pixel_values", "image_embeds")
     about = {"logit_scale": repr(scale), "license": "Apache-2.0"}

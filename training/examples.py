@@ -1,4 +1,4 @@
-"""What the detector learns from: frames moved, zoomed, mirrored, repainted and made worse."""
+"""Training examples of the detector: shifted, zoomed, mirrored, recolored and degraded frames."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,25 +13,26 @@ from wear import BLUR_PX, degrade, recolor
 from ldo_service.synthetic.flat.scene_object import CLASS_NAMES
 
 BATCH = 8
-PADDING = 114
+PADDING = 114  # Gray level outside the frame.
 
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """What an example is shown on: its size, multiples of the widest cell, and how large it is."""
+    """Size of an example's image, and range of the frame's zoom on it."""
 
-    size_px: tuple[int, int] = INPUT_PX  # width, height
-    zoom: tuple[float, float] = (0.8, 1.5)
+    size_px: tuple[int, int] = INPUT_PX  # Width and height, multiples of the widest cell.
+    zoom: tuple[float, float] = (0.8, 1.5)  # Minimum and maximum.
 
 
-# The first round's: three eighths of the work; things as large as they will be, and smaller
+# Canvas of the first round, with three eighths of the pixels. Objects have their final size or are
+# smaller.
 SMALL = Canvas((192, 160), (0.5, 1.2))
 
 
 def batches(
     material: Views, rng: np.random.Generator, canvas: Canvas = Canvas()
 ) -> Iterator[tuple]:
-    """Frames in random order without end, each with what its cells are to tell."""
+    """Yield batches of frames in random order, without end, with the targets of their cells."""
     names = _names_of_ids(material)
     order = _shuffled(len(material.colors), rng)
     while True:
@@ -43,13 +44,13 @@ def batches(
 
 
 def _shuffled(count: int, rng: np.random.Generator) -> Iterator[int]:
-    """Every index once, then again in another order, without end."""
+    """Yield every index once, then again in another order, without end."""
     while True:
         yield from rng.permutation(count)
 
 
 def _names_of_ids(material: Views) -> np.ndarray:
-    """Names [F, 256] of the ids of each frame, -1 for none."""
+    """Return the names [F, 256] of the instance ids of each frame; -1 for none."""
     seen: VisibleBoxes = material.seen
     names = np.full((len(material.colors), ID_COUNT), -1)
     own = {CLASS_NAMES.index(name): k for k, name in enumerate(THINGS)}
@@ -65,13 +66,13 @@ def _example(
     canvas: Canvas,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, ...]:
-    """An image of the canvas' size, and what its cells are to tell."""
+    """Return an image of the canvas' size, and the targets of its cells."""
     zoom = rng.uniform(*canvas.zoom)
     place_px = (np.array(canvas.size_px) - zoom * np.array(color.shape[1::-1])) * rng.random(2)
     seen, shown = _windows(color.shape[1::-1], place_px, zoom, canvas.size_px)
     color, plane = color[seen], plane[seen]
     size_px = shown[1].stop - shown[1].start, shown[0].stop - shown[0].start
-    if zoom < 1:  # made worse when it is small: that is less
+    if zoom < 1:  # Shrink before the degradation, which then has fewer pixels.
         color = cv2.resize(color, size_px, interpolation=cv2.INTER_AREA)
         plane = cv2.resize(plane, size_px, interpolation=cv2.INTER_NEAREST)
     color = degrade(recolor(color, plane, rng), rng, BLUR_PX * min(zoom, 1))
@@ -87,8 +88,17 @@ def _example(
 def _windows(
     size_px: tuple[int, int], place_px: np.ndarray, zoom: float, canvas_px: tuple[int, int]
 ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Rows and columns of a frame that are on a canvas, where its corner is at `place_px` of that,
-    and rows and columns of the canvas that show them."""
+    """Return the visible window of a frame and the window of the canvas that shows it.
+
+    Args:
+        size_px: Width and height of the frame.
+        place_px: Position of the frame's corner on the canvas.
+        zoom: Zoom of the frame.
+        canvas_px: Width and height of the canvas.
+
+    Returns:
+        Rows and columns of the frame, and rows and columns of the canvas.
+    """
     first = np.maximum(-place_px / zoom, 0).astype(int)
     stop = np.minimum(np.ceil((canvas_px - place_px) / zoom), size_px).astype(int)
     start = np.maximum(np.round(place_px + zoom * first), 0).astype(int)

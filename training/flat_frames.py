@@ -1,4 +1,4 @@
-"""Frames of the flat, for the last scores alone."""
+"""Frames of the flat, used only for the final scores."""
 
 import numpy as np
 import views
@@ -8,7 +8,7 @@ from ldo_service.synthetic.flat import FlatSequence
 
 
 def flat_frames(stride: int) -> tuple[list[np.ndarray], VisibleBoxes]:
-    """Every `stride`-th frame as recorded, and what it shows."""
+    """Return every `stride`-th frame as recorded, and its visible objects."""
     sequence = FlatSequence.named("flat")
     indices = range(0, len(sequence), stride)
     planes = [sequence.labels(index) for index in indices]

@@ -1,4 +1,4 @@
-"""Things at random places, where they meet nothing."""
+"""Objects at random positions where they do not collide."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -28,29 +28,37 @@ from ldo_service.synthetic.flat.scene_object import Heading, Placement, SceneObj
 
 Point = tuple[float, float, float]
 
-GAP_M = 0.015  # less than this may things overlap: they stand on rugs
-TRIES = 12  # places for a thing before it is left out
-HEADROOM_M = 0.6  # above tables and seats
-CHAIRS_MOST, PUSHED_M = 4, (-0.15, 0.3)  # at a table, and how far under it
+GAP_M = 0.015  # Maximum overlap of two objects; objects stand on rugs.
+TRIES = 12  # Number of positions to try before an object is omitted.
+HEADROOM_M = 0.6  # Free height above tables and seats.
+# Maximum number of chairs at a table, and range of their distance under it.
+CHAIRS_MOST, PUSHED_M = 4, (-0.15, 0.3)
 
-# To the back wall, the front wall and the sides: which way the front of a thing there looks.
+# Headings by the direction that the front faces. In this order, they suit objects at the back wall,
+# the front wall, and the walls at +x and -x.
 TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT = (1.0, 0.0), (-1.0, 0.0), (0.0, -1.0), (0.0, 1.0)
 ASKEW = ((1.0, 0.0), (0.96, 0.28), (0.8, 0.6), (0.8, -0.6), (0.96, -0.28))
 
 
 @dataclass
 class Builder:
-    """A room that is being furnished."""
+    """Builder of one furnished room."""
 
     rng: np.random.Generator
     paint: Materials
     size_m: tuple[float, float]
-    doorway: tuple[np.ndarray, np.ndarray]  # low and high corner [3] of what stays free
+    doorway: tuple[np.ndarray, np.ndarray]  # Low and high corner [3] of the space to keep free.
     things: list[SceneObject] = field(default_factory=list)
     _extents: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def build(self, label: str, heading: Heading, shapes: tuple[int, ...] = ()) -> SceneObject:
-        """One of its shapes at the origin."""
+        """Build an object of a random shape at the origin.
+
+        Args:
+            label: Class of the object.
+            heading: Direction of its x axis.
+            shapes: Shapes to choose from; all if empty.
+        """
         shape = int(self.rng.choice(shapes or range(SHAPES.get(label, 1))))
         solids = CATALOG[label](self.paint, shape)
         turned = Placement((0.0, 0.0, 0.0), heading)
@@ -59,7 +67,16 @@ class Builder:
     def put(
         self, thing: SceneObject, places: Iterable[Point], carrier: SceneObject | None = None
     ) -> SceneObject | None:
-        """Where it first meets nothing but its carrier, or nowhere."""
+        """Place an object at the first position where it is free of collisions.
+
+        Args:
+            thing: The object at the origin.
+            places: Positions to try, in order.
+            carrier: Object that it may touch.
+
+        Returns:
+            The placed object, or None if no position is free.
+        """
         for at in places:
             placed = SceneObject(thing.label, tuple(Placement(at)(solid) for solid in thing.solids))
             if self._is_free(*extent(placed), carrier):
@@ -69,6 +86,7 @@ class Builder:
         return None
 
     def between(self, low: float, high: float) -> float:
+        """Return a random number between two bounds."""
         return float(low + (high - low) * self.rng.random())
 
     def _is_free(self, low: np.ndarray, high: np.ndarray, carrier: SceneObject | None) -> bool:
@@ -85,15 +103,16 @@ class Builder:
 
 @dataclass(frozen=True, slots=True)
 class _Space:
-    """What may lie there, how many at most, between two corners [3]."""
+    """Free space on a table, seat or board."""
 
-    labels: tuple[str, ...]
-    most: int
-    low: np.ndarray
-    high: np.ndarray
+    labels: tuple[str, ...]  # Classes that may lie there.
+    most: int  # Maximum number of objects.
+    low: np.ndarray  # Low corner [3].
+    high: np.ndarray  # High corner [3].
 
 
 def furnish(builder: Builder) -> None:
+    """Place objects along the walls, on the walls and on the floor of a room."""
     rng = builder.rng
     for label in _some(rng, AT_WALLS, 15, 23):
         thing = builder.build(label, TO_FRONT, STANDING.get(label, ()))
@@ -107,7 +126,7 @@ def furnish(builder: Builder) -> None:
 
 
 def _place(builder: Builder, thing: SceneObject, places: Iterable[Point]) -> None:
-    """With what belongs to it: chairs at a table, things on it."""
+    """Place an object together with chairs at it and objects on it, where it takes any."""
     placed = builder.put(thing, places)
     if placed is not None:
         if placed.label == "dining table":
@@ -116,7 +135,7 @@ def _place(builder: Builder, thing: SceneObject, places: Iterable[Point]) -> Non
 
 
 def _seat(builder: Builder, table: SceneObject) -> None:
-    """Put chairs at its long sides, pushed under it more or less."""
+    """Place chairs at the long sides of a table, partly under it."""
     low, high = extent(table)
     across = int(np.argmin((high - low)[:2]))
     for _ in range(int(builder.rng.integers(CHAIRS_MOST + 1))):
@@ -131,7 +150,7 @@ def _seat(builder: Builder, table: SceneObject) -> None:
 
 
 def _some(rng: np.random.Generator, labels: tuple[str, ...], least: int, most: int) -> list[str]:
-    """Some of them in the order they are listed, so that large things come first."""
+    """Return a random selection in the listed order, in which large objects come first."""
     count = int(rng.integers(least, most + 1))
     chosen = np.sort(rng.permutation(len(labels))[:count])
     return [labels[k] for k in chosen]
@@ -142,7 +161,7 @@ def _turned(
     thing: SceneObject,
     ways: Sequence[Heading] = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT),
 ) -> SceneObject:
-    """To one of these sides, and a little more."""
+    """Turn an object to a random one of these headings, plus at most 37 degrees."""
     quarter = ways[int(builder.rng.integers(len(ways)))]
     askew = ASKEW[int(builder.rng.integers(len(ASKEW)))]
     turns = (Placement((0.0, 0.0, 0.0), quarter), Placement((0.0, 0.0, 0.0), askew))
@@ -152,10 +171,10 @@ def _turned(
 def _along_walls(
     builder: Builder, thing: SceneObject, on_floor: bool
 ) -> tuple[SceneObject, list[Point]]:
-    """The thing facing away from one wall, and places where its back touches that wall."""
+    """Return the object facing away from a random wall, and positions along that wall."""
     wall = int(builder.rng.integers(4))
     heading = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT)[wall]
-    if thing.label == "door":  # its leaf lies along the wall
+    if thing.label == "door":  # The leaf of a door is parallel to the wall.
         heading = (TO_RIGHT, TO_LEFT, TO_FRONT, TO_BACK)[wall]
     turned = Placement((0.0, 0.0, 0.0), heading)
     thing = SceneObject(thing.label, tuple(turned(solid) for solid in thing.solids))
@@ -179,7 +198,7 @@ def _anywhere(builder: Builder) -> Iterator[Point]:
 
 
 def _load(builder: Builder, carrier: SceneObject) -> None:
-    """Put what belongs there onto tables, seats and shelves."""
+    """Place suitable objects on a table, seat or shelf."""
     for space in _spaces(carrier):
         for label in _some(builder.rng, space.labels, 1, space.most):
             thing = _turned(builder, builder.build(label, TO_FRONT, LYING.get(label, ())))
@@ -191,7 +210,7 @@ def _load(builder: Builder, carrier: SceneObject) -> None:
 def _places_in(
     builder: Builder, space: _Space, low: np.ndarray, high: np.ndarray
 ) -> Iterator[Point]:
-    """For a thing of this extent, on the ground of a space."""
+    """Yield positions for an object of this extent at the bottom of a space."""
     to_middle = (space.low + space.high) / 2 - (low + high) / 2
     x, y = np.maximum((space.high - space.low - (high - low)) / 2, 0.0)[:2]
     for _ in range(TRIES // 2):
@@ -201,7 +220,7 @@ def _places_in(
 
 
 def _spaces(carrier: SceneObject) -> Iterator[_Space]:
-    """On tables, seats and boards."""
+    """Yield the free spaces on a table, a seat or the boards of a shelf."""
     low, high = extent(carrier)
     above = high + np.array([0.0, 0.0, HEADROOM_M])
     if carrier.label in TABLES:
@@ -222,6 +241,6 @@ def _at_height(corner: np.ndarray, z_m: float) -> np.ndarray:
 
 
 def extent(thing: SceneObject) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high corner [3] along the axes."""
+    """Return the low and high corner [3] of an object's bounding box along the axes."""
     center, size = thing.bounds_m
     return center - size / 2, center + size / 2

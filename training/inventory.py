@@ -1,6 +1,6 @@
-"""What may stand where in a room. Large things come first: they are placed first."""
+"""Objects per kind of place in a room; large objects come first because they are placed first."""
 
-SHAPES = {  # how many each has; one where it is not told
+SHAPES = {  # Number of shapes of each class; one for classes that are not listed.
     "chair": 3, "couch": 2, "dining table": 3, "shelf": 2, "cabinet": 2, "cushion": 2, "rug": 2,
     "lamp": 3, "potted plant": 3, "tv": 2, "speaker": 2, "bottle": 2, "cup": 2, "vase": 2,
     "suitcase": 2, "cardboard box": 2, "trash can": 2, "book": 3, "clock": 2, "picture frame": 3,
@@ -14,7 +14,7 @@ AT_WALLS = (
     "potted plant", "trash can", "projector", "cardboard box", "toolbox", "bucket", "backpack",
     "chair", "handbag", "tv", "teddy bear",
 )  # fmt: skip
-HUNG = {  # middle of the height
+HUNG = {  # Range of the height of the object's center, meters.
     "window": (1.4, 1.55), "whiteboard": (1.35, 1.6), "picture frame": (1.5, 2.0),
     "clock": (1.5, 2.0), "tv": (1.0, 1.4),
 }  # fmt: skip
@@ -30,18 +30,18 @@ ON_TABLES = (
 )  # fmt: skip
 ON_SEATS = ("cushion", "cushion", "teddy bear", "remote", "book", "cell phone", "handbag", "laptop")
 IN_SHELVES = ("book", "book", "book", "speaker", "vase", "globe", "handbag", "clock", "bowl", "cup")
-FLAT_SHAPES = {"tv": 1}  # which hang
-LYING = {
+FLAT_SHAPES = {"tv": 1}  # Shapes for the wall.
+LYING = {  # Shapes on tables.
     "lamp": (1, 2),
     "speaker": (1,),
     "tv": (0,),
     "cabinet": (0, 1),
-}  # shapes on tables
-STANDING = {"lamp": (0,), "speaker": (0,)}  # shapes on the floor
+}
+STANDING = {"lamp": (0,), "speaker": (0,)}  # Shapes on the floor.
 ON_SHELVES = ("vase", "globe", "printer", "clock", "book")
 TABLES = ("dining table", "cabinet")
-SEATS_M = {"couch": 0.48, "bed": 0.51, "bench": 0.45}  # heights
-BOARDS_M = {
+SEATS_M = {"couch": 0.48, "bed": 0.51, "bench": 0.45}  # Heights of the seats.
+BOARDS_M = {  # Heights of the boards of tall (True) and low (False) shelves.
     True: (0.105, 0.445, 0.785, 1.125, 1.465),
     False: (0.085, 0.425),
-}  # of tall and low ones
+}

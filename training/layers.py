@@ -1,7 +1,8 @@
-"""Convolutional networks written once and read twice: by JAX to train them, as ONNX to ship them.
+"""Layers of convolutional networks, for training in JAX and for export to ONNX.
 
-A network is a function of a reader and its input. The readers have the same methods; `JaxNetwork`
-holds arrays [N, H, W, C], `Graph` names of tensors [1, C, H, W].
+A network is one function of a reader and its input. The two readers have the same methods:
+`JaxNetwork` computes arrays [N, H, W, C], and `Graph` adds ONNX nodes and returns the names of
+tensors [1, C, H, W].
 """
 
 from collections.abc import Mapping
@@ -14,19 +15,22 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 Weights = dict[str, np.ndarray]
-Statistics = Mapping[str, tuple[np.ndarray, np.ndarray]]  # mean and variance by layer
+Statistics = Mapping[str, tuple[np.ndarray, np.ndarray]]  # Mean and variance by layer.
 
-EPSILON = 1e-3  # of variances
-UNFOLDED_PX = 9  # of an image up to which a product is faster to train than XLA's convolution
-OPSET, IR_VERSION = 17, 8  # what onnxruntime 1.18 reads
+EPSILON = 1e-3  # Added to variances.
+# Maximum number of output pixels for which a matrix product trains faster than XLA's convolution.
+UNFOLDED_PX = 9
+OPSET, IR_VERSION = 17, 8  # Versions that onnxruntime 1.18 supports.
 
 
 class JaxNetwork:
-    """Arrays. Missing weights are drawn when there is a generator for them.
+    """Reader that computes JAX arrays.
 
-    weights     by name
-    statistics  mean and variance of each normalised layer; without, those of the batch
-    observed    mean and variance that this reading saw, of each normalised layer
+    With a random generator, it initializes weights that are missing.
+
+    Attributes:
+        weights: Weights by name.
+        observed: Mean and variance of the batch in each normalized layer.
     """
 
     def __init__(
@@ -35,13 +39,20 @@ class JaxNetwork:
         statistics: Mapping | None = None,
         rng: np.random.Generator | None = None,
     ) -> None:
+        """Create a reader.
+
+        Args:
+            weights: Weights by name.
+            statistics: Mean and variance of each normalized layer; None for those of the batch.
+            rng: Source of missing weights; None if there may be none missing.
+        """
         self.weights = dict(weights)
         self.observed: dict = {}
         self._statistics = statistics
         self._rng = rng
 
     def conv(self, x, name: str, channels: int, stride: int = 1, size: int = 3):
-        """Convolution, normalised over the batch, then ReLU."""
+        """Apply a convolution, batch normalization and ReLU."""
         y = self._convolved(x, name, channels, stride, size)
         mean, variance = self._moments(y, name)
         gain = self._weight(f"{name}.gain", np.ones(channels))
@@ -49,7 +60,7 @@ class JaxNetwork:
         return jax.nn.relu((y - mean) * (gain * jax.lax.rsqrt(variance + EPSILON)) + bias)
 
     def linear(self, x, name: str, channels: int, bias: float = 0.0):
-        """A convolution of one pixel as it is: what a network tells."""
+        """Apply a 1x1 convolution with bias, without normalization, for the network's outputs."""
         y = self._convolved(x, name, channels, 1, 1)
         return y + self._weight(f"{name}.bias", np.full(channels, bias))
 
@@ -60,23 +71,23 @@ class JaxNetwork:
         return jnp.concatenate(parts, axis=-1)
 
     def folded(self, x, side: int):
-        """Squares of pixels become channels of one."""
+        """Return squares of `side` pixels as the channels of one pixel (space to depth)."""
         n, height, width, channels = x.shape
         x = x.reshape(n, height // side, side, width // side, side, channels)
         x = x.transpose(0, 1, 3, 2, 4, 5)
         return x.reshape(n, height // side, width // side, side * side * channels)
 
     def enlarged(self, x):
-        """Twice as large, each pixel four times."""
+        """Return the image at twice its size by nearest-neighbor upsampling."""
         return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)
 
     def widest(self, x):
-        """The largest of 5x5 pixels."""
+        """Return the maximum over 5x5 pixels around each pixel."""
         window = (1, 5, 5, 1)
         return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, window, (1, 1, 1, 1), "SAME")
 
     def mean(self, x):
-        """Over all pixels [N, 1, 1, C]."""
+        """Return the mean over all pixels, [N, 1, 1, C]."""
         return x.mean(axis=(1, 2), keepdims=True)
 
     def _convolved(self, x, name: str, channels: int, stride: int, size: int):
@@ -110,7 +121,7 @@ class JaxNetwork:
 
 
 class Graph:
-    """ONNX nodes, with normalisation folded into the convolutions."""
+    """Reader that builds ONNX nodes, with normalization folded into the convolutions."""
 
     def __init__(self, weights: Weights, statistics: Statistics) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -119,7 +130,7 @@ class Graph:
         self._statistics = statistics
 
     def beside(self, weights: Weights, statistics: Statistics) -> "Graph":
-        """To add another network's nodes to the same graph."""
+        """Return a reader that adds the nodes of another network to the same graph."""
         other = Graph(weights, statistics)
         other.nodes, other.constants = self.nodes, self.constants
         return other
@@ -157,25 +168,25 @@ class Graph:
         return self.node("GlobalAveragePool", x)
 
     def mirrored(self, x: str) -> str:
-        """Left and right exchanged."""
+        """Mirror an image left to right."""
         ends = (self.integers(value) for value in (-1, -(2**31), 3, -1))
         return self.node("Slice", x, *ends)
 
     def node(self, kind: str, *inputs: str, output: str = "", **attributes) -> str:
-        """Add a node; the name of what it gives."""
+        """Add a node and return the name of its output."""
         output = output or f"{kind.lower()}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
         return output
 
     def split(self, x: str, sizes: tuple[int, ...], axis: int = 1) -> list[str]:
-        """Parts of so many channels."""
+        """Split a tensor along an axis into parts of these sizes."""
         outputs = [f"{x}.{k}" for k in range(len(sizes))]
         parts = self.integers(*sizes)
         self.nodes.append(helper.make_node("Split", [x, parts], outputs, axis=axis))
         return outputs
 
     def halves(self, x: str) -> tuple[str, str]:
-        """The first half of a batch and the second."""
+        """Return the first and the second half of a batch."""
         outputs = f"{x}.first", f"{x}.second"
         self.nodes.append(helper.make_node("Split", [x], outputs, axis=0))
         return outputs
@@ -187,7 +198,7 @@ class Graph:
         return self.constant(np.array(value, np.float32))
 
     def halved(self, values: np.ndarray) -> str:
-        """A constant kept in half precision: it is read once, and the file is half as large."""
+        """Add a constant in half precision, which halves the file; it is cast to float once."""
         return self.node("Cast", self.constant(values.astype(np.float16)), to=TensorProto.FLOAT)
 
     def constant(self, values: np.ndarray) -> str:
@@ -202,7 +213,14 @@ class Graph:
         outputs: tuple[str, tuple],
         about: Mapping[str, str],
     ) -> None:
-        """Write the file: name and shape of its input and output, and its metadata."""
+        """Check the model and write it.
+
+        Args:
+            path: File to write.
+            inputs: Name and shape of the input.
+            outputs: Name and shape of the output.
+            about: Metadata of the model.
+        """
         ends = [
             [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)]
             for name, shape in (inputs, outputs)
@@ -224,12 +242,21 @@ class Graph:
 
 
 def pads(size: int) -> list[tuple[int, int]]:
-    """Of rows and columns, as ONNX has them: alike on both sides."""
+    """Return the padding of rows and columns; it is symmetric, as in ONNX."""
     return [(size // 2, size // 2)] * 2
 
 
 def unfolded(x, size: int, stride: int):
-    """Of each pixel that a convolution gives all that it is made of: [N, H, W, size * size * C]."""
+    """Return the inputs of each output pixel of a convolution (im2col).
+
+    Args:
+        x: Image [N, H, W, C].
+        size: Side of the kernel.
+        stride: Stride of the convolution.
+
+    Returns:
+        An array [N, H / stride, W / stride, size * size * C].
+    """
     x = jnp.pad(x, [(0, 0), *pads(size), (0, 0)])
     rows, columns = (range(0, side - size + 1, stride) for side in x.shape[1:3])
     parts = [
@@ -241,12 +268,15 @@ def unfolded(x, size: int, stride: int):
 
 
 def merged(net: JaxNetwork | Graph, x, name: str, channels: int, side: int = 2):
-    """Squares of pixels become one, each by all of them: Liu et al., ConvNeXt, CVPR 2022. Beside a
-    convolution of 3x3 pixels with stride 2, a quarter of the time of training."""
+    """Apply a patchify convolution: each square of `side` pixels becomes one pixel.
+
+    See Liu et al., ConvNeXt, CVPR 2022. Training takes a quarter of the time of a 3x3 convolution
+    with stride 2.
+    """
     return net.conv(net.folded(x, side), name, channels, size=1)
 
 
 def residual(net: JaxNetwork | Graph, x, name: str, channels: int):
-    """A bottleneck beside the way straight through."""
+    """Apply a bottleneck with a residual connection."""
     inner = net.conv(x, f"{name}.in", channels // 2, size=1)
     return net.add(x, net.conv(inner, f"{name}.out", channels))

@@ -1,7 +1,7 @@
-"""Rooms that are not the flat: other sizes, other layouts, other paints; the same catalogue.
+"""Rooms for training, with the flat's catalog but other sizes, layouts and paints.
 
-World: z up, origin on the floor in the middle of the room, below the lamp that the flat's renderer
-has there.
+World frame: z up, origin on the floor at the center of the room, below the lamp that the flat's
+renderer has there.
 """
 
 from collections.abc import Iterator
@@ -15,15 +15,15 @@ from ldo_service.synthetic.flat.scene import Flat
 from ldo_service.synthetic.flat.scene_object import CEILING, FLOOR, WALL
 from ldo_service.synthetic.solids import Solid
 
-VERSION = 3  # raise it with every change that alters a room
-LAMP = 2  # index of the renderer's lamp above the origin
-HALLWAY_M = 1.4  # of what is seen through the doorway
-WIDTH_M, DEPTH_M = (3.6, 5.4), (3.2, 4.8)  # least and most
-FIRST_SEED = 1000  # paints of the flat and its variants come from small seeds
+VERSION = 3  # Increase it with every change that alters a room.
+LAMP = 2  # Index of the renderer's lamp above the origin.
+HALLWAY_M = 1.4  # Depth of the hallway behind the doorway.
+WIDTH_M, DEPTH_M = (3.6, 5.4), (3.2, 4.8)  # Minimum and maximum.
+FIRST_SEED = 1000  # Offset of the seeds of paints; the flat and its variants use small seeds.
 
 
 def room(seed: int) -> Flat:
-    """A room with a doorway, furnished; `seed` sets its size, layout and paints."""
+    """Return a furnished room with a doorway; `seed` determines its size, layout and paints."""
     rng = np.random.default_rng([seed, 7])
     size_m = tuple(float(side) for side in rng.uniform(*zip(WIDTH_M, DEPTH_M, strict=True)))
     door_m = float(rng.uniform(-0.25, 0.25)) * size_m[0]
@@ -37,7 +37,7 @@ def room(seed: int) -> Flat:
 
 
 def inside_m(flat: Flat) -> tuple[float, float]:
-    """Width and depth of a room."""
+    """Return the width and depth of a room."""
     back, side = flat.panels[0].solid, flat.panels[1].solid
     return back.size_m[0], side.size_m[1] - HALLWAY_M - WALL_M
 
@@ -45,7 +45,7 @@ def inside_m(flat: Flat) -> tuple[float, float]:
 def _panels(
     rng: np.random.Generator, size_m: tuple[float, float], door_m: float
 ) -> Iterator[Panel]:
-    """Four walls, one with the doorway, what is seen through it, floor and ceiling."""
+    """Yield the four walls, one with the doorway, the hallway behind it, floor and ceiling."""
     width, depth = size_m
     paint = ("wall_a", "wall_b", "wall_c")[int(rng.integers(3))]
     floor = ("floor_a", "floor_b", "floor_c")[int(rng.integers(3))]
@@ -63,7 +63,7 @@ def _panels(
 
 
 def _door_wall(width_m: float, y_m: float, door_m: float, paint: str) -> Iterator[Panel]:
-    """Left of the doorway, right of it and above."""
+    """Yield the panels left of, right of and above the doorway."""
     left, right = door_m - DOOR_WIDTH_M / 2, door_m + DOOR_WIDTH_M / 2
     for start, end in ((-width_m / 2, left), (right, width_m / 2)):
         yield _wall(((start + end) / 2, y_m), (end - start, WALL_M), paint, 3)

@@ -1,4 +1,4 @@
-"""What the networks learn from: rooms rendered once, by several processes."""
+"""Training frames of many rooms, rendered once by several processes."""
 
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from views import Views, VisibleBoxes
 
 @dataclass(frozen=True, slots=True)
 class Rooms:
-    """Seeds of rooms, and how many frames of each."""
+    """Set of rooms."""
 
     seeds: range
-    frames: int
+    frames: int  # Number of frames per room.
 
     def load(self, folder: Path) -> Views:
-        """The frames of all of them, one after the other."""
+        """Return the frames of all rooms, in the order of the seeds."""
         parts = [views.cached(folder, seed, self.frames) for seed in self.seeds]
         return Views(
             np.concatenate([part.colors for part in parts]),
@@ -36,7 +36,7 @@ class Rooms:
 
 
 def render_all(rooms: list[Rooms], folder: Path, processes: int) -> None:
-    """Every room that is not kept yet, by several processes."""
+    """Render every room that is not in the folder yet."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         for part in rooms:
             render_one = partial(_render_one, folder, part.frames)

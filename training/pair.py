@@ -1,8 +1,8 @@
-"""The dual encoder's two rounds: on things, then on things and regions.
+"""The two training rounds of the dual encoder: first on objects, then on objects and regions.
 
-A service asks about what geometry and colour set apart (`regions`): a third of that is no thing,
-and a third a part of one. So in the second round half of each batch are crops of such regions, and
-there is one name more, for what is no thing.
+The service requests labels for region proposals from geometry and color (`regions`). A third of
+these show no object, and a third show a part of one. In the second round, half of each batch is
+therefore crops of such regions, with one additional name for regions without an object.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -21,28 +21,35 @@ import training
 from ldo_service.regions.region_views import ViewConfig
 from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES
 
-NO_NAME = "background"  # of a region that is no thing
+NO_NAME = "background"  # Name of a region that shows no object.
 NO_THINGS = (*BUILDING.split(), NO_NAME)
-# Sides of crops in pixels, and shares of a round's steps: small ones first, of which a minute has
-# several times as many (Tan and Le, EfficientNetV2, ICML 2021)
+# Sides of crops in pixels, and fractions of a round's steps. Small crops come first, because a
+# minute has several times as many steps with them (Tan and Le, EfficientNetV2, ICML 2021).
 SIDES = ((32, 0.3), (48, 0.7)), ((48, 0.5), (INPUT_PX, 0.5))
-ABOUT_REGIONS = Framing((0.1, 0.2), 0.04, 0.0)  # many are cut off as they are
-REGIONS_SHARE, NO_THING_SHARE = 0.5, 0.35  # of a batch, and of these
-MARGIN = ViewConfig().context  # of a region's sides, that a labeller's crop has around it
+ABOUT_REGIONS = Framing((0.1, 0.2), 0.04, 0.0)  # Many regions are cut off already, hence no cuts.
+# Fraction of regions in a batch, and fraction of these that show no object.
+REGIONS_SHARE, NO_THING_SHARE = 0.5, 0.35
+MARGIN = ViewConfig().context  # Margin of a labeller's crop, as a fraction of the region's sides.
 
 
 def train(material: Views, steps: Sequence[int], seed: int) -> Pair:
-    """In rounds of so many steps, each with its share of the rate: see `training.fit_in_rounds`."""
+    """Train the dual encoder.
+
+    Args:
+        material: Training frames.
+        steps: Steps of each round; see `training.ROUND_RATES`.
+        seed: Seed of weights and batches.
+    """
     rng = np.random.default_rng([seed, 2])
     live = JaxNetwork({}, rng=rng)
     encoder.network(live, jnp.zeros((1, INPUT_PX, INPUT_PX, 3)))
     texts = rng.standard_normal((len(NAMES), DIMENSIONS)).astype(np.float32)
     weights = live.weights | {"texts.kernel": texts}
     first, second = (share * RATE for share in training.ROUND_RATES)
-    # things
+    # First round: objects.
     things = growing(lambda side_px: encoder.batches(material, rng, side_px), SIDES[0], steps[0])
     weights = training.fit(encoder.loss, weights, things, steps[0], first)
-    # and regions
+    # Second round: objects and regions.
     weights |= {"texts.kernel": _with_no_name(weights["texts.kernel"])}
     rng = np.random.default_rng([seed, 7])
     both = growing(lambda side_px: batches(material, rng, side_px), SIDES[1], steps[1])
@@ -55,7 +62,7 @@ def train(material: Views, steps: Sequence[int], seed: int) -> Pair:
 
 
 def _with_no_name(texts: np.ndarray) -> np.ndarray:
-    """[T + 1, D]: it begins between wall, floor and ceiling."""
+    """Return the table [T + 1, D] with NO_NAME, initialized to the mean of wall, floor, ceiling."""
     building = [NAMES.index(name) for name in BUILDING.split()]
     return np.concatenate([texts, texts[building].mean(axis=0, keepdims=True)])
 
@@ -63,14 +70,20 @@ def _with_no_name(texts: np.ndarray) -> np.ndarray:
 def growing(
     source: Callable[[int], Iterator[tuple]], sides: Sequence[tuple[int, float]], steps: int
 ) -> Iterator[tuple]:
-    """Batches of `source(side_px)` for so many steps, `sides` as in SIDES."""
+    """Yield batches of growing crops.
+
+    Args:
+        source: Function that returns batches of crops with a side in pixels.
+        sides: Sides of crops and fractions of the steps, as in SIDES.
+        steps: Steps of the round.
+    """
     for side_px, share in sides[:-1]:
         yield from islice(source(side_px), round(share * steps))
     yield from source(sides[-1][0])
 
 
 def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) -> Iterator[tuple]:
-    """As those of `encoder`, with regions in place of a half."""
+    """Yield batches like those of `encoder`, with regions in place of half of the crops."""
     regions, names = named(material.regions)
     odds, count = _odds(names), round(REGIONS_SHARE * BATCH)
     for crops, told in encoder.batches(material, rng, side_px, BATCH - count):
@@ -83,22 +96,24 @@ def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) 
 
 
 def named(regions: VisibleBoxes) -> tuple[VisibleBoxes, np.ndarray]:
-    """Regions that have a name, and its index: after NAMES comes NO_NAME."""
+    """Return the regions that have a name, and its index in (*NAMES, NO_NAME)."""
     own = {CLASS_NAMES.index(name): k for k, name in enumerate(NAMES)} | {NO_THING: len(NAMES)}
     chosen = regions.chosen(np.array([k in own for k in regions.class_ids.tolist()], bool))
     return chosen, np.array([own[k] for k in chosen.class_ids.tolist()], np.int64)
 
 
 def crops_of(regions: VisibleBoxes, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Crops of regions as a labeller sees them, and their names' indices."""
+    """Return crops of regions as a labeller receives them, and the indices of their names."""
     regions, names = named(regions)
     rows = zip(regions.frames, regions.boxes_px, strict=True)
     return np.array([crop(colors[f], enlarged(box, MARGIN)) for f, box in rows]), names
 
 
 def is_right(names: np.ndarray) -> np.ndarray:
-    """[N, T + 1] bool, what regions with these names [N] may be called: any of NO_THINGS where they
-    are none."""
+    """Return a mask [N, T + 1] of the correct names of regions with these names [N].
+
+    For a region without an object, all of NO_THINGS are correct.
+    """
     among = (*NAMES, NO_NAME)
     right = np.arange(len(among)) == names[:, None]
     right[names == len(NAMES)] = np.isin(among, NO_THINGS)
@@ -106,7 +121,11 @@ def is_right(names: np.ndarray) -> np.ndarray:
 
 
 def _odds(names: np.ndarray) -> np.ndarray:
-    """[N] of regions: each name as often as the root of its number, and none as is set."""
+    """Return the sampling probabilities [N] of regions.
+
+    The frequency of a name is proportional to the square root of its number of regions. Regions
+    without an object together have the probability NO_THING_SHARE.
+    """
     odds, is_thing = 1 / np.sqrt(np.bincount(names)[names]), names < len(NAMES)
     odds[is_thing] *= (1 - NO_THING_SHARE) / odds[is_thing].sum()
     odds[~is_thing] *= NO_THING_SHARE / odds[~is_thing].sum()

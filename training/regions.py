@@ -1,7 +1,7 @@
-"""Regions of a frame as the service sets them apart, and what they are.
+"""Region proposals of a frame, as the service computes them, with their ground-truth objects.
 
-Who has seen whole things alone takes a piece of a wall for one, or two halves of things; and of the
-regions that a labeller is asked about, many are just that.
+Many of the regions that a labeller receives show a piece of a wall or parts of two objects. A
+network that was trained only on whole objects takes these for an object.
 """
 
 from collections.abc import Iterator
@@ -15,18 +15,27 @@ from ldo_service.regions.region_proposals import RegionProposalConfig, regions_o
 from ldo_service.synthetic.flat.render import FlatRendering
 from ldo_service.synthetic.flat.sensor import measured_depth_m
 
-# of frames half as wide as those that it is made for
+# Settings for frames that are half as wide as the default settings expect.
 TRIGGER = RegionProposalConfig(min_side_px=12)
 BLUR_PX = 4.0
-NO_THING = -1  # in place of a class
-OWN = 0.7  # share of a region that one thing has, to be that thing
-SHOWN = 0.1  # share of what is seen of the thing: a smaller piece shows nobody what it is
+NO_THING = -1  # Class of a region that shows no object.
+OWN = 0.7  # Minimum fraction of a region that one object covers.
+# Minimum fraction of the visible object in the region; a smaller piece cannot be recognized.
+SHOWN = 0.1
 
 
 def regions(frame: FlatRendering, lens: Camera, rng: np.random.Generator) -> Iterator[tuple]:
-    """Class, instance, box and pixels of the thing, of each region that shows one, or no thing. By
-    colors and depth as a camera measures them; where it measures none, depth is exact, as a map has
-    it."""
+    """Yield class, instance, box and pixels of each region proposal of a frame.
+
+    Color and depth have the errors of a camera. Where the camera measures no depth, it is exact,
+    because the service fills it from the map. A region without an object has the class NO_THING;
+    a region with too small a piece of an object is omitted.
+
+    Args:
+        frame: The exact frame.
+        lens: Intrinsics.
+        rng: Source of the errors.
+    """
     sharp = np.floor(np.clip(frame.light, 0, 1) * 255 + 0.5).astype(np.uint8)
     measured_m = measured_depth_m(frame, lens.fx, rng)
     depth_m = np.where(measured_m > 0, measured_m, frame.depth_m).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What the shipped files find, read as anybody would read them: by onnxruntime alone."""
+"""Scores of the exported files, which are read with onnxruntime only, as by any other program."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -15,53 +15,55 @@ from views import VisibleBoxes
 import examples
 from ldo_service.synthetic.flat.scene_object import CLASS_NAMES
 
-SCORE_MIN, NMS_IOU = 0.01, 0.45  # of boxes that precision and recall are measured over
-HIT_IOU = 0.5
-SHARE_MIN = 1e-3  # of the image, of an object that has to be found
+# Minimum score of the evaluated boxes, and maximum IoU between two of them.
+SCORE_MIN, NMS_IOU = 0.01, 0.45
+HIT_IOU = 0.5  # Minimum IoU of a correct box.
+SHARE_MIN = 1e-3  # Minimum size of an object to be detected, as a fraction of the image.
 FRAME_PX = (320, 240)
-TOP_PX = (cells.INPUT_PX[1] - FRAME_PX[1]) // 2  # of the frame in the input
+TOP_PX = (cells.INPUT_PX[1] - FRAME_PX[1]) // 2  # First row of the frame in the input.
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Boxes in one frame of FRAME_PX: [M, 4] corners, scores [M], class ids [M]."""
+    """Detections in one frame of FRAME_PX."""
 
-    boxes_px: np.ndarray
-    scores: np.ndarray
-    class_ids: np.ndarray
+    boxes_px: np.ndarray  # Corners [M, 4].
+    scores: np.ndarray  # Scores [M].
+    class_ids: np.ndarray  # Class ids [M].
 
 
 @dataclass(frozen=True, slots=True)
 class ClassScore:
-    """One class over all frames."""
+    """Scores of one class over all frames."""
 
-    objects: int
-    average_precision: float  # all points, IoU 0.5
-    recall: float  # of boxes with a score of at least `at`
-    precision: float
+    objects: int  # Number of ground-truth objects.
+    average_precision: float  # Average precision over all points, at IoU 0.5.
+    recall: float  # Recall of the boxes with at least the score `at` of `detection`.
+    precision: float  # Precision of the same boxes.
 
 
 def session(path: Path) -> onnxruntime.InferenceSession:
+    """Return a single-threaded CPU session of an ONNX file."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
 
 
 def canvas(color: np.ndarray) -> np.ndarray:
-    """The detector's input [256, 320, 3] for a frame [H, W, 3] uint8 RGB in proportion 4:3."""
+    """Return the detector's input [256, 320, 3] for a frame [H, W, 3] uint8 RGB of aspect 4:3."""
     whole = np.full((*cells.INPUT_PX[::-1], 3), examples.PADDING, np.uint8)
     whole[TOP_PX : TOP_PX + FRAME_PX[1]] = cv2.resize(color, FRAME_PX)
     return whole
 
 
 def output(network: onnxruntime.InferenceSession, image: np.ndarray) -> np.ndarray:
-    """What the detector tells of each cell, [N, 4 + C]."""
+    """Return the detector's output of each cell, [N, 4 + C]."""
     values = image.transpose(2, 0, 1)[None].astype(np.float32) / 255
     return np.asarray(network.run(None, {"images": values})[0])[0].T
 
 
 def find(network: onnxruntime.InferenceSession, color: np.ndarray) -> Found:
-    """Objects in a frame [H, W, 3] uint8 RGB in proportion 4:3."""
+    """Return the detections in a frame [H, W, 3] uint8 RGB of aspect 4:3."""
     rows = output(network, canvas(color))
     class_ids, scores = rows[:, 4:].argmax(axis=1), rows[:, 4:].max(axis=1)
     corners = np.hstack((rows[:, :2] - rows[:, 2:4] / 2, rows[:, 2:4]))
@@ -80,7 +82,15 @@ def find(network: onnxruntime.InferenceSession, color: np.ndarray) -> Found:
 def detection(
     found: Iterable[Found], seen: VisibleBoxes, at: float = 0.25
 ) -> dict[str, ClassScore]:
-    """Per class, with boxes of `seen` in pixels of FRAME_PX; small objects count neither way."""
+    """Return the scores of each class.
+
+    Small objects count neither as objects nor as false detections.
+
+    Args:
+        found: Detections of each frame.
+        seen: Ground-truth boxes in pixels of FRAME_PX.
+        at: Minimum score of boxes for recall and precision.
+    """
     frames = list(found)
     truth = of_coco(seen)
     return {
@@ -91,11 +101,12 @@ def detection(
 
 
 def mean_average_precision(scores: dict[str, ClassScore]) -> float:
+    """Return the mean average precision over all classes."""
     return float(np.mean([score.average_precision for score in scores.values()]))
 
 
 def of_coco(seen: VisibleBoxes) -> VisibleBoxes:
-    """The objects of the classes that the detector has, with its class ids."""
+    """Return the objects of the detector's classes, with the detector's class ids."""
     own = {CLASS_NAMES.index(name): k for k, name in enumerate(cells.NAMES)}
     chosen = seen.chosen(np.array([k in own for k in seen.class_ids.tolist()]))
     return replace(chosen, class_ids=np.array([own[k] for k in chosen.class_ids.tolist()]))
@@ -106,9 +117,12 @@ def _counts(truth: VisibleBoxes) -> np.ndarray:
 
 
 def _class_score(frames: list[Found], truth: VisibleBoxes, class_id: int, at: float) -> ClassScore:
-    """Boxes by falling score, each taking the free object that it overlaps most."""
+    """Match the boxes of one class in order of descending score.
+
+    Each box takes the unmatched object that it overlaps most.
+    """
     counts = _counts(truth)
-    rows = []  # score, is a hit
+    rows = []  # Pairs of score and 1 for a correct box, 0 otherwise.
     for number, frame in enumerate(frames):
         mine = np.flatnonzero(frame.class_ids == class_id)
         mine = mine[np.argsort(-frame.scores[mine], kind="stable")]
@@ -139,23 +153,19 @@ def _iou(box: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Naming:
-    """Names given to N crops, and how sure.
+    """Predicted names of N crops."""
 
-    truth, told   [N] indices into the encoder's names
-    confidence    [N] of the softmax
-    """
-
-    truth: np.ndarray
-    told: np.ndarray
-    confidence: np.ndarray
+    truth: np.ndarray  # Ground-truth indices [N] into the encoder's names.
+    told: np.ndarray  # Predicted indices [N] into the encoder's names.
+    confidence: np.ndarray  # Softmax probabilities [N] of the predicted names.
 
     def accuracy(self, names: Iterable[str] = encoder.NAMES) -> float:
-        """Share of the crops with these true names that are named right."""
+        """Return the fraction of correct predictions among the crops with these true names."""
         mine = np.isin(self.truth, [encoder.NAMES.index(name) for name in names])
         return float(np.mean(self.told[mine] == self.truth[mine])) if mine.any() else float("nan")
 
     def calibration_error(self, bins: int = 10) -> float:
-        """Expected difference of confidence and accuracy: Guo et al., ICML 2017."""
+        """Return the expected calibration error (Guo et al., ICML 2017)."""
         place = np.minimum((self.confidence * bins).astype(int), bins - 1)
         right = self.told == self.truth
         gaps = [
@@ -168,11 +178,12 @@ class Naming:
 
 
 def embedded(network: onnxruntime.InferenceSession, crops: np.ndarray) -> np.ndarray:
-    """[N, D] of crops [N, 64, 64, 3] uint8."""
+    """Return the vectors [N, D] of crops [N, 64, 64, 3] uint8."""
     return np.asarray(network.run(None, {"pixel_values": planes(crops)})[0])
 
 
 def naming(folder: Path, crops: np.ndarray, truth: np.ndarray) -> Naming:
+    """Predict the names of crops [N, 64, 64, 3] with the files in a folder."""
     with np.load(folder / "text_embeddings.npz") as texts:
         vectors, scale = texts["embeddings"], float(texts["logit_scale"])
     cosines = embedded(session(folder / "image_encoder.onnx"), crops) @ vectors.T

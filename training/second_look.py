@@ -1,12 +1,18 @@
-"""The detector that ships, in the layout of YOLOv8: a second look at what the first one found.
+"""Export of the detector in the layout of YOLOv8: proposals, rescored by the image encoder.
 
-in   images   [1, 3, 256, 320]   RGB 0..1, the image centred on grey
-out  output0  [1, 4 + C, 1680]   cx, cy, w, h in pixels of the input, then a score per class of COCO
+Input:
+    images: RGB [1, 3, 256, 320] in 0..1, the frame centered on gray.
 
-The first look (`detector`) proposes boxes; the image encoder of the pair names the best of them.
-A score is the probability of the class by both, times how well the box fits; boxes that nobody
-looked at twice have none. As in two-stage detectors (Ren et al., NeurIPS 2015), but the second
-stage is a network of its own, that has learned from crops: that takes far fewer steps.
+Output:
+    output0: Array [1, 4 + C, 1680] of cx, cy, w, h in pixels of the input, then a score per class
+        of COCO.
+
+The proposal network (`detector`) predicts boxes, and the image encoder of the pair classifies the
+best of them. A score is the class probability from both, times the fit of the box. Boxes that are
+not rescored have score 0.
+
+This follows two-step detectors (Ren et al., NeurIPS 2015). Here, however, the second step is a
+separate network that was trained on crops, which takes far fewer training steps.
 """
 
 from pathlib import Path
@@ -22,23 +28,31 @@ from encoder import Pair, embedded
 from layers import Graph
 from onnx import TensorProto
 
-LOOKS = 64  # boxes that are looked at twice
-DISTINCT_IOU = 0.7  # boxes that overlap more are looked at once
-# Logits of both looks are added, each with less than its full weight: they see the same pixels.
-FIRST_WEIGHT, SECOND_WEIGHT = 0.5, 0.6  # the best on the rooms for calibration
+LOOKS = 64  # Maximum number of rescored boxes.
+DISTINCT_IOU = 0.7  # Maximum IoU of two rescored boxes.
+# Weights of both networks' logits. They are below 1 because both see the same pixels, and they are
+# the best values on the calibration rooms.
+FIRST_WEIGHT, SECOND_WEIGHT = 0.5, 0.6
 
 
 def export(first: FirstStage, pair: Pair, scale: float, path: Path) -> None:
-    """Write the detector; `scale` calibrates the pair's cosines."""
+    """Write the detector.
+
+    Args:
+        first: The proposal network.
+        pair: The dual encoder without NO_NAME, the name of regions that show no object.
+        scale: Calibrated scale of the pair's cosines.
+        path: File to write.
+    """
     graph = Graph(first.weights, first.statistics)
-    # the first look
+    # Proposals.
     corners, fit, logits = detector.looked(graph)
     fit = graph.node("Sigmoid", fit)
     cells = _best(graph, corners, fit, logits)
     boxes = graph.node("Gather", graph.node("Squeeze", corners, graph.integers(0)), cells, axis=0)
-    # the second
+    # Rescoring.
     second = _second_logits(graph.beside(pair.weights, pair.statistics), boxes, pair, scale)
-    # both
+    # Scores from both.
     names = graph.node("Softmax", _joined(graph, _rows(graph, logits, cells), second), axis=1)
     names, _ = graph.split(names, (len(NAMES), len(THINGS) + 1 - len(NAMES)))
     scores = graph.node("Mul", names, _rows(graph, fit, cells))
@@ -51,7 +65,18 @@ def export(first: FirstStage, pair: Pair, scale: float, path: Path) -> None:
 def output(
     first: FirstStage, pair: Pair, scale: float, image: np.ndarray, is_chosen: np.ndarray
 ) -> np.ndarray:
-    """The plain twin [N, 4 + C] for an image [H, W, 3] uint8; `is_chosen` [N] for a second look."""
+    """Compute the detector's output in NumPy, as a reference for the exported graph.
+
+    Args:
+        first: The proposal network.
+        pair: The dual encoder without NO_NAME, the name of regions that show no object.
+        scale: Calibrated scale of the pair's cosines.
+        image: Image [H, W, 3] uint8.
+        is_chosen: Mask [N] of the cells to rescore.
+
+    Returns:
+        An array [N, 4 + C] of cx, cy, w, h and the scores.
+    """
     corners, fit, logits = (part[0] for part in first.look(image[None]))
     cells = np.flatnonzero(is_chosen)
     parts = np.array([crop(image, enlarged(corners[cell], MARGIN)) for cell in cells])
@@ -66,7 +91,7 @@ def output(
 
 
 def _best(graph: Graph, corners: str, fit: str, logits: str) -> str:
-    """Cells [K] whose boxes hold something, each another thing."""
+    """Return the cells [K] with the most likely objects after non-maximum suppression."""
     _, nothing = graph.split(graph.node("Softmax", logits, axis=1), (len(THINGS), 1))
     likely = graph.node("Mul", fit, graph.node("Sub", graph.number(1), nothing))
     most, iou = graph.integers(LOOKS), graph.constant(np.array([DISTINCT_IOU], np.float32))
@@ -75,14 +100,15 @@ def _best(graph: Graph, corners: str, fit: str, logits: str) -> str:
 
 
 def _rows(graph: Graph, x: str, cells: str) -> str:
-    """[K, C] of [1, C, N]"""
+    """Return the rows [K, C] of `cells` of a tensor [1, C, N]."""
     rows = graph.node("Transpose", graph.node("Squeeze", x, graph.integers(0)), perm=[1, 0])
     return graph.node("Gather", rows, cells, axis=0)
 
 
 def _second_logits(graph: Graph, boxes: str, pair: Pair, scale: float) -> str:
-    """[K, T + 1] of names and nothing, by the pair."""
-    images = embedded(graph, _crops(graph, boxes), with_mirror=False)  # there are many
+    """Return the pair's logits [K, T + 1] of names and background."""
+    # Mirror images would double the work for the many crops.
+    images = embedded(graph, _crops(graph, boxes), with_mirror=False)
     cosines = graph.node("MatMul", images, graph.constant(SECOND_WEIGHT * scale * pair.texts.T))
     things, building = graph.split(cosines, (len(THINGS), len(pair.texts) - len(THINGS)))
     nothing = graph.node("ReduceLogSumExp", building, axes=[1], keepdims=1)
@@ -94,7 +120,7 @@ def _joined(graph: Graph, first: str, second: str) -> str:
 
 
 def _crops(graph: Graph, boxes: str) -> str:
-    """`pixel_values` [K, 3, 64, 64], as `crops.crop` makes them."""
+    """Return the crops [K, 3, 64, 64] of boxes, as `crops.crop` and `crops.planes` do."""
     low, high = graph.split(boxes, (2, 2))
     margin = graph.node("Mul", graph.node("Sub", high, low), graph.number(MARGIN))
     low = graph.node("Max", graph.node("Sub", low, margin), graph.number(0))
@@ -115,13 +141,19 @@ def _crops(graph: Graph, boxes: str) -> str:
 
 
 def _zeros(graph: Graph, like: str) -> str:
-    """Indices [K] of the one image, of [K, 1]."""
+    """Return the image index 0 for each row of a tensor [K, 1]."""
     flat = graph.node("Squeeze", graph.node("Mul", like, graph.number(0)), graph.integers(1))
     return graph.node("Cast", flat, to=TensorProto.INT64)
 
 
 def _masked(graph: Graph, crops: str, extents: str) -> str:
-    """What is beyond the sides [K, 2] of a box, in halves of its square, is CLIP's mean: zero."""
+    """Set pixels outside the box to zero, which is CLIP's mean.
+
+    Args:
+        graph: The graph.
+        crops: Crops [K, 3, 64, 64] of squares.
+        extents: Sides [K, 2] of the boxes, in halves of the square's side.
+    """
     places = np.abs((np.arange(CROP_PX) + 0.5) * 2 / CROP_PX - 1).astype(np.float32)
     shapes = (1, 1, 1, CROP_PX), (1, 1, CROP_PX, 1)
     extents = graph.node("Mul", extents, graph.number(0.5))
@@ -133,7 +165,7 @@ def _masked(graph: Graph, crops: str, extents: str) -> str:
 
 
 def _write(graph: Graph, corners: str, cells: str, scores: str) -> None:
-    """`output0`: boxes of all cells, and scores of those that were looked at twice."""
+    """Add `output0`: the boxes of all cells, and the scores of the rescored ones."""
     empty = graph.constant(np.zeros((CELL_COUNT, len(NAMES)), np.float32))
     rows = graph.node("Unsqueeze", cells, graph.integers(1))
     scores = graph.node("ScatterND", empty, rows, scores)

@@ -1,11 +1,15 @@
-"""Train the built-in networks of the semantic path and write them with their scores.
+"""Training of the built-in networks of the semantic path, with export and scores.
 
     python training/train_demo.py [--out DIR] [--work DIR] [--share SHARE]
 
-Renders rooms other than the flat (two processes), trains the detector's first look and the dual
-encoder beside each other (one thread each), fits the confidences on rooms kept apart, writes ONNX,
-and scores the files on rooms kept apart from both and, at the very end, on the flat. Nothing is
-chosen by those last scores. The same machine gives the same bytes.
+The program runs these steps:
+
+1. Render rooms other than the flat, in two processes.
+2. Train the detector's proposal network and the dual encoder in parallel, one thread each.
+3. Calibrate the confidences on separate rooms, and write the ONNX files.
+4. Score the files on a third set of rooms and, at the very end, on the flat.
+
+The final scores select nothing. Two runs on one machine write the same bytes.
 """
 
 import argparse
@@ -20,7 +24,7 @@ from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
-# one thread an operation: sums keep their order, whatever the machine
+# One thread per operation keeps the order of sums independent of the number of cores.
 os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ["JAX_PLATFORMS"] = "cpu"
@@ -45,22 +49,25 @@ TRAINING = Rooms(range(200, 488), 8)
 CALIBRATION = Rooms(range(160, 172), 12)
 HELD_OUT = Rooms(range(172, 190), 12)
 SEED = 0
-APART = 0.2  # of scores at most: the graph cuts its crops by other pixels
-STEPS = {"detector": (1900, 1400), "encoder": (5500, 6500)}  # of two rounds each
-FLAT_STRIDE = 8  # of its frames that are scored
+# Maximum difference of scores between the graph and its reference. The graph samples its crops at
+# other pixels.
+APART = 0.2
+STEPS = {"detector": (1900, 1400), "encoder": (5500, 6500)}  # Steps of two rounds each.
+FLAT_STRIDE = 8  # Every 8th frame of the flat is scored.
 SHIPPED = Path(__file__).parents[1] / "ldo_service" / "demo_networks"
 
 log = logging.getLogger(__name__)
 
 
 def main() -> None:
+    """Run the program."""
     given = _arguments()
     given.out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
-    # rooms
+    # Rooms.
     render_all([TRAINING, CALIBRATION, HELD_OUT], given.work, processes=2)
     rendering_s = _children_s()
-    # networks, one process each
+    # Networks, one process each.
     steps = {
         name: [max(1, round(given.share * count)) for count in counts]
         for name, counts in STEPS.items()
@@ -70,7 +77,7 @@ def main() -> None:
         both = pool.submit(train_encoder, given.work, steps["encoder"])
         export(first.result(), both.result(), given.work, given.out)
     training_s = _children_s() - rendering_s
-    # scores
+    # Scores.
     report = score(given.work, given.out)
     report["seed"] = SEED
     report["steps"] = {name: sum(counts) for name, counts in steps.items()}
@@ -80,11 +87,13 @@ def main() -> None:
     }
     (given.out / "scores.json").write_text(json.dumps(report, indent=1) + "\n")
     (given.out / "CARD.md").write_text(card.written(report, given.out))
-    log.info("written to %s in %.0f s", given.out, time.monotonic() - started)
+    log.info(
+        "networks, scores and card written to %s in %.0f s", given.out, time.monotonic() - started
+    )
 
 
 def _children_s() -> float:
-    """CPU time of the processes that have ended."""
+    """Return the CPU time of the child processes that have ended."""
     return sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
 
 
@@ -93,33 +102,43 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=SHIPPED)
     parser.add_argument("--work", type=Path, default=Path("build/networks"))
     parser.add_argument(
-        "--share", type=float, default=1.0, help="of all steps; less is worse and sooner done"
+        "--share",
+        type=float,
+        default=1.0,
+        help="fraction of the training steps; less is faster and gives worse networks",
     )
     start_logging()
     return parser.parse_args()
 
 
 def start_logging() -> None:
+    """Log to stderr, and use one thread in OpenCV."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s")
     cv2.setNumThreads(1)
 
 
 def train_detector(work: Path, steps: Sequence[int]) -> FirstStage:
+    """Train the detector's proposal network in a process of its own."""
     start_logging()
     return detector.train(TRAINING.load(work), steps, SEED)
 
 
 def train_encoder(work: Path, steps: Sequence[int]) -> Pair:
+    """Train the dual encoder in a process of its own."""
     start_logging()
     return pair.train(TRAINING.load(work), steps, SEED)
 
 
 def export(first: FirstStage, both: Pair, work: Path, out: Path) -> None:
-    """Calibrate, write the files, and require that they tell what was trained."""
+    """Calibrate the networks, write the files, and compare their outputs with the trained ones.
+
+    Raises:
+        SystemExit: If the outputs differ by more than the tolerance.
+    """
     views = CALIBRATION.load(work)
     colors = _as_recorded(views)
     _export_labeller(both, views, colors, out)
-    # a detector looks at things
+    # The detector classifies boxes of objects, so NO_NAME is omitted and objects calibrate it.
     things = replace(both, texts=both.texts[: len(encoder.NAMES)], names=encoder.NAMES)
     crops, names = encoder.crops_of(views.seen, colors)
     is_right = names[:, None] == np.arange(len(things.names))
@@ -131,12 +150,12 @@ def export(first: FirstStage, both: Pair, work: Path, out: Path) -> None:
         mine = second_look.output(first, things, scale, canvas, theirs[:, 4:].any(axis=1))
         sides = np.maximum(theirs[:, 2:4].max(axis=1, keepdims=True), cells.STRIDES_PX[-1])
         boxes = mine[:, :4] / sides, theirs[:, :4] / sides
-        _require_equal("boxes of detector.onnx, by their sides", *boxes, 0.05)
+        _require_equal("boxes of detector.onnx (relative to their sides)", *boxes, 0.05)
         _require_equal("scores of detector.onnx", mine[:, 4:], theirs[:, 4:], APART)
 
 
 def _export_labeller(both: Pair, views: Views, colors: Sequence[np.ndarray], out: Path) -> None:
-    """Its confidences suit regions, those of the detector things."""
+    """Write the labeller's files, with confidences calibrated on region proposals."""
     crops, names = pair.crops_of(views.regions, colors)
     images = both.images(crops)
     encoder.export(both, encoder.fitted_scale(images, both.texts, pair.is_right(names)), out)
@@ -147,12 +166,14 @@ def _export_labeller(both: Pair, views: Views, colors: Sequence[np.ndarray], out
 def _require_equal(what: str, mine: np.ndarray, theirs: np.ndarray, tolerance: float) -> None:
     apart = float(np.abs(mine - theirs).max())
     if apart > tolerance:
-        raise SystemExit(f"{what}: {apart:g} off what was trained; at most {tolerance:g} expected.")
-    log.info("%s: as trained, within %.2g", what, apart)
+        raise SystemExit(
+            f"{what}: differ from the trained network by {apart:g}; at most {tolerance:g} expected."
+        )
+    log.info("%s: equal to the trained network within %.2g", what, apart)
 
 
 def score(work: Path, out: Path) -> dict:
-    """Of the files in `out`, on the rooms kept apart and on the flat."""
+    """Return the scores of the files in `out` on the held-out rooms and on the flat."""
     held_out = HELD_OUT.load(work)
     colors, seen = flat_frames(FLAT_STRIDE)
     return {
@@ -163,7 +184,7 @@ def score(work: Path, out: Path) -> dict:
 
 
 def _as_recorded(views: Views) -> list[np.ndarray]:
-    """Frames made worse as a camera does, each in its own way, always the same."""
+    """Return frames with the errors of a camera; each frame always has the same ones."""
     return [
         degrade(color, np.random.default_rng([SEED, 3, k])) for k, color in enumerate(views.colors)
     ]
@@ -191,6 +212,7 @@ def _regions_scored(out: Path, views: Views) -> dict:
 
 
 def vars_of(one: scores.ClassScore) -> dict[str, float]:
+    """Return the fields of a score, rounded to 4 digits."""
     return {name: round(getattr(one, name), 4) for name in one.__slots__}
 
 

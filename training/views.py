@@ -1,4 +1,4 @@
-"""Frames of rooms at the size of the networks' input, and the boxes of what is seen in them."""
+"""Frames of rooms at the size of the networks' input, with boxes of the visible objects."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,79 +15,74 @@ from ldo_service.synthetic.flat.scene_object import CEILING, FLOOR, WALL
 from ldo_service.synthetic.flat.sequence import FOCAL_PER_WIDTH
 from ldo_service.synthetic.path import look_at
 
-VERSION = 2  # of what is kept of a room: to be raised when `regions` or the segments change
+VERSION = 2  # Version of the cached rooms; increase it when `regions` or the segmentation change.
 WIDTH_PX, HEIGHT_PX = 320, 240
-EYE_M = (1.2, 1.6)  # above the floor, as a hand holds a camera
-GAZE_SLOPE = (-0.45, 0.05)
-CLEARANCE_M = 0.3  # of the eye from things
-WALL_AHEAD_M = 1.3  # nearer to a wall, nobody looks at it
-GLANCES, NEAR_M = 2, 3.0  # before a frame is taken where most is to be seen, within so much
-SHARE_MIN = 3.9e-4  # of the image, of an object that is told: 30 pixels
-WINDOWS = 6  # tried per frame for a piece of the building
-PURITY = 0.8  # of such a window
+EYE_M = (1.2, 1.6)  # Height of the camera above the floor, as in a hand.
+GAZE_SLOPE = (-0.45, 0.05)  # Vertical component of the gaze.
+CLEARANCE_M = 0.3  # Minimum distance of the camera to objects.
+WALL_AHEAD_M = 1.3  # Minimum distance to the wall in front of the camera.
+# Candidate poses per frame, and the depth up to which the objects in view are counted. The pose
+# with the most objects is used.
+GLANCES, NEAR_M = 2, 3.0
+SHARE_MIN = 3.9e-4  # Minimum size of an object, as a fraction of the image: 30 pixels.
+WINDOWS = 6  # Random windows per frame that may show the building.
+PURITY = 0.8  # Minimum fraction of one surface in such a window.
 
 
 @dataclass(frozen=True, slots=True)
 class VisibleBoxes:
-    """B boxes in F frames.
+    """B boxes of objects or regions in F frames."""
 
-    frames     [B] index of the frame
-    class_ids  [B] into CLASS_NAMES; of a region that shows no thing -1
-    instances  [B] id in the frame's plane of instances, 0 for the building and for no thing
-    boxes_px   [B, 4] x0, y0, x1, y1 counted from the corner of the first pixel
-    pixels     [B] visible of the object, within a region; of no thing, all of the region's
-    """
-
-    frames: np.ndarray
-    class_ids: np.ndarray
-    instances: np.ndarray
-    boxes_px: np.ndarray
+    frames: np.ndarray  # Index [B] of the frame.
+    class_ids: np.ndarray  # Index [B] into CLASS_NAMES; -1 for a region without an object.
+    instances: np.ndarray  # Instance id [B]; 0 for the building and for no object.
+    boxes_px: np.ndarray  # Boxes [B, 4], x0, y0, x1, y1, from the corner of the first pixel.
+    # Visible pixels [B] of the object, in a region those inside it; without an object, all pixels
+    # of the region.
     pixels: np.ndarray
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def chosen(self, which: np.ndarray) -> "VisibleBoxes":
+        """Return the boxes of a mask or of indices."""
         return VisibleBoxes(*(getattr(self, name)[which] for name in self.__slots__))
 
     def scaled(self, scale: float) -> "VisibleBoxes":
-        """In frames of another size."""
+        """Return the boxes in frames of another size."""
         return replace(self, boxes_px=self.boxes_px * scale, pixels=self.pixels * scale**2)
 
     def table(self) -> np.ndarray:
-        """Rows [B, 8], one per box."""
+        """Return the boxes as rows [B, 8]."""
         columns = self.frames, self.class_ids, self.instances, self.boxes_px, self.pixels
         return np.column_stack(columns)
 
     @staticmethod
     def of(table: np.ndarray) -> "VisibleBoxes":
+        """Return the boxes of a table [B, 8], the inverse of `table`."""
         ids = table[:, :3].astype(np.int64)
         return VisibleBoxes(*ids.T, table[:, 3:7], table[:, 7])
 
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """colors [F, H, W, 3] uint8 RGB, sharp and without noise, and what they show.
+    """F frames with their ground truth."""
 
-    instances  [F, H, W] uint8, 0 for the building
-    regions    those that the service would set apart, see `regions`
-    """
-
-    colors: np.ndarray
-    instances: np.ndarray
-    seen: VisibleBoxes
-    regions: VisibleBoxes
+    colors: np.ndarray  # RGB [F, H, W, 3] uint8, sharp and without noise.
+    instances: np.ndarray  # Instance ids [F, H, W] uint8; 0 for the building.
+    seen: VisibleBoxes  # Visible objects and pieces of the building.
+    regions: VisibleBoxes  # Region proposals, see `regions`.
 
 
 def camera() -> Camera:
-    """The flat's lens."""
+    """Return intrinsics with the flat's field of view."""
     focal_px = FOCAL_PER_WIDTH * WIDTH_PX
     center_px = (WIDTH_PX - 1) / 2, (HEIGHT_PX - 1) / 2
     return Camera(WIDTH_PX, HEIGHT_PX, focal_px, focal_px, *center_px)
 
 
 def render(seed: int, count: int) -> Views:
-    """`count` frames of the room of this seed."""
+    """Render `count` frames of the room of a seed."""
     flat = layout.room(seed)
     renderer, lens = FlatRenderer(flat), camera()
     rng = np.random.default_rng([seed, 8])
@@ -105,7 +100,7 @@ def render(seed: int, count: int) -> Views:
 
 
 def cached(folder: Path, seed: int, count: int) -> Views:
-    """As `render`, kept in a folder."""
+    """Return the frames of `render` from a folder; render and store them if they are missing."""
     file = folder / f"{VERSION}-{layout.VERSION}-{seed}-{count}.npz"
     if not file.exists():
         views = render(seed, count)
@@ -125,7 +120,10 @@ def cached(folder: Path, seed: int, count: int) -> Views:
 def seen_in(
     planes: list[tuple[np.ndarray, np.ndarray]], rng: np.random.Generator | None = None
 ) -> VisibleBoxes:
-    """Objects in frames of class and instance ids [H, W]; with `rng`, bare walls and floors too."""
+    """Return the visible objects in frames of class and instance ids [H, W].
+
+    With `rng`, random windows on bare walls, floors and ceilings are added.
+    """
     rows = [
         (frame, *row)
         for frame, (class_ids, instance_ids) in enumerate(planes)
@@ -142,7 +140,7 @@ def _seen(rows: Sequence[tuple]) -> VisibleBoxes:
 
 
 def _objects(class_ids: np.ndarray, instance_ids: np.ndarray) -> Iterator[tuple]:
-    """Class, instance, box, pixels of each object."""
+    """Yield class, instance, box and pixels of each object."""
     for instance in np.unique(instance_ids):
         v, u = np.nonzero(instance_ids == instance)
         if instance and len(v) >= SHARE_MIN * instance_ids.size:
@@ -151,7 +149,7 @@ def _objects(class_ids: np.ndarray, instance_ids: np.ndarray) -> Iterator[tuple]
 
 
 def _building(class_ids: np.ndarray, rng: np.random.Generator) -> Iterator[tuple]:
-    """Windows on the bare wall, floor or ceiling."""
+    """Yield random windows on a bare wall, floor or ceiling."""
     height, width = class_ids.shape
     for _ in range(WINDOWS):
         w, h = rng.integers(12, 100, 2)
@@ -164,8 +162,10 @@ def _building(class_ids: np.ndarray, rng: np.random.Generator) -> Iterator[tuple
 
 
 def _poses(flat: Flat, count: int, rng: np.random.Generator) -> np.ndarray:
-    """T_world_camera [count, 4, 4] of eyes where nothing stands; of a few that look anywhere, those
-    before which most things are."""
+    """Return random camera poses T_world_camera [count, 4, 4] in free space.
+
+    Each is the one of GLANCES candidates with the most objects in view.
+    """
     boxes = [thing.bounds_m for thing in flat.things]
     centers_m = np.array([center for center, _ in boxes])
     found = []
@@ -190,7 +190,7 @@ def _glance(
 
 
 def _things_before(T_world_camera: np.ndarray, centers_m: np.ndarray) -> int:
-    """How many have their middle in the image, and are near."""
+    """Return the number of objects whose center is in the image and nearer than NEAR_M."""
     x, y, z = ((centers_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]).T
     half_x, half_y = 0.5 / FOCAL_PER_WIDTH, 0.5 * HEIGHT_PX / WIDTH_PX / FOCAL_PER_WIDTH
     is_near = (z > 0) & (z < NEAR_M)

@@ -1,20 +1,21 @@
-"""Frames as a worse camera takes them, and of things painted otherwise."""
+"""Augmentation of frames: errors of a poor camera, and objects in other colors."""
 
 import cv2
 import numpy as np
 
-GAIN = (0.72, 1.3)  # of exposure; the flat's drifts by +-20 %
-TINT = (0.85, 1.18)  # of each channel
-SWAP_SHARE = 0.3  # of frames whose channels are permuted: paints have any hue
-BLUR_SHARE, BLUR_PX = 0.6, 6.0  # of frames, and at most in a frame of 320 pixels
-NOISE = (0.0, 5.0)  # grey levels
+GAIN = (0.72, 1.3)  # Range of the exposure gain; the flat's drifts by +-20 %.
+TINT = (0.85, 1.18)  # Range of the gain of each channel.
+SWAP_SHARE = 0.3  # Fraction of frames with permuted channels; paints have any hue.
+BLUR_SHARE, BLUR_PX = 0.6, 6.0  # Fraction of blurred frames; maximum blur at a width of 320 pixels.
+NOISE = (0.0, 5.0)  # Range of the standard deviation, gray levels.
 DRAWN = np.random.default_rng(12).standard_normal(1 << 20, np.float32)
-REPAINTED_SHARE = 0.6  # of objects
-REPAINT, REPAINT_TINT, REPAINT_MOST = 0.35, 0.25, 2.5  # deviations of logarithms; largest factor
+REPAINTED_SHARE = 0.6  # Fraction of objects with another color.
+# Standard deviations of the logarithms of brightness and channels; largest factor.
+REPAINT, REPAINT_TINT, REPAINT_MOST = 0.35, 0.25, 2.5
 
 
 def degrade(image: np.ndarray, rng: np.random.Generator, blur_px: float = BLUR_PX) -> np.ndarray:
-    """A frame [H, W, 3] uint8 of another exposure and tint, blurred by motion, with noise."""
+    """Return a frame [H, W, 3] uint8 with random exposure, tint, motion blur and noise."""
     values = image.astype(np.float32)
     if rng.random() < SWAP_SHARE:
         values = values[..., rng.permutation(3)]
@@ -26,14 +27,20 @@ def degrade(image: np.ndarray, rng: np.random.Generator, blur_px: float = BLUR_P
 
 
 def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Of deviation 1, a stretch of what was drawn once: that takes a tenth of the time."""
+    """Return unit noise, cut from a precomputed array in a tenth of the time."""
     count = int(np.prod(shape))
     start = int(rng.integers(len(DRAWN) - count))
     return DRAWN[start : start + count].reshape(shape)
 
 
 def recolor(image: np.ndarray, plane: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A frame [H, W, 3] uint8 whose objects, ids in `plane`, have other brightness and hue."""
+    """Return a frame [H, W, 3] uint8 with random brightness and hue of its objects.
+
+    Args:
+        image: The frame.
+        plane: Instance ids [H, W]; 0 keeps its color.
+        rng: Source of the colors.
+    """
     factors = np.exp(
         REPAINT * rng.standard_normal((256, 1)) + REPAINT_TINT * rng.standard_normal((256, 3))
     )
@@ -44,7 +51,7 @@ def recolor(image: np.ndarray, plane: np.ndarray, rng: np.random.Generator) -> n
 
 
 def blurred(values: np.ndarray, du_px: float, dv_px: float) -> np.ndarray:
-    """The mean along a segment, by a kernel of its own."""
+    """Return the image averaged along a line of this extent, by one filter kernel."""
     radius = int(np.ceil(max(abs(du_px), abs(dv_px)) / 2)) + 1
     cells, shares = np.arange(2 * radius + 1)[:, None], np.linspace(-0.5, 0.5, 9)
     rows, columns = (
