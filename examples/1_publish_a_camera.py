@@ -1,7 +1,9 @@
-"""Be a camera: send colour and depth to a running service.
+"""Camera that publishes color and depth to a running service.
 
-Start `ldo serve` first. Any source of arrays will do in place of the built-in synthetic room: a
-RealSense, a Kinect, a simulator. Depth must be registered to colour.
+The example sends frames of the built-in synthetic room at 15 Hz. Replace the room by any source of
+NumPy arrays: a RealSense, a Kinect or a simulator. Depth must be registered to color.
+
+Start `ldo serve` in another terminal, then run:
 
     python examples/1_publish_a_camera.py [FRAMES]
 """

@@ -1,7 +1,11 @@
-"""Where is the camera: print each pose as it comes.
+"""Subscriber that prints each camera pose of a running service.
 
-Start `ldo serve`, and a camera: `ldo publish synthetic:room`. `T_odom_camera` is continuous,
-but after a loss; `T_map_odom` from the left makes it the globally consistent pose.
+Each line shows the time stamp in nanoseconds, the tracking status (OK, WEAK or LOST) and the
+camera position in meters. `T_odom_camera` is continuous except after relocalization. The globally
+consistent pose is `T_map_odom @ T_odom_camera`.
+
+Start `ldo serve` and a camera, such as `ldo publish synthetic:room`, each in its own terminal. Then
+run:
 
     python examples/2_follow_the_pose.py [POSES]
 """

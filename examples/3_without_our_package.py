@@ -1,7 +1,10 @@
-"""The same without our package: any language with Zenoh and MessagePack reads the topics.
+"""Subscriber that prints each camera pose without the package ldo-slam.
 
-Needs `pip install eclipse-zenoh msgpack`. Start `ldo serve` and a camera first. `ldo topics
+Any language with Zenoh and MessagePack can read the topics in the same way. `ldo topics
 --json-schema` describes every message.
+
+Install `pip install eclipse-zenoh msgpack`. Start `ldo serve` and a camera, such as `ldo publish
+synthetic:room`, each in its own terminal. Then run:
 
     python examples/3_without_our_package.py [POSES]
 """
@@ -21,7 +24,7 @@ with (
     zenoh.open(config) as session,
     session.declare_subscriber(
         "ldo/robot/pose/tracked",
-        zenoh.handlers.RingChannel(1),  # never be late: an older pose is overwritten
+        zenoh.handlers.RingChannel(1),  # Keeps only the newest pose, so that none is old.
     ) as poses,
 ):
     for number, sample in enumerate(poses, 1):

@@ -1,10 +1,15 @@
-"""Help tracking with another odometry, of wheels or an inertial unit, and without our package.
+"""Publisher of an odometry prior, from wheels or an inertial unit, without the package ldo-slam.
 
-Each message says where the robot's base is, in a frame that only the sender knows: what counts is
-the motion between two messages. Stamps are of the clock that stamps the camera's frames; where the
-camera sits on the base is `tracker.T_base_camera` of the service. Here the poses are lines of a
-file, `stamp tx ty tz qx qy qz qw` in seconds and metres, sent when they are due; a robot sends what
-its driver says. Start `ldo serve`, this, and `ldo publish` of the sequence that the file goes with.
+The service uses the prior as the initial guess of tracking. Each message is the pose of the robot's
+base in a fixed frame that the sender chooses; only the motion between two messages counts. Stamps
+must be of the same clock as those of the camera's frames. The setting `tracker.T_base_camera` of
+the service is the pose of the camera on the base.
+
+A robot publishes the poses of its driver. This example reads them from a file instead and sends
+each at its time. The lines of the file are `stamp tx ty tz qx qy qz qw`, in seconds and meters.
+
+Install `pip install eclipse-zenoh msgpack`. Start `ldo serve`, then this program, then `ldo
+publish` of the sequence that belongs to the file:
 
     python examples/4_publish_odometry.py FILE
 """
@@ -32,7 +37,8 @@ with (
     started_s = time.monotonic()
     for stamp_s, x, y, z, *xyzw in poses:
         norm = sum(q * q for q in xyzw) ** 0.5
-        qx, qy, qz, qw = (q / norm for q in xyzw)  # a file has few digits, and we are exact
+        # The file has few digits; the message needs a unit quaternion.
+        qx, qy, qz, qw = (q / norm for q in xyzw)
         time.sleep(max(0.0, started_s + stamp_s - poses[0][0] - time.monotonic()))
         message = {
             "type": "OdometryPrior",

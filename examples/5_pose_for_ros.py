@@ -1,8 +1,11 @@
-"""Tell ROS 2 where the camera is: /tf, through zenoh-bridge-ros2dds.
+"""Bridge that publishes the camera pose on /tf of ROS 2, through zenoh-bridge-ros2dds.
 
-Needs `pip install 'ldo-slam[ros2]'`. Start `ldo serve`, a camera, and the bridge as a client:
-`zenoh-bridge-ros2dds -m client -e tcp/127.0.0.1:7447`. It takes CDR from the key `tf` and writes it
-to the topic `/tf` when somebody listens. Frames have the axes of the camera where it started.
+The program publishes the transforms `ldo_map` to `ldo_odom` to `ldo_camera` as CDR on the Zenoh key
+`tf`. The bridge forwards them to the ROS topic `/tf` while it has subscribers. The axes of
+`ldo_map` and `ldo_odom` are those of the camera's first pose.
+
+Install `pip install 'ldo-slam[ros2]'`. Start `ldo serve`, a camera, such as `ldo publish
+synthetic:room`, and the bridge: `zenoh-bridge-ros2dds -m client -e tcp/127.0.0.1:7447`. Then run:
 
     python examples/5_pose_for_ros.py [POSES]
 """
@@ -25,6 +28,7 @@ config.insert_json5("connect/endpoints", json.dumps(["tcp/127.0.0.1:7447"]))
 
 
 def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Pose):
+    """Return a geometry_msgs/TransformStamped of a pose."""
     w, x, y, z = T_parent_child.quaternion
     stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
     return types["geometry_msgs/msg/TransformStamped"](

@@ -1,15 +1,18 @@
-"""A recording as a regression test: every actor must still make what it made on the robot.
+"""Regression test that replays a recording: every actor must publish the same messages again.
 
-Record once, with a camera or `ldo publish`, and stop with Ctrl-C:
+Record once, and stop with Ctrl-C. `ldo record` is `ldo serve` that also records; a camera or `ldo
+publish` sends its frames:
 
     ldo record recordings/desk
 
+Copy this file to a folder of your own and run:
+
     LDO_RECORDING=recordings/desk pytest replay_test.py
 
-in a folder of your own; in a clone of this repository after `make test`, which installs what its
-settings of pytest ask for.
+In a clone of this repository, run `make test` once before, which installs the plugins that its
+pytest settings need.
 
-Each recorded actor is a case. One that fails names the step, and the message that differs.
+Each recorded actor is one test case. A failure reports the step and the message that differs.
 """
 
 import os
