@@ -1,29 +1,30 @@
-# Everything below sets itself up in .venv: a fresh machine needs Python 3.11+ and a C++17 compiler.
+# Each target installs what it needs into .venv. A new machine needs Python 3.11+ and a C++17
+# compiler.
 PYTHON ?= python3
 BIN := .venv/bin
 SOURCES := pyproject.toml CMakeLists.txt $(wildcard ldo_service/kernels/*.cpp ldo_service/kernels/*.hpp)
 
 .PHONY: help demo test check slow bench clean
-help:  ## what can be made
+help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
-demo: .venv/installed  ## the main job on a built-in synthetic room: a table and three pictures
+demo: .venv/installed  ## run SLAM on a built-in synthetic room: a table and three pictures
 	$(BIN)/ldo demo --out build/demo --overwrite
 
-test: .venv/tests  ## the default test suite, one process a core; ARGS="-n 0 ..." for one process
+test: .venv/tests  ## run the default tests, one process per core; ARGS="-n 0 ..." for one process
 	$(BIN)/python -m pytest -q -n auto --dist worksteal $(ARGS)
 
-slow: .venv/tests  ## the tests that take longer, one by one: each needs the cores
+slow: .venv/tests  ## run the slow tests one after the other, because each needs all cores
 	$(BIN)/python -m pytest -q -m slow $(ARGS)
 
-check: .venv/dev  ## format, lint, types
+check: .venv/dev  ## check format, lint and types
 	deploy/check
 
-bench: .venv/tests  ## the benchmarks; copy what they print to tests/bench/RESULTS.md
+bench: .venv/tests  ## run the benchmarks; copy their output to tests/bench/RESULTS.md
 	@for program in $(basename $(notdir $(wildcard tests/bench/bench_*.py))); do \
 		echo "== $$program"; $(BIN)/python -m tests.bench.$$program || exit 1; done
 
-clean:  ## remove what the targets above made
+clean:  ## remove .venv, build and dist
 	rm -rf .venv build dist
 
 .venv/pip:
