@@ -1,4 +1,4 @@
-"""Fixtures that many rooms share."""
+"""Fixtures that several test packages share."""
 
 import json
 import os
@@ -18,13 +18,13 @@ from ldo_service.runs.source import Selection
 
 @pytest.fixture(scope="session")
 def room() -> Sequence:
-    """The synthetic room with its exact truth; frames are ray cast once a session."""
+    """Return the synthetic room with exact ground truth; frames are rendered once per session."""
     return Cached(open_sequence("synthetic:room"))
 
 
 @pytest.fixture(scope="session")
 def room_folder(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first 16 frames of the room in the layout of TUM RGB-D, with its truth."""
+    """Return a folder with the first 16 frames of the room and their ground truth, as TUM RGB-D."""
     folder = tmp_path_factory.mktemp("data") / "room"
     lines = []
     for kind in ("rgb", "depth"):
@@ -49,7 +49,7 @@ def room_folder(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture(scope="session")
 def finished_run(room_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `ldo run --hold-out-every 5` writes of `room_folder`; not to be changed."""
+    """Return the output of `ldo run --hold-out-every 5` on `room_folder`; tests only read it."""
     folder = tmp_path_factory.mktemp("run") / "room"
     prepare(folder, overwrite=False)
     config = load_config(settings=("tracker.hold_out=5", "mapper.threads=1"))
@@ -60,7 +60,7 @@ def finished_run(room_folder: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.fixture(scope="session")
 def data() -> Path:
-    """The shared data sets."""
+    """Return the folder of the data sets, LDO_DATA; skip the test if it is not set."""
     folder = os.environ.get("LDO_DATA")
     if not folder:
         pytest.skip("set LDO_DATA to a folder with tum/kitchen and replica/apartment_floor1")

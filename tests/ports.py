@@ -1,9 +1,9 @@
-"""Ports of this machine that no other test process takes."""
+"""Ports of this machine that no other test process uses."""
 
 import random
 import socket
 
-# Linux gives ports from 32768 on to connections: any of them can be taken at any time.
+# Linux assigns ports from 32768 on to outgoing connections, so these can be in use at any time.
 PORTS = range(20_000, 30_000)
 
 _reservations: list[socket.socket] = []  # They last as long as the process.
@@ -28,11 +28,11 @@ def free_port() -> int:
         _reservations.append(reservation)
         if _is_closed(port):
             return port
-    raise RuntimeError(f"no port of {PORTS} is free")
+    raise RuntimeError(f"all ports in {PORTS} are in use; end other test runs on this machine")
 
 
 def free_endpoint() -> str:
-    """Return an endpoint on a port of its own; see `free_port`."""
+    """Return an endpoint on a free port; see `free_port`."""
     return f"tcp/127.0.0.1:{free_port()}"
 
 

@@ -1,4 +1,4 @@
-"""Imports point to lower floors, and the structure stays within its bounds."""
+"""Architecture: imports point to lower layers, and files and packages stay within bounds."""
 
 import ast
 import sys
@@ -9,9 +9,9 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 
-# Every package and every module at the top of ldo_service. An import may only point to a lower
-# floor, so there is no loop between packages. `ldo_service` itself holds the version.
-FLOORS = (
+# Every package and every top-level module of ldo_service. An import may only point to a lower
+# layer, so there is no import cycle between packages. `ldo_service` itself contains the version.
+LAYERS = (
     ("errors", "ldo_service"),
     ("schemas", "kernels", "demo_networks"),
     ("geometry", "storage"),
@@ -28,25 +28,29 @@ FLOORS = (
     ("commands",),
     ("__main__",),
 )
-FLOOR = {package: number for number, packages in enumerate(FLOORS) for package in packages}
-EXCEPTIONS: frozenset[tuple[str, str]] = frozenset()  # (file, imported package); none may be added
+LAYER = {package: number for number, packages in enumerate(LAYERS) for package in packages}
+# Pairs of file and imported package. Add none.
+EXCEPTIONS: frozenset[tuple[str, str]] = frozenset()
 NUMERICS = (
     *("datasets", "detection", "evaluation", "gaussians", "geometry", "kernels", "loop_closing"),
     *("pose_graph", "regions", "semantics", "synthetic", "tracking", "volumes"),
 )
-MAX_LINES = 400  # of a file outside the kernels
+MAX_LINES = 400  # Maximum length of a file outside the kernels.
 MAX_TOP_MODULES = 5
 
 
 def sources(package: str = "") -> list[Path]:
-    """The Python files of a package of `ldo_service`, found through its links; all by default."""
+    """Return the Python files of a package of `ldo_service`; all packages by default.
+
+    `ldo_service/actors` and `ldo_service/schemas` are links, which `rglob` does not follow.
+    """
     folder = ROOT / "ldo_service" / package
     links = [path.rglob("*.py") for path in folder.iterdir() if path.is_symlink()]
     return sorted({*folder.rglob("*.py"), *(path for found in links for path in found)})
 
 
 def imports(path: Path, source: str) -> Iterator[str]:
-    """Absolute dotted names of everything that a file imports, at any depth."""
+    """Yield the absolute dotted names of all imports in a file, nested ones included."""
     package = path.relative_to(ROOT).with_suffix("").parts[:-1]
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -58,13 +62,13 @@ def imports(path: Path, source: str) -> Iterator[str]:
 
 
 def package_of(path: Path) -> str:
-    """The package of a file, or the name of a module at the top."""
+    """Return the package of a file, or the name of a top-level module."""
     first = path.relative_to(ROOT / "ldo_service").parts[0].removesuffix(".py")
     return "ldo_service" if first == "__init__" else first
 
 
 def imported_by(package: str) -> set[tuple[str, str]]:
-    """(file, imported name) of a package."""
+    """Return all pairs of file and imported name of a package."""
     return {
         (str(path.relative_to(ROOT)), name)
         for path in sources(package)
@@ -72,20 +76,21 @@ def imported_by(package: str) -> set[tuple[str, str]]:
     }
 
 
-def arrows() -> Iterator[tuple[str, str, str]]:
-    """(file, its package, imported package) of every import between packages."""
+def cross_package_imports() -> Iterator[tuple[str, str, str]]:
+    """Yield file, its package and the imported package of every import between packages."""
     for path in sources():
         here = package_of(path)
         for name in imports(path, path.read_text()):
             parts = name.split(".")
             if parts[0] != "ldo_service":
                 continue
-            there = parts[1] if len(parts) > 1 and parts[1] in FLOOR else "ldo_service"
+            there = parts[1] if len(parts) > 1 and parts[1] in LAYER else "ldo_service"
             if there != here:
                 yield str(path.relative_to(ROOT)), here, there
 
 
-def offenders(package: str, forbidden: tuple[str, ...]) -> list[str]:
+def forbidden_imports(package: str, forbidden: tuple[str, ...]) -> list[str]:
+    """Return one line per import of a forbidden package."""
     prefixes = tuple(f"ldo_service.{name}" for name in forbidden)
     return [
         f"{path} imports {name}"
@@ -105,24 +110,25 @@ def test_relative_imports_are_resolved() -> None:
     ]
 
 
-def test_every_package_is_found_and_has_a_floor() -> None:
-    assert {package_of(path) for path in sources()} == FLOOR.keys()
+def test_every_package_has_a_layer() -> None:
+    assert {package_of(path) for path in sources()} == LAYER.keys()
     assert all(sources(package) for package in ("geometry", "schemas", "actors", "runtime"))
 
 
-def test_imports_point_to_lower_floors() -> None:
-    upward = {(path, there) for path, here, there in arrows() if FLOOR[there] >= FLOOR[here]}
+def test_imports_point_to_lower_layers() -> None:
+    found = cross_package_imports()
+    upward = {(path, there) for path, here, there in found if LAYER[there] >= LAYER[here]}
     assert sorted(upward - EXCEPTIONS) == []
-    assert sorted(EXCEPTIONS - upward) == [], "an exception that is not needed any more"
+    assert sorted(EXCEPTIONS - upward) == [], "remove the exceptions that are no longer needed"
 
 
-def test_few_modules_stand_at_the_top() -> None:
-    loose = sorted(path.stem for path in (ROOT / "ldo_service").glob("*.py"))
-    public = [name for name in loose if not name.startswith("__")]
+def test_package_root_has_few_public_modules() -> None:
+    modules = sorted(path.stem for path in (ROOT / "ldo_service").glob("*.py"))
+    public = [name for name in modules if not name.startswith("__")]
     assert len(public) <= MAX_TOP_MODULES, public
 
 
-def test_no_file_is_too_long() -> None:
+def test_no_file_exceeds_max_lines() -> None:
     lines = {
         str(path.relative_to(ROOT)): len(path.read_text().splitlines())
         for path in sources()
@@ -132,24 +138,24 @@ def test_no_file_is_too_long() -> None:
 
 
 @pytest.mark.parametrize("package", NUMERICS)
-def test_numerics_know_no_message_no_runtime_and_no_actor(package: str) -> None:
-    assert offenders(package, ("schemas", "runtime", "actors", "transport")) == []
+def test_numerics_import_no_messages_runtime_or_actors(package: str) -> None:
+    assert forbidden_imports(package, ("schemas", "runtime", "actors", "transport")) == []
 
 
-def test_runtime_knows_no_actor_and_no_numerics() -> None:
-    assert offenders("runtime", (*NUMERICS, "actors")) == []
+def test_runtime_imports_no_actors_or_numerics() -> None:
+    assert forbidden_imports("runtime", (*NUMERICS, "actors")) == []
 
 
-def test_schemas_know_only_msgspec_numpy_and_themselves() -> None:
+def test_schemas_import_only_msgspec_numpy_and_schemas() -> None:
     names = {name for _, name in imported_by("schemas")}
     third_party = {name for name in names if name.split(".")[0] not in sys.stdlib_module_names}
     allowed = ("msgspec", "numpy", "ldo_service.schemas")
     assert [name for name in sorted(third_party) if not name.startswith(allowed)] == []
 
 
-@pytest.mark.parametrize("package", sorted(FLOOR.keys() - {"pose_graph", "ldo_service"}))
-def test_gtsam_is_imported_by_the_pose_graph_only(package: str) -> None:
-    """It holds the interpreter's lock during every call."""
+@pytest.mark.parametrize("package", sorted(LAYER.keys() - {"pose_graph", "ldo_service"}))
+def test_only_pose_graph_imports_gtsam(package: str) -> None:
+    """Every call of gtsam holds the interpreter lock."""
     if (ROOT / "ldo_service" / package).is_dir():
         found = [x for x in sorted(imported_by(package)) if x[1].split(".")[0] == "gtsam"]
         assert found == []

@@ -1,4 +1,4 @@
-"""Benchmarks are run by hand, seldom: what they import must still be there."""
+"""Benchmarks, which are run by hand: their imports must still resolve."""
 
 from importlib import import_module
 from pathlib import Path
@@ -8,10 +8,10 @@ import pytest
 PROGRAMS = sorted(path.stem for path in Path(__file__).parent.glob("bench/bench_*.py"))
 
 
-def test_there_are_benchmarks() -> None:
+def test_benchmarks_exist() -> None:
     assert PROGRAMS
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_a_benchmark_can_be_started(program: str) -> None:
+def test_benchmark_imports_and_has_main(program: str) -> None:
     assert callable(import_module(f"tests.bench.{program}").main)

@@ -1,4 +1,4 @@
-"""Every command that the manual shows is one that `ldo` takes."""
+"""Commands in the manual, each of which `ldo` must accept."""
 
 import contextlib
 import functools
@@ -19,11 +19,11 @@ PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.DOTALL | re.MULTILINE)
 LDO = re.compile(r"^(?:[A-Z_]+=\S+ )*(?:\S*/)?ldo (?P<words>.*)")
 INLINE = re.compile(r"`ldo ([a-z]+)((?: [^`]*)?)`")
-AFTER = re.compile(r"\s(?:>|\||&&|&$|#|\().*")  # what the shell does with it; remarks
+AFTER = re.compile(r"\s(?:>|\||&&|&$|#|\().*")  # Shell operators and comments after the command.
 
 
 def commands(text: str) -> Iterator[str]:
-    """The words after `ldo` on each line of a shell block; a backslash continues a line."""
+    """Yield the words after `ldo` on each line of a shell block; a backslash continues a line."""
     for block in BLOCK.findall(text):
         for line in block.replace("\\\n", " ").splitlines():
             if found := LDO.match(line.strip()):
@@ -31,12 +31,13 @@ def commands(text: str) -> Iterator[str]:
 
 
 def inline(text: str) -> Iterator[tuple[str, list[str]]]:
-    """Verb and options of each command within a sentence, which need not be whole."""
+    """Yield verb and options of each command in a sentence, which may be incomplete."""
     for verb, rest in INLINE.findall(BLOCK.sub("", text)):
         yield verb, re.findall(r"--[a-z][a-z0-9-]*", rest)
 
 
 def cases(find: Callable[[str], Iterator]) -> list:
+    """Return one test case for each distinct command on each page."""
     return [
         pytest.param(one, id=f"{page.name}: {one}")
         for page in PAGES
@@ -46,19 +47,19 @@ def cases(find: Callable[[str], Iterator]) -> list:
 
 @pytest.fixture
 def parsed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the verbs that were taken, instead of what they would do."""
-    taken: list[str] = []
+    """Replace each verb by a function that records its name, and return the recorded names."""
+    called: list[str] = []
 
-    def instead(name: str, verb: Callable[..., None]) -> Callable[..., None]:
-        return functools.wraps(verb)(lambda *_, **__: taken.append(name))
+    def recorder(name: str, verb: Callable[..., None]) -> Callable[..., None]:
+        return functools.wraps(verb)(lambda *_, **__: called.append(name))
 
-    verbs = {name: instead(name, verb) for name, verb in cli.verbs().items()}
+    verbs = {name: recorder(name, verb) for name, verb in cli.verbs().items()}
     monkeypatch.setattr(cli, "verbs", lambda: verbs)
-    return taken
+    return called
 
 
 @pytest.mark.parametrize("command", cases(commands))
-def test_a_command_of_the_manual_parses(command: str, parsed: list[str]) -> None:
+def test_command_in_manual_parses(command: str, parsed: list[str]) -> None:
     words = shlex.split(command)
     if "--help" in words:
         with pytest.raises(SystemExit, match="0"):
@@ -71,6 +72,7 @@ def test_a_command_of_the_manual_parses(command: str, parsed: list[str]) -> None
 
 @functools.cache
 def help_of(verb: str) -> str:
+    """Return the help text of a verb."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), pytest.raises(SystemExit):
         cli.main([verb, "--help"])
@@ -85,9 +87,9 @@ def test_verbs_and_options_in_sentences_exist() -> None:
                 assert f"{option} " in help_of(verb), f"{page.name}: ldo {verb} {option}"
 
 
-def test_a_command_that_is_none_is_found(parsed: list[str]) -> None:
+def test_invalid_command_exits_with_code_2(parsed: list[str]) -> None:
     for wrong in ("serf", "serve --robots a", "run", "publish room --rate fast"):
-        with pytest.raises(SystemExit) as leaving:
+        with pytest.raises(SystemExit) as exit_info:
             cli.main(shlex.split(wrong))
-        assert leaving.value.code == 2
+        assert exit_info.value.code == 2
     assert parsed == []

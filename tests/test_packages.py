@@ -1,4 +1,4 @@
-"""What is built holds what is tracked: links to folders are easily lost in packages."""
+"""Built packages contain all tracked files; links to folders are easily lost in them."""
 
 import os
 import shutil
@@ -15,18 +15,18 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 def tracked() -> set[str]:
-    """Files under version control; links to folders are left out."""
+    """Return the files under version control, without links to folders."""
     done = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False
     )
     if done.returncode != 0:
-        pytest.skip("needs a git checkout: the judge is the list of tracked files")
+        pytest.skip("needs a git checkout, whose tracked files are the expected contents")
     return {name for name in done.stdout.split("\0") if name and (ROOT / name).is_file()}
 
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a fresh sdist and the wheel built from it."""
+    """Return a folder with a new sdist and the wheel built from it."""
     out = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(ROOT)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -34,7 +34,7 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_wheel_holds_every_module_and_network(packages: Path) -> None:
+def test_wheel_contains_every_module_and_network(packages: Path) -> None:
     (wheel,) = packages.glob("*.whl")
     packed = set(zipfile.ZipFile(wheel).namelist())
     for name in tracked():
@@ -46,7 +46,7 @@ def test_wheel_holds_every_module_and_network(packages: Path) -> None:
             assert f"ldo_service/{name}" in packed
 
 
-def test_wheel_holds_compiled_kernels_and_types_but_no_sources(packages: Path) -> None:
+def test_wheel_contains_compiled_kernels_and_types_without_sources(packages: Path) -> None:
     (wheel,) = packages.glob("*.whl")
     packed = set(zipfile.ZipFile(wheel).namelist())
     modules = {n for n in tracked() if n.endswith("_module.cpp")}
@@ -58,7 +58,7 @@ def test_wheel_holds_compiled_kernels_and_types_but_no_sources(packages: Path) -
     assert {name.split("/")[0] for name in packed if ".dist-info" not in name} == {"ldo_service"}
 
 
-def test_sdist_holds_what_a_build_needs(packages: Path) -> None:
+def test_sdist_contains_all_files_of_a_build(packages: Path) -> None:
     (sdist,) = packages.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
         packed = {name.split("/", 1)[-1] for name in archive.getnames()}
@@ -73,19 +73,19 @@ def test_sdist_holds_what_a_build_needs(packages: Path) -> None:
 
 
 def without_compiler(folder: Path, *tools: str) -> dict[str, str]:
-    """An environment whose PATH is `folder`, with these tools alone."""
+    """Return an environment with only these tools on its PATH, which is `folder`."""
     folder.mkdir(exist_ok=True)
     for tool in tools:
         found = shutil.which(tool, path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
         if found is None:
-            pytest.skip(f"needs {tool}, which a build brings along elsewhere")
+            pytest.skip(f"needs {tool}, which only an isolated build installs by itself")
         (folder / tool).symlink_to(found)
     kept = {name: value for name, value in os.environ.items() if name not in ("CC", "CXX")}
     return {**kept, "PATH": str(folder)}
 
 
-def test_the_wheel_runs_where_there_is_no_compiler(packages: Path, tmp_path: Path) -> None:
-    """In a virtual environment of its own, with all that it depends on."""
+def test_wheel_installs_and_runs_without_a_compiler(packages: Path, tmp_path: Path) -> None:
+    """A new virtual environment gets the wheel and all of its dependencies."""
     (wheel,) = packages.glob("*.whl")
     subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True)
     ours = tmp_path / "venv" / "bin"
@@ -93,7 +93,7 @@ def test_the_wheel_runs_where_there_is_no_compiler(packages: Path, tmp_path: Pat
     install = [ours / "python", "-m", "pip", "install", "--quiet", "--only-binary", ":all:", wheel]
     done = subprocess.run(install, env=environment, capture_output=True, text=True)
     if "No matching distribution" in done.stderr or "ConnectionError" in done.stderr:
-        pytest.skip("needs a package index to install what the wheel depends on")
+        pytest.skip("needs a package index to install the dependencies of the wheel")
     assert done.returncode == 0, done.stderr[-3000:]
     run = [ours / "ldo", "run", "synthetic:room", "--max-frames", "3", "--out", tmp_path / "out"]
     done = subprocess.run(run, env=environment, capture_output=True, text=True, cwd=tmp_path)
@@ -101,7 +101,7 @@ def test_the_wheel_runs_where_there_is_no_compiler(packages: Path, tmp_path: Pat
     assert (tmp_path / "out" / "map.ply").is_file()
 
 
-def test_a_source_without_a_compiler_says_so_in_one_line(tmp_path: Path) -> None:
+def test_build_without_a_compiler_reports_it_in_one_line(tmp_path: Path) -> None:
     environment = without_compiler(tmp_path / "bin", "cmake", "ninja")
     command = [sys.executable, "-m", "pip", "install", "--no-build-isolation", "--no-deps"]
     command += ["--target", str(tmp_path / "target"), "-C", f"build-dir={tmp_path / 'build'}"]

@@ -1,4 +1,4 @@
-"""The manual says what the code says."""
+"""Agreement of the manual with the code."""
 
 import re
 from pathlib import Path
@@ -13,12 +13,12 @@ MANUAL = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_what_is_taken_from_the_code_is_as_the_code_has_it(page: Path) -> None:
+def test_generated_parts_of_docs_are_up_to_date(page: Path) -> None:
     assert page.read_text() == generated(page.read_text()), "run `python docs/generate.py`"
 
 
 @pytest.mark.parametrize("page", MANUAL, ids=lambda page: page.name)
-def test_every_link_to_a_file_leads_somewhere(page: Path) -> None:
+def test_links_to_files_resolve(page: Path) -> None:
     for target in re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text()):
         assert (page.parent / target).exists(), target
 
