@@ -1,10 +1,9 @@
-# Each target installs what it needs into .venv. A new machine needs Python 3.11+ and a C++17
-# compiler.
+# Everything below sets itself up in .venv: a fresh machine needs Python 3.11+ and a C++17 compiler.
 PYTHON ?= python3
 BIN := .venv/bin
 SOURCES := pyproject.toml CMakeLists.txt $(wildcard ldo_service/kernels/*.cpp ldo_service/kernels/*.hpp)
 
-.PHONY: help demo test check slow bench clean
+.PHONY: help demo test check slow bench docs clean
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
@@ -17,12 +16,16 @@ test: .venv/tests  ## run the default tests, one process per core; ARGS="-n 0 ..
 slow: .venv/tests  ## run the slow tests one after the other, because each needs all cores
 	$(BIN)/python -m pytest -q -m slow $(ARGS)
 
-check: .venv/dev  ## check format, lint and types
+check: .venv/dev  ## check format, lint, types and pages
 	deploy/check
 
-bench: .venv/tests  ## run the benchmarks; copy their output to tests/bench/RESULTS.md
+bench: .venv/tests  ## the benchmarks; docs/benchmarks has a page for each question
 	@for program in $(basename $(notdir $(wildcard tests/bench/bench_*.py))); do \
 		echo "== $$program"; $(BIN)/python -m tests.bench.$$program || exit 1; done
+
+docs: .venv/docs  ## the documentation site, in build/site
+	$(BIN)/python docs/generate.py
+	$(BIN)/mkdocs build --strict
 
 clean:  ## remove .venv, build and dist
 	rm -rf .venv build dist
@@ -38,6 +41,10 @@ clean:  ## remove .venv, build and dist
 
 .venv/tests: .venv/installed pyproject.toml
 	$(BIN)/python -m pip install --quiet --group test --group build
+	@touch $@
+
+.venv/docs: .venv/installed pyproject.toml
+	$(BIN)/python -m pip install --quiet --group docs
 	@touch $@
 
 .venv/dev: .venv/tests pyproject.toml
