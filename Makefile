@@ -19,11 +19,11 @@ slow: .venv/tests  ## run the slow tests one after the other, because each needs
 check: .venv/dev  ## check format, lint, types and pages
 	deploy/check
 
-bench: .venv/tests  ## the benchmarks; docs/benchmarks has a page for each question
+bench: .venv/tests  ## run the benchmarks; docs/benchmarks has a page per question
 	@for program in $(basename $(notdir $(wildcard tests/bench/bench_*.py))); do \
 		echo "== $$program"; $(BIN)/python -m tests.bench.$$program || exit 1; done
 
-docs: .venv/docs  ## the documentation site, in build/site
+docs: .venv/docs  ## build the documentation site in build/site
 	$(BIN)/python docs/generate.py
 	$(BIN)/mkdocs build --strict
 

@@ -1,6 +1,6 @@
 """Graph of actors: every actor with its ports and its factory.
 
-README's diagram and topic table are generated from this module (`ldo topics --markdown`).
+The diagram and the topic table of the documentation are generated from this module (`ldo topics --markdown`).
 """
 
 from collections.abc import Callable, Iterable

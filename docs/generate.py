@@ -1,27 +1,44 @@
-"""Write what the manual takes from the code: the text between `<!-- NAME -->` and `<!-- end -->`.
+"""Generator of the parts of the pages that are taken from the code.
 
-python docs/generate.py
+`python docs/generate.py` replaces the text between `<!-- NAME -->` and `<!-- end -->` in each page
+and draws `docs/actors.svg`. With `--check` it changes nothing and exits with 1 if a file would
+change.
 """
 
 import ast
+import dataclasses
+import inspect
 import re
+import sys
+import tokenize
+import typing
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any
 
-from ldo_service.actors.topology import mermaid_diagram, topics_table
+import tyro
+
+from ldo_service.actors.topology import GRAPH, mermaid_diagram, topics_table
+from ldo_service.commands import cli
 from ldo_service.config import Config
 from ldo_service.config.printing import section_titles, settings_of
+from ldo_service.schemas.topics import TOPICS
 
 ROOT = Path(__file__).parent.parent
-PAGES = (ROOT / "README.md", ROOT / "docs/architecture.md", ROOT / "docs/configuration.md")
+DOCS = ROOT / "docs"
+PAGES = tuple(
+    DOCS / name for name in ("architecture.md", "configuration.md", "topics.md", "command-line.md")
+)
 UNITS = {"_s": "s", "_m": "m", "_rad": "rad", "_px": "px", "_mb": "MB", "_gb": "GB"}
 UNITS |= {"_frames": "frames", "_keyframes": "keyframes", "_ratio": "fraction"}
 BLOCK = re.compile(r"(<!-- (?P<name>[^>]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+COMMAND = re.compile(r"^(?:\s+\S|ldo )")
 
 
 def packages_table() -> str:
-    """Markdown: every package with the first sentence of its docstring."""
-    lines = ["| package | what is in it |", "|---|---|"]
+    """Return Markdown: every package with the first sentence of its docstring."""
+    lines = ["| package | contents |", "|---|---|"]
     lines += [f"| `{name}/` | {_first_sentence(path)} |" for name, path in _packages()]
     return "\n".join(lines)
 
@@ -70,20 +87,259 @@ def _unit(path: str) -> str:
     return UNITS[max(endings, key=len)] if endings else ""
 
 
+def messages() -> str:
+    """Return Markdown: every message and every record in one, with a table of its fields."""
+    topics: dict[str, list[str]] = {}
+    for topic in TOPICS:
+        for message in filter(None, (topic.message, topic.answer)):
+            topics.setdefault(message.__name__, []).append(topic.name)
+    structs = {
+        node.name: (node, path)
+        for path in sorted((ROOT / "schemas").glob("*.py"))
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.ClassDef) and _is_struct(node)
+    }
+    records = [name for name in structs if name not in topics and name != "Message"]
+    lines = [*_fields_of("Message", *structs["Message"], [])]
+    for name in sorted(topics):
+        lines += _fields_of(name, *structs[name], topics[name])
+    for name in sorted(records):
+        lines += _fields_of(name, *structs[name], [])
+    return "\n".join(lines[:-1])
+
+
+def _is_struct(node: ast.ClassDef) -> bool:
+    return any(ast.unparse(base) in ("msgspec.Struct", "Message") for base in node.bases)
+
+
+def _fields_of(name: str, node: ast.ClassDef, path: Path, topics: list[str]) -> list[str]:
+    comments = _comments(path)
+    lines = [f"### {name}", ""]
+    if topics:
+        lines += ["Topic: " + ", ".join(f"`{topic}`" for topic in topics) + ".", ""]
+    for paragraph in (ast.get_docstring(node) or "").split("\n\n"):
+        lines += [" ".join(paragraph.split()), ""]
+    fields = [part for part in node.body if isinstance(part, ast.AnnAssign)]
+    if fields:
+        lines += ["| field | type | default | meaning |", "|---|---|---|---|"]
+    for field in fields:
+        kind = ast.unparse(field.annotation).replace(" | ", " or ")
+        default = f"`{ast.unparse(field.value)}`" if field.value else ""
+        meaning = _comment_of(field, comments).replace("|", "\\|")
+        lines.append(f"| `{ast.unparse(field.target)}` | `{kind}` | {default} | {meaning} |")
+    return [*lines, ""] if fields else lines
+
+
+def _comments(path: Path) -> dict[int, tuple[str, bool]]:
+    """Return the comments of a file by line, each with whether it stands on a line of its own."""
+    with path.open("rb") as file:
+        return {
+            token.start[0]: (token.string.lstrip("# "), token.line.strip().startswith("#"))
+            for token in tokenize.tokenize(file.readline)
+            if token.type == tokenize.COMMENT
+        }
+
+
+def _comment_of(field: ast.AnnAssign, comments: dict[int, tuple[str, bool]]) -> str:
+    above, line = list[str](), field.lineno - 1
+    while line in comments and comments[line][1]:
+        above.insert(0, comments[line][0])
+        line -= 1
+    lines = range(field.lineno, (field.end_lineno or field.lineno) + 1)
+    return " ".join([*above, *(comments[line][0] for line in lines if line in comments)])
+
+
+def commands() -> str:
+    """Return Markdown: every verb of `ldo` with its help and a table of its arguments."""
+    lines = list[str]()
+    for name, verb in cli.verbs().items():
+        lines += [f"## ldo {name}", "", *_help(verb), *_arguments(verb)]
+        for sub, kind in _subcommands(verb):
+            lines += [f"### ldo {name} {sub}", "", *_help(kind), *_arguments(kind)]
+    return "\n".join(lines[:-1])
+
+
+def _help(verb: Callable[..., Any]) -> Iterator[str]:
+    for paragraph in (inspect.getdoc(verb) or "").split("\n\n"):
+        words, code = list[str](), list[str]()
+        for line in paragraph.splitlines():
+            (code if COMMAND.match(line) else words).append(line.strip())
+        if words:
+            yield from (" ".join(words), "")
+        if code:
+            yield from ("```sh", *code, "```", "")
+
+
+def _arguments(verb: Callable[..., Any]) -> list[str]:
+    rows = list(_rows(verb))
+    if not rows:
+        return []
+    lines = ["| argument | meaning | default |", "|---|---|---|"]
+    return [*lines, *(f"| {name} | {text} | {default} |" for name, text, default in rows), ""]
+
+
+def _rows(verb: Callable[..., Any]) -> Iterator[tuple[str, str, str]]:
+    """Yield a row for each argument; those of a dataclass follow in its place."""
+    owner = verb.__init__ if inspect.isclass(verb) else verb
+    hints = typing.get_type_hints(owner, include_extras=True)
+    for name, parameter in inspect.signature(verb).parameters.items():
+        kind, marks = _annotation(hints[name])
+        if dataclasses.is_dataclass(kind):
+            yield from _rows(typing.cast(type, kind))
+        elif not _parts(kind):
+            yield _row(name, parameter.default, marks, kind)
+
+
+def _row(name: str, default: object, marks: list[Any], kind: object) -> tuple[str, str, str]:
+    argument = next((mark for mark in marks if hasattr(mark, "metavar")), None)
+    metavar = (argument and argument.metavar) or ""
+    choices = typing.get_args(kind) if typing.get_origin(kind) is typing.Literal else ()
+    metavar = metavar or "\\|".join(map(str, choices))
+    meaning = ((argument and argument.help) or "").replace("|", "\\|")
+    if tyro.conf.Positional in marks:
+        shown = f"`{metavar or name.upper()}`"
+    else:
+        given = (argument and argument.name) or name
+        options = [
+            f"--{given.strip('_').replace('_', '-')}",
+            *((argument and argument.aliases) or ()),
+        ]
+        shown = ", ".join(f"`{option} {metavar}`".replace(" `", "`") for option in options)
+    is_plain = default in (inspect.Parameter.empty, None, (), "", False)
+    return (
+        shown.replace("|", "\\|").replace("\\\\|", "\\|"),
+        meaning,
+        "" if is_plain else f"`{default}`",
+    )
+
+
+def _subcommands(verb: Callable[..., Any]) -> Iterator[tuple[str, Callable[..., Any]]]:
+    for hint in typing.get_type_hints(verb, include_extras=True).values():
+        for part in _parts(_annotation(hint)[0]):
+            kind, marks = _annotation(part)
+            yield next(mark.name for mark in marks if hasattr(mark, "name")), kind
+
+
+def _annotation(hint: Any) -> tuple[Any, list[Any]]:
+    """Return a type without its annotations and without None, and the annotations."""
+    marks = list[Any]()
+    while typing.get_origin(hint) is typing.Annotated:
+        hint, *more = typing.get_args(hint)
+        marks += more
+    if typing.get_origin(hint) in (typing.Union, UnionType):
+        kinds = [kind for kind in typing.get_args(hint) if kind is not NoneType]
+        if len(kinds) == 1:
+            hint = kinds[0]
+    return hint, marks
+
+
+def _parts(kind: Any) -> tuple[Any, ...]:
+    """Return the members of a union of subcommands."""
+    parts = typing.get_args(kind) if typing.get_origin(kind) in (typing.Union, UnionType) else ()
+    return tuple(part for part in parts if dataclasses.is_dataclass(_annotation(part)[0]))
+
+
+# Place of each actor in the drawing: column and row.
+PLACES = {
+    "camera": (0, 0), "odometry": (0, 2), "frame_source": (1, 0), "tracker": (1, 2),
+    "detector": (2, 0), "mapper": (2, 2), "loop_closer": (2, 4), "vlm_labeller": (3, 0),
+    "optimizer": (3, 4),
+}  # fmt: skip
+WIDTH_PX, HEIGHT_PX, COLUMN_PX, ROW_PX = 120, 34, 200, 62
+
+
+def drawing() -> str:
+    """Return an SVG of the actors: solid arrows are lossless, dashed ones keep the latest."""
+    arrows = dict[tuple[str, str], bool]()
+    for line in mermaid_diagram().splitlines():
+        if found := re.match(r"\s+(\w+) (-->|-\.->)\|[^|]+\| (\w+)", line):
+            maker, arrow, taker = found.groups()
+            arrows[maker, taker] = arrows.get((maker, taker), False) or arrow == "-->"
+    lines = [_arrow(maker, taker, solid) for (maker, taker), solid in arrows.items()]
+    outside = {"camera": "camera", "odometry": "other odometry"}
+    lines += [_box(name, text, "#ffffff") for name, text in outside.items()]
+    lines += [_box(actor.name, actor.name, "#e3ecf7") for actor in GRAPH]
+    size = f'width="{3 * COLUMN_PX + WIDTH_PX + 20}" height="{4 * ROW_PX + HEIGHT_PX + 20}"'
+    marker = (
+        '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
+        'markerHeight="7" orient="auto"><path d="M0 0 8 4 0 8z" fill="#335"/></marker></defs>'
+    )
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="14">'
+    )
+    back = '<rect width="100%" height="100%" fill="#ffffff"/>'
+    return "\n".join([head, back, marker, *lines, "</svg>\n"])
+
+
+def _center(name: str) -> tuple[float, float]:
+    column, row = PLACES[name]
+    return 10 + column * COLUMN_PX + WIDTH_PX / 2, 10 + row * ROW_PX + HEIGHT_PX / 2
+
+
+def _box(name: str, text: str, fill: str) -> str:
+    x, y = _center(name)
+    place = f'x="{x - WIDTH_PX / 2:g}" y="{y - HEIGHT_PX / 2:g}"'
+    size = f'width="{WIDTH_PX}" height="{HEIGHT_PX}" rx="6"'
+    words = f'<text x="{x:g}" y="{y + 5:g}" text-anchor="middle" fill="#223">{text}</text>'
+    return f'<rect {place} {size} fill="{fill}" stroke="#335"/>{words}'
+
+
+def _arrow(maker: str, taker: str, solid: bool) -> str:
+    """Return a line between two boxes, moved to its right so that both directions show."""
+    (x0, y0), (x1, y1) = _center(maker), _center(taker)
+    length = ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
+    right_x, right_y = -(y1 - y0) / length * 7, (x1 - x0) / length * 7
+    x0, y0, x1, y1 = x0 + right_x, y0 + right_y, x1 + right_x, y1 + right_y
+    sx, sy = _leave(maker, x0, y0, x1, y1)
+    ex, ey = _leave(taker, x1, y1, x0, y0)
+    dash = "" if solid else ' stroke-dasharray="5 4"'
+    ends = f'x1="{sx:.1f}" y1="{sy:.1f}" x2="{ex:.1f}" y2="{ey:.1f}"'
+    return f'<line {ends} stroke="#335" stroke-width="1.4"{dash} marker-end="url(#tip)"/>'
+
+
+def _leave(name: str, x0: float, y0: float, x1: float, y1: float) -> tuple[float, float]:
+    """Return the point where a line from inside a box leaves it."""
+    x, y = _center(name)
+    steps = [1.0]
+    if x1 != x0:
+        side = x + (WIDTH_PX / 2 if x1 > x0 else -WIDTH_PX / 2)
+        steps.append((side - x0) / (x1 - x0))
+    if y1 != y0:
+        side = y + (HEIGHT_PX / 2 if y1 > y0 else -HEIGHT_PX / 2)
+        steps.append((side - y0) / (y1 - y0))
+    step = min(steps)
+    return x0 + step * (x1 - x0), y0 + step * (y1 - y0)
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
     "ldo topics --markdown": topics_table,
-    "ldo topics --mermaid": lambda: f"```mermaid\n{mermaid_diagram()}\n```",
     "packages": packages_table,
     "public settings": public_settings,
     "number of settings": settings_count,
+    "messages": messages,
+    "commands": commands,
 }
 
 
 def generated(page: str) -> str:
-    """The page with every block as the code has it now. Raises KeyError for an unknown block."""
+    """Return the page with every block as the code has it. Raises KeyError for an unknown block."""
     return BLOCK.sub(lambda found: f"{found[1]}{BLOCKS[found['name']]()}\n{found[3]}", page)
 
 
+def outputs() -> Iterator[tuple[Path, str]]:
+    """Yield each generated file with the text that it must have."""
+    yield from ((page, generated(page.read_text())) for page in PAGES)
+    yield DOCS / "actors.svg", drawing()
+
+
+def main() -> None:
+    stale = [path for path, text in outputs() if not path.exists() or path.read_text() != text]
+    if "--check" in sys.argv[1:]:
+        names = ", ".join(str(path.relative_to(ROOT)) for path in stale)
+        sys.exit(f"{names} must be generated again: python docs/generate.py" if stale else 0)
+    for path, text in outputs():
+        path.write_text(text)
+
+
 if __name__ == "__main__":
-    for path in PAGES:
-        path.write_text(generated(path.read_text()))
+    main()

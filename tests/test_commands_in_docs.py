@@ -15,7 +15,7 @@ from ldo_service.commands import cli
 from ldo_service.config import load_config
 
 ROOT = Path(__file__).parent.parent
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.DOTALL | re.MULTILINE)
 LDO = re.compile(r"^(?:[A-Z_]+=\S+ )*(?:\S*/)?ldo (?P<words>.*)")
 INLINE = re.compile(r"`ldo ([a-z]+)((?: [^`]*)?)`")

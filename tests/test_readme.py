@@ -5,19 +5,36 @@ from pathlib import Path
 
 import pytest
 
-from docs.generate import PAGES, generated
+from docs.generate import outputs
 from ldo_service.errors import LdoError
 
 ROOT = Path(__file__).parent.parent
-MANUAL = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+MANUAL = tuple(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")) + tuple(
+    sorted((ROOT / "docs").rglob("*.md"))
+)
+DECISIONS = sorted((ROOT / "docs/decisions").glob("0*.md"))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_generated_parts_of_docs_are_up_to_date(page: Path) -> None:
-    assert page.read_text() == generated(page.read_text()), "run `python docs/generate.py`"
+def test_generated_files_are_current() -> None:
+    for path, text in outputs():
+        assert path.read_text() == text, f"{path.name}: run `python docs/generate.py`"
 
 
-@pytest.mark.parametrize("page", MANUAL, ids=lambda page: page.name)
+def test_readme_has_at_most_200_lines() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 200
+
+
+@pytest.mark.parametrize("page", DECISIONS, ids=lambda page: page.stem)
+def test_decision_record_has_its_form(page: Path) -> None:
+    text = page.read_text()
+    assert len(text.splitlines()) <= 20
+    headings = re.findall(r"^#.*", text, re.MULTILINE)
+    assert headings[0].startswith(f"# {page.stem[:4]}. ")
+    assert headings[1:] == ["## Context", "## Decision", "## Consequence"]
+    assert f"({page.name})" in (page.parent / "index.md").read_text()
+
+
+@pytest.mark.parametrize("page", MANUAL, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_to_files_resolve(page: Path) -> None:
     for target in re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text()):
         assert (page.parent / target).exists(), target

@@ -22,8 +22,8 @@ def topics(
         bool,
         tyro.conf.arg(name="json-schema", help="print the JSON Schema of every message"),
     ] = False,
-    markdown: Annotated[bool, tyro.conf.arg(help="print the table of the README")] = False,
-    mermaid: Annotated[bool, tyro.conf.arg(help="print the diagram of the README")] = False,
+    markdown: Annotated[bool, tyro.conf.arg(help="print the table of the documentation")] = False,
+    mermaid: Annotated[bool, tyro.conf.arg(help="print the diagram in Mermaid")] = False,
 ) -> None:
     """List every topic: its key, message, producer, consumers and their policies.
 

@@ -42,7 +42,8 @@ class NoiseConfig:
     sigma_box_share: float = 0.15
     # Observations of an object from one side share that error, so N of them have less information
     # than N independent ones. The maximum number per landmark (`landmarks.most_sights`) counts as a
-    # tenth of one. Counted as one, they moved odometry by 3 mm that was accurate to 2 mm (RESULTS).
+    # tenth of one. Counted as one, they moved odometry by 3 mm that was accurate to 2 mm
+    # (docs/decisions/0057-tenth-information.md).
     independent_sights: float = 1 / 320
     robust_sigmas: float = 2.385  # Cauchy kernel width: 95 % efficient on Gaussian noise.
 
