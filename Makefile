@@ -25,7 +25,7 @@ bench: .venv/tests  ## run the benchmarks; docs/benchmarks has a page per questi
 
 docs: .venv/docs  ## build the documentation site in build/site
 	$(BIN)/python docs/generate.py
-	$(BIN)/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 clean:  ## remove .venv, build and dist
 	rm -rf .venv build dist

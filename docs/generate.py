@@ -242,10 +242,10 @@ def _parts(kind: Any) -> tuple[Any, ...]:
 # Place of each actor in the drawing: column and row.
 PLACES = {
     "camera": (0, 0), "odometry": (0, 2), "frame_source": (1, 0), "tracker": (1, 2),
-    "detector": (2, 0), "mapper": (2, 2), "loop_closer": (2, 4), "vlm_labeller": (3, 0),
-    "optimizer": (3, 4),
+    "detector": (2, 0), "loop_closer": (2, 4), "mapper": (3, 2), "vlm_labeller": (4, 0),
+    "optimizer": (4, 4),
 }  # fmt: skip
-WIDTH_PX, HEIGHT_PX, COLUMN_PX, ROW_PX = 120, 34, 200, 62
+WIDTH_PX, HEIGHT_PX, COLUMN_PX, ROW_PX = 120, 34, 170, 62
 
 
 def drawing() -> str:
@@ -259,7 +259,7 @@ def drawing() -> str:
     outside = {"camera": "camera", "odometry": "other odometry"}
     lines += [_box(name, text, "#ffffff") for name, text in outside.items()]
     lines += [_box(actor.name, actor.name, "#e3ecf7") for actor in GRAPH]
-    size = f'width="{3 * COLUMN_PX + WIDTH_PX + 20}" height="{4 * ROW_PX + HEIGHT_PX + 20}"'
+    size = f'width="{4 * COLUMN_PX + WIDTH_PX + 20}" height="{4 * ROW_PX + HEIGHT_PX + 20}"'
     marker = (
         '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
         'markerHeight="7" orient="auto"><path d="M0 0 8 4 0 8z" fill="#335"/></marker></defs>'
