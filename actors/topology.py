@@ -1,6 +1,6 @@
 """Graph of actors: every actor with its ports and its factory.
 
-The diagram and the topic table of the documentation are generated from this module (`ldo topics --markdown`).
+The diagram and the topic table of the pages are generated from here (`ldo topics --markdown`).
 """
 
 from collections.abc import Callable, Iterable

@@ -118,7 +118,10 @@ def _fields_of(name: str, node: ast.ClassDef, path: Path, topics: list[str]) -> 
     if topics:
         lines += ["Topic: " + ", ".join(f"`{topic}`" for topic in topics) + ".", ""]
     for paragraph in (ast.get_docstring(node) or "").split("\n\n"):
-        lines += [" ".join(paragraph.split()), ""]
+        rows = paragraph.splitlines()
+        is_aligned = len(rows) > 1 and all(re.search(r"\S  +\S", row) for row in rows)
+        lines += ["```text", *rows, "```"] if is_aligned else [" ".join(paragraph.split())]
+        lines.append("")
     fields = [part for part in node.body if isinstance(part, ast.AnnAssign)]
     if fields:
         lines += ["| field | type | default | meaning |", "|---|---|---|---|"]
