@@ -33,6 +33,7 @@ PAGES = tuple(
 UNITS = {"_s": "s", "_m": "m", "_rad": "rad", "_px": "px", "_mb": "MB", "_gb": "GB"}
 UNITS |= {"_frames": "frames", "_keyframes": "keyframes", "_ratio": "fraction"}
 BLOCK = re.compile(r"(<!-- (?P<name>[^>]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+TAG = re.compile(r"(?P<code>`[^`]*`)|<(?P<name>\w+)>")
 COMMAND = re.compile(r"^(?:\s+\S|ldo )")
 
 
@@ -326,7 +327,14 @@ BLOCKS: dict[str, Callable[[], str]] = {
 
 def generated(page: str) -> str:
     """Return the page with every block as the code has it. Raises KeyError for an unknown block."""
-    return BLOCK.sub(lambda found: f"{found[1]}{BLOCKS[found['name']]()}\n{found[3]}", page)
+    return BLOCK.sub(
+        lambda found: f"{found[1]}{_escaped(BLOCKS[found['name']]())}\n{found[3]}", page
+    )
+
+
+def _escaped(text: str) -> str:
+    """Return Markdown in which a name in angle brackets is text and not an HTML tag."""
+    return TAG.sub(lambda found: found["code"] or f"&lt;{found['name']}&gt;", text)
 
 
 def outputs() -> Iterator[tuple[Path, str]]:
