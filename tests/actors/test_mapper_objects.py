@@ -38,14 +38,22 @@ from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantic_fusion import FusionConfig, SemanticFusionConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
-from tests.semantics.scenes import CAMERA, THINGS, Shot, Thing, poses, shoot, true_things
+from tests.semantics.scenes import (
+    CAMERA,
+    SCENE_OBJECTS,
+    SceneObject,
+    Shot,
+    poses,
+    shoot,
+    true_objects,
+)
 
 # of an image of 128x96, where walls hold a fifth each and the ball is 20 px wide
 TRIGGER = RegionProposalConfig(min_side_px=10)
 REGIONS = RegionTrackerConfig(per_keyframe=4, at_once=8)  # the walk is short
 SEMANTICS = SemanticMapConfig(naming=OpenVocabularyConfig(trigger=TRIGGER, regions=REGIONS))
 CONFIG = MapperConfig(iterations=3, threads=1, semantics=SEMANTICS)
-COUCH, TABLE, VASE, _, CHAIR, BALL = THINGS
+COUCH, TABLE, VASE, _, CHAIR, BALL = SCENE_OBJECTS
 AHEAD = poses(1)[0]
 WAY = poses(12)
 STAMP_NS = 10**8
@@ -69,13 +77,19 @@ def keyframe_of(shot: Shot, number: int) -> Keyframe:
 
 
 def boxes_of(
-    shot: Shot, number: int, things: Iterable[Thing], score: float = 0.9, network: str = "exact"
+    shot: Shot,
+    number: int,
+    things: Iterable[SceneObject],
+    score: float = 0.9,
+    network: str = "exact",
 ) -> DetectionBoxes:
     """Of those of the room's things; the detector knows no others."""
     known = [thing.name for thing in things]
-    claims = shot.claims(THINGS)
-    names = [thing.name for k, thing in enumerate(THINGS, 1) if np.sum(shot.instances == k) >= 40]
-    found = zip(names, claims.boxes.tolist(), strict=True)
+    detections = shot.detections(SCENE_OBJECTS)
+    names = [
+        thing.name for k, thing in enumerate(SCENE_OBJECTS, 1) if np.sum(shot.instances == k) >= 40
+    ]
+    found = zip(names, detections.boxes.tolist(), strict=True)
     return DetectionBoxes(
         stamp_ns=number * STAMP_NS,
         keyframe=number,
@@ -94,13 +108,13 @@ def walk(
     mapper: Mapper,
     way: np.ndarray = WAY,
     first: int = 0,
-    known: Iterable[Thing] = THINGS,
+    known: Iterable[SceneObject] = SCENE_OBJECTS,
     **fields,
 ) -> list[Message]:
     """All that the mapper makes of a walk past all things."""
     made: list[Message] = []
     for number, T in enumerate(way, first):
-        shot = shoot(THINGS, T, number)
+        shot = shoot(SCENE_OBJECTS, T, number)
         made += mapper.handle(keyframe_of(shot, number))
         made += mapper.handle(boxes_of(shot, number, known, **fields))
     return made
@@ -148,7 +162,7 @@ def test_where_nobody_looked_nothing_is_said_of_objects_and_no_bit_differs() -> 
     plain, mapper = Mapper(CONFIG), Mapper(CONFIG)
     alone: list[Message] = []
     for number, T in enumerate(WAY[:4]):
-        alone += plain.handle(keyframe_of(shoot(THINGS, T, number), number))
+        alone += plain.handle(keyframe_of(shoot(SCENE_OBJECTS, T, number), number))
     made = walk(mapper, WAY[:4], known=(), network="")
     ask = RefineMap(stamp_ns=0, iterations=2, initial_rate=1.0, final_rate=1.0)
     turned = correction_to_message(0, 1, {0: se3.exp(np.full(6, 0.1)) @ WAY[0]})
@@ -192,7 +206,7 @@ def test_a_successor_goes_on_with_objects_bit_for_bit(tmp_path: Path) -> None:
     made = walk(first, WAY[:5], known=(BALL,))
     *_, question = of(LabelRequest, made)
     list(first.handle(answer(of(LabelRequest, made)[0], "samovar")))
-    list(first.handle(boxes_of(shoot(THINGS, WAY[6], 6), 6, (BALL,))))
+    list(first.handle(boxes_of(shoot(SCENE_OBJECTS, WAY[6], 6), 6, (BALL,))))
     state = decode_state(encode_state(first.checkpoint()))
     shutil.copytree(tmp_path / "first", tmp_path / "second")
     second = Mapper(replace(config, folder=str(tmp_path / "second")), has_labeller=True)
@@ -227,11 +241,11 @@ def answer(request: LabelRequest, label: str, confidence: float = 0.9) -> LabelR
     )
 
 
-def shown_in(request: LabelRequest) -> Thing | None:
+def shown_in(request: LabelRequest) -> SceneObject | None:
     """The thing whose true box a question's is most like."""
-    shot = shoot(THINGS, WAY[request.keyframe % len(WAY)], request.keyframe)
+    shot = shoot(SCENE_OBJECTS, WAY[request.keyframe % len(WAY)], request.keyframe)
     best, most = None, 0.5
-    for number, thing in enumerate(THINGS, 1):
+    for number, thing in enumerate(SCENE_OBJECTS, 1):
         v, u = np.nonzero(shot.instances == number)
         if len(u) == 0:
             continue
@@ -270,21 +284,22 @@ def test_answers_land_on_the_gaussians_they_speak_of_however_late(late: int) -> 
         made += new
     made += mapper.on_stop()
     follower = followed(made)
-    top, truth = top_labels(follower.map.labels), true_things(follower.map.means, THINGS, WAY)
-    names = np.array([f"my {thing.name}" for thing in THINGS] + ["background"])
+    top = top_labels(follower.map.labels)
+    truth = true_objects(follower.map.means, SCENE_OBJECTS, WAY)
+    names = np.array([f"my {thing.name}" for thing in SCENE_OBJECTS] + ["background"])
     said = np.array(follower.label_names)[top]
     mine = np.char.startswith(said, "my ")
     is_wrong = mine & (said != names[truth])
     assert np.count_nonzero(is_wrong & (truth >= 0)) < 0.05 * np.count_nonzero(mine), "another's"
     # splats of 128x96 pixels reach over edges: of what an exact box makes couch, 0.16 is none
     assert np.count_nonzero(is_wrong) < 0.33 * np.count_nonzero(mine)
-    chairs = truth == THINGS.index(CHAIR)
+    chairs = truth == SCENE_OBJECTS.index(CHAIR)
     assert np.mean(said[chairs] == "my chair") > 0.6
     *_, last = of(MapObjects, made)
     for thing in (CHAIR, TABLE):  # the vase is some 10 px wide, and not set apart from its table
         center_m = np.array(thing.solid.center_m)
         named = [one for one in last.objects if one.name == f"my {thing.name}"]
-        assert len(named) <= sum(other.name == thing.name for other in THINGS), "one of each"
+        assert len(named) <= sum(other.name == thing.name for other in SCENE_OBJECTS), "one of each"
         assert min(np.linalg.norm(np.array(one.centroid) - center_m) for one in named) < 0.3
 
 
@@ -334,9 +349,10 @@ def test_a_box_and_an_answer_are_weighed_as_printed_or_the_box_alone_counts(
         ]
     assert mapper.metrics()["answers_named"] > 0
     follower = followed([*made, *mapper.on_stop()])
-    top, truth = top_labels(follower.map.labels), true_things(follower.map.means, THINGS, WAY)
+    top = top_labels(follower.map.labels)
+    truth = true_objects(follower.map.means, SCENE_OBJECTS, WAY)
     said = np.array(follower.label_names)[top]
-    assert np.mean(said[truth == THINGS.index(COUCH)] == named) > 0.6
+    assert np.mean(said[truth == SCENE_OBJECTS.index(COUCH)] == named) > 0.6
 
 
 def test_names_beyond_the_cap_are_other_and_no_opinion_is_no_label() -> None:

@@ -7,14 +7,14 @@ from ldo_service.conversions.poses import pose_from_message
 from ldo_service.maps.publisher import ObjectPublisher
 from ldo_service.schemas import MapObjects, decode, encode
 from ldo_service.semantics.object_landmarks import distributions, entropies
-from tests.semantics.scenes import NAMES, THINGS, Stage, poses
+from tests.semantics.scenes import NAMES, SCENE_OBJECTS, LabelledMap, poses
 
 
 def test_objects_and_observations_travel_as_they_are() -> None:
-    stage = Stage()
-    told = list(stage.walk(THINGS, poses(20)[:6]))
-    table = stage.objects.landmarks
-    message = ObjectPublisher().message(stage.objects, NAMES.names, 5, 3, stamp_ns=7)
+    labelled_map = LabelledMap()
+    updates = list(labelled_map.walk(SCENE_OBJECTS, poses(20)[:6]))
+    table = labelled_map.objects.landmarks
+    message = ObjectPublisher().message(labelled_map.objects, NAMES.names, 5, 3, stamp_ns=7)
     assert decode(encode(message), MapObjects) == message
     assert [one.id for one in message.objects] == table["id"].tolist() != []
     for one, landmark, p in zip(message.objects, table, distributions(table), strict=True):
@@ -29,8 +29,8 @@ def test_objects_and_observations_travel_as_they_are() -> None:
         assert (one.observation_count, one.miss_count) == (landmark["seen"], landmark["missed"])
         assert 1 <= len(one.views) <= 3
     np.testing.assert_allclose([one.entropy for one in message.objects], entropies(table))
-    for keyframe, observed in enumerate(told):
+    for keyframe, observed in enumerate(updates):
         sent = observations_to_messages(observed, NAMES.names, keyframe, stamp_ns=7)
         assert [one.object for one in sent] == [seen.object for seen in observed.observations]
         assert all(one.keyframe == keyframe for one in sent)
-    assert sent[0].box_px == tuple(told[-1].observations[0].box)
+    assert sent[0].box_px == tuple(updates[-1].observations[0].box)

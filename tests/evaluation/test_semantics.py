@@ -34,10 +34,10 @@ FRAMES, SCALE = 9, 5000
 THINGS = (
     *(
         replace(thing, name="desk") if thing.name == "dining table" else thing
-        for thing in scenes.THINGS[:4]
+        for thing in scenes.SCENE_OBJECTS[:4]
     ),
-    replace(scenes.THINGS[4], name="speaker"),
-    replace(scenes.THINGS[5], name="globe"),
+    replace(scenes.SCENE_OBJECTS[4], name="speaker"),
+    replace(scenes.SCENE_OBJECTS[5], name="globe"),
 )
 CLASSES = ("undefined", "wall", *dict.fromkeys(thing.name for thing in THINGS))
 COCO, ALL_NAMES = range(2)

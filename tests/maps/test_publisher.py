@@ -5,24 +5,24 @@ import numpy as np
 from ldo_service.conversions.objects import map_objects
 from ldo_service.geometry import se3
 from ldo_service.maps.publisher import ObjectPublisher
-from tests.semantics.scenes import NAMES, THINGS, Stage, poses
+from tests.semantics.scenes import NAMES, SCENE_OBJECTS, LabelledMap, poses
 
 
 def test_what_is_kept_is_what_would_be_made() -> None:
-    stage, teller = Stage(), ObjectPublisher()
+    labelled_map, teller = LabelledMap(), ObjectPublisher()
     counts = set()
 
     def check() -> None:
-        now = stage.objects, NAMES.names, stage.keyframe, 7, 100
+        now = labelled_map.objects, NAMES.names, labelled_map.keyframe, 7, 100
         told = teller.message(*now)
-        assert told.objects == map_objects(stage.objects.landmarks, NAMES.names)
+        assert told.objects == map_objects(labelled_map.objects.landmarks, NAMES.names)
         counts.add(len(told.objects))
 
-    way = poses(12)
-    for _ in stage.walk(THINGS, way):
+    path = poses(12)
+    for _ in labelled_map.walk(SCENE_OBJECTS, path):
         check()
-    stage.objects.move({k: se3.exp(np.full(6, 0.1)) for k in range(4)})
+    labelled_map.objects.move({k: se3.exp(np.full(6, 0.1)) for k in range(4)})
     check()
-    for _ in stage.walk((), np.tile(way[:1], (12, 1, 1))):  # all are taken away
+    for _ in labelled_map.walk((), np.tile(path[:1], (12, 1, 1))):  # all are taken away
         check()
-    assert len(stage.objects) < max(counts)
+    assert len(labelled_map.objects) < max(counts)

@@ -23,7 +23,7 @@ BOXES = np.array([[5.2, 4.1, 40.7, 30.3], [20.0, 10.0, 60.0, 45.0], [30.0, 2.0, 
 SCORES = np.array([0.6, 0.55, 0.9])
 
 
-def scattered(n: int) -> np.ndarray:
+def random_gaussians(n: int) -> np.ndarray:
     rng = np.random.default_rng(n)
     rows = rng.normal(size=(n, 16)).astype(np.float32)
     p_camera = np.stack([*rng.uniform(-1.2, 1.2, (2, n)), rng.uniform(0.5, 3, n)], axis=1)
@@ -38,7 +38,7 @@ def depth_image() -> np.ndarray:
     return depth_m
 
 
-def parts() -> list[Foreground]:
+def foregrounds() -> list[Foreground]:
     rng = np.random.default_rng(1)
     return [
         Foreground(5, 6, rng.random((24, 30)) < 0.6),
@@ -47,7 +47,7 @@ def parts() -> list[Foreground]:
     ]
 
 
-def ours(
+def assign(
     rows: np.ndarray, regions: Regions, config: AssignmentConfig, threads: int = 1
 ) -> Assignment:
     indices = np.arange(len(rows), dtype=np.uint32)
@@ -55,66 +55,71 @@ def ours(
     return assign_gaussians(rows, *where, threads=threads)
 
 
-def test_examples_in_the_docstring_hold() -> None:
+def test_docstring_examples_pass() -> None:
     assert doctest.testmod(label_assignment).failed == 0
 
 
 @pytest.mark.parametrize("rule", ["coverage", "iou"])
 @pytest.mark.parametrize("is_masked", [False, True])
-def test_kernel_does_what_its_twin_does(rule, is_masked) -> None:
-    rows, config = scattered(3000), AssignmentConfig(rule, 0.02 if rule == "iou" else 0.3, 1.0)
-    masks = [part.image((48, 64)) for part in parts()] if is_masked else None
+def test_kernel_matches_reference(rule, is_masked) -> None:
+    rows, config = (
+        random_gaussians(3000),
+        AssignmentConfig(rule, 0.02 if rule == "iou" else 0.3, 1.0),
+    )
+    masks = [part.image((48, 64)) for part in foregrounds()] if is_masked else None
     regions = (
-        Regions.of_foregrounds(BOXES, SCORES, parts())
+        Regions.of_foregrounds(BOXES, SCORES, foregrounds())
         if is_masked
         else Regions.of_boxes(BOXES, SCORES)
     )
-    kernel = ours(rows, regions, config)
+    kernel = assign(rows, regions, config)
     boxes, scores = BOXES.astype(np.float32).astype(float), SCORES.astype(np.float32)
-    twin = assign_reference(rows, CAMERA, T_CAMERA_MAP, depth_image(), boxes, scores, masks, config)
-    differ = kernel.regions != twin.regions  # by rounding, at a threshold
+    reference = assign_reference(
+        rows, CAMERA, T_CAMERA_MAP, depth_image(), boxes, scores, masks, config
+    )
+    differ = kernel.regions != reference.regions  # Rounding at a threshold.
     assert np.count_nonzero(differ) <= 3
-    np.testing.assert_allclose(kernel.overlaps[~differ], twin.overlaps[~differ], atol=2e-4)
-    np.testing.assert_allclose(kernel.depths_m, twin.depths_m, atol=1e-5)
+    np.testing.assert_allclose(kernel.overlaps[~differ], reference.overlaps[~differ], atol=2e-4)
+    np.testing.assert_allclose(kernel.depths_m, reference.depths_m, atol=1e-5)
     for wanted in (HIDDEN, UNMATCHED, 0, 1):
         assert np.count_nonzero(kernel.regions == wanted) > 10
 
 
 @pytest.mark.parametrize("count", [16, 17, 40])
-def test_many_regions_are_tried_as_few_are(count: int) -> None:
-    """More than a vector has lanes, over each other and beside the image."""
-    rng, rows = np.random.default_rng(5), scattered(1500)
+def test_kernel_matches_reference_for_many_regions(count: int) -> None:
+    """More regions than a vector has lanes, overlapping and partly outside of the image."""
+    rng, rows = np.random.default_rng(5), random_gaussians(1500)
     low = rng.uniform(-10, 50, (count, 2))
     boxes = np.concatenate([low, low + rng.uniform(2, 25, (count, 2))], axis=1).astype(np.float32)
     scores = rng.uniform(0.2, 1, count).astype(np.float32)
     config = AssignmentConfig(max_depth_gap_m=1.0)
-    kernel = ours(rows, Regions.of_boxes(boxes, scores), config)
+    kernel = assign(rows, Regions.of_boxes(boxes, scores), config)
     view = CAMERA, T_CAMERA_MAP, depth_image(), boxes.astype(float), scores, None, config
-    twin = assign_reference(rows, *view)
-    assert np.count_nonzero(kernel.regions != twin.regions) <= 3
-    assert kernel.regions.max() >= count - 4, "the last ones have some too"
+    reference = assign_reference(rows, *view)
+    assert np.count_nonzero(kernel.regions != reference.regions) <= 3
+    assert kernel.regions.max() >= count - 4, "the last regions match some Gaussians too"
 
 
-def test_a_mask_that_fills_its_box_is_the_box() -> None:
-    rows, box = scattered(2000), np.array([[9.5, 7.5, 40.5, 30.5]])
+def test_full_mask_equals_its_box() -> None:
+    rows, box = random_gaussians(2000), np.array([[9.5, 7.5, 40.5, 30.5]])
     full = [Foreground(8, 10, np.ones((23, 31), bool))]
     config = AssignmentConfig(max_depth_gap_m=1.0)
-    as_box = ours(rows, Regions.of_boxes(box, np.ones(1)), config)
-    as_mask = ours(rows, Regions.of_foregrounds(box, np.ones(1), full), config)
+    as_box = assign(rows, Regions.of_boxes(box, np.ones(1)), config)
+    as_mask = assign(rows, Regions.of_foregrounds(box, np.ones(1), full), config)
     np.testing.assert_array_equal(as_box.regions, as_mask.regions)
     np.testing.assert_allclose(as_box.overlaps, as_mask.overlaps, atol=1e-4)
 
 
-def test_of_equal_regions_the_first_wins_and_a_surer_one_before_it() -> None:
-    rows, box = scattered(2000), np.array([[0, 0, 63, 47]] * 3, float)
+def test_overlapping_regions_are_ranked_by_score_then_index() -> None:
+    rows, box = random_gaussians(2000), np.array([[0, 0, 63, 47]] * 3, float)
     config = AssignmentConfig(max_depth_gap_m=1.0)
-    equal = ours(rows, Regions.of_boxes(box, np.array([0.5, 0.5, 0.5])), config).regions
-    surer = ours(rows, Regions.of_boxes(box, np.array([0.5, 0.5, 0.6])), config).regions
+    equal = assign(rows, Regions.of_boxes(box, np.array([0.5, 0.5, 0.5])), config).regions
+    better = assign(rows, Regions.of_boxes(box, np.array([0.5, 0.5, 0.6])), config).regions
     assert set(equal) == {HIDDEN, UNMATCHED, 0} or set(equal) == {HIDDEN, 0}
-    np.testing.assert_array_equal(surer[equal == 0], 2)
+    np.testing.assert_array_equal(better[equal == 0], 2)
 
 
-def test_a_gaussian_behind_the_surface_is_hidden() -> None:
+def test_gaussian_behind_measured_surface_is_hidden() -> None:
     rows = np.zeros((2, 16), np.float32)
     rows[:, 2], rows[:, 3:6], rows[:, 6] = [1.0, 1.2], -4, 1
     regions = Regions.of_boxes(np.array([[0, 0, 63, 47]], float), np.ones(1))
@@ -123,34 +128,34 @@ def test_a_gaussian_behind_the_surface_is_hidden() -> None:
     assert seen.regions.tolist() == [0, HIDDEN]
 
 
-def test_without_regions_all_that_is_seen_is_unmatched() -> None:
+def test_visible_gaussians_are_unmatched_without_regions() -> None:
     none = Regions.of_boxes(np.zeros((0, 4)), np.zeros(0))
-    seen = ours(scattered(500), none, AssignmentConfig(max_depth_gap_m=1.0))
+    seen = assign(random_gaussians(500), none, AssignmentConfig(max_depth_gap_m=1.0))
     assert set(seen.regions.tolist()) == {HIDDEN, UNMATCHED}
 
 
-def test_gaussians_that_are_not_finite_are_hidden() -> None:
-    rows = scattered(100)
+def test_non_finite_gaussians_are_hidden() -> None:
+    rows = random_gaussians(100)
     rows[::2, 4], rows[1::4, 0] = np.nan, np.inf
-    seen = ours(rows, Regions.of_boxes(BOXES, SCORES), AssignmentConfig(max_depth_gap_m=9.0))
+    seen = assign(rows, Regions.of_boxes(BOXES, SCORES), AssignmentConfig(max_depth_gap_m=9.0))
     assert np.all(seen.regions[::2] == HIDDEN)
     assert np.all(seen.regions[1::4] == HIDDEN)
 
 
-def test_a_point_that_rounds_to_behind_the_image_is_its_last_pixel() -> None:
-    """The last float below 0.5, plus a half, is 1: what lies behind is not of the image."""
+def test_point_that_rounds_past_the_image_uses_the_last_pixel() -> None:
+    """The last float below 0.5, plus a half, is 1, which lies outside of the image."""
     rows, memory = np.zeros((1, 16), np.float32), np.array([[1.0, 9.0]], np.float32)
     rows[0, 2], rows[0, 3:6], rows[0, 6] = 1.0, -4, 1
     just_short = float(np.nextafter(np.float32(0.5), np.float32(0)))
     camera = Camera(1, 1, 50.0, 50.0, just_short, 0.0)
     regions = Regions.of_boxes(np.array([[0.0, 0.0, 0.0, 0.0]]), np.ones(1))
-    look = rows, np.zeros(1, np.uint32), camera, np.eye(4), memory.ravel()[:1].reshape(1, 1)
-    assert assign_gaussians(*look, regions, AssignmentConfig()).regions.tolist() != [HIDDEN]
+    view = rows, np.zeros(1, np.uint32), camera, np.eye(4), memory.ravel()[:1].reshape(1, 1)
+    assert assign_gaussians(*view, regions, AssignmentConfig()).regions.tolist() != [HIDDEN]
 
 
-def test_bits_do_not_depend_on_the_number_of_threads() -> None:
-    rows, regions = scattered(20_000), Regions.of_foregrounds(BOXES, SCORES, parts())
-    alone, many = (ours(rows, regions, AssignmentConfig(), threads) for threads in (1, 3))
+def test_result_is_bitwise_equal_for_any_thread_count() -> None:
+    rows, regions = random_gaussians(20_000), Regions.of_foregrounds(BOXES, SCORES, foregrounds())
+    alone, many = (assign(rows, regions, AssignmentConfig(), threads) for threads in (1, 3))
     assert alone.regions.tobytes() == many.regions.tobytes()
     assert alone.overlaps.tobytes() == many.overlaps.tobytes()
 
@@ -164,19 +169,19 @@ def test_bits_do_not_depend_on_the_number_of_threads() -> None:
         ([[0, 0, 1, 1]], [1, 1], "shape"),
     ],
 )
-def test_regions_that_do_not_fit_are_refused(boxes, scores, message) -> None:
+def test_invalid_regions_raise(boxes, scores, message) -> None:
     regions = Regions.of_boxes(np.array(boxes, float), np.array(scores, float))
     with pytest.raises(ValueError, match=message):
-        ours(scattered(10), regions, AssignmentConfig())
+        assign(random_gaussians(10), regions, AssignmentConfig())
 
 
-def test_tables_that_do_not_fit_are_refused() -> None:
-    good = Regions.of_foregrounds(BOXES, SCORES, parts())
-    short = Regions(good.boxes, good.scores, good.rects, good.sums[:-1])
+def test_truncated_summed_area_table_raises() -> None:
+    valid = Regions.of_foregrounds(BOXES, SCORES, foregrounds())
+    truncated = Regions(valid.boxes, valid.scores, valid.rects, valid.sums[:-1])
     with pytest.raises(ValueError, match="sums must hold"):
-        ours(scattered(10), short, AssignmentConfig())
+        assign(random_gaussians(10), truncated, AssignmentConfig())
 
 
-def test_unknown_rules_are_refused() -> None:
+def test_unknown_rule_raises_config_error() -> None:
     with pytest.raises(ConfigError, match="coverage"):
         AssignmentConfig(rule="all")  # type: ignore[arg-type]

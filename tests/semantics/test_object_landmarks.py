@@ -1,4 +1,4 @@
-"""The table of landmarks against plain loops and against shapes that are known."""
+"""Table of object landmarks against plain loops and known shapes."""
 
 import numpy as np
 import pytest
@@ -24,19 +24,21 @@ from ldo_service.semantics.object_landmarks import (
 )
 
 CHAIR = 58
-ids = st.lists(st.integers(0, 10**12), max_size=400, unique=True)
+id_lists = st.lists(st.integers(0, 10**12), max_size=400, unique=True)
 
 
 def packed(members: list[int], votes: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [1, 256] in shuffled order."""
+    """Return members and votes [1, 256] in shuffled order."""
     out = np.full((1, MEMBERS), NO_MEMBER)
     ordered = sorted(members, key=lambda i: int(shuffled(np.array(i))))[:MEMBERS]
     out[0, : len(ordered)] = ordered
     return out, np.where(out >= 0, votes, 0).astype(np.int8)
 
 
-@given(ids, ids)
-def test_a_union_is_the_first_of_all_and_keeps_votes(one: list[int], other: list[int]) -> None:
+@given(id_lists, id_lists)
+def test_joined_members_are_first_in_shuffled_order_and_keep_votes(
+    one: list[int], other: list[int]
+) -> None:
     members, votes = packed(one, 5)
     others, other_votes = packed(other, 1)
     got, got_votes = joined(members, votes, others, other_votes)
@@ -47,42 +49,42 @@ def test_a_union_is_the_first_of_all_and_keeps_votes(one: list[int], other: list
     assert got_votes[0].tolist() == expected_votes
 
 
-@given(ids, ids)
-def test_a_union_is_the_same_in_either_order(one: list[int], other: list[int]) -> None:
+@given(id_lists, id_lists)
+def test_joined_members_do_not_depend_on_order(one: list[int], other: list[int]) -> None:
     a, b = packed(one), packed(other)
     np.testing.assert_array_equal(joined(*a, *b)[0], joined(*b, *a)[0])
 
 
-def test_who_has_no_vote_left_goes() -> None:
+def test_members_without_votes_are_removed() -> None:
     members, votes = packed([1, 2, 3])
     votes[members == 2] = 0
     got, _ = joined(members, votes, *packed([4]))
     assert sorted(got[got >= 0].tolist()) == [1, 3, 4]
 
 
-def test_places_of_ids_are_all_different_and_spread() -> None:
-    places = shuffled(np.arange(100_000))
-    assert len(np.unique(places)) == 100_000
-    per_cell = np.bincount((places >> np.uint64(58)).astype(int))
+def test_shuffled_ids_are_unique_and_uniform() -> None:
+    positions = shuffled(np.arange(100_000))
+    assert len(np.unique(positions)) == 100_000
+    per_cell = np.bincount((positions >> np.uint64(58)).astype(int))
     assert per_cell.max() - per_cell.min() < 10
 
 
-def test_rows_of_ids_that_are_there() -> None:
-    have = np.array([2, 5, 9])
+def test_rows_of_gives_minus_one_for_missing_ids() -> None:
+    resident_ids = np.array([2, 5, 9])
     np.testing.assert_array_equal(
-        rows_of(np.array([[9, 3], [2, NO_MEMBER]]), have), [[2, -1], [0, -1]]
+        rows_of(np.array([[9, 3], [2, NO_MEMBER]]), resident_ids), [[2, -1], [0, -1]]
     )
-    np.testing.assert_array_equal(rows_of(np.array([4]), have[:0]), [-1])
+    np.testing.assert_array_equal(rows_of(np.array([4]), resident_ids[:0]), [-1])
 
 
 # --- shapes ---------------------------------------------------------------------------------------
 def cloud(size: tuple[float, float, float], T: np.ndarray, count: int = 250) -> np.ndarray:
-    """Points [1, 250, 3] in a box."""
+    """Return points [1, count, 3] in a box of the given size and pose."""
     rng = np.random.default_rng(3)
     return se3.transform(T, (rng.random((count, 3)) - 0.5) * size)[None]
 
 
-def test_a_turned_box_is_found_with_its_size_and_without_strays() -> None:
+def test_rotated_box_is_recovered_despite_outliers() -> None:
     T = se3.exp(np.array([0.0, 0.0, 0.6, 1.0, -2.0, 0.5]))
     p = cloud((2.0, 0.6, 0.3), T)
     p[0, :4] += 50
@@ -96,7 +98,7 @@ def test_a_turned_box_is_found_with_its_size_and_without_strays() -> None:
     assert np.linalg.det(T_map_object[0, :3, :3]) == pytest.approx(1)
 
 
-def test_a_cube_stays_along_the_axes_of_the_map() -> None:
+def test_box_of_a_cube_is_aligned_with_map_axes() -> None:
     p = cloud((1.0, 1.0, 1.0), np.eye(4))
     _, covariance = moments(p, np.ones(p.shape[:2]))
     T, _ = boxes(p, np.ones(p.shape[:2], bool), covariance)
@@ -104,7 +106,7 @@ def test_a_cube_stays_along_the_axes_of_the_map() -> None:
 
 
 @given(st.integers(1, MEMBERS), st.integers(0, 2**32))
-def test_trimming_leaves_out_a_fiftieth_at_each_end(count: int, seed: int) -> None:
+def test_trimmed_drops_two_percent_at_each_end(count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     values, valid = rng.normal(size=(1, MEMBERS, 2)), np.arange(MEMBERS)[None] < count
     low, high = trimmed(values, valid)
@@ -114,14 +116,17 @@ def test_trimming_leaves_out_a_fiftieth_at_each_end(count: int, seed: int) -> No
     np.testing.assert_array_equal(high[0], ordered[count - 1 - cut])
 
 
-def test_of_no_values_ends_are_empty() -> None:
+def test_trimmed_without_values_gives_empty_range() -> None:
     low, high = trimmed(np.zeros((1, 4, 1)), np.zeros((1, 4), bool))
     assert low[0, 0] > high[0, 0]
 
 
 # --- the table ------------------------------------------------------------------------------------
 def one_landmark(p: np.ndarray, opacity_logits: np.ndarray) -> tuple[np.ndarray, tuple]:
-    """A landmark of Gaussians at p [M, 3], which are all of the map; half of the last is chair."""
+    """Return a landmark of all Gaussians of a map at p [M, 3].
+
+    The Gaussians are chairs; the last one is half background.
+    """
     m = len(p)
     rows, labels = np.zeros((m, 16), np.float32), new_labels(m)
     rows[:, :3], rows[:, 10] = p, opacity_logits
@@ -133,7 +138,7 @@ def one_landmark(p: np.ndarray, opacity_logits: np.ndarray) -> tuple[np.ndarray,
     return table, (rows, labels, np.arange(m), anchors)
 
 
-def test_means_are_weighted_by_opacity() -> None:
+def test_landmark_statistics_are_weighted_by_opacity() -> None:
     p = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
     logits = np.array([0.0, 1.0, 2.0, 3.0])
     table, gaussians = one_landmark(p, logits)
@@ -145,23 +150,23 @@ def test_means_are_weighted_by_opacity() -> None:
     background = 0.5 * weights[-1] / weights.sum()
     assert table["labels"][0, :2].tolist() == [CHAIR, 0]
     np.testing.assert_allclose(table["weights"][0, :2], [1 - background, background], rtol=1e-6)
-    assert table["anchor"].tolist() == [3]  # two of each: the smaller
+    assert table["anchor"].tolist() == [3]  # Two Gaussians of each anchor: the smaller id.
 
 
-def test_a_landmark_too_few_of_whose_gaussians_are_awake_stays() -> None:
-    table, (rows, labels, ids_, anchors) = one_landmark(np.eye(3), np.zeros(3))
+def test_landmark_with_too_few_resident_gaussians_is_not_changed() -> None:
+    table, (rows, labels, ids, anchors) = one_landmark(np.eye(3), np.zeros(3))
     before = table.copy()
-    derive(table, rows[:1], labels[:1], ids_[:1], anchors[:1], least=2)
+    derive(table, rows[:1], labels[:1], ids[:1], anchors[:1], least=2)
     np.testing.assert_array_equal(table, before)
 
 
-def test_members_with_few_votes_are_not_believed() -> None:
+def test_members_with_few_votes_are_not_reliable() -> None:
     table = new_landmarks(1, 0)
     table["votes"][0, :4] = 8, 3, 2, 0
     assert reliable_members(table)[0, :5].tolist() == [True, True, False, False, False]
 
 
-def test_a_moved_landmark_is_one_of_moved_gaussians() -> None:
+def test_moved_landmark_encloses_moved_gaussians() -> None:
     p = cloud((1.0, 0.4, 0.2), np.eye(4))[0]
     table, (rows, *others) = one_landmark(p, np.zeros(len(p)))
     derive(table, rows, *others, least=1)
@@ -175,7 +180,7 @@ def test_a_moved_landmark_is_one_of_moved_gaussians() -> None:
 
 
 @given(st.floats(-4, 4), st.floats(-4, 4), st.floats(-2, 6))
-def test_whoever_has_a_point_in_the_image_is_within_view(x: float, y: float, z: float) -> None:
+def test_landmark_with_a_point_in_the_image_is_within_view(x: float, y: float, z: float) -> None:
     camera = Camera(64, 48, 50.0, 60.0, 30.0, 25.0)
     table = new_landmarks(1, 0)
     table["centroid"], table["size"] = [x, y, z], [0.5, 0.2, 0.3]
@@ -187,7 +192,7 @@ def test_whoever_has_a_point_in_the_image_is_within_view(x: float, y: float, z: 
         assert within(table, camera, np.eye(4))[0]
 
 
-def test_what_is_far_off_or_behind_is_not_within_view() -> None:
+def test_landmark_outside_or_behind_the_camera_is_not_within_view() -> None:
     camera = Camera(64, 48, 50.0, 60.0, 30.0, 25.0)
     table = new_landmarks(3, 0)
     table["centroid"], table["size"] = [[0, 0, -1], [5, 0, 1], [0, 0, 3]], 0.3

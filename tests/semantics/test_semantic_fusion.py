@@ -1,4 +1,4 @@
-"""A wall with a thing before it, as Gaussians of one pixel each."""
+"""Semantic fusion on a wall with an object in front, with one Gaussian per pixel."""
 
 from dataclasses import replace
 
@@ -20,20 +20,22 @@ from ldo_service.semantics.semantic_fusion import (
     reliable_label_mask,
 )
 
+from .scenes import NO_DETECTIONS
+
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
-THING = slice(20, 44), slice(36, 60)
-BOX = np.array([[30.0, 14.0, 66.0, 50.0]])  # six pixels larger on each side
+OBJECT = slice(20, 44), slice(36, 60)
+BOX = np.array([[30.0, 14.0, 66.0, 50.0]])  # Six pixels larger on each side.
 CHAIR, LAMP = 58, 90
 
 
 def depth_image() -> np.ndarray:
     depth_m = np.full((64, 96), 2.0, np.float32)
-    depth_m[THING] = 1.2
+    depth_m[OBJECT] = 1.2
     return depth_m
 
 
-def surfels() -> np.ndarray:
-    """One per pixel, sharp and opaque."""
+def pixel_gaussians() -> np.ndarray:
+    """Return the rows of one small, opaque Gaussian per pixel."""
     depth_m = depth_image()
     rows = aligned_rows(depth_m.size)
     rows[:] = 0
@@ -43,161 +45,159 @@ def surfels() -> np.ndarray:
     return rows
 
 
-def thing() -> np.ndarray:
+def object_mask() -> np.ndarray:
     out = np.zeros((64, 96), bool)
-    out[THING] = True
+    out[OBJECT] = True
     return out
 
 
-def claims(detector: float = 0.8, labeller: float = 0.0) -> RegionDetections:
+def detections(detector: float = 0.8, labeller: float = 0.0) -> RegionDetections:
     labels = np.array([CHAIR]), np.array([detector], np.float32)
     return RegionDetections(BOX, *labels, np.array([LAMP]), np.array([labeller], np.float32))
 
 
 def labelled(
-    config: SemanticFusionConfig, *what: RegionDetections, late: RegionDetections | None = None
+    config: SemanticFusionConfig, *batches: RegionDetections, late: RegionDetections | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    rows = surfels()
+    rows = pixel_gaussians()
     labels, indices = new_labels(len(rows)), np.arange(len(rows), dtype=np.uint32)
     view = CAMERA, np.eye(4), depth_image()
-    for claim in what:
-        fuse_detections(rows, labels, indices, *view, claim, config)
+    for batch in batches:
+        fuse_detections(rows, labels, indices, *view, batch, config)
     if late is not None:
         fuse_detections(rows, labels, indices, *view, late, config, is_late=True)
     return rows, labels
 
 
-def test_the_thing_gets_the_label_and_the_wall_in_its_box_does_not() -> None:
-    _, labels = labelled(SemanticFusionConfig(), claims())
+def test_foreground_gets_label_and_wall_in_the_box_does_not() -> None:
+    _, labels = labelled(SemanticFusionConfig(), detections())
     got = (top_labels(labels) == CHAIR).reshape(64, 96)
-    assert np.mean(got[thing()]) > 0.95
-    assert np.count_nonzero(got & ~thing()) < 0.02 * np.count_nonzero(thing())
+    assert np.mean(got[object_mask()]) > 0.95
+    assert np.count_nonzero(got & ~object_mask()) < 0.02 * np.count_nonzero(object_mask())
 
 
-def test_what_is_said_anew_stands_alone() -> None:
-    """Ten boxes of a chair, and an answer about what stands on it."""
-    before = [claims()] * 10
-    late = claims(0, 0.9)
-    for anew, label, share in ((False, CHAIR, 0.15), (True, LAMP, 1.0)):
+def test_replacing_label_result_overrides_earlier_detections() -> None:
+    """Ten detections of a chair, then a label result for an object on it."""
+    before = [detections()] * 10
+    late = detections(0, 0.9)
+    for replaces_labels, label, weight in ((False, CHAIR, 0.15), (True, LAMP, 1.0)):
         _, labels = labelled(
-            SemanticFusionConfig(), *before, late=replace(late, replaces_labels=anew)
+            SemanticFusionConfig(), *before, late=replace(late, replaces_labels=replaces_labels)
         )
-        was = fields(labelled(SemanticFusionConfig(), *before)[1])
-        of_thing = fields(labels)[thing().ravel()]
-        assert np.mean(top_labels(labels)[thing().ravel()] == label) > 0.95
-        shares = np.where(of_thing["ids"] == LAMP, of_thing["weights"], 0).sum(axis=1)
-        assert np.median(shares) == pytest.approx(share, abs=0.05)
-        # the wall keeps what it had
-        wall = ~thing().ravel() & (top_labels(labels) != LAMP)
-        assert np.array_equal(fields(labels)["weights"][wall], was["weights"][wall])
+        before_late = fields(labelled(SemanticFusionConfig(), *before)[1])
+        of_object = fields(labels)[object_mask().ravel()]
+        assert np.mean(top_labels(labels)[object_mask().ravel()] == label) > 0.95
+        weights = np.where(of_object["ids"] == LAMP, of_object["weights"], 0).sum(axis=1)
+        assert np.median(weights) == pytest.approx(weight, abs=0.05)
+        # The labels of the wall stay.
+        wall = ~object_mask().ravel() & (top_labels(labels) != LAMP)
+        assert np.array_equal(fields(labels)["weights"][wall], before_late["weights"][wall])
 
 
-def test_by_box_the_wall_becomes_chair_too() -> None:
-    _, labels = labelled(SemanticFusionConfig(region="box"), claims())
+def test_box_region_labels_the_wall_too() -> None:
+    _, labels = labelled(SemanticFusionConfig(region="box"), detections())
     got = (top_labels(labels) == CHAIR).reshape(64, 96)
-    assert np.count_nonzero(got) > 2 * np.count_nonzero(thing())
+    assert np.count_nonzero(got) > 2 * np.count_nonzero(object_mask())
 
 
-def test_the_literal_rule_labels_nothing_here() -> None:
+def test_iou_rule_labels_no_small_gaussians() -> None:
     config = SemanticFusionConfig(assignment=AssignmentConfig("iou"))
-    _, labels = labelled(config, claims())
+    _, labels = labelled(config, detections())
     assert not top_labels(labels).any()
 
 
-@pytest.mark.parametrize(("rule", "wins"), [("adaptive", LAMP), ("detector", CHAIR)])
-def test_a_surer_labeller_overrules_the_detector_where_it_is_heard(rule, wins) -> None:
+@pytest.mark.parametrize(("rule", "expected"), [("adaptive", LAMP), ("detector", CHAIR)])
+def test_labeller_overrides_detector_only_with_adaptive_rule(rule, expected) -> None:
     config = SemanticFusionConfig(fusion=FusionConfig(rule=rule))
-    _, labels = labelled(config, claims(detector=0.3, labeller=0.9))
-    assert np.median(top_labels(labels).reshape(64, 96)[THING]) == wins
+    _, labels = labelled(config, detections(detector=0.3, labeller=0.9))
+    assert np.median(top_labels(labels).reshape(64, 96)[OBJECT]) == expected
 
 
-def test_a_late_answer_lands_on_the_thing_and_misses_nothing_else() -> None:
-    _, once = labelled(SemanticFusionConfig(), claims(detector=0.3))
+def test_late_label_result_labels_object_without_counting_misses() -> None:
+    _, once = labelled(SemanticFusionConfig(), detections(detector=0.3))
     _, labels = labelled(
-        SemanticFusionConfig(), claims(detector=0.3), late=claims(detector=0.0, labeller=0.9)
+        SemanticFusionConfig(),
+        detections(detector=0.3),
+        late=detections(detector=0.0, labeller=0.9),
     )
-    assert np.median(top_labels(labels).reshape(64, 96)[THING]) == LAMP
-    outside = ~thing().ravel()
+    assert np.median(top_labels(labels).reshape(64, 96)[OBJECT]) == LAMP
+    outside = ~object_mask().ravel()
     np.testing.assert_array_equal(
         fields(labels)["misses"][outside], fields(once)["misses"][outside]
     )
 
 
-def test_a_late_answer_that_the_detector_outweighs_is_not_counted_again() -> None:
-    sure, doubt = claims(detector=0.9), claims(detector=0.9, labeller=0.3)
-    _, once = labelled(SemanticFusionConfig(), sure)
-    _, labels = labelled(SemanticFusionConfig(), sure, late=doubt)
+def test_late_label_result_below_detector_weight_changes_nothing() -> None:
+    confident, uncertain = detections(detector=0.9), detections(detector=0.9, labeller=0.3)
+    _, once = labelled(SemanticFusionConfig(), confident)
+    _, labels = labelled(SemanticFusionConfig(), confident, late=uncertain)
     np.testing.assert_array_equal(labels, once)
 
 
-def test_pixels_that_were_asked_about_are_labelled_whatever_else_is_in_the_box() -> None:
+def test_only_requested_pixels_are_labelled() -> None:
     upper = Foreground(20, 36, np.ones((10, 24), bool))
-    _, labels = labelled(SemanticFusionConfig(), replace(claims(0, 0.9), parts=(upper,)))
+    _, labels = labelled(SemanticFusionConfig(), replace(detections(0, 0.9), parts=(upper,)))
     got = (top_labels(labels) == LAMP).reshape(64, 96)
     assert np.mean(got[20:30, 36:60]) > 0.9
     assert not got[32:].any()
 
 
-def test_by_the_detector_alone_what_only_the_labeller_says_is_not_heard() -> None:
+def test_detector_rule_ignores_regions_of_the_labeller() -> None:
     rule, ema = FusionConfig(rule="detector"), LabelConfig(ema="paper")
-    _, labels = labelled(SemanticFusionConfig(fusion=rule, labels=ema), claims(0, 0.9))
-    assert not labels[thing().ravel()].any()
+    _, labels = labelled(SemanticFusionConfig(fusion=rule, labels=ema), detections(0, 0.9))
+    assert not labels[object_mask().ravel()].any()
 
 
-def test_a_detector_cannot_miss_what_it_does_not_know() -> None:
+def test_labels_unknown_to_the_detector_are_not_missed() -> None:
     config = SemanticFusionConfig(labels=LabelConfig(least_px=20))
-    rows, labels = labelled(config, late=claims(0, 0.9))
+    rows, labels = labelled(config, late=detections(0, 0.9))
     at = np.arange(len(rows), dtype=np.uint32), CAMERA, np.eye(4), depth_image()
-    nothing = RegionDetections.of_detector(
-        np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32)
-    )
     lamps, spared = labels.copy(), np.zeros(256, bool)
     spared[LAMP] = True
     for _ in range(9):
-        fuse_detections(rows, lamps, *at, nothing, config, spared=spared)
-        fuse_detections(rows, labels, *at, nothing, config)
-    assert np.mean(top_labels(lamps).reshape(64, 96)[thing()] == LAMP) > 0.9
-    assert not top_labels(labels).any(), "what it knows, it can miss"
+        fuse_detections(rows, lamps, *at, NO_DETECTIONS, config, spared=spared)
+        fuse_detections(rows, labels, *at, NO_DETECTIONS, config)
+    assert np.mean(top_labels(lamps).reshape(64, 96)[object_mask()] == LAMP) > 0.9
+    assert not top_labels(labels).any(), "a class that the detector knows can be missed"
 
 
-def test_a_pixel_has_a_reliable_name_where_its_gaussian_has() -> None:
+def test_reliable_label_mask_follows_weight_of_front_gaussian() -> None:
     labels, top = new_labels(3), np.array([[0, 1], [2, -1]])
     fields(labels)["weights"][:2, 0], fields(labels)["ids"][:2, 0] = [0.7, 0.5], CHAIR
     assert reliable_label_mask(labels, top, 0.6).tolist() == [[True, False], [False, False]]
 
 
-def test_a_keyframe_without_claims_counts_misses_of_what_is_in_view() -> None:
-    none = RegionDetections.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
-    _, labels = labelled(SemanticFusionConfig(), none)
+def test_keyframe_without_detections_counts_misses_in_view() -> None:
+    _, labels = labelled(SemanticFusionConfig(), NO_DETECTIONS)
     assert np.all(fields(labels)["misses"] == 1)
 
 
-def test_gaussians_that_are_not_finite_stay_without_a_label() -> None:
-    rows, config = surfels(), SemanticFusionConfig()
-    broken = np.flatnonzero(thing())[::7]
+def test_non_finite_gaussians_are_not_labelled() -> None:
+    rows, config = pixel_gaussians(), SemanticFusionConfig()
+    broken = np.flatnonzero(object_mask())[::7]
     rows[broken, 2] = np.nan
     labels, indices = new_labels(len(rows)), np.arange(len(rows), dtype=np.uint32)
-    fuse_detections(rows, labels, indices, CAMERA, np.eye(4), depth_image(), claims(), config)
+    fuse_detections(rows, labels, indices, CAMERA, np.eye(4), depth_image(), detections(), config)
     is_chair = top_labels(labels) == CHAIR
     assert not is_chair[broken].any()
-    assert np.mean(is_chair[np.setdiff1d(np.flatnonzero(thing()), broken)]) > 0.95
+    assert np.mean(is_chair[np.setdiff1d(np.flatnonzero(object_mask()), broken)]) > 0.95
 
 
-def test_an_image_of_labels_shows_the_thing() -> None:
-    rows, labels = labelled(SemanticFusionConfig(), claims())
+def test_label_image_shows_the_object() -> None:
+    rows, labels = labelled(SemanticFusionConfig(), detections())
     shown = render(rows, CAMERA, np.eye(4), contributions=True)
     image = label_image(rows, labels, shown, CAMERA, np.eye(4))
-    agreement = np.count_nonzero((image == CHAIR) & thing())
-    # splats reach a pixel over the edge
-    assert agreement > 0.8 * np.count_nonzero((image == CHAIR) | thing())
+    agreement = np.count_nonzero((image == CHAIR) & object_mask())
+    # Gaussians cover one pixel beyond the edge.
+    assert agreement > 0.8 * np.count_nonzero((image == CHAIR) | object_mask())
 
 
-def test_an_image_of_labels_is_of_the_largest_sum_not_of_the_nearest_gaussian() -> None:
-    """Three in a row, each of a fourth to a third of the pixel; the two behind agree."""
+def test_label_image_uses_largest_weight_sum_not_nearest_gaussian() -> None:
+    """Three Gaussians on a ray, each with a fourth to a third of the weight; the last two agree."""
     rows, labels = aligned_rows(3), new_labels(3)
     rows[:] = 0
     rows[:, 2], rows[:, 3:6], rows[:, 6] = [1, 1.1, 1.2], -1, 1
-    alphas = np.array([0.3, 0.35, 0.5])  # weights 0.3, 0.245, 0.2275
+    alphas = np.array([0.3, 0.35, 0.5])  # Blending weights 0.3, 0.245 and 0.2275.
     rows[:, 10] = np.log(alphas / (1 - alphas))
     fields(labels)["weights"][:, 0], fields(labels)["ids"][:, 0] = 1, [CHAIR, LAMP, LAMP]
     shown = render(rows, CAMERA, np.eye(4), contributions=True)
@@ -206,32 +206,29 @@ def test_an_image_of_labels_is_of_the_largest_sum_not_of_the_nearest_gaussian() 
     assert label_image(rows, labels, shown, CAMERA, np.eye(4))[31, 47] == LAMP
 
 
-def test_a_name_the_detector_cannot_know_is_not_held_back_by_what_it_missed() -> None:
-    """Ten keyframes of misses are worth 2 answers of 0.9."""
-    nothing = RegionDetections.of_detector(
-        np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32)
-    )
+def test_earlier_misses_do_not_delay_a_label_unknown_to_the_detector() -> None:
+    """Ten keyframes of misses have the weight of two label results of 0.9."""
     config = SemanticFusionConfig(labels=LabelConfig(least_px=1))
-    rows, labels = labelled(config, *[nothing] * 10)
+    rows, labels = labelled(config, *[NO_DETECTIONS] * 10)
     view = np.arange(len(rows), dtype=np.uint32), CAMERA, np.eye(4), depth_image()
     spared, known = np.zeros(256, bool), labels.copy()
     spared[LAMP] = True
-    for told, which in ((spared, labels), (None, known)):
-        said = claims(0, 0.9)
-        fuse_detections(rows, which, *view, said, config, is_late=True, spared=told)
-    assert np.mean(top_labels(labels).reshape(64, 96)[thing()] == LAMP) > 0.9
-    assert not top_labels(known).any(), "what it knows, it did miss"
+    for spared_classes, fused in ((spared, labels), (None, known)):
+        late = detections(0, 0.9)
+        fuse_detections(rows, fused, *view, late, config, is_late=True, spared=spared_classes)
+    assert np.mean(top_labels(labels).reshape(64, 96)[object_mask()] == LAMP) > 0.9
+    assert not top_labels(known).any(), "a class that the detector knows was missed"
 
 
-def test_what_lies_on_a_thing_is_no_part_of_its_region() -> None:
+def test_nested_object_is_cut_from_the_region_below_it() -> None:
     table, cup = (Foreground(20, 36, np.ones(shape, bool)) for shape in ((24, 24), (6, 6)))
     boxes = np.array([[35.5, 19.5, 59.5, 43.5], [35.5, 19.5, 41.5, 25.5]])
-    told = RegionDetections.of_detector(
+    both = RegionDetections.of_detector(
         boxes, np.array([CHAIR, LAMP]), np.array([0.9, 0.7], np.float32)
     )
     regions = regions_of(
-        replace(told, parts=(table, cup)), depth_image(), CAMERA, SemanticFusionConfig()
+        replace(both, parts=(table, cup)), depth_image(), CAMERA, SemanticFusionConfig()
     )
     table.mask[:6, :6] = False
-    expected = Regions.of_foregrounds(boxes, told.scores(), (table, cup))
+    expected = Regions.of_foregrounds(boxes, both.scores(), (table, cup))
     np.testing.assert_array_equal(regions.sums, expected.sums)

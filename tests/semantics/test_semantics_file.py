@@ -1,4 +1,4 @@
-"""Labels in a file come back to the bit, and nothing else is taken for them."""
+"""Semantics file: round trip and rejection of invalid files."""
 
 from pathlib import Path
 
@@ -19,67 +19,67 @@ from ldo_service.semantics.semantics_file import read_semantics, write_semantics
 N = 50
 
 
-def seen(times: int = 8) -> np.ndarray:
-    """Labels of Gaussians after some keyframes, a few of them never seen."""
+def random_labels(times: int = 8) -> np.ndarray:
+    """Return labels of Gaussians after some keyframes; a few were never observed."""
     rng, labels = np.random.default_rng(0), new_labels(N)
     for _ in range(times):
         indices = np.flatnonzero(rng.random(N - 5) < 0.6).astype(np.uint32)
-        said = rng.integers(-1, len(FIRST_NAMES), len(indices)).astype(np.int16)
+        observed = rng.integers(-1, len(FIRST_NAMES), len(indices)).astype(np.int16)
         numbers = rng.random((2, len(indices)), np.float32)
-        observe(labels, Observations(indices, said, *numbers), LabelConfig())
+        observe(labels, Observations(indices, observed, *numbers), LabelConfig())
     return labels
 
 
 @pytest.fixture
-def written(tmp_path: Path) -> Path:
-    write_semantics(tmp_path / "semantics.npz", seen(), FIRST_NAMES)
+def semantics_file(tmp_path: Path) -> Path:
+    write_semantics(tmp_path / "semantics.npz", random_labels(), FIRST_NAMES)
     return tmp_path / "semantics.npz"
 
 
-def rewritten(path: Path, **changed: np.ndarray) -> None:
+def rewrite(path: Path, **changed: np.ndarray) -> None:
     with np.load(path) as file:
         arrays = {**file, **changed}
     np.savez(path, **arrays)
 
 
-def test_labels_come_back_to_the_bit(written: Path) -> None:
-    saved = read_semantics(written, N)
-    assert saved.labels.tobytes() == seen().tobytes()
+def test_labels_are_read_back_bitwise_equal(semantics_file: Path) -> None:
+    saved = read_semantics(semantics_file, N)
+    assert saved.labels.tobytes() == random_labels().tobytes()
     assert saved.names == FIRST_NAMES
 
 
-def test_numpy_alone_reads_what_each_gaussian_is(written: Path) -> None:
-    with np.load(written) as file:
+def test_file_is_readable_with_numpy_alone(semantics_file: Path) -> None:
+    with np.load(semantics_file) as file:
         weights, ids, names = file["weights"], file["ids"], file["names"]
     row = int(np.argmax(weights[:, 0]))
-    record = fields(seen())[row]
+    record = fields(random_labels())[row]
     assert str(names[ids[row, 0]]) == FIRST_NAMES[record["ids"][0]]
     assert np.all(weights.sum(axis=1) <= 1 + 1e-6)
 
 
-def test_the_same_labels_make_the_same_file(written: Path, tmp_path: Path) -> None:
-    write_semantics(tmp_path / "again.npz", seen(), FIRST_NAMES)
-    assert (tmp_path / "again.npz").read_bytes() == written.read_bytes()
+def test_equal_labels_give_bitwise_equal_files(semantics_file: Path, tmp_path: Path) -> None:
+    write_semantics(tmp_path / "again.npz", random_labels(), FIRST_NAMES)
+    assert (tmp_path / "again.npz").read_bytes() == semantics_file.read_bytes()
 
 
-def test_labels_of_another_map_are_refused(written: Path) -> None:
+def test_labels_of_another_map_raise(semantics_file: Path) -> None:
     with pytest.raises(DataError, match="labels 50 Gaussians, but the map next to it has 51"):
-        read_semantics(written, N + 1)
+        read_semantics(semantics_file, N + 1)
 
 
 @pytest.mark.parametrize("keep", [0, 10, 300, -30])
-def test_a_truncated_file_is_refused(written: Path, keep: int) -> None:
-    written.write_bytes(written.read_bytes()[:keep])
+def test_truncated_file_raises(semantics_file: Path, keep: int) -> None:
+    semantics_file.write_bytes(semantics_file.read_bytes()[:keep])
     with pytest.raises(DataError, match="cannot be read as labels"):
-        read_semantics(written)
+        read_semantics(semantics_file)
 
 
-def test_a_damaged_file_is_refused(written: Path) -> None:
-    body = bytearray(written.read_bytes())
+def test_damaged_file_raises(semantics_file: Path) -> None:
+    body = bytearray(semantics_file.read_bytes())
     body[len(body) // 2] ^= 0xFF
-    written.write_bytes(body)
+    semantics_file.write_bytes(body)
     with pytest.raises(DataError, match=r"semantics\.npz"):
-        read_semantics(written)
+        read_semantics(semantics_file)
 
 
 @pytest.mark.parametrize(
@@ -92,13 +92,13 @@ def test_a_damaged_file_is_refused(written: Path) -> None:
         ({"names": np.array(["a"] * 300)}, "has 300 names"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(written: Path, changed: dict, complaint: str) -> None:
-    rewritten(written, **changed)
+def test_invalid_arrays_raise(semantics_file: Path, changed: dict, complaint: str) -> None:
+    rewrite(semantics_file, **changed)
     with pytest.raises(DataError, match=complaint):
-        read_semantics(written)
+        read_semantics(semantics_file)
 
 
-def test_something_else_is_refused(tmp_path: Path) -> None:
+def test_file_without_labels_raises(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", weights=np.zeros(3))
     with pytest.raises(DataError, match="cannot be read as labels"):
         read_semantics(tmp_path / "other.npz")
