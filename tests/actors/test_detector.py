@@ -11,7 +11,7 @@ from ldo_service.actors.detector import Detector, DetectorConfig, require_detect
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.errors import ConfigError, ModelError
 from ldo_service.schemas import Array, CameraModel, DetectionBoxes, Keyframe, encode
-from tests.detection.networks import SQUARES, changed, squares_image
+from tests.detection.networks import SQUARES, squares_image, squares_network
 
 SIZE = 128, 96
 
@@ -108,7 +108,7 @@ def test_a_model_that_cannot_be_used_is_said_once_and_the_service_goes_on(
 def test_a_model_of_other_classes_is_not_taken_for_one_of_coco(
     tmp_path: Path, red: Keyframe, caplog
 ) -> None:
-    actor = detector(changed("yolox", metadata=None).write(tmp_path / "net.onnx"))
+    actor = detector(squares_network("yolox", metadata=None).write(tmp_path / "net.onnx"))
     assert only(actor.handle(red)).detections == ()
     assert "3 classes without names" in caplog.text
 
@@ -116,7 +116,7 @@ def test_a_model_of_other_classes_is_not_taken_for_one_of_coco(
 def test_a_network_that_fails_is_counted_and_warned_about_once(
     tmp_path: Path, red: Keyframe, caplog
 ) -> None:
-    actor = detector(changed("yolov8", fails_on_white=True).write(tmp_path / "net.onnx"))
+    actor = detector(squares_network("yolov8", fails_on_white=True).write(tmp_path / "net.onnx"))
     white = keyframe_of(red, np.full((96, 128, 3), 255, np.uint8))
     answers = [only(actor.handle(frame)) for frame in (red, white, white, red, white)]
     assert [bool(answer.network) for answer in answers] == [True, False, False, True, False]

@@ -27,8 +27,8 @@ from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_REQUEST, LA
 from ldo_service.service.service import open_recorder
 from ldo_service.storage.state_store import MemoryStore
 from ldo_service.transport.interface import MemoryTransport
-from tests.detection.labellers.encoders import ColorPair, embeddings, plain, vocabulary
-from tests.detection.labellers.server import hangs, says, sends, serving
+from tests.detection.labellers.encoders import ColorPair, embeddings, plain_image, vocabulary
+from tests.detection.labellers.server import hangs, replies_with, responds, serving
 from tests.runtime.fake_actors import QUICK, eventually, running, send
 
 
@@ -46,7 +46,7 @@ def request(region: int = 7, color: str = "red", **fields) -> LabelRequest:
             "region": region,
             "keyframe": 3,
             "box_px": (1.0, 2.0, 30.0, 40.0),
-            "crops": (crop_message(plain(color)),),
+            "crops": (crop_message(plain_image(color)),),
             **fields,
         }
     )
@@ -195,10 +195,13 @@ def test_a_crop_that_is_no_image_leaves_its_region_unnamed() -> None:
 @pytest.mark.parametrize(
     ("behaves", "facts"),
     [
-        (says("cup", 0.75), {"regions_named": 1}),
-        (says("a kind of thing, I believe", 0.9), {"answers_refused": 1, "regions_unnamed": 1}),
-        (sends(500), {"labellings_failed": 1, "labeller_failing": 1}),
-        (sends(200, b"nonsense"), {"labellings_failed": 1, "labeller_failing": 1}),
+        (replies_with("cup", 0.75), {"regions_named": 1}),
+        (
+            replies_with("a kind of thing, I believe", 0.9),
+            {"answers_refused": 1, "regions_unnamed": 1},
+        ),
+        (responds(500), {"labellings_failed": 1, "labeller_failing": 1}),
+        (responds(200, b"nonsense"), {"labellings_failed": 1, "labeller_failing": 1}),
         (hangs, {"labellings_failed": 1, "labeller_failing": 1}),
     ],
     ids=["good", "nonsense", "500", "no json", "hangs"],
@@ -273,7 +276,7 @@ async def test_a_slow_labeller_keeps_the_newest_of_each_region_and_no_more_than_
         await send(mapper, request(0))
         await eventually(lambda: labeller.seen)
         for region in (1, 1, 1, *range(2, 41)):
-            await send(mapper, request(region, crops=(crop_message(plain("red")),) * 2))
+            await send(mapper, request(region, crops=(crop_message(plain_image("red")),) * 2))
         await eventually(lambda: slow.health().inputs[0].queued == 32)
         assert len(heard) == 0, "nobody waited for an answer"
         gate.set()
@@ -351,12 +354,12 @@ async def test_encoders_replay_with_the_names_that_were_added(
 
 async def test_a_server_is_not_asked_again_in_a_replay(tmp_path: Path, names: Path) -> None:
     names.write_text("red\n")
-    with serving(says("blue", 0.5)) as server:
+    with serving(replies_with("blue", 0.5)) as server:
         config = VlmLabellerConfig(url=server.url, names=str(names))
         heard = await recorded(tmp_path / "recording", config)
-        asked = len(server.asked)
+        asked = len(server.requests)
         (replayed,) = open_recording(tmp_path / "recording")
         result = replayed.verify()
-        assert len(server.asked) == asked == 2
+        assert len(server.requests) == asked == 2
     assert [answer.label for answer in heard] == ["", "blue"]
     assert (result.steps, result.made) == (4, {})

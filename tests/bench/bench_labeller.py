@@ -169,7 +169,7 @@ def measured(
     guide = Guide(scene.sequence, scene.order)
 
     def late(handler: BaseHTTPRequestHandler) -> None:
-        handler.over.wait(delay_s)  # type: ignore[attr-defined]
+        handler.ended.wait(delay_s)  # type: ignore[attr-defined]
         guide(handler)
 
     with ExitStack() as stack:

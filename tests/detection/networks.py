@@ -1,7 +1,7 @@
-"""Small networks in ONNX that find squares of red, green or blue, in every layout.
+"""Small ONNX networks that detect red, green or blue squares, in every layout.
 
-A square has 16 pixels in the input and fills a cell of the grid with that stride: its box is the
-cell, its score the purity of its colour. Grey and black are nothing.
+A square has 16 pixels in the input and fills a cell of the grid with that stride. Its box is the
+cell and its score is the purity of its color. Gray and black are background.
 """
 
 from dataclasses import dataclass, replace
@@ -12,27 +12,27 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 STRIDES = (8, 16, 32)
-OF_SQUARES = 16
+SQUARE_STRIDE = 16
 COLORS = ("red", "green", "blue")
 PURITY = np.array([[1, -1, -1], [-1, 1, -1], [-1, -1, 1]], np.float32)
 
 
 @dataclass(frozen=True)
 class Squares:
-    """`write` makes the file; each field but the first three breaks something."""
+    """Network for squares; `write` makes the file. Most fields make it invalid on purpose."""
 
     layout: str
     width: int = 128
     height: int = 96
     classes: int = 3
     metadata: str | None = str(dict(enumerate(COLORS)))
-    is_decoded: bool = True  # boxes in pixels; yolox has them as offsets
+    is_decoded: bool = True  # Boxes in pixels; yolox has them as offsets.
     has_nan: bool = False
     has_logits: bool = False
-    is_normalized: bool = False  # boxes in 0..1
-    is_free: bool = False  # declares no size
+    is_normalized: bool = False  # Boxes in 0..1.
+    is_free: bool = False  # Declares no size.
     more_outputs: bool = False
-    fails_on_white: bool = False  # NaN, where a pixel of the input is 255
+    fails_on_white: bool = False  # Gives NaN where a pixel of the input is 255.
 
     def write(self, path: Path) -> Path:
         graph = _Graph()
@@ -49,9 +49,9 @@ class Squares:
         return path
 
     def boxes(self) -> np.ndarray:
-        """[N, 4] as the layout has them."""
-        parts = [self._cells(stride) for stride in STRIDES]
-        return np.concatenate(parts).astype(np.float32)
+        """Return boxes [N, 4] in the format of the layout."""
+        cells = [self._cells(stride) for stride in STRIDES]
+        return np.concatenate(cells).astype(np.float32)
 
     @property
     def count(self) -> int:
@@ -75,13 +75,16 @@ class Squares:
         return np.array(boxes) / size
 
     def _scores(self, graph: "_Graph", stride: int) -> str:
-        """[1, C, boxes of the stride]: purity of each cell's mean, of the first anchor only."""
+        """Add scores [1, C, N] of a stride and return their name.
+
+        The score is the purity of the mean color of a cell, for the first anchor only.
+        """
         weights = np.zeros((self.classes, 3), np.float32)
-        if stride == OF_SQUARES:
+        if stride == SQUARE_STRIDE:
             weights[:3] = PURITY[:, ::-1] / 255 if self.layout == "yolox" else PURITY
         pooled, pure, clipped, flat = (f"{name}_{stride}" for name in ("mean", "pure", "clip", "f"))
-        sides = {"kernel_shape": [stride, stride], "strides": [stride, stride]}
-        graph.add("AveragePool", ["images"], pooled, **sides)
+        pooling = {"kernel_shape": [stride, stride], "strides": [stride, stride]}
+        graph.add("AveragePool", ["images"], pooled, **pooling)
         graph.add("Conv", [pooled, graph.constant(weights[:, :, None, None])], pure)
         low, high = (-9, 9) if self.has_logits else (0, 1)
         bounds = [graph.constant(np.float32(bound)) for bound in (low, high)]
@@ -96,23 +99,23 @@ class Squares:
         graph.add("Reshape", [clipped, graph.constant(np.array([1, self.classes, -1]))], flat)
         if self._anchors == 1:
             return flat
-        graph.add("Mul", [flat, graph.constant(np.float32(0))], f"nothing_{stride}")
-        both = [flat, f"nothing_{stride}", f"nothing_{stride}"]
-        graph.add("Concat", both, f"anchors_{stride}", axis=2)
+        graph.add("Mul", [flat, graph.constant(np.float32(0))], f"zeros_{stride}")
+        anchors = [flat, f"zeros_{stride}", f"zeros_{stride}"]
+        graph.add("Concat", anchors, f"anchors_{stride}", axis=2)
         return f"anchors_{stride}"
 
     def _times_zero(self, graph: "_Graph", name: str, stride: int) -> str:
-        """log 0 times 0 is NaN."""
+        """Multiply by zero; log(0) * 0 is NaN."""
         graph.add("Mul", [name, graph.constant(np.float32(0))], f"nan_{stride}")
         return f"nan_{stride}"
 
     def _nan_of_white(self, graph: "_Graph", name: str, stride: int) -> str:
-        """0 / 0 where the image has a one, added to every score."""
+        """Multiply every score by 0 / 0 where the image has a one."""
         graph.add("ReduceMax", ["images"], f"max_{stride}", keepdims=0)
         graph.add("Sub", [graph.constant(np.float32(1)), f"max_{stride}"], f"below_{stride}")
         graph.add("Div", [f"below_{stride}", f"below_{stride}"], f"one_{stride}")
-        graph.add("Mul", [name, f"one_{stride}"], f"judged_{stride}")
-        return f"judged_{stride}"
+        graph.add("Mul", [name, f"one_{stride}"], f"with_nan_{stride}")
+        return f"with_nan_{stride}"
 
     def _model(self, graph: "_Graph") -> onnx.ModelProto:
         size = ("height", "width") if self.is_free else (self.height, self.width)
@@ -150,14 +153,15 @@ SQUARES = {
 }
 
 
-def changed(layout: str, **fields) -> Squares:
+def squares_network(layout: str, **fields) -> Squares:
+    """Return the network of a layout with changed fields."""
     return replace(SQUARES[layout], **fields)
 
 
 def squares_image(
     squares: list[tuple[str, int, int, int]], width: int = 128, height: int = 96
 ) -> np.ndarray:
-    """[H, W, 3] uint8 RGB, black but for squares: colour, left, top, side in pixels."""
+    """Return a black image [H, W, 3] uint8 RGB with squares: color, left, top, side in pixels."""
     image = np.zeros((height, width, 3), np.uint8)
     for color, left, top, side in squares:
         image[top : top + side, left : left + side, COLORS.index(color)] = 254

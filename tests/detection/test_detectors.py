@@ -1,4 +1,4 @@
-"""Networks that find coloured squares, in three layouts; those that are none; and real ones."""
+"""Detectors: synthetic networks in three layouts, invalid files and real networks."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from ldo_service.detection.vocabulary import COCO, coco_class
 from ldo_service.detection.yolo import STRIDES_PX, find_grid
 from ldo_service.errors import ConfigError, ModelError
 
-from .networks import COLORS, SQUARES, changed, squares_image
+from .networks import COLORS, SQUARES, squares_image, squares_network
 
 LAYOUTS = tuple(SQUARES)
 
@@ -26,21 +26,21 @@ def layout(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-def opened(tmp_path: Path, layout: str, config: NetworkConfig | None = None, **fields):
-    return OnnxDetector(changed(layout, **fields).write(tmp_path / "net.onnx"), config)
+def open_detector(tmp_path: Path, layout: str, config: NetworkConfig | None = None, **fields):
+    return OnnxDetector(squares_network(layout, **fields).write(tmp_path / "net.onnx"), config)
 
 
-def found(detector: OnnxDetector, image: np.ndarray) -> list[tuple[str, list[float]]]:
+def named_boxes(detector: OnnxDetector, image: np.ndarray) -> list[tuple[str, list[float]]]:
     detections = detector.detect(image)
     names = [detector.labels[class_id] for class_id in detections.class_ids]
     return sorted(zip(names, detections.boxes_px.tolist(), strict=True))
 
 
-def test_the_layout_is_recognized_and_boxes_are_where_the_squares_are(tmp_path, layout) -> None:
-    detector = opened(tmp_path, layout)
+def test_layout_is_recognized_and_boxes_match_squares(tmp_path, layout) -> None:
+    detector = open_detector(tmp_path, layout)
     assert (detector.layout, detector.labels, detector.input_px) == (layout, COLORS, (128, 96))
     image = squares_image([("red", 16, 48, 16), ("blue", 112, 80, 16), ("red", 64, 0, 16)])
-    assert found(detector, image) == [
+    assert named_boxes(detector, image) == [
         ("blue", [111.5, 79.5, 127.5, 95.5]),
         ("red", [15.5, 47.5, 31.5, 63.5]),
         ("red", [63.5, -0.5, 79.5, 15.5]),
@@ -48,65 +48,65 @@ def test_the_layout_is_recognized_and_boxes_are_where_the_squares_are(tmp_path, 
     assert detector.detect(image).scores == pytest.approx(254 / 255, rel=1e-5)
 
 
-def test_images_of_another_size_are_fitted_in(tmp_path, layout) -> None:
-    """A cell of 16 px is 40 px of the image; where, depends on the layout's letterbox."""
-    detector = opened(tmp_path, layout)
-    left = {"yolov5": 40, "yolov8": 40, "yolox": 80}[layout]  # 16 of 128 columns are padding
+def test_images_of_another_size_are_letterboxed(tmp_path, layout) -> None:
+    """A cell of 16 px is 40 px of the image; its position depends on the letterbox."""
+    detector = open_detector(tmp_path, layout)
+    left = {"yolov5": 40, "yolov8": 40, "yolox": 80}[layout]  # 16 of 128 columns are padding.
     image = squares_image([("green", left, 40, 40)], width=240, height=240)
-    ((name, box),) = found(detector, image)
+    ((name, box),) = named_boxes(detector, image)
     assert name == "green"
     assert box == pytest.approx([left - 0.5, 39.5, left + 39.5, 79.5])
 
 
-def test_a_network_that_takes_any_size_gets_the_configured_one(tmp_path, layout) -> None:
-    detector = opened(tmp_path, layout, NetworkConfig(input_px=(128, 96)), is_free=True)
+def test_dynamic_input_size_uses_configured_size(tmp_path, layout) -> None:
+    detector = open_detector(tmp_path, layout, NetworkConfig(input_px=(128, 96)), is_free=True)
     assert detector.input_px == (128, 96)
     assert len(detector.detect(squares_image([("red", 16, 48, 16)]))) == 1
 
 
-def test_an_image_without_objects_has_no_boxes(tmp_path, layout) -> None:
-    nothing = opened(tmp_path, layout).detect(np.full((96, 128, 3), 128, np.uint8))
-    assert (nothing.boxes_px.shape, len(nothing)) == ((0, 4), 0)
+def test_image_without_objects_gives_no_boxes(tmp_path, layout) -> None:
+    detections = open_detector(tmp_path, layout).detect(np.full((96, 128, 3), 128, np.uint8))
+    assert (detections.boxes_px.shape, len(detections)) == ((0, 4), 0)
 
 
-def test_thresholds_are_those_of_the_configuration(tmp_path, layout) -> None:
+def test_configured_score_and_box_limits_apply(tmp_path, layout) -> None:
     image = squares_image([("red", 16, 48, 16), ("red", 64, 48, 16), ("blue", 0, 0, 16)])
-    image[48:64, 64:80] //= 4  # a dim one
-    assert len(opened(tmp_path, layout, NetworkConfig(score_min=0.2)).detect(image)) == 3
-    assert len(opened(tmp_path, layout, NetworkConfig(score_min=0.3)).detect(image)) == 2
-    (score,) = opened(tmp_path, layout, NetworkConfig(max_boxes=1)).detect(image).scores
+    image[48:64, 64:80] //= 4  # A dark square.
+    assert len(open_detector(tmp_path, layout, NetworkConfig(score_min=0.2)).detect(image)) == 3
+    assert len(open_detector(tmp_path, layout, NetworkConfig(score_min=0.3)).detect(image)) == 2
+    (score,) = open_detector(tmp_path, layout, NetworkConfig(max_boxes=1)).detect(image).scores
     assert score > 0.9, "the most certain is kept"
 
 
-def test_a_decoded_yolox_is_told_from_one_with_offsets(tmp_path) -> None:
-    detector = opened(tmp_path, "yolox", is_decoded=True)
-    assert found(detector, squares_image([("red", 16, 48, 16)])) == [
+def test_decoded_yolox_output_is_recognized(tmp_path) -> None:
+    detector = open_detector(tmp_path, "yolox", is_decoded=True)
+    assert named_boxes(detector, squares_image([("red", 16, 48, 16)])) == [
         ("red", [15.5, 47.5, 31.5, 63.5])
     ]
 
 
-def test_it_gives_the_same_bits_each_time(tmp_path, layout) -> None:
+def test_repeated_detection_is_bitwise_equal(tmp_path, layout) -> None:
     image = np.random.default_rng(1).integers(0, 256, (100, 150, 3)).astype(np.uint8)
     config = NetworkConfig(score_min=0.0)
-    one, other = (opened(tmp_path, layout, config).detect(image) for _ in range(2))
+    one, other = (open_detector(tmp_path, layout, config).detect(image) for _ in range(2))
     assert len(one) == config.max_boxes
     for field in ("boxes_px", "scores", "class_ids"):
         np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
 
 
 # --- names ----------------------------------------------------------------------------------------
-def test_eighty_classes_without_names_are_those_of_coco(tmp_path, layout) -> None:
-    assert opened(tmp_path, layout, metadata=None, classes=80).names == COCO
+def test_eighty_classes_without_names_are_coco_classes(tmp_path, layout) -> None:
+    assert open_detector(tmp_path, layout, metadata=None, classes=80).names == COCO
 
 
-def test_the_names_of_the_user_come_before_those_it_carries(tmp_path, layout) -> None:
+def test_configured_names_override_names_of_the_file(tmp_path, layout) -> None:
     (tmp_path / "names.txt").write_text("Sofa\nTV-Screen\nglobe\n")
     config = NetworkConfig(names=str(tmp_path / "names.txt"))
-    assert opened(tmp_path, layout, config).labels == ("couch", "tv", "globe")
+    assert open_detector(tmp_path, layout, config).labels == ("couch", "tv", "globe")
 
 
 @pytest.mark.parametrize(
-    ("metadata", "says"),
+    ("metadata", "message"),
     [
         (None, "3 classes without names"),
         ("{0: 'a', 1: 'b'}", "3 classes and its metadata names 2"),
@@ -117,43 +117,44 @@ def test_the_names_of_the_user_come_before_those_it_carries(tmp_path, layout) ->
         ("__import__('os').getcwd()", "metadata names no classes"),
     ],
 )
-def test_classes_that_do_not_fit_are_refused(tmp_path, layout, metadata, says: str) -> None:
-    with pytest.raises(ModelError, match=says):
-        opened(tmp_path, layout, metadata=metadata)
+def test_invalid_class_names_in_metadata_raise(tmp_path, layout, metadata, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        open_detector(tmp_path, layout, metadata=metadata)
 
 
 @pytest.mark.parametrize(
-    ("text", "says"), [("a\nb\n", "file of names has 2"), ("a\n\nc\n", "line 2 of"), (None, "read")]
+    ("text", "message"),
+    [("a\nb\n", "file of names has 2"), ("a\n\nc\n", "line 2 of"), (None, "read")],
 )
-def test_a_file_of_other_names_is_refused(tmp_path, text: str | None, says: str) -> None:
+def test_invalid_names_file_raises_config_error(tmp_path, text: str | None, message: str) -> None:
     if text is not None:
         (tmp_path / "names.txt").write_text(text)
-    with pytest.raises(ConfigError, match=says):
-        opened(tmp_path, "yolov8", NetworkConfig(names=str(tmp_path / "names.txt")))
+    with pytest.raises(ConfigError, match=message):
+        open_detector(tmp_path, "yolov8", NetworkConfig(names=str(tmp_path / "names.txt")))
 
 
-# --- what is refused ------------------------------------------------------------------------------
+# --- invalid networks and settings ----------------------------------------------------------------
 @pytest.mark.parametrize("body", [b"", b"no network", b"\x08\x08" + bytes(100)])
-def test_garbage_is_no_network(tmp_path, body: bytes) -> None:
+def test_file_that_is_not_onnx_raises(tmp_path, body: bytes) -> None:
     (tmp_path / "net.onnx").write_bytes(body)
     with pytest.raises(ModelError, match=r"net\.onnx cannot be used .*no network in ONNX"):
         OnnxDetector(tmp_path / "net.onnx")
 
 
-def test_half_a_file_is_no_network(tmp_path) -> None:
+def test_truncated_file_raises(tmp_path) -> None:
     path = SQUARES["yolov5"].write(tmp_path / "net.onnx")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(ModelError, match="cannot be used"):
         OnnxDetector(path)
 
 
-def test_an_absent_file_is_said(tmp_path) -> None:
+def test_missing_file_raises(tmp_path) -> None:
     with pytest.raises(ModelError, match="no such file"):
         OnnxDetector(tmp_path / "absent.onnx")
 
 
 @pytest.mark.parametrize(
-    ("fields", "says"),
+    ("fields", "message"),
     [
         ({"has_nan": True}, "NaN or infinity"),
         ({"has_logits": True}, "no probabilities"),
@@ -161,31 +162,31 @@ def test_an_absent_file_is_said(tmp_path) -> None:
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
-def test_another_output_is_refused(tmp_path, layout, fields, says: str) -> None:
-    with pytest.raises(ModelError, match=says) as caught:
-        opened(tmp_path, layout, **fields)
+def test_unsupported_output_raises_one_line_message(tmp_path, layout, fields, message: str) -> None:
+    with pytest.raises(ModelError, match=message) as caught:
+        open_detector(tmp_path, layout, **fields)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("pixels", ["yolov5", "yolov8"])
-def test_boxes_in_parts_of_the_image_are_refused(tmp_path, pixels: str) -> None:
+@pytest.mark.parametrize("layout", ["yolov5", "yolov8"])
+def test_normalized_boxes_raise(tmp_path, layout: str) -> None:
     with pytest.raises(ModelError, match="export the network with boxes in pixels"):
-        opened(tmp_path, pixels, is_normalized=True, width=640, height=640)
+        open_detector(tmp_path, layout, is_normalized=True, width=640, height=640)
 
 
-def test_boxes_that_fit_no_grid_are_refused(tmp_path, layout) -> None:
+def test_box_count_of_no_known_grid_raises(tmp_path, layout) -> None:
     with pytest.raises(ModelError, match=r"none that is known. Expected: \[1, N, 5 \+ C\]"):
-        opened(tmp_path, layout, width=120, height=88)
+        open_detector(tmp_path, layout, width=120, height=88)
 
 
-@pytest.mark.parametrize("wanted", LAYOUTS)
-def test_a_layout_may_be_named_and_must_be_the_right_one(tmp_path, layout, wanted: str) -> None:
-    config = NetworkConfig(layout=wanted)
-    if wanted == layout:
-        assert opened(tmp_path, layout, config).layout == wanted
+@pytest.mark.parametrize("configured", LAYOUTS)
+def test_configured_layout_must_match_the_network(tmp_path, layout, configured: str) -> None:
+    config = NetworkConfig(layout=configured)
+    if configured == layout:
+        assert open_detector(tmp_path, layout, config).layout == configured
     else:
         with pytest.raises(ModelError):
-            opened(tmp_path, layout, config)
+            open_detector(tmp_path, layout, config)
 
 
 @pytest.mark.parametrize(
@@ -199,32 +200,32 @@ def test_a_layout_may_be_named_and_must_be_the_right_one(tmp_path, layout, wante
         {"input_px": (0, 480)},
     ],
 )
-def test_settings_that_cannot_be_are_refused(fields) -> None:
+def test_invalid_settings_raise_config_error(fields) -> None:
     with pytest.raises(ConfigError):
         NetworkConfig(**fields)
 
 
 @pytest.mark.parametrize("input_px", [(640, 640), (640, 448), (448, 256), (128, 64)])
-def test_no_two_grids_of_an_input_have_as_many_boxes(input_px: tuple[int, int]) -> None:
+def test_box_count_identifies_the_grid(input_px: tuple[int, int]) -> None:
     strides = [STRIDES_PX[first:end] for first, end in combinations(range(len(STRIDES_PX) + 1), 2)]
-    cells = [sum(input_px[0] * input_px[1] // side**2 for side in some) for some in strides]
+    cells = [sum(input_px[0] * input_px[1] // side**2 for side in subset) for subset in strides]
     assert len({*cells, *(3 * count for count in cells)}) == 2 * len(strides) == 30
-    for some, count in zip(strides, cells, strict=True):
+    for subset, count in zip(strides, cells, strict=True):
         for boxes_per_cell in (1, 3):
             grid = find_grid(boxes_per_cell * count, input_px)
             assert grid is not None
             assert grid.boxes_per_cell == boxes_per_cell
-            assert set(grid.strides_px.ravel()) == set(some)
+            assert set(grid.strides_px.ravel()) == set(subset)
 
 
 # --- execution providers --------------------------------------------------------------------------
-def test_an_unknown_provider_is_an_error_that_names_the_known_ones(tmp_path) -> None:
+def test_unknown_provider_raises_with_list_of_known_ones(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"knows no execution provider 'gpu'.*cuda.*cpu"):
-        opened(tmp_path, "yolov8", NetworkConfig(providers=("gpu",)))
+        open_detector(tmp_path, "yolov8", NetworkConfig(providers=("gpu",)))
 
 
-def test_a_provider_that_this_machine_lacks_is_warned_about_and_left_out(tmp_path, caplog) -> None:
-    detector = opened(
+def test_unavailable_provider_is_skipped_with_a_warning(tmp_path, caplog) -> None:
+    detector = open_detector(
         tmp_path, "yolov8", NetworkConfig(providers=("rknpu", "CPUExecutionProvider"))
     )
     assert detector.providers == ["CPUExecutionProvider"]
@@ -234,14 +235,14 @@ def test_a_provider_that_this_machine_lacks_is_warned_about_and_left_out(tmp_pat
 
 # --- real networks --------------------------------------------------------------------------------
 @pytest.fixture(params=["yolox_nano.onnx", "yolov5n_480x640_w16.onnx"])
-def real(request: pytest.FixtureRequest) -> OnnxDetector:
+def real_detector(request: pytest.FixtureRequest) -> OnnxDetector:
     folder = os.environ.get("LDO_WEIGHTS")
     if not folder:
         pytest.skip("set LDO_WEIGHTS to a folder with yolox_nano.onnx and yolov5n_480x640_w16.onnx")
     return OnnxDetector(Path(folder) / request.param)
 
 
-def color(folder: Path, index: int) -> np.ndarray:
+def read_color(folder: Path, index: int) -> np.ndarray:
     return open_sequence(str(folder)).read(index).color
 
 
@@ -249,32 +250,34 @@ def labels_of(detector: OnnxDetector, detections: Detections) -> list[str]:
     return [detector.labels[class_id] for class_id in detections.class_ids]
 
 
-def test_real_networks_find_the_furniture_of_the_kitchen(data: Path, real: OnnxDetector) -> None:
-    labels = labels_of(real, real.detect(color(data / "tum" / "kitchen", 0)))
+def test_real_networks_detect_furniture_of_the_kitchen(
+    data: Path, real_detector: OnnxDetector
+) -> None:
+    labels = labels_of(real_detector, real_detector.detect(read_color(data / "tum" / "kitchen", 0)))
     assert {"chair", "cup"} <= set(labels)
     assert "book" not in labels[:2]
     assert set(labels) <= {"chair", "cup", "dining table", "book", "laptop"}
 
 
-def test_real_networks_find_the_apartment_where_its_labels_say(
-    data: Path, real: OnnxDetector
+def test_real_networks_match_ground_truth_of_the_apartment(
+    data: Path, real_detector: OnnxDetector
 ) -> None:
-    """Boxes of 0.5 and more, against boxes around the true instances of the class."""
+    """Compare boxes with scores from 0.5 with boxes of the true instances of the class."""
     folder = data / "replica" / "apartment_floor1"
-    detections = real.detect(color(folder, 100))
-    sure = detections.chosen(np.flatnonzero(detections.scores >= 0.5))
+    detections = real_detector.detect(read_color(folder, 100))
+    confident = detections.chosen(np.flatnonzero(detections.scores >= 0.5))
     truth = true_boxes(folder, 100)
     overlaps = [
         max(iou(box, true) for true in truth[label])
-        for label, box in zip(labels_of(real, sure), sure.boxes_px, strict=True)
+        for label, box in zip(labels_of(real_detector, confident), confident.boxes_px, strict=True)
     ]
-    assert {"chair", "potted plant"} <= set(labels_of(real, sure))
+    assert {"chair", "potted plant"} <= set(labels_of(real_detector, confident))
     assert np.mean(np.array(overlaps) > 0.5) >= 0.6, overlaps
     assert max(overlaps) > 0.8
 
 
 def true_boxes(folder: Path, index: int) -> dict[str, list[np.ndarray]]:
-    """By class of COCO: a box around each instance that the frame shows."""
+    """Return the box of each instance in the frame, by COCO class."""
     names = {
         int(number): coco_class(entry["name"])
         for number, entry in json.loads((folder / "labels.json").read_text())["instances"].items()
@@ -295,10 +298,12 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return intersection / (np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - intersection)
 
 
-def test_plain_loops_and_opencv_read_yolox_the_same(data: Path, real: OnnxDetector) -> None:
-    if real.layout != "yolox":
-        pytest.skip("a twin of the one layout whose boxes are not decoded")
-    image = color(data / "tum" / "kitchen", 0)
+def test_yolox_decoding_matches_plain_loops_and_opencv(
+    data: Path, real_detector: OnnxDetector
+) -> None:
+    if real_detector.layout != "yolox":
+        pytest.skip("the reference covers only the layout with encoded boxes")
+    image = read_color(data / "tum" / "kitchen", 0)
     scale = 416 / 640
     canvas = np.full((416, 416, 3), 114, np.uint8)
     canvas[:312] = cv2.resize(image, (416, 312))
@@ -317,10 +322,10 @@ def test_plain_loops_and_opencv_read_yolox_the_same(data: Path, real: OnnxDetect
             class_ids.append(int(row[5:].argmax()))
             scores.append(float(row[4] * row[5:].max()))
     kept = cv2.dnn.NMSBoxesBatched(boxes, scores, class_ids, 0.25, 0.45)  # type: ignore[call-overload]
-    ours = real.detect(image)
-    assert ours.class_ids.tolist() == [class_ids[i] for i in kept]
-    np.testing.assert_allclose(ours.scores, [scores[i] for i in kept], rtol=1e-5)
-    theirs = np.array([boxes[i] for i in kept])
-    corners = np.hstack((theirs[:, :2], theirs[:, :2] + theirs[:, 2:]))
+    actual = real_detector.detect(image)
+    assert actual.class_ids.tolist() == [class_ids[i] for i in kept]
+    np.testing.assert_allclose(actual.scores, [scores[i] for i in kept], rtol=1e-5)
+    expected = np.array([boxes[i] for i in kept])
+    corners = np.hstack((expected[:, :2], expected[:, :2] + expected[:, 2:]))
     clipped = np.clip(corners, 0, [640, 480, 640, 480]) - 0.5
-    np.testing.assert_allclose(ours.boxes_px, clipped, atol=1e-3)
+    np.testing.assert_allclose(actual.boxes_px, clipped, atol=1e-3)

@@ -1,4 +1,4 @@
-"""An image in the input of a network, and boxes back in the image."""
+"""Letterbox: image to network input, and boxes back to the image."""
 
 import numpy as np
 import pytest
@@ -11,9 +11,11 @@ SIDES = st.tuples(st.integers(8, 900), st.integers(8, 900))
 
 
 @pytest.mark.parametrize(
-    ("is_centered", "rows"), [(True, (16, 112)), (False, (0, 96))], ids=["centred", "corner"]
+    ("is_centered", "rows"), [(True, (16, 112)), (False, (0, 96))], ids=["centered", "corner"]
 )
-def test_the_image_keeps_its_proportions_on_gray(is_centered: bool, rows: tuple[int, int]) -> None:
+def test_letterbox_keeps_aspect_ratio_with_gray_padding(
+    is_centered: bool, rows: tuple[int, int]
+) -> None:
     letterbox = Letterbox.fit((640, 480), (128, 128), is_centered)
     canvas = letterbox.canvas(np.full((480, 640, 3), 7, np.uint8))
     assert canvas.shape == (128, 128, 3)
@@ -23,7 +25,7 @@ def test_the_image_keeps_its_proportions_on_gray(is_centered: bool, rows: tuple[
 
 
 @given(image=SIDES, inputs=SIDES, is_centered=st.booleans())
-def test_the_whole_image_comes_back_as_itself(image, inputs, is_centered: bool) -> None:
+def test_box_of_the_whole_image_is_restored(image, inputs, is_centered: bool) -> None:
     letterbox = Letterbox.fit(image, inputs, is_centered)
     (left, top), (width, height) = letterbox.offset_px, letterbox.inner_px
     assert width in (inputs[0], letterbox.inner_px[0])
@@ -38,14 +40,16 @@ def test_the_whole_image_comes_back_as_itself(image, inputs, is_centered: bool) 
 
 @pytest.mark.parametrize("is_centered", [True, False])
 @pytest.mark.parametrize("input_px", [(640, 480), (416, 416), (160, 320)])
-def test_a_bright_patch_is_where_its_box_says(is_centered: bool, input_px) -> None:
-    """Judged by the centre of brightness, to a tenth of a pixel of the input."""
+def test_bright_patch_maps_back_to_its_box(is_centered: bool, input_px) -> None:
+    """Compare the center of brightness, to a tenth of a pixel of the input."""
     image = np.zeros((240, 320, 3), np.uint8)
     image[60:120, 200:260] = 255
     letterbox = Letterbox.fit((320, 240), input_px, is_centered)
     canvas = letterbox.canvas(image).astype(float)[..., 0]
     canvas[canvas == PADDING] = 0
-    rows, columns = np.indices(canvas.shape) + 0.5  # from the corner, as networks count
+    rows, columns = (
+        np.indices(canvas.shape) + 0.5
+    )  # Pixel coordinates from the corner, as in networks.
     center = np.array([(columns * canvas).sum(), (rows * canvas).sum()]) / canvas.sum()
     (box,) = letterbox.to_image(np.r_[center, center][None])
     scale = 320 / letterbox.inner_px[0]

@@ -1,4 +1,4 @@
-"""Registered networks: whole or not at all, and what was registered is what is run."""
+"""Model registry: registration, verification and removal of networks."""
 
 import json
 from pathlib import Path
@@ -15,9 +15,9 @@ from ldo_service.detection.model_registry import (
     open_labeller,
 )
 from ldo_service.errors import ConfigError, ModelError
-from tests.detection.labellers.encoders import ColorPair, embeddings, plain, vocabulary
+from tests.detection.labellers.encoders import ColorPair, embeddings, plain_image, vocabulary
 
-from .networks import SQUARES, changed, squares_image
+from .networks import SQUARES, squares_image, squares_network
 
 CONFIG = NetworkConfig()
 ENCODERS = DualEncoderConfig()
@@ -34,7 +34,7 @@ def file(tmp_path: Path) -> Path:
     return SQUARES["yolox"].write(tmp_path / "squares.onnx")
 
 
-def test_what_is_registered_is_a_copy_with_all_that_is_known(models: Models, file: Path) -> None:
+def test_registered_model_is_a_copy_with_metadata(models: Models, file: Path) -> None:
     models.add("squares", file, CONFIG, license="do what you like")
     file.unlink()
     assert models.names == ["squares"]
@@ -46,8 +46,8 @@ def test_what_is_registered_is_a_copy_with_all_that_is_known(models: Models, fil
     assert detector.identity == f"squares {about.sha256[:12]}"
 
 
-def test_names_given_when_it_is_registered_are_kept(models: Models, tmp_path: Path) -> None:
-    file = changed("yolov8", metadata=None).write(tmp_path / "net.onnx")
+def test_names_given_at_registration_are_kept(models: Models, tmp_path: Path) -> None:
+    file = squares_network("yolov8", metadata=None).write(tmp_path / "net.onnx")
     (tmp_path / "names.txt").write_text("sofa\ncup\nglobe\n")
     models.add("mine", file, NetworkConfig(names=str(tmp_path / "names.txt"), layout="yolov8"))
     (tmp_path / "names.txt").unlink()
@@ -56,18 +56,18 @@ def test_names_given_when_it_is_registered_are_kept(models: Models, tmp_path: Pa
     assert detector.labels == ("couch", "cup", "globe")
 
 
-def test_a_file_may_be_used_without_registering_it(models: Models, file: Path) -> None:
+def test_file_is_usable_without_registration(models: Models, file: Path) -> None:
     assert open_detector(str(file), CONFIG).identity.startswith("squares ")
     assert models.names == []
 
 
 @pytest.mark.parametrize("name", ["", ".hidden", "../up", "a/b", "a b", "x" * 65])
-def test_a_name_that_is_no_name_is_refused(models: Models, file: Path, name: str) -> None:
+def test_invalid_model_name_raises(models: Models, file: Path, name: str) -> None:
     with pytest.raises(ConfigError, match="not a valid model name"):
         models.add(name, file, CONFIG)
 
 
-def test_a_taken_name_is_refused_and_its_model_stays(models: Models, file: Path) -> None:
+def test_duplicate_name_raises_and_keeps_its_model(models: Models, file: Path) -> None:
     models.add("one", file, CONFIG)
     other = SQUARES["yolov8"].write(file.with_name("other.onnx"))
     with pytest.raises(ConfigError, match="there is a model 'one' already"):
@@ -75,24 +75,22 @@ def test_a_taken_name_is_refused_and_its_model_stays(models: Models, file: Path)
     assert models.get("one").about.layout == "yolox"
 
 
-def test_what_is_no_detector_leaves_nothing_behind(models: Models, file: Path) -> None:
+def test_invalid_detector_leaves_no_files(models: Models, file: Path) -> None:
     file.write_bytes(b"garbage")
     with pytest.raises(ModelError, match="no network in ONNX") as caught:
         models.add("one", file, CONFIG)
-    assert ".new-" not in str(caught.value), "the file that the user named, not the copy"
+    assert ".new-" not in str(caught.value), "the message names the file of the user, not the copy"
     assert list(models.folder.iterdir()) == []
 
 
-@pytest.mark.parametrize("damage", ["file", "about", "file gone"])
-def test_a_damaged_model_is_refused_and_can_be_removed(
-    models: Models, file: Path, damage: str
-) -> None:
+@pytest.mark.parametrize("damage", ["file", "about", "file missing"])
+def test_damaged_model_raises_and_is_removable(models: Models, file: Path, damage: str) -> None:
     model = models.add("one", file, CONFIG)
     if damage == "file":
         body = bytearray(model.file.read_bytes())
         body[len(body) // 2] ^= 1
         model.file.write_bytes(body)
-    elif damage == "file gone":
+    elif damage == "file missing":
         model.file.unlink()
     else:
         (model.folder / "about.json").write_text(json.dumps({"sha256": 3}))
@@ -102,7 +100,7 @@ def test_a_damaged_model_is_refused_and_can_be_removed(
     assert models.names == []
 
 
-def test_an_unknown_name_says_which_there_are(models: Models, file: Path) -> None:
+def test_unknown_name_raises_with_list_of_models(models: Models, file: Path) -> None:
     models.add("one", file, CONFIG)
     with pytest.raises(ConfigError, match="there are: one"):
         open_detector("two", CONFIG)
@@ -110,7 +108,7 @@ def test_an_unknown_name_says_which_there_are(models: Models, file: Path) -> Non
         models.remove("two")
 
 
-def test_a_folder_that_cannot_be_written_is_said(
+def test_unwritable_folder_raises_with_advice(
     tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "no_folder").write_text("")
@@ -120,7 +118,7 @@ def test_a_folder_that_cannot_be_written_is_said(
     assert Models().names == []
 
 
-def test_models_live_where_programs_keep_their_data(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_default_folder_follows_xdg(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("LDO_MODELS", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", "/data")
     assert default_folder() == Path("/data/ldo/models")
@@ -129,7 +127,7 @@ def test_models_live_where_programs_keep_their_data(monkeypatch: pytest.MonkeyPa
     assert default_folder() == Path("/home/ada/.local/share/ldo/models")
 
 
-def test_the_configuration_may_overrule_the_names(models: Models, file, tmp_path: Path) -> None:
+def test_configured_names_override_registered_names(models: Models, file, tmp_path: Path) -> None:
     models.add("one", file, CONFIG)
     (tmp_path / "names.txt").write_text("a\nb\nc\n")
     detector = open_detector("one", NetworkConfig(names=str(tmp_path / "names.txt")))
@@ -137,7 +135,7 @@ def test_the_configuration_may_overrule_the_names(models: Models, file, tmp_path
     assert np.isfinite(detector.detect(squares_image([])).scores).all()
 
 
-# --- pairs that name regions ----------------------------------------------------------------------
+# --- pairs of encoders ----------------------------------------------------------------------------
 @pytest.fixture
 def pair(tmp_path: Path) -> EncoderFiles:
     colors = ColorPair()
@@ -148,74 +146,68 @@ def pair(tmp_path: Path) -> EncoderFiles:
     )
 
 
-def test_a_pair_is_registered_with_all_its_files(models: Models, pair: EncoderFiles) -> None:
-    about = models.add_pair("colours", pair, ENCODERS, ("Red", "sofa", "green")).about
+def test_pair_is_registered_with_all_its_files(models: Models, pair: EncoderFiles) -> None:
+    about = models.add_pair("colors", pair, ENCODERS, ("Red", "sofa", "green")).about
     for file in (pair.image, pair.text, pair.vocabulary):
         assert file is not None
         file.unlink()
     assert (about.layout, about.classes) == ("clip", ("Red", "sofa", "green"))
     assert set(about.parts) == {"text.onnx", "bpe.txt.gz"}
-    labeller = open_labeller("colours", ENCODERS)
+    labeller = open_labeller("colors", ENCODERS)
     assert labeller.names == ("red", "couch", "green")
-    assert labeller.label([plain("green")])[0][0] == "green"
-    assert open_labeller("colours", ENCODERS, ("blue",)).names == ("blue",)
-    assert labeller.identity == f"colours {about.sha256[:12]}"
+    assert labeller.label([plain_image("green")])[0][0] == "green"
+    assert open_labeller("colors", ENCODERS, ("blue",)).names == ("blue",)
+    assert labeller.identity == f"colors {about.sha256[:12]}"
 
 
-def test_embeddings_are_registered_under_words_of_the_same_meaning(
+def test_embeddings_are_registered_under_canonical_names(
     models: Models, pair: EncoderFiles, tmp_path: Path
 ) -> None:
     path = embeddings(tmp_path / "e.npz", names=np.array(["sofa", "green", "blue"]))
     models.add_pair("cached", EncoderFiles(pair.image, embeddings=path), ENCODERS)
     for names in ((), ("couch", "green")):
         labeller = open_labeller("cached", ENCODERS, names)
-        assert labeller.label([plain("red")])[0][0] == "couch"
+        assert labeller.label([plain_image("red")])[0][0] == "couch"
 
 
 @pytest.mark.parametrize("part", ["model.onnx", "text.onnx", "bpe.txt.gz"])
-def test_a_pair_with_a_damaged_file_is_refused(
-    models: Models, pair: EncoderFiles, part: str
-) -> None:
-    model = models.add_pair("colours", pair, ENCODERS)
+def test_pair_with_a_damaged_file_raises(models: Models, pair: EncoderFiles, part: str) -> None:
+    model = models.add_pair("colors", pair, ENCODERS)
     (model.folder / part).write_bytes(b"garbage")
     with pytest.raises(ModelError, match=f"{part} is not the file registered"):
-        open_labeller("colours", ENCODERS)
+        open_labeller("colors", ENCODERS)
 
 
-def test_a_pair_that_does_not_fit_leaves_nothing_behind(
-    models: Models, pair: EncoderFiles, tmp_path: Path
-) -> None:
+def test_invalid_pair_leaves_no_files(models: Models, pair: EncoderFiles, tmp_path: Path) -> None:
     (tmp_path / "merges.gz").write_bytes(b"garbage")
     with pytest.raises(ModelError, match=r"merges\.gz") as caught:
-        models.add_pair("colours", pair, ENCODERS)
+        models.add_pair("colors", pair, ENCODERS)
     assert ".new-" not in str(caught.value)
     assert list(models.folder.iterdir()) == []
 
 
-def test_detectors_and_pairs_are_not_taken_for_each_other(
+def test_detector_and_pair_are_not_interchangeable(
     models: Models, file: Path, pair: EncoderFiles
 ) -> None:
     models.add("squares", file, CONFIG)
-    models.add_pair("colours", pair, ENCODERS)
+    models.add_pair("colors", pair, ENCODERS)
     with pytest.raises(ModelError, match=r"set it as vlm_labeller\.model"):
-        open_detector("colours", CONFIG)
+        open_detector("colors", CONFIG)
     with pytest.raises(ModelError, match=r"set it as detector\.model"):
         open_labeller("squares", ENCODERS)
-    with pytest.raises(ConfigError, match="there are: colours, squares"):
+    with pytest.raises(ConfigError, match="there are: colors, squares"):
         open_labeller("other", ENCODERS)
 
 
-def test_a_folder_of_a_pair_may_be_used_without_registering_it(
-    models: Models, tmp_path: Path
-) -> None:
+def test_folder_of_a_pair_is_usable_without_registration(models: Models, tmp_path: Path) -> None:
     ColorPair().image(tmp_path / "image_encoder.onnx")
     embeddings(tmp_path / "text_embeddings.npz")
     labeller = open_labeller(str(tmp_path), ENCODERS)
-    assert labeller.label([plain("blue")])[0][0] == "blue"
+    assert labeller.label([plain_image("blue")])[0][0] == "blue"
     assert models.names == []
 
 
-def test_the_networks_of_the_package_open_by_their_name(models: Models) -> None:
+def test_demo_networks_open_by_name(models: Models) -> None:
     detector, labeller = open_detector("demo", CONFIG), open_labeller("demo", ENCODERS)
     assert detector.layout == "yolov8"
     assert detector.identity.startswith("demo ")
@@ -225,7 +217,7 @@ def test_the_networks_of_the_package_open_by_their_name(models: Models) -> None:
     assert models.names == []
 
 
-def test_the_built_in_pair_takes_names_of_its_table_while_it_runs(models: Models) -> None:
+def test_demo_pair_accepts_names_of_its_table_at_runtime(models: Models) -> None:
     labeller = open_labeller("demo", ENCODERS, ("lamp", "chair"))
     labeller.add("radiator")
     assert labeller.names == ("lamp", "chair", "radiator")
@@ -234,6 +226,6 @@ def test_the_built_in_pair_takes_names_of_its_table_while_it_runs(models: Models
     assert models.names == []
 
 
-def test_the_name_of_the_built_in_networks_is_taken(models: Models, file: Path) -> None:
+def test_name_of_demo_networks_is_reserved(models: Models, file: Path) -> None:
     with pytest.raises(ConfigError, match="choose another name"):
         models.add("demo", file, CONFIG)

@@ -1,4 +1,4 @@
-"""Other words for the classes of COCO."""
+"""Synonyms of the COCO classes."""
 
 import os
 from pathlib import Path
@@ -20,7 +20,7 @@ TABLE = yaml.safe_load((Path(vocabulary.__file__).parent / vocabulary.TABLE).rea
 WORDS = [word for row in TABLE.values() for words in row.values() for word in words]
 
 
-def test_the_table_is_about_classes_of_coco_and_each_word_stands_once() -> None:
+def test_synonyms_map_to_coco_classes_and_are_unique() -> None:
     assert set(TABLE) <= set(COCO)
     assert {column for row in TABLE.values() for column in row} == {"same", "kinds"}
     assert len(WORDS) == len(set(WORDS))
@@ -29,7 +29,7 @@ def test_the_table_is_about_classes_of_coco_and_each_word_stands_once() -> None:
 
 
 @pytest.mark.parametrize("name", ["TV-screen", "tv_screen", "  Tv   Screen "])
-def test_case_spaces_hyphens_and_underscores_do_not_matter(name: str) -> None:
+def test_names_are_normalized(name: str) -> None:
     assert normalized(name) == "tv screen"
     assert canonical(name) == "tv"
 
@@ -51,11 +51,11 @@ def test_case_spaces_hyphens_and_underscores_do_not_matter(name: str) -> None:
         ("background", None),
     ],
 )
-def test_names_of_data_sets_lead_to_the_class_of_coco_or_to_none(name, expected) -> None:
+def test_coco_class_of_data_set_names(name, expected) -> None:
     assert coco_class(name) == expected
 
 
-def test_who_asks_for_a_class_finds_its_kinds_and_the_other_way_round() -> None:
+def test_answers_to_includes_subclasses_and_superclass() -> None:
     assert answers_to("Sofa") == ("couch",)
     assert answers_to("desk") == ("desk", "dining table")
     assert answers_to("chair")[0] == "chair"
@@ -63,8 +63,8 @@ def test_who_asks_for_a_class_finds_its_kinds_and_the_other_way_round() -> None:
     assert answers_to("fire-extinguisher") == ("fire extinguisher",)
 
 
-def test_the_names_that_other_detectors_use_are_those_of_coco() -> None:
-    """As of Pascal VOC: sofa, tvmonitor, diningtable."""
+def test_names_of_other_detectors_are_coco_classes() -> None:
+    """Names of Pascal VOC such as sofa, tvmonitor and diningtable."""
     folder = os.environ.get("LDO_WEIGHTS")
     if not folder:
         pytest.skip("set LDO_WEIGHTS to a folder with coco_classes.txt")

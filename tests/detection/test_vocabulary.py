@@ -1,4 +1,4 @@
-"""Names with indices that never change."""
+"""Vocabulary of names with constant indices."""
 
 import json
 
@@ -11,15 +11,15 @@ from ldo_service.errors import ConfigError
 from ldo_service.synthetic.flat.scene_object import CLASS_NAMES, COCO_COUNT
 
 
-def test_it_starts_with_background_other_and_the_names_of_coco_in_order() -> None:
+def test_vocabulary_starts_with_background_other_and_coco() -> None:
     vocabulary = Vocabulary()
     assert vocabulary.names == ("background", "other", *COCO)
     assert (vocabulary.index("background"), vocabulary.index("other")) == (BACKGROUND, OTHER)
-    assert CLASS_NAMES[:COCO_COUNT] == COCO, "as the synthetic flat has them"
+    assert CLASS_NAMES[:COCO_COUNT] == COCO, "equal to the names of the synthetic flat"
     assert len(set(COCO)) == 80
 
 
-def test_new_names_get_the_next_index_and_keep_it() -> None:
+def test_new_names_get_constant_consecutive_indices() -> None:
     vocabulary = Vocabulary()
     assert vocabulary.find("fire extinguisher") is None
     assert vocabulary.index("Fire_Extinguisher") == 82
@@ -29,19 +29,19 @@ def test_new_names_get_the_next_index_and_keep_it() -> None:
     assert "GLOBE" in vocabulary
 
 
-def test_words_for_the_same_thing_share_an_index() -> None:
+def test_synonyms_share_an_index() -> None:
     vocabulary = Vocabulary()
     assert vocabulary.index("Sofa") == vocabulary.index("couch") == COCO.index("couch") + 2
     assert vocabulary.index("tv-screen") == vocabulary.index("tv")
-    assert vocabulary.index("armchair") != vocabulary.index("chair"), "a kind keeps its name"
+    assert vocabulary.index("armchair") != vocabulary.index("chair"), "a subclass keeps its name"
 
 
 @pytest.mark.parametrize("name", ["", "  ", "_"])
-def test_no_name_is_other(name: str) -> None:
+def test_empty_name_is_other(name: str) -> None:
     assert Vocabulary().index(name) == OTHER
 
 
-def test_beyond_the_cap_new_names_are_other_and_known_ones_stay() -> None:
+def test_new_names_above_the_cap_are_other() -> None:
     vocabulary = Vocabulary(cap=84)
     assert [vocabulary.index(name) for name in ("globe", "fan", "rug", "fan", "rug")] == [
         *(82, 83, OTHER, 83, OTHER)
@@ -50,13 +50,13 @@ def test_beyond_the_cap_new_names_are_other_and_known_ones_stay() -> None:
     assert vocabulary.find("rug") is None
 
 
-def test_a_cap_without_room_for_the_first_names_is_refused() -> None:
+def test_cap_below_the_first_names_raises() -> None:
     with pytest.raises(ConfigError, match="no room for the 82 names"):
         Vocabulary(cap=81)
 
 
 @given(st.lists(st.text(max_size=12), max_size=30), st.integers(82, 100))
-def test_what_was_saved_goes_on_as_if_it_had_never_been(names: list[str], cap: int) -> None:
+def test_restored_vocabulary_continues_equal(names: list[str], cap: int) -> None:
     vocabulary = Vocabulary(cap)
     indices = [vocabulary.index(name) for name in names]
     assert all(0 <= index < cap for index in indices)
@@ -75,6 +75,6 @@ def test_what_was_saved_goes_on_as_if_it_had_never_been(names: list[str], cap: i
         {"names": ["background", "other", *COCO, "fan"], "cap": 82},
     ],
 )
-def test_names_that_no_vocabulary_has_are_refused(change: dict) -> None:
+def test_invalid_saved_names_raise(change: dict) -> None:
     with pytest.raises(ValueError, match="name"):
         Vocabulary.unpack({**Vocabulary().pack(), **change})

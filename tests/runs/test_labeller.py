@@ -11,7 +11,7 @@ from ldo_service.runs.folder import RunWriter
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.records import read_objects
 from ldo_service.semantics.gaussian_labels import fields
-from tests.detection.labellers.server import Server, hangs, says, sends, serving
+from tests.detection.labellers.server import Server, hangs, replies_with, responds, serving
 
 from .jobs import job
 
@@ -47,7 +47,7 @@ def labelled(folder: Path) -> set[str]:
 def test_answers_however_late_leave_poses_and_map_to_the_bit(
     room: Sequence, tmp_path: Path, alone: Path, latency: int
 ) -> None:
-    with serving(says("samovar", 0.9)) as server:
+    with serving(replies_with("samovar", 0.9)) as server:
         record = run(room, tmp_path / "run", server, latency)
         assert record.summary["labeller_requests"] > 0
     for name in ("trajectory_online.txt", "trajectory.txt", "map.ply", "keyframes.json"):
@@ -61,7 +61,7 @@ def test_answers_however_late_leave_poses_and_map_to_the_bit(
 
 @pytest.mark.parametrize(
     "behaves",
-    [sends(500), says("I think it is a kind of thing", 0.9), hangs],
+    [responds(500), replies_with("I think it is a kind of thing", 0.9), hangs],
     ids=["500", "nonsense", "hangs"],
 )
 def test_a_server_that_fails_leaves_the_run_as_it_is_and_names_nothing(
@@ -69,7 +69,7 @@ def test_a_server_that_fails_leaves_the_run_as_it_is_and_names_nothing(
 ) -> None:
     with serving(behaves) as server:
         run(room, tmp_path / "run", server, 5)
-        assert server.asked
+        assert server.requests
     for name in ("trajectory.txt", "map.ply"):
         assert (tmp_path / "run" / name).read_bytes() == (alone / name).read_bytes(), name
     assert labelled(tmp_path / "run") == set()

@@ -21,7 +21,7 @@ from ldo_service.runs.offline import run_offline
 from ldo_service.runs.source import Warn
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantics_file import write_semantics
-from tests.detection.networks import changed
+from tests.detection.networks import squares_network
 
 from .jobs import job
 
@@ -170,7 +170,7 @@ def test_forty_real_frames_stay_within_three_centimeters(data: Path, tmp_path: P
 def test_a_run_with_a_detector_says_what_each_gaussian_of_the_map_is(
     room: Sequence, finished: Path, tmp_path: Path
 ) -> None:
-    model = changed("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
+    model = squares_network("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
     settings = (f"detector.model={model}", "detector.min_score=0.02")
     record = run(room, tmp_path / "out", *settings)
     saved, gaussians = MapFolder(tmp_path / "out").semantics(), record.follower.map

@@ -10,7 +10,7 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import ReplayDiverged
 from ldo_service.runs.replayed import open_recording
 from ldo_service.testing import replay_recording
-from tests.detection.networks import changed
+from tests.detection.networks import squares_network
 from tests.runs.conftest import live
 from tests.runs.jobs import ROUGH
 
@@ -18,13 +18,13 @@ FRAMES = 8
 
 
 def test_boxes_replay_and_another_network_is_noticed(room: Sequence, tmp_path: Path) -> None:
-    model = changed("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
+    model = squares_network("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
     settings = (ROUGH, f"detector.model={model}", "detector.min_score=0")
     asyncio.run(live(tmp_path / "recording", room, load_config(settings=settings), FRAMES))
     replayed = replay_recording(tmp_path / "recording", "detector", "mapper")
     assert replayed["detector"].made["detection/boxes"] >= 1
     assert replayed["mapper"].made["map/delta"] >= 1
-    changed("yolov5", width=320, height=256, metadata="['a', 'b', 'c']").write(model)
+    squares_network("yolov5", width=320, height=256, metadata="['a', 'b', 'c']").write(model)
     (actor,) = open_recording(tmp_path / "recording", ("detector",))
     with pytest.raises(ReplayDiverged, match="detection/boxes"):
         actor.verify()

@@ -13,7 +13,7 @@ from ldo_service.runtime.journal import StepRecord
 from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import LabelResult, decode
 from ldo_service.testing import replay_recording
-from tests.detection.labellers.server import says, serving
+from tests.detection.labellers.server import replies_with, serving
 from tests.runs.conftest import live
 from tests.runs.jobs import ROUGH
 
@@ -36,7 +36,7 @@ def names_taken(folder: Path) -> list[str]:
 
 
 def test_the_mapper_replays_with_the_answers_that_it_got(room: Sequence, tmp_path: Path) -> None:
-    with serving(says("samovar", 0.9)) as server:
+    with serving(replies_with("samovar", 0.9)) as server:
         settings = (*SOON, f"vlm_labeller.url={server.url}")
         config = load_config(settings=settings)
         with patch("ldo_service.config.parameters.RegionTrackerConfig", IMPATIENT):

@@ -19,7 +19,7 @@ from ldo_service.runs.source import Selection
 from ldo_service.schemas import Keyframe
 from tests.actors.conftest import frames, keyframes, tracked  # noqa: F401
 from tests.commands.test_cli import ldo
-from tests.detection.networks import changed
+from tests.detection.networks import squares_network
 
 from .jobs import ROUGH
 
@@ -133,7 +133,7 @@ def test_real_frames_give_the_same_digests_for_one_thread_and_two(data: Path) ->
 def squares(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
     """Settings of a detector that finds what is red, green or blue, however pale."""
     path = tmp_path_factory.mktemp("model") / "squares.onnx"
-    model = changed("yolov5", width=320, height=256).write(path)
+    model = squares_network("yolov5", width=320, height=256).write(path)
     return f"detector.model={model}", "detector.min_score=0.02"
 
 

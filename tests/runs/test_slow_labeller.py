@@ -130,7 +130,7 @@ def test_nobody_waits_for_a_slow_labeller_and_its_answers_lie_where_it_was_asked
             # it is asked, and says nothing
             for frame in FRAMES[:SILENT]:
                 walker.go(frame)
-            assert server.asked
+            assert server.requests
             assert slow.answers == []
             wait_until(lambda: is_called_late(slow), 10, "called late")
             # it says something now and then, while the camera goes on

@@ -21,7 +21,7 @@ from ldo_service.geometry.codecs import shrunk
 from ldo_service.schemas import LabelRequest
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.synthetic.flat import FlatSequence
-from tests.detection.labellers.server import says
+from tests.detection.labellers.server import replies_with
 
 FILLED = 0.7  # of a box, by a thing that it is of
 NEAR_M = 0.05  # of a surface, to lie on it: what the depth of a Kinect may be off by
@@ -72,7 +72,7 @@ class Guide:
         self._allowed.release(answers)
 
     def __call__(self, handler: BaseHTTPRequestHandler) -> None:
-        over, question = handler.over, handler.question  # type: ignore[attr-defined]
+        over, question = handler.ended, handler.payload  # type: ignore[attr-defined]
         while self.waits and not self._allowed.acquire(timeout=0.1):
             if over.is_set():
                 return
@@ -80,7 +80,7 @@ class Guide:
         until_s = time.monotonic() + TOLD_WITHIN_S
         while picture not in self.names and time.monotonic() < until_s and not over.wait(0.02):
             pass
-        says(self.names.get(picture, NOT_TOLD), 0.9)(handler)
+        replies_with(self.names.get(picture, NOT_TOLD), 0.9)(handler)
 
 
 def _picture(crop: np.ndarray) -> str:

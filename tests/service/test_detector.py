@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ldo_service.schemas import DetectionBoxes
-from tests.detection.networks import changed
+from tests.detection.networks import squares_network
 from tests.service.conftest import live_service, wait_until
 
 APART = ("--set", "service.process_actors=[detector]", "--set", "mapper.iterations=2")
@@ -16,7 +16,7 @@ APART = ("--set", "service.process_actors=[detector]", "--set", "mapper.iteratio
 def test_every_keyframe_is_answered_whatever_the_network_is(
     tmp_path: Path, is_garbage: bool
 ) -> None:
-    model = changed("yolox", width=320, height=256).write(tmp_path / "squares.onnx")
+    model = squares_network("yolox", width=320, height=256).write(tmp_path / "squares.onnx")
     if is_garbage:
         model.write_bytes(b"garbage")
     use = ("--set", f"detector.model={model}", "--set", "detector.min_score=0")

@@ -13,7 +13,7 @@ from ldo_service.schemas import LabelNames, MapDelta, MapObject, MapObjects
 from ldo_service.schemas.topics import LABEL_NAMES
 from ldo_service.synthetic.flat import FlatSequence
 from tests.detection.labellers.encoders import ColorPair, vocabulary
-from tests.detection.labellers.server import hangs, says, serving
+from tests.detection.labellers.server import hangs, replies_with, serving
 from tests.service.conftest import LDO, live_service, wait_until
 
 
@@ -56,7 +56,7 @@ def test_a_name_that_was_added_is_used_from_then_on(tmp_path: Path, room: Sequen
     (tmp_path / "names.txt").write_text("red\n")
     names = ("--set", f"vlm_labeller.class_names={tmp_path / 'names.txt'}")
     with (
-        serving(says("fire hydrant", 0.9)) as server,
+        serving(replies_with("fire hydrant", 0.9)) as server,
         live_service(tmp_path, *asking(server.url), *names) as service,
         service.client.poller("map/delta", MapDelta) as deltas,
     ):
@@ -88,7 +88,7 @@ def test_a_labeller_that_takes_five_seconds_keeps_nobody_waiting(tmp_path: Path)
             service.wait_for_actors()
             publisher = service.publisher("synthetic:room", "--rate", "10", "--max-frames", "60")
             poses = service.wait_for_poses(40, timeout_s=30)
-            wait_until(lambda: len(server.asked) > 0, 10, "asked")
+            wait_until(lambda: len(server.requests) > 0, 10, "asked")
             assert publisher.wait(60) == 0
             assert {pose.status for pose in poses} == {"OK"}
 
@@ -97,7 +97,7 @@ def test_a_labeller_that_takes_five_seconds_keeps_nobody_waiting(tmp_path: Path)
 
             wait_until(is_said, 15, "said")
             assert service.client.objects().objects == ()
-            server.over.set()
+            server.ended.set()
             assert service.stop() == 0
             assert "Traceback" not in service.log
 

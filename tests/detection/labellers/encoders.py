@@ -1,6 +1,6 @@
-"""A tiny pair of encoders in ONNX whose space is colour.
+"""Tiny pair of ONNX encoders that embed images and texts in color space.
 
-An image is where its mean colour is; a text is the sum of the colours that it names.
+The embedding of an image is its mean color; that of a text is the sum of the colors it names.
 """
 
 import gzip
@@ -19,7 +19,7 @@ SCALE = 20.0
 
 @dataclass(frozen=True)
 class ColorPair:
-    """`write` makes the files; each field breaks something or is optional."""
+    """Pair of encoders; the fields describe valid variants and defects of the files."""
 
     side: int | str = 32
     channels: int = 3
@@ -40,13 +40,13 @@ class ColorPair:
             helper.make_node("ReduceMean", ["pixels"], ["mean"], axes=[2, 3], keepdims=0),
             helper.make_node("MatMul", ["mean", "weights"], ["embedding"]),
         ]
-        if self.fails_on_white:  # 0 / 0
-            nodes[-1] = helper.make_node("MatMul", ["mean", "weights"], ["colour"])
+        if self.fails_on_white:  # Division of zero by zero.
+            nodes[-1] = helper.make_node("MatMul", ["mean", "weights"], ["color"])
             nodes += [
-                helper.make_node("ReduceMin", ["colour"], ["least"], axes=[1], keepdims=1),
+                helper.make_node("ReduceMin", ["color"], ["least"], axes=[1], keepdims=1),
                 helper.make_node("Sub", ["one", "least"], ["below"]),
                 helper.make_node("Div", ["below", "below"], ["unity"]),
-                helper.make_node("Mul", ["colour", "unity"], ["embedding"]),
+                helper.make_node("Mul", ["color", "unity"], ["embedding"]),
             ]
         shape = ["N", self.channels, self.side, self.side]
         pixels = helper.make_tensor_value_info("pixels", TensorProto.FLOAT, shape)
@@ -58,8 +58,8 @@ class ColorPair:
 
     def text(self, path: Path) -> Path:
         table = np.full((512 + len(MERGES) + 2, 3), 0.001, np.float32)
-        for color, place in COLORS.items():
-            table[_token(color)] = place
+        for color, position in COLORS.items():
+            table[_token(color)] = position
         nodes = [
             helper.make_node("Gather", ["table", "tokens"], ["hidden"]),
             helper.make_node("ReduceSum", ["hidden", "along"], ["embedding"], keepdims=0),
@@ -81,28 +81,28 @@ def vocabulary(path: Path, merges: tuple[str, ...] = MERGES) -> Path:
 
 
 def embeddings(path: Path, **arrays: np.ndarray) -> Path:
-    """Of the colours; `arrays` come in place of, or beside, what is in the file."""
+    """Write embeddings of the colors; `arrays` replace or extend the arrays of the file."""
     rows = np.array([np.multiply(COLORS[name], 7.0) for name in COLORS], np.float32)
     np.savez(path, **{"names": np.array(tuple(COLORS)), "embeddings": rows, **arrays})
     return path
 
 
-def plain(color: str, height: int = 20, width: int = 30, level: int = 255) -> np.ndarray:
-    """[h, w, 3] uint8 RGB"""
+def plain_image(color: str, height: int = 20, width: int = 30, level: int = 255) -> np.ndarray:
+    """Return a uniform image [height, width, 3] uint8 RGB."""
     image = np.zeros((height, width, 3), np.uint8)
     image[:] = np.multiply(COLORS[color], level)
     return image
 
 
 def _token(color: str) -> int:
-    """Of the merge that ends the word."""
+    """Return the token of the merge that completes the word."""
     ends = ["".join(merge.split()) for merge in MERGES]
     return 512 + ends.index(color + "</w>")
 
 
 def _model(nodes, inputs, outputs, constants) -> onnx.ModelProto:
     values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in outputs]
-    held = [numpy_helper.from_array(array, name) for name, array in constants.items()]
-    graph = helper.make_graph(nodes, "colours", inputs, values, held)
+    initializers = [numpy_helper.from_array(array, name) for name, array in constants.items()]
+    graph = helper.make_graph(nodes, "colors", inputs, values, initializers)
     opset = [helper.make_opsetid("", 13)]
     return helper.make_model(graph, ir_version=8, opset_imports=opset)

@@ -1,4 +1,4 @@
-"""An OpenAI-compatible server on this machine that behaves as a test tells it."""
+"""Local OpenAI-compatible server with scripted replies."""
 
 import json
 import threading
@@ -11,32 +11,35 @@ from math import log
 
 @dataclass
 class Server:
-    """`answers` are used up in order, the last one for ever; each writes to the handler."""
+    """Scripted server and the requests that it received.
+
+    The replies are used in order; the last one repeats. Each writes to the handler.
+    """
 
     url: str = ""
-    answers: list[Callable[[BaseHTTPRequestHandler], None]] = field(default_factory=list)
-    asked: list[dict] = field(default_factory=list)
+    replies: list[Callable[[BaseHTTPRequestHandler], None]] = field(default_factory=list)
+    requests: list[dict] = field(default_factory=list)
     paths: list[str] = field(default_factory=list)
     keys: list[str | None] = field(default_factory=list)
-    over: threading.Event = field(default_factory=threading.Event)  # who hangs, waits for it
+    ended: threading.Event = field(default_factory=threading.Event)  # Ends replies that hang.
 
-    def next_answer(self) -> Callable[[BaseHTTPRequestHandler], None]:
-        return self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+    def next_reply(self) -> Callable[[BaseHTTPRequestHandler], None]:
+        return self.replies.pop(0) if len(self.replies) > 1 else self.replies[0]
 
 
 @contextmanager
-def serving(*answers: Callable[[BaseHTTPRequestHandler], None]) -> Iterator[Server]:
-    server = Server(answers=list(answers))
+def serving(*replies: Callable[[BaseHTTPRequestHandler], None]) -> Iterator[Server]:
+    server = Server(replies=list(replies))
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             length = int(self.headers["Content-Length"])
-            server.asked.append(json.loads(self.rfile.read(length)))
+            server.requests.append(json.loads(self.rfile.read(length)))
             server.paths.append(self.path)
             server.keys.append(self.headers["Authorization"])
-            self.over, self.question = server.over, server.asked[-1]
-            with suppress(OSError):  # who asked has left
-                server.next_answer()(self)
+            self.ended, self.payload = server.ended, server.requests[-1]
+            with suppress(OSError):  # The client may have disconnected.
+                server.next_reply()(self)
 
         def log_message(self, *_arguments: object) -> None:
             pass
@@ -49,14 +52,20 @@ def serving(*answers: Callable[[BaseHTTPRequestHandler], None]) -> Iterator[Serv
     try:
         yield server
     finally:
-        server.over.set()
+        server.ended.set()
         http.shutdown()
         thread.join()
         http.server_close()
 
 
-def says(text: str, *probabilities: float) -> Callable[[BaseHTTPRequestHandler], None]:
-    """A completion; a probability for each piece of the text, none: no log-probabilities."""
+def replies_with(text: str, *probabilities: float) -> Callable[[BaseHTTPRequestHandler], None]:
+    """Return a reply with a chat completion.
+
+    Args:
+        text: Text of the completion.
+        probabilities: Probability of each piece of the text; log-probabilities are absent if
+            none is given.
+    """
     message: dict = {"message": {"role": "assistant", "content": text}, "index": 0}
     if probabilities:
         size = -(-len(text) // len(probabilities))
@@ -67,43 +76,43 @@ def says(text: str, *probabilities: float) -> Callable[[BaseHTTPRequestHandler],
         ]
         content.append({"token": "<|im_end|>", "logprob": log(0.01), "top_logprobs": []})
         message["logprobs"] = {"content": content}
-    return sends(200, json.dumps({"object": "chat.completion", "choices": [message]}).encode())
+    return responds(200, json.dumps({"object": "chat.completion", "choices": [message]}).encode())
 
 
-def sends(status: int, body: bytes = b"{}") -> Callable[[BaseHTTPRequestHandler], None]:
-    def answer(handler: BaseHTTPRequestHandler) -> None:
+def responds(status: int, body: bytes = b"{}") -> Callable[[BaseHTTPRequestHandler], None]:
+    def reply(handler: BaseHTTPRequestHandler) -> None:
         handler.send_response(status)
         handler.send_header("Content-Length", str(len(body)))
         handler.end_headers()
         handler.wfile.write(body)
 
-    return answer
+    return reply
 
 
 def hangs(handler: BaseHTTPRequestHandler) -> None:
-    handler.over.wait()  # type: ignore[attr-defined]
+    handler.ended.wait()  # type: ignore[attr-defined]
 
 
 def trickles(handler: BaseHTTPRequestHandler) -> None:
-    """A byte now and then, so that no read ever times out."""
+    """Send a byte every 20 ms without end, so no single read times out."""
     handler.send_response(200)
     handler.send_header("Content-Length", "1000000")
     handler.end_headers()
-    while not handler.over.wait(0.02):  # type: ignore[attr-defined]
+    while not handler.ended.wait(0.02):  # type: ignore[attr-defined]
         handler.wfile.write(b" ")
         handler.wfile.flush()
 
 
 def trickles_headers(handler: BaseHTTPRequestHandler) -> None:
-    """A header line now and then, without end."""
+    """Send a header line every 20 ms without end."""
     handler.send_response(200)
-    while not handler.over.wait(0.02):  # type: ignore[attr-defined]
+    while not handler.ended.wait(0.02):  # type: ignore[attr-defined]
         handler.send_header("X-More", "to come")
         handler.flush_headers()
 
 
-def breaks_off(handler: BaseHTTPRequestHandler) -> None:
-    """Sends less than it announced, and a whole completion."""
+def cuts_off(handler: BaseHTTPRequestHandler) -> None:
+    """Send a whole completion that is shorter than announced."""
     body = b'{"choices": [{"message": {"content": "sofa"}}]}'
     handler.send_response(200)
     handler.send_header("Content-Length", str(len(body) + 10))
@@ -113,15 +122,15 @@ def breaks_off(handler: BaseHTTPRequestHandler) -> None:
 
 
 def redirects(url: str) -> Callable[[BaseHTTPRequestHandler], None]:
-    """To another server, with the question."""
+    """Return a reply that redirects the request to another server."""
 
-    def answer(handler: BaseHTTPRequestHandler) -> None:
+    def reply(handler: BaseHTTPRequestHandler) -> None:
         handler.send_response(307)
         handler.send_header("Location", url)
         handler.send_header("Content-Length", "0")
         handler.end_headers()
 
-    return answer
+    return reply
 
 
 def hangs_up(handler: BaseHTTPRequestHandler) -> None:

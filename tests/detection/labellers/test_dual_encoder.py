@@ -1,4 +1,4 @@
-"""A pair of encoders: names by where images and texts lie."""
+"""Dual encoder: labels from the similarity of image and text embeddings."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,19 +16,19 @@ from ldo_service.detection.labellers.dual_encoder import (
 )
 from ldo_service.errors import ConfigError, ModelError
 
-from .encoders import COLORS, SCALE, ColorPair, embeddings, plain, vocabulary
+from .encoders import COLORS, SCALE, ColorPair, embeddings, plain_image, vocabulary
 
 PAIR = ColorPair()
 
 
 @pytest.fixture
-def cached(tmp_path: Path) -> EncoderFiles:
+def cached_files(tmp_path: Path) -> EncoderFiles:
     files = PAIR.image(tmp_path / "image.onnx"), embeddings(tmp_path / "names.npz")
     return EncoderFiles(files[0], embeddings=files[1])
 
 
 @pytest.fixture
-def full(tmp_path: Path) -> EncoderFiles:
+def full_files(tmp_path: Path) -> EncoderFiles:
     return with_text(tmp_path, PAIR)
 
 
@@ -38,54 +38,55 @@ def with_text(folder: Path, pair: ColorPair) -> EncoderFiles:
 
 
 def softmax_of_red() -> float:
-    """Cosines 1, 0, 0."""
+    """Return the softmax probability of red for the cosines 1, 0, 0."""
     return np.exp(SCALE) / (np.exp(SCALE) + 2)
 
 
-def test_cached_names_are_told_with_the_probability_of_the_softmax(cached: EncoderFiles) -> None:
-    labeller = DualEncoder(cached)
+def test_cached_names_have_softmax_probabilities(cached_files: EncoderFiles) -> None:
+    labeller = DualEncoder(cached_files)
     assert labeller.names == tuple(COLORS)
-    opinions = labeller.label([plain("red", 32, 32)])
-    assert opinions[0] == ("red", pytest.approx(softmax_of_red()))
-    assert sum(p for _, p in opinions) == pytest.approx(1)
+    labels = labeller.label([plain_image("red", 32, 32)])
+    assert labels[0] == ("red", pytest.approx(softmax_of_red()))
+    assert sum(p for _, p in labels) == pytest.approx(1)
 
 
-def test_views_are_averaged(cached: EncoderFiles) -> None:
-    crops = [plain(color, 32, 32) for color in ("red", "blue", "blue")]
-    labeller = DualEncoder(cached)
+def test_probabilities_of_views_are_averaged(cached_files: EncoderFiles) -> None:
+    crops = [plain_image(color, 32, 32) for color in ("red", "blue", "blue")]
+    labeller = DualEncoder(cached_files)
     alone = [dict(labeller.label([crop])) for crop in crops]
-    both = dict(labeller.label(crops))
+    fused = dict(labeller.label(crops))
     for name in COLORS:
-        assert both[name] == pytest.approx(np.mean([one[name] for one in alone]))
+        assert fused[name] == pytest.approx(np.mean([one[name] for one in alone]))
     assert labeller.label(crops)[0][0] == "blue"
     assert labeller.label([]) == []
 
 
-def test_a_crop_is_shown_whole_in_a_square_of_the_mean(tmp_path: Path) -> None:
-    """A wide crop fills half of the square; the rest is the mean, which is nothing."""
+def test_crop_is_padded_to_a_square_with_the_mean_color(tmp_path: Path) -> None:
+    """A wide crop fills half of the square; the rest has the mean color, which embeds to zero."""
     gray = (("mean", "0.5, 0.5, 0.5"), ("std", "[0.25, 0.25, 0.25]"))
     image = replace(PAIR, image_metadata=gray).image(tmp_path / "image.onnx")
     labeller = DualEncoder(EncoderFiles(image, embeddings=embeddings(tmp_path / "n.npz")))
     encoder = labeller._image
-    wide, square = plain("red", 20, 40), plain("red", 40, 40)
+    wide, square = plain_image("red", 20, 40), plain_image("red", 40, 40)
     assert encoder.embed(wide) == pytest.approx(encoder.embed(square), abs=0.02)
     assert encoder.embed(square) == pytest.approx(np.array([1, -1, -1]) / np.sqrt(3), abs=1e-5)
 
 
-def test_a_text_encoder_places_any_name(full: EncoderFiles) -> None:
-    labeller = DualEncoder(full, names=("red", "green"))
-    assert labeller.label([plain("blue")])[0][1] == pytest.approx(0.5, abs=0.01)
+def test_text_encoder_embeds_new_names(full_files: EncoderFiles) -> None:
+    labeller = DualEncoder(full_files, names=("red", "green"))
+    assert labeller.label([plain_image("blue")])[0][1] == pytest.approx(0.5, abs=0.01)
     labeller.add("Blue")
     assert labeller.names == ("red", "green", "blue")
-    assert labeller.label([plain("blue")])[0] == ("blue", pytest.approx(1, abs=1e-4))
+    assert labeller.label([plain_image("blue")])[0] == ("blue", pytest.approx(1, abs=1e-4))
 
 
-def test_prompts_are_averaged_and_brought_to_length_one(full: EncoderFiles) -> None:
+def test_prompt_embeddings_are_averaged_and_normalized(full_files: EncoderFiles) -> None:
     prompts = ("a {}", "red {}")
-    labeller = DualEncoder(full, DualEncoderConfig(prompts=prompts), names=("green",))
-    labeller.label([plain("red")])
+    labeller = DualEncoder(full_files, DualEncoderConfig(prompts=prompts), names=("green",))
+    labeller.label([plain_image("red")])
     row = labeller._rows["green"]
-    expected = np.array([0.5 / np.sqrt(2), 0.5 + 0.5 / np.sqrt(2), 0])  # of (0,1,0), (1,1,0)/√2
+    # Mean of (0, 1, 0) and (1, 1, 0) / √2.
+    expected = np.array([0.5 / np.sqrt(2), 0.5 + 0.5 / np.sqrt(2), 0])
     assert row == pytest.approx(expected / np.linalg.norm(expected), abs=0.02)
 
 
@@ -98,41 +99,41 @@ def test_prompts_are_averaged_and_brought_to_length_one(full: EncoderFiles) -> N
     ],
     ids=["plain", "int32", "any side"],
 )
-def test_variants_of_the_layout_are_read(tmp_path: Path, pair: ColorPair) -> None:
+def test_encoder_variants_are_supported(tmp_path: Path, pair: ColorPair) -> None:
     labeller = DualEncoder(with_text(tmp_path, pair), names=tuple(COLORS))
-    assert labeller.label([plain("green")])[0][0] == "green"
+    assert labeller.label([plain_image("green")])[0][0] == "green"
 
 
-def test_synonyms_are_one_name(full: EncoderFiles) -> None:
-    labeller = DualEncoder(full, names=("sofa", "couch", "TV"))
+def test_synonyms_become_one_name(full_files: EncoderFiles) -> None:
+    labeller = DualEncoder(full_files, names=("sofa", "couch", "TV"))
     assert labeller.names == ("couch", "tv")
 
 
-def test_nothing_competes_and_is_never_told(cached: EncoderFiles) -> None:
-    labeller = DualEncoder(cached, DualEncoderConfig(nothing=("blue",)))
+def test_background_names_compete_but_are_never_returned(cached_files: EncoderFiles) -> None:
+    labeller = DualEncoder(cached_files, DualEncoderConfig(nothing=("blue",)))
     assert labeller.names == ("red", "green")
-    assert labeller.label([plain("blue")]) == []
-    assert {name for name, _ in labeller.label([plain("red")])} == {"red", "green"}
+    assert labeller.label([plain_image("blue")]) == []
+    assert {name for name, _ in labeller.label([plain_image("red")])} == {"red", "green"}
 
 
-def test_without_a_text_encoder_a_new_name_is_refused_with_what_is_missing(
-    cached: EncoderFiles,
+def test_new_name_without_text_encoder_raises_with_advice(
+    cached_files: EncoderFiles,
 ) -> None:
-    labeller = DualEncoder(cached)
+    labeller = DualEncoder(cached_files)
     with pytest.raises(ConfigError, match=r"'teapot' is not among .* --text and --vocabulary"):
         labeller.add("teapot")
     assert labeller.names == tuple(COLORS)
     with pytest.raises(ConfigError, match="'teapot'"):
-        DualEncoder(cached, names=("red", "teapot"))
+        DualEncoder(cached_files, names=("red", "teapot"))
 
 
 @pytest.mark.parametrize("name", ["", "  ", "x" * 101])
-def test_what_is_no_name_is_not_added(full: EncoderFiles, name: str) -> None:
+def test_invalid_name_raises_config_error(full_files: EncoderFiles, name: str) -> None:
     with pytest.raises(ConfigError, match="is not a name"):
-        DualEncoder(full).add(name)
+        DualEncoder(full_files).add(name)
 
 
-def test_the_scale_of_the_file_comes_before_that_of_the_encoder(tmp_path: Path) -> None:
+def test_logit_scale_of_config_and_embeddings_take_precedence(tmp_path: Path) -> None:
     image = PAIR.image(tmp_path / "image.onnx")
     npz = embeddings(tmp_path / "n.npz", logit_scale=np.float32(3))
     assert DualEncoder(EncoderFiles(image, embeddings=npz)).logit_scale == 3
@@ -143,64 +144,62 @@ def test_the_scale_of_the_file_comes_before_that_of_the_encoder(tmp_path: Path) 
     assert DualEncoder(EncoderFiles(bare, embeddings=plain_npz)).logit_scale == CLIP_SCALE
 
 
-def test_embeddings_may_come_in_safetensors(tmp_path: Path) -> None:
+def test_embeddings_are_read_from_safetensors(tmp_path: Path) -> None:
     rows = np.eye(3, dtype=np.float32)
     path = tmp_path / "names.safetensors"
     save_file({"embeddings": rows}, path, metadata={"names": "\n".join(COLORS)})
     labeller = DualEncoder(EncoderFiles(PAIR.image(tmp_path / "image.onnx"), embeddings=path))
-    assert labeller.label([plain("green")])[0][0] == "green"
+    assert labeller.label([plain_image("green")])[0][0] == "green"
 
 
-def test_the_same_crop_gives_the_same_bits_whatever_it_comes_with(full: EncoderFiles) -> None:
+def test_label_is_bitwise_equal_after_other_crops(full_files: EncoderFiles) -> None:
     crop = np.random.default_rng(1).integers(0, 256, (37, 21, 3), np.uint8)
-    one, other = DualEncoder(full, names=tuple(COLORS)), DualEncoder(full, names=tuple(COLORS))
-    other.label([plain("red"), crop])
+    one, other = (DualEncoder(full_files, names=tuple(COLORS)) for _ in range(2))
+    other.label([plain_image("red"), crop])
     assert one.label([crop]) == other.label([crop])
 
 
-# --- what is refused ------------------------------------------------------------------------------
-def test_a_pair_of_different_dimensions_is_refused(tmp_path: Path) -> None:
+# --- invalid files and settings -------------------------------------------------------------------
+def test_mismatched_embedding_dimensions_raise(tmp_path: Path) -> None:
     image = replace(PAIR, image_dimensions=4).image(tmp_path / "image.onnx")
     with pytest.raises(ModelError, match="4 dimensions and its texts 3"):
         DualEncoder(EncoderFiles(image, embeddings=embeddings(tmp_path / "n.npz")))
 
 
 @pytest.mark.parametrize(
-    ("pair", "complaint"),
+    ("pair", "message"),
     [
         (replace(PAIR, channels=1), r"its inputs are pixels .* Expected: one image"),
-        (replace(PAIR, image_metadata=(("mean", "grey"),)), "3 numbers are expected"),
+        (replace(PAIR, image_metadata=(("mean", "gray"),)), "3 numbers are expected"),
         (replace(PAIR, image_metadata=(("std", "0,1,1"),)), "3 numbers are expected"),
     ],
 )
-def test_what_is_no_image_encoder_is_refused(
-    tmp_path: Path, pair: ColorPair, complaint: str
-) -> None:
+def test_invalid_image_encoder_raises(tmp_path: Path, pair: ColorPair, message: str) -> None:
     image = pair.image(tmp_path / "image.onnx")
-    with pytest.raises(ModelError, match=complaint):
+    with pytest.raises(ModelError, match=message):
         DualEncoder(EncoderFiles(image, embeddings=embeddings(tmp_path / "n.npz")))
 
 
-def test_garbage_and_other_networks_are_refused(tmp_path: Path, full: EncoderFiles) -> None:
+def test_invalid_and_swapped_files_raise(tmp_path: Path, full_files: EncoderFiles) -> None:
     (tmp_path / "garbage.onnx").write_text("garbage")
     with pytest.raises(ModelError, match="no network in ONNX"):
-        DualEncoder(replace(full, image=tmp_path / "garbage.onnx"))
-    assert full.text is not None
+        DualEncoder(replace(full_files, image=tmp_path / "garbage.onnx"))
+    assert full_files.text is not None
     with pytest.raises(ModelError, match="Expected: one image"):
-        DualEncoder(replace(full, image=full.text))
+        DualEncoder(replace(full_files, image=full_files.text))
     with pytest.raises(ModelError, match="Expected: tokens"):
-        DualEncoder(replace(full, text=full.image))
+        DualEncoder(replace(full_files, text=full_files.image))
     vocabulary(tmp_path / "large.gz", tuple(f"x {chr(ord('!') + n)}" for n in range(40)))
     with pytest.raises(ModelError, match="inference fails"):
-        DualEncoder(replace(full, vocabulary=tmp_path / "large.gz"))
+        DualEncoder(replace(full_files, vocabulary=tmp_path / "large.gz"))
 
 
-def test_an_encoder_that_yields_nan_is_said_to_fail(tmp_path: Path) -> None:
+def test_nan_embedding_raises(tmp_path: Path) -> None:
     image = replace(PAIR, fails_on_white=True).image(tmp_path / "image.onnx")
     labeller = DualEncoder(EncoderFiles(image, embeddings=embeddings(tmp_path / "n.npz")))
     with pytest.raises(ModelError, match="NaN"):
         labeller.label([np.full((32, 32, 3), 255, np.uint8)])
-    assert labeller.label([plain("red")])[0][0] == "red"
+    assert labeller.label([plain_image("red")])[0][0] == "red"
 
 
 @pytest.mark.parametrize(
@@ -215,23 +214,23 @@ def test_an_encoder_that_yields_nan_is_said_to_fail(tmp_path: Path) -> None:
     ],
     ids=["too few", "zeros", "nan", "no name", "scale", "pickle"],
 )
-def test_embeddings_that_cannot_be_are_refused(tmp_path: Path, arrays: dict) -> None:
+def test_invalid_embeddings_raise(tmp_path: Path, arrays: dict) -> None:
     image = PAIR.image(tmp_path / "image.onnx")
     path = embeddings(tmp_path / "n.npz", **arrays)
     with pytest.raises(ModelError, match=r"n\.npz"):
         DualEncoder(EncoderFiles(image, embeddings=path))
 
 
-def test_half_a_pair_is_refused(full: EncoderFiles) -> None:
+def test_incomplete_pair_raises_config_error(full_files: EncoderFiles) -> None:
     with pytest.raises(ConfigError, match="needs its byte pairs"):
-        EncoderFiles(full.image, text=full.text)
+        EncoderFiles(full_files.image, text=full_files.text)
     with pytest.raises(ConfigError, match="needs texts"):
-        EncoderFiles(full.image)
+        EncoderFiles(full_files.image)
 
 
 @pytest.mark.parametrize(
     "fields", [{"prompts": ()}, {"prompts": ("a",)}, {"mean": (1.0,)}, {"std": (0.0, 1, 1)}]
 )
-def test_settings_that_cannot_be_are_refused(fields: dict) -> None:
+def test_invalid_settings_raise_config_error(fields: dict) -> None:
     with pytest.raises(ConfigError, match="dual_encoder"):
         DualEncoderConfig(**fields)

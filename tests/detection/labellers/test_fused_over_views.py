@@ -1,4 +1,4 @@
-"""Views of one region, made one opinion."""
+"""Fusion of the label probabilities of several views of a region."""
 
 import doctest
 
@@ -14,21 +14,21 @@ VIEW = st.dictionaries(st.sampled_from("abcd"), PROBABILITIES).map(lambda view: 
 
 
 @pytest.mark.parametrize("module", [labellers, chat_completion, dual_encoder])
-def test_the_examples_hold(module) -> None:
+def test_docstring_examples_pass(module) -> None:
     result = doctest.testmod(module, extraglobs={"np": __import__("numpy")})
     assert result.attempted > 0
     assert result.failed == 0
 
 
 @given(st.lists(VIEW, min_size=1, max_size=5))
-def test_means_are_sorted_and_within_what_the_views_say(views) -> None:
+def test_fused_probabilities_are_sorted_means_of_the_views(views) -> None:
     fused = fused_over_views(views)
     means = [mean for _, mean in fused]
     assert means == sorted(means, reverse=True)
     for name, mean in fused:
-        told = [dict(view).get(name, 0.0) for view in views]
-        assert mean == pytest.approx(sum(told) / len(told))
+        probabilities = [dict(view).get(name, 0.0) for view in views]
+        assert mean == pytest.approx(sum(probabilities) / len(probabilities))
 
 
-def test_nobody_saying_anything_is_no_opinion() -> None:
+def test_views_without_labels_give_no_labels() -> None:
     assert fused_over_views([]) == fused_over_views([[], []]) == []

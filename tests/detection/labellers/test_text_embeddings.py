@@ -1,4 +1,4 @@
-"""Byte pairs, against an example worked by hand and against numbers that CLIP is known for."""
+"""Byte-pair tokenizer against a manual example and the published token ids of CLIP."""
 
 from itertools import islice, product
 from pathlib import Path
@@ -11,26 +11,27 @@ from ldo_service.errors import ModelError
 
 from .encoders import vocabulary
 
-HAND = ("l o", "lo w</w>", "e r</w>")
+EXAMPLE_MERGES = ("l o", "lo w</w>", "e r</w>")
 START, END = 515, 516
 
 
 @pytest.fixture
-def by_hand(tmp_path: Path) -> Tokenizer:
-    return read_tokenizer(vocabulary(tmp_path / "bpe.txt.gz", HAND))
+def example_tokenizer(tmp_path: Path) -> Tokenizer:
+    return read_tokenizer(vocabulary(tmp_path / "bpe.txt.gz", EXAMPLE_MERGES))
 
 
-def test_an_example_by_hand(by_hand: Tokenizer) -> None:
-    """low: l o w</w>, lo w</w>, low</w>. lower: l o w e r</w>, lo w e r</w>, lo w er</w>.
+def test_tokens_match_a_manual_example(example_tokenizer: Tokenizer) -> None:
+    """The merges of "low" are l o w</w>, lo w</w>, low</w>.
 
-    Bytes that print count from "!", so w is 119 - 33; the end of a word is 256 later.
+    The merges of "lower" are l o w e r</w>, lo w e r</w>, lo w er</w>.
+    Ids of printable bytes start at "!", so w is 119 - 33; the last byte of a word is 256 later.
     """
-    assert by_hand.encode("Low  LOWER!").ids == [START, 513, 512, 86, 514, 256, END]
-    assert by_hand.encode("").ids == [START, END]
+    assert example_tokenizer.encode("Low  LOWER!").ids == [START, 513, 512, 86, 514, 256, END]
+    assert example_tokenizer.encode("").ids == [START, END]
 
 
-def test_numbers_that_clip_is_known_for(tmp_path: Path) -> None:
-    """49,408 tokens, start 49406, end 49407, "a" 320, "." 269, whatever its merges are."""
+def test_vocabulary_size_and_ids_match_clip(tmp_path: Path) -> None:
+    """CLIP has 49,408 tokens: start 49406, end 49407, "a" 320, "." 269, for any merges."""
     letters = sorted(pre_tokenizers.ByteLevel.alphabet())
     merges = islice(map(" ".join, product(letters, letters)), MAX_MERGES + 5)
     tokenizer = read_tokenizer(vocabulary(tmp_path / "bpe.txt.gz", tuple(merges)))
@@ -38,22 +39,22 @@ def test_numbers_that_clip_is_known_for(tmp_path: Path) -> None:
     assert tokenizer.get_vocab_size() == 49408
 
 
-def test_words_are_cut_as_clip_cuts_them(by_hand: Tokenizer) -> None:
-    first, end = ord("!"), 256  # of the numbers of bytes, and of those that end a word
-    numbers = [ord(digit) - first + end for digit in "2x4"]
-    assert by_hand.encode("2x4").ids[1:-1] == numbers, "digits stand alone"
-    assert len(by_hand.encode("é").ids) == 4, "a letter of two bytes"
-    assert by_hand.encode("a²b").ids[1:-1] == by_hand.encode("a ² b").ids[1:-1]
-    assert by_hand.encode("low_low").ids[1:-1] == [513, ord("_") - first + end, 513]
-    marks = by_hand.encode("<|endoftext|>").ids
-    assert (marks.count(END), len(marks)) == (1, 2 + 13), "a mark in a text is no mark"
+def test_words_are_split_as_in_clip(example_tokenizer: Tokenizer) -> None:
+    first, end = ord("!"), 256  # First id of bytes and offset at the end of a word.
+    ids = [ord(digit) - first + end for digit in "2x4"]
+    assert example_tokenizer.encode("2x4").ids[1:-1] == ids, "each digit is a token"
+    assert len(example_tokenizer.encode("é").ids) == 4, "a letter of two bytes"
+    assert example_tokenizer.encode("a²b").ids[1:-1] == example_tokenizer.encode("a ² b").ids[1:-1]
+    assert example_tokenizer.encode("low_low").ids[1:-1] == [513, ord("_") - first + end, 513]
+    marks = example_tokenizer.encode("<|endoftext|>").ids
+    assert (marks.count(END), len(marks)) == (1, 2 + 13), "a mark inside a text is plain text"
 
 
-def test_a_file_is_read_packed_or_plain(tmp_path: Path) -> None:
-    path = vocabulary(tmp_path / "bpe.txt.gz", HAND)
+def test_gzip_and_plain_files_are_equal(tmp_path: Path) -> None:
+    path = vocabulary(tmp_path / "bpe.txt.gz", EXAMPLE_MERGES)
     (tmp_path / "bpe.txt").write_text("#version\nl o\nlo w</w>\ne r</w>\n")
-    read = [read_tokenizer(path), read_tokenizer(tmp_path / "bpe.txt")]
-    assert {tuple(tokenizer.encode("low").ids) for tokenizer in read} == {(START, 513, END)}
+    tokenizers = [read_tokenizer(path), read_tokenizer(tmp_path / "bpe.txt")]
+    assert {tuple(tokenizer.encode("low").ids) for tokenizer in tokenizers} == {(START, 513, END)}
 
 
 @pytest.mark.parametrize(
@@ -68,7 +69,7 @@ def test_a_file_is_read_packed_or_plain(tmp_path: Path) -> None:
         b"\xff\xfe\n",
     ],
 )
-def test_garbage_is_no_list_of_pairs(tmp_path: Path, body: bytes) -> None:
+def test_invalid_merges_file_raises(tmp_path: Path, body: bytes) -> None:
     (tmp_path / "bpe").write_bytes(body)
     with pytest.raises(ModelError, match="byte pairs"):
         read_tokenizer(tmp_path / "bpe")
