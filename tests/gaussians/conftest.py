@@ -1,4 +1,4 @@
-"""Gaussians of every kind, and a room to fit some to."""
+"""Fixtures of Gaussian rows and of a small synthetic room."""
 
 from collections.abc import Callable
 
@@ -8,12 +8,12 @@ import pytest
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import RgbdFrame
 
-Posed = tuple[RgbdFrame, np.ndarray]  # and T_world_camera
+Posed = tuple[RgbdFrame, np.ndarray]  # Frame and T_world_camera.
 
 
 @pytest.fixture
 def some_rows() -> np.ndarray:
-    """Rows [200, 16] with every attribute different: also opacities near 0 and 1, black, white."""
+    """Return rows [200, 16] with varied attributes, opacities near 0 and 1, black and white."""
     rng = np.random.default_rng(5)
     rows = np.zeros((200, 16), np.float32)
     rows[:, 0:3] = rng.uniform(-8, 8, (200, 3))
@@ -27,13 +27,19 @@ def some_rows() -> np.ndarray:
 
 @pytest.fixture(scope="package")
 def small_room(room: Sequence) -> Callable[[int], Posed]:
-    """A frame of the synthetic room at a quarter of its size, and where it was taken."""
+    """Return a function that gives a frame of the synthetic room at 1/4 size, and its pose."""
     T_world_camera = room.truth().T_world_camera
     return lambda index: (halved(halved(room[index])), T_world_camera[index])
 
 
 def halved(frame: RgbdFrame) -> RgbdFrame:
+    """Return the frame at half of its width and height, averaged over 2x2 pixels."""
     size = (frame.camera.height // 2, 2, frame.camera.width // 2, 2, -1)
     color = frame.color.astype(float).reshape(size).mean(axis=(1, 3))
     depth_m = frame.depth_m.reshape(size).mean(axis=(1, 3))[..., 0]
     return RgbdFrame(np.round(color).astype(np.uint8), depth_m, frame.camera.halved())
+
+
+def labels_of(n: int, seed: int = 0) -> np.ndarray:
+    """Return random label rows [n, 32]."""
+    return np.random.default_rng(seed).integers(0, 256, (n, 32), np.uint8)

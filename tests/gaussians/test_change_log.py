@@ -1,4 +1,4 @@
-"""A follower that applies what the log says holds the same map."""
+"""Change log: a replica that applies its changes equals the map."""
 
 import numpy as np
 import pytest
@@ -15,15 +15,15 @@ def rows(count: int, value: float = 0.0) -> np.ndarray:
     return out
 
 
-class Follower:
-    """Ids and rows, by id."""
+class Replica:
+    """Replica of the rows, by id."""
 
     def __init__(self) -> None:
         self.rows: dict[int, bytes] = {}
 
-    def take(self, changes: Changes, gaussians: GaussianMap) -> None:
-        for gone in changes.removed:
-            del self.rows[int(gone)]
+    def apply(self, changes: Changes, gaussians: GaussianMap) -> None:
+        for removed_id in changes.removed:
+            del self.rows[int(removed_id)]
         for row in changes.changed:
             assert int(gaussians.ids[row]) in self.rows, "changed before it was added"
             self.rows[int(gaussians.ids[row])] = gaussians.rows[row].tobytes()
@@ -32,13 +32,13 @@ class Follower:
             self.rows[int(gaussians.ids[row])] = gaussians.rows[row].tobytes()
 
 
-def truth(gaussians: GaussianMap) -> dict[int, bytes]:
+def expected_rows(gaussians: GaussianMap) -> dict[int, bytes]:
     return {int(i): row.tobytes() for i, row in zip(gaussians.ids, gaussians.rows, strict=True)}
 
 
 STEPS = st.lists(
     st.tuples(
-        st.sampled_from(["add", "write", "remove", "tell", "tell all", "sleep", "wake"]),
+        st.sampled_from(["add", "write", "remove", "drain", "drain all", "offload", "load"]),
         st.integers(0, 2**30),
     ),
     max_size=30,
@@ -47,13 +47,13 @@ STEPS = st.lists(
 
 @settings(deadline=None, max_examples=150)
 @given(STEPS)
-def test_a_follower_ends_with_the_same_rows_whatever_happens(steps: list[tuple[str, int]]) -> None:
-    gaussians, log, follower = GaussianMap(), ChangeLog(), Follower()
-    asleep: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    for what, seed in steps:
+def test_replica_equals_map_after_any_sequence_of_changes(steps: list[tuple[str, int]]) -> None:
+    gaussians, log, replica = GaussianMap(), ChangeLog(), Replica()
+    offloaded: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for action, seed in steps:
         rng = np.random.default_rng(seed)
         mask = rng.random(len(gaussians)) < 0.3
-        match what:
+        match action:
             case "add":
                 gaussians.add(rows(int(rng.integers(1, 5)), float(seed)), 0)
                 log.mark_added(gaussians)
@@ -63,30 +63,30 @@ def test_a_follower_ends_with_the_same_rows_whatever_happens(steps: list[tuple[s
             case "remove":
                 log.mark_removed(gaussians, mask)
                 gaussians.remove(mask)
-            case "tell":
-                follower.take(log.drain(gaussians, with_changed=False), gaussians)
-            case "tell all":
-                follower.take(log.drain(gaussians, with_changed=True), gaussians)
-                assert {i: r for i, r in follower.rows.items() if i in truth(gaussians)} == truth(
-                    gaussians
-                )
-            case "sleep":
-                follower.take(log.drain(gaussians, with_changed=True), gaussians)
-                asleep.append(gaussians.extract(mask))
+            case "drain":
+                replica.apply(log.drain(gaussians, with_changed=False), gaussians)
+            case "drain all":
+                replica.apply(log.drain(gaussians, with_changed=True), gaussians)
+                assert {
+                    i: r for i, r in replica.rows.items() if i in expected_rows(gaussians)
+                } == expected_rows(gaussians)
+            case "offload":
+                replica.apply(log.drain(gaussians, with_changed=True), gaussians)
+                offloaded.append(gaussians.extract(mask))
                 log.mark_all_published(gaussians)
-            case "wake" if asleep:
-                woken = asleep.pop()
-                gaussians.reinsert(*woken)
-                log.mark_loaded(gaussians, woken.ids)
-    while asleep:
-        woken = asleep.pop()
-        gaussians.reinsert(*woken)
-        log.mark_loaded(gaussians, woken.ids)
-    follower.take(log.drain(gaussians, with_changed=True), gaussians)
-    assert follower.rows == truth(gaussians)
+            case "load" if offloaded:
+                loaded = offloaded.pop()
+                gaussians.reinsert(*loaded)
+                log.mark_loaded(gaussians, loaded.ids)
+    while offloaded:
+        loaded = offloaded.pop()
+        gaussians.reinsert(*loaded)
+        log.mark_loaded(gaussians, loaded.ids)
+    replica.apply(log.drain(gaussians, with_changed=True), gaussians)
+    assert replica.rows == expected_rows(gaussians)
 
 
-def test_what_came_and_went_untold_is_never_told() -> None:
+def test_gaussian_removed_before_drain_is_not_published() -> None:
     gaussians, log = GaussianMap(), ChangeLog()
     gaussians.add(rows(3), 0)
     log.mark_added(gaussians)
@@ -99,10 +99,10 @@ def test_what_came_and_went_untold_is_never_told() -> None:
 
 
 @pytest.mark.parametrize("with_changed", [True, False])
-def test_nothing_is_told_twice(with_changed: bool) -> None:
+def test_changes_are_drained_once(with_changed: bool) -> None:
     gaussians, log = GaussianMap(), ChangeLog()
     gaussians.add(rows(3), 0)
     log.mark_added(gaussians)
     log.drain(gaussians, with_changed=with_changed)
-    again = log.drain(gaussians, with_changed=with_changed)
-    assert len(again.removed) == len(again.changed) == len(again.added) == 0
+    repeated = log.drain(gaussians, with_changed=with_changed)
+    assert len(repeated.removed) == len(repeated.changed) == len(repeated.added) == 0

@@ -15,7 +15,7 @@ T_MAP_CAMERA = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
 
 
 def corner_of_a_room(T_room_camera: np.ndarray | None = None) -> RgbdFrame:
-    """A back wall at z = 2 m with a checkerboard, and a floor at y = 0.7 m with a gradient."""
+    """Return a frame of a checkerboard wall at z = 2 m and a gradient floor at y = 0.7 m."""
     T = np.eye(4) if T_room_camera is None else T_room_camera
     rays = CAMERA.rays() @ T[:3, :3].T
     to_wall, to_floor = (2 - T[2, 3]) / rays[..., 2], (0.7 - T[1, 3]) / rays[..., 1]
@@ -34,7 +34,7 @@ def view(gaussians: GaussianMap, T_map_camera: np.ndarray):
 
 
 def psnr(color: np.ndarray, truth: np.ndarray) -> float:
-    """Of a rendering in 0..1 against a camera's 0..255."""
+    """Return the PSNR of a rendering in 0..1 against an image in 0..255."""
     return views.psnr(color, truth / np.float32(255))
 
 
@@ -44,35 +44,35 @@ def without_depth(frame: RgbdFrame, missing: np.ndarray) -> RgbdFrame:
 
 
 def with_box(frame: RgbdFrame, columns: slice) -> RgbdFrame:
-    """A red box one metre away."""
+    """Return the frame with a red box at a depth of 1 m."""
     depth_m, color = frame.depth_m.copy(), frame.color.copy()
     depth_m[30:50, columns], color[30:50, columns] = 1.0, (255, 0, 0)
     return RgbdFrame(color, depth_m, CAMERA)
 
 
-def test_inserted_frame_is_rendered_as_it_was_seen() -> None:
+def test_densified_frame_is_rendered_as_observed() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
     ids = densify(gaussians, frame, T_MAP_CAMERA, keyframe=7)
-    seen = view(gaussians, T_MAP_CAMERA)
-    assert psnr(seen.color, frame.color) > 28
-    assert np.mean(seen.opacity > 0.8) > 0.99
-    error = np.abs(seen.median_depth_m / frame.depth_m - 1)
+    rendering = view(gaussians, T_MAP_CAMERA)
+    assert psnr(rendering.color, frame.color) > 28
+    assert np.mean(rendering.opacity > 0.8) > 0.99
+    error = np.abs(rendering.median_depth_m / frame.depth_m - 1)
     assert np.mean(error < 0.02) > 0.94
     np.testing.assert_array_equal(gaussians.ids, ids)
     assert set(gaussians.anchors) == {7}
 
 
-def test_view_from_elsewhere_has_no_cracks() -> None:
+def test_rendering_from_another_pose_has_no_gaps() -> None:
     gaussians = GaussianMap()
     densify(gaussians, corner_of_a_room(), np.eye(4), 0)
     T = se3.exp(np.array([0.05, 0.06, 0.02, 0.1, -0.05, 0.3]))
-    seen, truth = view(gaussians, T), corner_of_a_room(T)
+    rendering, truth = view(gaussians, T), corner_of_a_room(T)
     inside = np.s_[12:-12, 12:-12]
-    assert np.mean(seen.opacity[inside] > 0.8) > 0.97
-    assert psnr(seen.color[inside], truth.color[inside]) > 24
+    assert np.mean(rendering.opacity[inside] > 0.8) > 0.97
+    assert psnr(rendering.color[inside], truth.color[inside]) > 24
 
 
-def test_edges_get_more_gaussians_than_flats() -> None:
+def test_textured_areas_get_more_gaussians_than_uniform_areas() -> None:
     frame = corner_of_a_room()
     flat = RgbdFrame(np.full_like(frame.color, 128), np.full_like(frame.depth_m, 2), CAMERA)
     sparse, dense = GaussianMap(), GaussianMap()
@@ -82,14 +82,14 @@ def test_edges_get_more_gaussians_than_flats() -> None:
     assert len(dense) > 1.5 * len(sparse)
 
 
-def test_frame_that_the_map_explains_adds_almost_nothing() -> None:
+def test_frame_of_mapped_surface_adds_almost_no_gaussians() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
-    first = len(densify(gaussians, frame, T_MAP_CAMERA, 0))
-    again = len(densify(gaussians, frame, T_MAP_CAMERA, 1))
-    assert again < 0.02 * first
+    first_count = len(densify(gaussians, frame, T_MAP_CAMERA, 0))
+    second_count = len(densify(gaussians, frame, T_MAP_CAMERA, 1))
+    assert second_count < 0.02 * first_count
 
 
-def test_pixels_without_depth_get_nothing() -> None:
+def test_pixels_without_depth_get_no_gaussians() -> None:
     frame = corner_of_a_room()
     missing = np.zeros(frame.depth_m.shape, bool)
     missing[:, 50:] = True
@@ -101,10 +101,10 @@ def test_pixels_without_depth_get_nothing() -> None:
     assert len(densify(GaussianMap(), without_depth(frame, ~missing | missing), np.eye(4), 0)) == 0
 
 
-def test_small_holes_are_filled_with_the_depth_behind_and_large_ones_stay() -> None:
+def test_small_depth_holes_are_filled_with_background_depth() -> None:
     depth_m = np.full((60, 80), 2.0, np.float32)
     depth_m[:, :20] = 1.0
-    depth_m[10:50, 20:23] = 0  # the shadow of the near surface
+    depth_m[10:50, 20:23] = 0  # Missing depth next to the near surface.
     depth_m[10:50, 45:75] = 0
     filled = with_small_holes_filled(depth_m, 4)
     np.testing.assert_array_equal(filled[10:50, 20:23], 2.0)
@@ -117,22 +117,22 @@ def test_surface_in_front_of_the_map_is_added() -> None:
     densify(gaussians, frame, np.eye(4), 0)
     ids = densify(gaussians, with_box(frame, slice(40, 70)), np.eye(4), 1)
     assert 30 < len(ids) < 1000
-    seen = view(gaussians, np.eye(4))
-    np.testing.assert_allclose(seen.median_depth_m[34:46, 44:66], 1.0, atol=0.02)
-    assert seen.color[34:46, 44:66, 0].min() > 0.85
-    assert seen.color[34:46, 44:66, 1].max() < 0.15
+    rendering = view(gaussians, np.eye(4))
+    np.testing.assert_allclose(rendering.median_depth_m[34:46, 44:66], 1.0, atol=0.02)
+    assert rendering.color[34:46, 44:66, 0].min() > 0.85
+    assert rendering.color[34:46, 44:66, 1].max() < 0.15
 
 
-def test_an_edge_that_noise_or_drift_displaces_adds_nothing() -> None:
+def test_displaced_depth_edge_adds_no_gaussians() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
     densify(gaussians, with_box(frame, slice(40, 70)), np.eye(4), 0)
     displaced = with_box(frame, slice(41, 72))
-    strict = GaussianMap.restore(gaussians.snapshot())
-    assert len(densify(strict, displaced, np.eye(4), 1, DensificationConfig(edge_px=0))) > 50
+    copy = GaussianMap.restore(gaussians.snapshot())
+    assert len(densify(copy, displaced, np.eye(4), 1, DensificationConfig(edge_px=0))) > 50
     assert len(densify(gaussians, displaced, np.eye(4), 1)) == 0
 
 
-def test_a_thin_surface_in_front_of_the_map_is_added() -> None:
+def test_thin_surface_in_front_of_the_map_is_added() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
     densify(gaussians, frame, np.eye(4), 0)
     pole = with_box(frame, slice(40, 42))
@@ -146,7 +146,7 @@ def test_gaussians_are_flat_and_lie_in_the_surface() -> None:
     R, scales = se3.rotation(gaussians.quats.astype(float)), np.exp(gaussians.log_scales)
     thinnest = np.take_along_axis(R, scales.argmin(1)[:, None, None], axis=2)[..., 0]
     _, y, z = gaussians.means.T
-    on_wall = (np.abs(z - 2) < 1e-3) & (y < 0.62)  # not in the corner, where normals are mixed
+    on_wall = (np.abs(z - 2) < 1e-3) & (y < 0.62)  # Excludes the corner with its mixed normals.
     on_floor = (np.abs(y - 0.7) < 1e-3) & (z < 1.85)
     assert np.all(scales.min(1) < 0.2 * scales.max(1))
     assert np.mean(np.abs(thinnest[on_wall, 2]) > 0.99) > 0.9
@@ -154,24 +154,24 @@ def test_gaussians_are_flat_and_lie_in_the_surface() -> None:
     assert on_floor.sum() > 20
 
 
-def test_color_criterion_reinserts_what_changed_its_color() -> None:
+def test_color_criterion_densifies_repainted_surface() -> None:
     frame, config = corner_of_a_room(), DensificationConfig(max_color_error=0.1)
-    plain, strict = GaussianMap(), GaussianMap()
-    for gaussians in (plain, strict):
+    depth_only, with_color = GaussianMap(), GaussianMap()
+    for gaussians in (depth_only, with_color):
         densify(gaussians, frame, np.eye(4), 0)
     repainted = RgbdFrame(255 - frame.color, frame.depth_m, CAMERA)
-    assert len(densify(plain, repainted, np.eye(4), 1)) < 20
-    assert len(densify(strict, repainted, np.eye(4), 1, config)) > 300
+    assert len(densify(depth_only, repainted, np.eye(4), 1)) < 20
+    assert len(densify(with_color, repainted, np.eye(4), 1, config)) > 300
 
 
-def test_number_of_threads_changes_no_bit() -> None:
+def test_result_is_bitwise_equal_for_any_thread_count() -> None:
     maps = [GaussianMap(), GaussianMap()]
     for gaussians, threads in zip(maps, (1, 3), strict=True):
         densify(gaussians, corner_of_a_room(), T_MAP_CAMERA, 0, threads=threads)
     assert maps[0].rows.tobytes() == maps[1].rows.tobytes()
 
 
-def test_image_whose_sides_are_not_multiples_of_a_cell_is_covered() -> None:
+def test_image_size_that_is_no_multiple_of_a_cell_is_covered() -> None:
     frame = corner_of_a_room()
     camera = Camera(117, 86, 100.0, 100.0, 59.5, 43.5)
     cropped = RgbdFrame(
@@ -179,8 +179,8 @@ def test_image_whose_sides_are_not_multiples_of_a_cell_is_covered() -> None:
     )
     gaussians = GaussianMap()
     densify(gaussians, cropped, np.eye(4), 0)
-    seen = render(gaussians.rows, camera, np.eye(4))
-    assert np.mean(seen.opacity > 0.5) > 0.99
+    rendering = render(gaussians.rows, camera, np.eye(4))
+    assert np.mean(rendering.opacity > 0.5) > 0.99
 
 
 def test_image_of_one_pixel_gives_one_gaussian() -> None:
@@ -192,7 +192,7 @@ def test_image_of_one_pixel_gives_one_gaussian() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "settings",
     [
         {"coarsest_px": 3},
         {"opacity": 1.0},
@@ -203,12 +203,12 @@ def test_image_of_one_pixel_gives_one_gaussian() -> None:
         {"max_contrast": float("nan")},
     ],
 )
-def test_config_refuses_senseless_values(wrong: dict) -> None:
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
-        DensificationConfig(**wrong)
+def test_invalid_settings_raise_config_error(settings: dict) -> None:
+    with pytest.raises(ConfigError, match=next(iter(settings))):
+        DensificationConfig(**settings)
 
 
-def test_real_room_is_rendered_between_its_keyframes(data: Path) -> None:
+def test_real_room_is_rendered_well_between_keyframes(data: Path) -> None:
     apartment = open_sequence(str(data / "replica" / "apartment_floor1"))
     truth = apartment.truth()
     assert truth is not None
@@ -217,8 +217,8 @@ def test_real_room_is_rendered_between_its_keyframes(data: Path) -> None:
     for i in (0, 5, 20, 25):
         densify(gaussians, apartment[i], T_map_camera[i], i)
     for i in (2, 22):
-        seen = render(gaussians.rows, apartment.camera, se3.inverse(T_map_camera[i]))
-        covered = seen.opacity > 0.5
+        rendering = render(gaussians.rows, apartment.camera, se3.inverse(T_map_camera[i]))
+        covered = rendering.opacity > 0.5
         assert covered.mean() > 0.95
-        assert psnr(seen.color[covered], apartment[i].color[covered]) > 25
+        assert psnr(rendering.color[covered], apartment[i].color[covered]) > 25
     assert len(gaussians) < 80_000

@@ -16,11 +16,11 @@ from ldo_service.gaussians.training_views import KeyframeImages, pack, unpack
 from ldo_service.geometry import Camera
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
-MB_EACH = 64 * 48 * 7 / 1e6  # in memory
+MB_EACH = 64 * 48 * 7 / 1e6  # Size of a keyframe in memory.
 
 
 def images_of(keyframe: int, *, step_m: float = 0.0, mask: bool = False) -> KeyframeImages:
-    """Noise in colour, a slope in depth; `step_m` of the depth sensor."""
+    """Return images with random color and sloped depth, quantized to `step_m`."""
     rng = np.random.default_rng(keyframe)
     color = rng.integers(0, 256, (3, 48, 64), np.uint8)
     depth = np.linspace(1, 3, 48 * 64).reshape(48, 64) + rng.uniform(0, 0.01, (48, 64))
@@ -40,7 +40,7 @@ def assert_same(a: KeyframeImages | None, b: KeyframeImages) -> None:
 
 
 def store_on_disk(folder: Path, keyframes: list[int], **config: float) -> KeyframeStore:
-    """Without a cache, so that all is read from the disk."""
+    """Return a store without a cache, so each read is from disk."""
     store = KeyframeStore(folder, KeyframeStoreConfig(cache_mb=0, **config))  # type: ignore[arg-type]
     for keyframe in keyframes:
         store.put(images_of(keyframe))
@@ -52,43 +52,42 @@ def file_of(folder: Path, keyframe: int) -> Path:
     return path
 
 
-# --- bytes ------------------------------------------------------------------------------------
+# --- format -----------------------------------------------------------------------------------
 @pytest.mark.parametrize("step_m", [0.0, 0.001, 1 / 5000])
 @pytest.mark.parametrize("mask", [False, True])
-def test_images_come_back_bit_for_bit(step_m: float, mask: bool) -> None:
+def test_images_are_restored_bitwise_equal(step_m: float, mask: bool) -> None:
     images = images_of(3, step_m=step_m, mask=mask)
     assert_same(unpack(pack(images)), images)
 
 
-def test_depth_of_any_bits_comes_back_bit_for_bit() -> None:
-    bits = np.random.default_rng(0).integers(
-        0, 2**32, (48, 64), np.uint32
-    )  # with NaN, -0, denormals
+def test_depth_of_any_bits_is_restored_bitwise_equal() -> None:
+    # Any bits, including NaN, -0 and denormals.
+    bits = np.random.default_rng(0).integers(0, 2**32, (48, 64), np.uint32)
     images = KeyframeImages(0, CAMERA, images_of(0).color, bits.view(np.float32))
     assert unpack(pack(images)).depth_m.tobytes() == bits.tobytes()
 
 
-def test_a_smooth_picture_takes_less_room_than_noise() -> None:
+def test_smooth_image_compresses_better_than_noise() -> None:
     ramp = np.add.outer(np.arange(48), 2 * np.arange(64)).astype(np.uint8)
     smooth = KeyframeImages(0, CAMERA, np.stack([ramp] * 3), np.ones((48, 64), np.float32))
     assert 20 * len(pack(smooth)) < smooth.nbytes < 4 * len(pack(images_of(0)))
 
 
-def test_images_that_do_not_fit_their_camera_are_refused() -> None:
-    good = images_of(0)
+def test_images_that_mismatch_their_camera_raise() -> None:
+    images = images_of(0)
     with pytest.raises(DataError, match=r"depth_m is float32\(48, 63\)"):
-        KeyframeImages(0, CAMERA, good.color, good.depth_m[:, 1:])
+        KeyframeImages(0, CAMERA, images.color, images.depth_m[:, 1:])
     with pytest.raises(DataError, match="color"):
-        KeyframeImages(0, CAMERA, good.color.transpose(1, 2, 0), good.depth_m)
+        KeyframeImages(0, CAMERA, images.color.transpose(1, 2, 0), images.depth_m)
 
 
 @pytest.mark.parametrize("body", [b"", b"\x93\x01\x02\x03", b"\xff" * 100])
-def test_other_bytes_are_refused(body: bytes) -> None:
+def test_invalid_bytes_raise(body: bytes) -> None:
     with pytest.raises(DataError, match="no images of a keyframe"):
         unpack(body)
 
 
-def test_a_view_is_the_images_at_a_pose() -> None:
+def test_view_combines_images_with_pose_and_exposure() -> None:
     images, T = images_of(5, mask=True), np.diag([1.0, -1, -1, 1])
     view = images.view(T, Exposure(np.full(3, 2, np.float32)))
     assert_same(KeyframeImages.of(view), images)
@@ -97,7 +96,7 @@ def test_a_view_is_the_images_at_a_pose() -> None:
 
 
 # --- the store --------------------------------------------------------------------------------
-def test_what_was_put_is_there_and_nothing_else(tmp_path: Path) -> None:
+def test_store_returns_exactly_the_put_keyframes(tmp_path: Path) -> None:
     store = store_on_disk(tmp_path, [7, 3, 12])
     assert store.keyframes() == [3, 7, 12]
     assert len(store) == 3
@@ -108,28 +107,28 @@ def test_what_was_put_is_there_and_nothing_else(tmp_path: Path) -> None:
         assert_same(store.get(keyframe), images_of(keyframe))
 
 
-def test_the_store_keeps_no_array_of_its_callers_and_gives_none_to_write(tmp_path: Path) -> None:
+def test_store_copies_its_input_and_returns_read_only_arrays(tmp_path: Path) -> None:
     store, images = KeyframeStore(tmp_path), images_of(1)
     store.put(images)
     images.color[...] = 0
     images.depth_m[...] = 0
     assert_same(store.get(1), images_of(1))
     for other in (store, store_on_disk(tmp_path, [])):
-        got = other.get(1)
-        assert got is not None
+        stored = other.get(1)
+        assert stored is not None
         with pytest.raises(ValueError, match="read-only"):
-            got.color[...] = 0
+            stored.color[...] = 0
         with pytest.raises(ValueError, match="read-only"):
-            got.depth_m[...] = 0
+            stored.depth_m[...] = 0
 
 
-def test_cache_holds_the_last_used_and_no_more_than_its_megabytes(tmp_path: Path) -> None:
+def test_cache_keeps_recently_used_images_within_its_limit(tmp_path: Path) -> None:
     store = KeyframeStore(tmp_path, KeyframeStoreConfig(cache_mb=3.5 * MB_EACH))
     for keyframe in range(4):
         store.put(images_of(keyframe))
         assert store.metrics()["keyframes_cache_mb"] <= 3.5 * MB_EACH
     store.get(1)
-    store.put(images_of(4))  # 2 goes, 1 was used
+    store.put(images_of(4))  # Evicts 2, because 1 was used.
     assert store.metrics()["keyframes_read"] == 0
     for keyframe in (1, 3, 4):
         store.get(keyframe)
@@ -140,18 +139,18 @@ def test_cache_holds_the_last_used_and_no_more_than_its_megabytes(tmp_path: Path
     assert store.metrics()["keyframes_cache_mb"] == pytest.approx(3 * MB_EACH)
 
 
-def test_a_successor_finds_what_is_there(tmp_path: Path) -> None:
+def test_reopened_store_finds_its_keyframes(tmp_path: Path) -> None:
     store_on_disk(tmp_path, [1, 2, 3])
     (tmp_path / "00000009.keyframe.new").write_bytes(b"half")
     (tmp_path / "notes.txt").write_text("not ours")
-    successor = store_on_disk(tmp_path, [4])
-    assert successor.keyframes() == [1, 2, 3, 4]
-    assert_same(successor.get(2), images_of(2))
+    restored = store_on_disk(tmp_path, [4])
+    assert restored.keyframes() == [1, 2, 3, 4]
+    assert_same(restored.get(2), images_of(2))
     assert not (tmp_path / "00000009.keyframe.new").exists()
     assert (tmp_path / "notes.txt").exists()
 
 
-def test_keyframes_that_a_checkpoint_does_not_know_are_dropped(tmp_path: Path) -> None:
+def test_keep_only_removes_keyframes_unknown_to_the_checkpoint(tmp_path: Path) -> None:
     store = KeyframeStore(tmp_path)
     for keyframe in (1, 2, 3, 4):
         store.put(images_of(keyframe))
@@ -161,7 +160,7 @@ def test_keyframes_that_a_checkpoint_does_not_know_are_dropped(tmp_path: Path) -
     assert store_on_disk(tmp_path, []).keyframes() == [1, 3]
 
 
-def test_a_temporary_folder_goes_with_the_store() -> None:
+def test_temporary_folder_is_removed_with_the_store() -> None:
     store = KeyframeStore(None, KeyframeStoreConfig(cache_mb=0))
     store.put(images_of(1))
     folder = store._files._folder
@@ -171,39 +170,39 @@ def test_a_temporary_folder_goes_with_the_store() -> None:
     assert not folder.exists()
 
 
-def test_a_folder_that_cannot_be_used_is_a_clear_error(tmp_path: Path) -> None:
+def test_unusable_folder_raises_with_advice(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="Choose a folder"):
         KeyframeStore(tmp_path / "file")
 
 
 @pytest.mark.parametrize("change", [{"cache_mb": -1}, {"quota_mb": 0}, {"newest_kept": 0}])
-def test_senseless_configuration_is_refused(change: dict) -> None:
+def test_invalid_settings_raise_config_error(change: dict) -> None:
     with pytest.raises(ConfigError):
         KeyframeStoreConfig(**change)
 
 
 # --- quota ------------------------------------------------------------------------------------
 def quota_for(folder: Path, count: int) -> float:
-    """MB that `count` keyframes need, and half of one."""
+    """Return a quota in MB for `count` and a half keyframes."""
     store = store_on_disk(folder, [0])
     return (count + 0.5) * store.metrics()["keyframes_disk_mb"]
 
 
-def test_over_the_quota_the_one_with_the_nearest_neighbors_goes_first(tmp_path: Path) -> None:
+def test_quota_removes_keyframe_with_the_smallest_gap_first(tmp_path: Path) -> None:
     quota_mb = quota_for(tmp_path / "one", 5)
     store = store_on_disk(tmp_path / "many", [0, 10, 13, 20, 30], quota_mb=quota_mb, newest_kept=2)
-    store.put(images_of(31))  # gaps: 10 has 13, 13 has 10, 20 has 17, the two newest are safe
+    store.put(images_of(31))  # Gaps: 13 at 10, 10 at 13, 17 at 20; the two newest are kept.
     assert store.keyframes() == [0, 10, 20, 30, 31]
-    store.put(images_of(40))  # 10 and 20 have 20, 30 has 11
+    store.put(images_of(40))  # Gaps: 20 at 10 and 20, 11 at 30.
     assert store.keyframes() == [0, 10, 20, 31, 40]
-    store.put(images_of(50))  # 10 has 20, 20 has 21, 31 has 20: the older of two
+    store.put(images_of(50))  # Gaps: 20 at 10, 21 at 20, 20 at 31; the older one goes.
     assert store.keyframes() == [0, 20, 31, 40, 50]
     assert store.metrics()["keyframes_forgotten"] == 3
     assert len(list((tmp_path / "many").iterdir())) == 5
 
 
-def test_a_long_run_stays_within_the_quota_and_keeps_keyframes_of_all_times(tmp_path: Path) -> None:
+def test_quota_of_a_long_run_keeps_evenly_spaced_keyframes(tmp_path: Path) -> None:
     quota_mb = quota_for(tmp_path / "one", 8)
     store = store_on_disk(tmp_path / "many", list(range(60)), quota_mb=quota_mb, newest_kept=3)
     assert store.metrics()["keyframes_disk_mb"] <= quota_mb
@@ -212,12 +211,12 @@ def test_a_long_run_stays_within_the_quota_and_keeps_keyframes_of_all_times(tmp_
     assert max(np.diff(kept)) <= 4 * 60 / 8
 
 
-def test_the_newest_stay_even_over_the_quota(tmp_path: Path) -> None:
+def test_newest_keyframes_are_kept_above_the_quota(tmp_path: Path) -> None:
     store = store_on_disk(tmp_path, list(range(9)), quota_mb=1e-6, newest_kept=4)
     assert store.keyframes() == [0, 5, 6, 7, 8]
 
 
-def test_a_forgotten_keyframe_is_not_in_the_cache_either(tmp_path: Path) -> None:
+def test_keyframe_removed_by_quota_leaves_the_cache(tmp_path: Path) -> None:
     config = KeyframeStoreConfig(quota_mb=1e-6, newest_kept=1)
     store = KeyframeStore(tmp_path, config)
     for keyframe in range(4):
@@ -227,7 +226,7 @@ def test_a_forgotten_keyframe_is_not_in_the_cache_either(tmp_path: Path) -> None
 
 
 # --- damage -----------------------------------------------------------------------------------
-def cut(data: bytes) -> bytes:
+def truncated(data: bytes) -> bytes:
     return data[: len(data) // 2]
 
 
@@ -235,17 +234,17 @@ def flipped(data: bytes) -> bytes:
     return data[:-7] + bytes([data[-7] ^ 1]) + data[-6:]
 
 
-def emptied(_: bytes) -> bytes:
+def empty(_: bytes) -> bytes:
     return b""
 
 
-@pytest.mark.parametrize("spoil", [cut, flipped, emptied])
-def test_a_damaged_keyframe_is_dropped_with_one_line(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, spoil: Callable[[bytes], bytes]
+@pytest.mark.parametrize("damage", [truncated, flipped, empty])
+def test_damaged_keyframe_is_dropped_with_one_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: Callable[[bytes], bytes]
 ) -> None:
     store = store_on_disk(tmp_path, [1, 2])
     path = file_of(tmp_path, 1)
-    path.write_bytes(spoil(path.read_bytes()))
+    path.write_bytes(damage(path.read_bytes()))
     with caplog.at_level(logging.WARNING):
         assert [store.get(1), store.get(1)] == [None, None]
     assert len(caplog.records) == 1
@@ -255,7 +254,7 @@ def test_a_damaged_keyframe_is_dropped_with_one_line(
     assert store.metrics()["keyframes_damaged"] == 1
 
 
-def test_a_file_that_is_gone_or_under_another_name_is_dropped(tmp_path: Path) -> None:
+def test_missing_or_renamed_file_is_dropped(tmp_path: Path) -> None:
     store = store_on_disk(tmp_path, [1, 2, 3])
     file_of(tmp_path, 1).rename(file_of(tmp_path, 2))
     assert store.get(1) is None
@@ -263,17 +262,17 @@ def test_a_file_that_is_gone_or_under_another_name_is_dropped(tmp_path: Path) ->
     assert store.keyframes() == [3]
 
 
-def test_a_full_disk_leaves_the_newest_in_memory_and_is_told_once(
+def test_full_disk_keeps_newest_in_memory_and_logs_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = KeyframeStore(tmp_path, KeyframeStoreConfig(cache_mb=2.5 * MB_EACH))
     store.put(images_of(0))
 
-    def full(*_: object) -> int:
+    def raise_disk_full(*_: object) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch, caplog.at_level(logging.WARNING):
-        patch.setattr(Path, "replace", full)
+        patch.setattr(Path, "replace", raise_disk_full)
         for keyframe in (1, 2, 3):
             store.put(images_of(keyframe))
     assert store.keyframes() == [0, 2, 3]
@@ -286,8 +285,8 @@ def test_a_full_disk_leaves_the_newest_in_memory_and_is_told_once(
     assert 4 in store_on_disk(tmp_path, [])
 
 
-def test_a_file_that_the_system_cuts_leaves_nothing_behind(tmp_path: Path) -> None:
-    """RLIMIT_FSIZE makes the write itself fail half way."""
+def test_partial_write_leaves_no_file(tmp_path: Path) -> None:
+    """RLIMIT_FSIZE makes the write fail halfway."""
     store = store_on_disk(tmp_path, [1])
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""What corrections leave to do is paid off where it can be; the map is a stand-in that counts."""
+"""Loop refit: pending iterations on a map stub that counts them."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -21,52 +21,52 @@ CONFIG = LoopRefitConfig(
 )
 
 
-class Map:
-    """Five keyframes with images; some see what sleeps."""
+class MapStub:
+    """Map stub of five keyframes; some of them see offloaded Gaussians."""
 
-    def __init__(self, asleep: set[int]) -> None:
+    def __init__(self, offloaded: set[int]) -> None:
         poses = PoseTable()
         for keyframe in range(5):
             poses[keyframe] = np.eye(4)
         self.views = SimpleNamespace(poses=poses, cameras=dict.fromkeys(range(5)))
-        self.asleep = asleep
+        self.offloaded = offloaded
         self.iterations: list[int] = []
 
     def is_resident(self, keyframe: int) -> bool:
-        return keyframe not in self.asleep
+        return keyframe not in self.offloaded
 
     def refine(self, iterations: int, *_: Any, **__: Any) -> int:
         self.iterations.append(iterations)
         return iterations
 
 
-def torn(map_: Map) -> LoopRefit:
-    """By a correction that moves keyframes 3 and 4 against the first."""
-    poses, repair = KeyframePoses(), LoopRefit(map_, CONFIG)  # type: ignore[arg-type]
+def refit_after_correction(map_: MapStub) -> LoopRefit:
+    """Return the refit after a correction that moves keyframes 3 and 4 against the first."""
+    poses, refit = KeyframePoses(), LoopRefit(map_, CONFIG)  # type: ignore[arg-type]
     for keyframe in range(5):
-        aside = se3.exp(np.array([0, 0, 0, 0.1 * (keyframe >= 3), 0, 0]))
-        poses.add(keyframe, None, np.eye(4), aside)
-    repair.mark_moved(poses)
-    return repair
+        correction = se3.exp(np.array([0, 0, 0, 0.1 * (keyframe >= 3), 0, 0]))
+        poses.add(keyframe, None, np.eye(4), correction)
+    refit.mark_moved(poses)
+    return refit
 
 
-def test_what_is_due_is_paid_and_no_more() -> None:
-    map_ = Map(asleep=set())
-    repair = torn(map_)
+def test_pending_iterations_are_run_once() -> None:
+    map_ = MapStub(offloaded=set())
+    refit = refit_after_correction(map_)
     for _ in range(4):
-        repair.with_keyframe(is_behind=False)
+        refit.with_keyframe(is_behind=False)
     assert map_.iterations == [6, 2]
-    assert repair.pending_iterations == 0
+    assert refit.pending_iterations == 0
 
 
-def test_what_is_due_where_all_sleeps_waits_and_costs_nothing() -> None:
-    map_ = Map(asleep={3, 4})
-    repair = torn(map_)
-    repair.with_keyframe(is_behind=False)
+def test_iterations_of_offloaded_keyframes_stay_pending() -> None:
+    map_ = MapStub(offloaded={3, 4})
+    refit = refit_after_correction(map_)
+    refit.with_keyframe(is_behind=False)
     assert map_.iterations == []
-    assert repair.pending_iterations == 8
-    map_.asleep = {4}
+    assert refit.pending_iterations == 8
+    map_.offloaded = {4}
     for _ in range(3):
-        repair.with_keyframe(is_behind=False)
+        refit.with_keyframe(is_behind=False)
     assert map_.iterations == [4]
-    assert repair.pending_iterations == 4
+    assert refit.pending_iterations == 4

@@ -1,4 +1,4 @@
-"""Keyframes become a map that looks like them, the same way each time, in bounded memory."""
+"""Map builder: quality, determinism, restart and offloading."""
 
 import shutil
 from dataclasses import replace
@@ -22,44 +22,44 @@ HELD_OUT = (3, 9, 15)
 
 
 @pytest.fixture(scope="module")
-def posed(small_room) -> dict[int, Posed]:
+def posed_frames(small_room) -> dict[int, Posed]:
     return {i: small_room(i) for i in sorted((*KEYFRAMES, *HELD_OUT))}
 
 
-def built(
-    posed: dict, config: MapBuilderConfig | None = None, *, iterations: int = 10, **options
+def build_map(
+    posed_frames: dict, config: MapBuilderConfig | None = None, *, iterations: int = 10, **options
 ) -> MapBuilder:
     builder = MapBuilder(config, **options)
     for keyframe, i in enumerate(KEYFRAMES):
-        builder.add(*posed[i], keyframe, iterations)
+        builder.add(*posed_frames[i], keyframe, iterations)
     return builder
 
 
-def mean_psnr(builder: MapBuilder, posed: dict, frames=HELD_OUT) -> float:
+def mean_psnr(builder: MapBuilder, posed_frames: dict, frames=HELD_OUT) -> float:
     values = []
     for i in frames:
-        frame, T_map_camera = posed[i]
-        seen = render(builder.gaussians.rows, frame.camera, se3.inverse(T_map_camera)).color
-        values.append(psnr(seen.clip(0, 1), frame.color / np.float32(255)))
+        frame, T_map_camera = posed_frames[i]
+        rendered = render(builder.gaussians.rows, frame.camera, se3.inverse(T_map_camera)).color
+        values.append(psnr(rendered.clip(0, 1), frame.color / np.float32(255)))
     return float(np.mean(values))
 
 
-def test_fitting_improves_views_that_it_was_not_fitted_to(posed: dict) -> None:
-    inserted, fitted = built(posed, iterations=0), built(posed, iterations=15)
-    assert mean_psnr(fitted, posed) > mean_psnr(inserted, posed) + 1
-    refined = built(posed, iterations=15)
+def test_optimization_improves_held_out_views(posed_frames: dict) -> None:
+    inserted, fitted = build_map(posed_frames, iterations=0), build_map(posed_frames, iterations=15)
+    assert mean_psnr(fitted, posed_frames) > mean_psnr(inserted, posed_frames) + 1
+    refined = build_map(posed_frames, iterations=15)
     refined.refine(60, (1.0, 0.1))
-    assert mean_psnr(refined, posed) > mean_psnr(fitted, posed) + 0.5
+    assert mean_psnr(refined, posed_frames) > mean_psnr(fitted, posed_frames) + 0.5
 
 
 @pytest.mark.parametrize("threads", [2, 3])
-def test_the_same_keyframes_give_the_same_bits(posed: dict, threads: int) -> None:
+def test_map_is_bitwise_equal_for_any_thread_count(posed_frames: dict, threads: int) -> None:
     config = MapBuilderConfig(
         optimiser=GaussianOptimizerConfig(rotation_rate_rad=1e-4, translation_rate_m=1e-4)
     )
     one, many = (
-        built(posed, config, iterations=4),
-        built(posed, config, iterations=4, threads=threads),
+        build_map(posed_frames, config, iterations=4),
+        build_map(posed_frames, config, iterations=4, threads=threads),
     )
     assert one.gaussians.rows.tobytes() == many.gaussians.rows.tobytes()
     assert [T.tobytes() for T in one.views.poses.values()] == [
@@ -67,123 +67,133 @@ def test_the_same_keyframes_give_the_same_bits(posed: dict, threads: int) -> Non
     ]
 
 
-def test_a_restored_builder_goes_on_as_its_predecessor(posed: dict, tmp_path: Path) -> None:
+def test_restored_builder_continues_bitwise_equal(posed_frames: dict, tmp_path: Path) -> None:
     first = MapBuilder(folder=tmp_path)
     for keyframe, i in enumerate(KEYFRAMES[:3]):
-        first.add(*posed[i], keyframe, 5)
+        first.add(*posed_frames[i], keyframe, 5)
     second = MapBuilder(folder=tmp_path)
     second.restore(first.snapshot())
     for builder in (first, second):
-        builder.add(*posed[KEYFRAMES[3]], 3, 5)
+        builder.add(*posed_frames[KEYFRAMES[3]], 3, 5)
         builder.refine(5)
     assert first.gaussians.rows.tobytes() == second.gaussians.rows.tobytes()
     assert first.metrics()["iterations"] == second.metrics()["iterations"]
 
 
-def test_a_new_journey_finds_nothing_of_another_in_its_folder(posed: dict, tmp_path: Path) -> None:
-    built(posed, iterations=0, folder=tmp_path)
-    anew = MapBuilder(folder=tmp_path)
-    anew.add(*posed[KEYFRAMES[0]], 0, 3)
-    assert anew.views.store.keyframes() == [0]
+def test_new_map_ignores_earlier_keyframes_in_its_folder(
+    posed_frames: dict, tmp_path: Path
+) -> None:
+    build_map(posed_frames, iterations=0, folder=tmp_path)
+    fresh = MapBuilder(folder=tmp_path)
+    fresh.add(*posed_frames[KEYFRAMES[0]], 0, 3)
+    assert fresh.views.store.keyframes() == [0]
 
 
-def test_a_darker_camera_leaves_the_brightness_of_the_map(posed: dict) -> None:
-    """Its exposure is found before its Gaussians are inserted, and theirs are the map's colours."""
-    frame, T = posed[6]
-    dark = {**posed, 6: (replace(frame, color=(0.7 * frame.color + 8).astype(np.uint8)), T)}
-    builder = built(dark, iterations=4)
+def test_darker_keyframe_keeps_the_brightness_of_the_map(posed_frames: dict) -> None:
+    """The exposure is estimated before densification, so new Gaussians have the map's colors."""
+    frame, T = posed_frames[6]
+    darkened = {
+        **posed_frames,
+        6: (replace(frame, color=(0.7 * frame.color + 8).astype(np.uint8)), T),
+    }
+    builder = build_map(darkened, iterations=4)
     assert np.abs(builder.views.exposures[1].gain - 0.7).max() < 0.06
-    assert mean_psnr(builder, posed) > mean_psnr(built(posed, iterations=4), posed) - 1.5
+    undarkened = build_map(posed_frames, iterations=4)
+    assert mean_psnr(builder, posed_frames) > mean_psnr(undarkened, posed_frames) - 1.5
 
 
-def test_keyframes_that_are_gone_from_the_disk_are_left_out(posed: dict, tmp_path: Path) -> None:
+def test_keyframes_damaged_on_disk_are_skipped(posed_frames: dict, tmp_path: Path) -> None:
     builder = MapBuilder(folder=tmp_path)
     builder.views.store.config = replace(builder.views.store.config, cache_mb=0)
     for keyframe, i in enumerate(KEYFRAMES[:3]):
-        builder.add(*posed[i], keyframe, 2)
+        builder.add(*posed_frames[i], keyframe, 2)
     for file in sorted((tmp_path / "images").iterdir())[:2]:
         file.write_bytes(file.read_bytes()[:-20])
-    builder.add(*posed[KEYFRAMES[3]], 3, 20)
+    builder.add(*posed_frames[KEYFRAMES[3]], 3, 20)
     assert builder.views.store.keyframes() == [2, 3]
     assert builder.metrics()["keyframes_skipped"] >= 2
 
 
-def test_pruning_looks_at_what_was_fitted_alone(posed: dict) -> None:
+def test_pruning_removes_transparent_gaussians(posed_frames: dict) -> None:
     config = MapBuilderConfig(pruning=PruningConfig(min_opacity=0.9), prune_keyframes=1)
-    builder = built(posed, config, iterations=3)
+    builder = build_map(posed_frames, config, iterations=3)
     assert builder.metrics()["gaussians_pruned"] > 100
     assert (1 / (1 + np.exp(-builder.gaussians.opacity_logits))).min() < 0.9 + 0.1
 
 
-def test_a_correction_moves_gaussians_and_view_together(posed: dict) -> None:
-    builder = built(posed, iterations=2)
-    before = mean_psnr(builder, posed, KEYFRAMES[:1])
+def test_correction_moves_gaussians_and_views_together(posed_frames: dict) -> None:
+    builder = build_map(posed_frames, iterations=2)
+    before = mean_psnr(builder, posed_frames, KEYFRAMES[:1])
     T_new_old = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, 0.1, -0.2]))
     builder.move(dict.fromkeys(range(len(KEYFRAMES)), T_new_old))
-    frame, T = posed[KEYFRAMES[0]]
+    frame, T = posed_frames[KEYFRAMES[0]]
     np.testing.assert_allclose(builder.views.poses[0], T_new_old @ T, atol=1e-12)
     moved = {KEYFRAMES[0]: (frame, T_new_old @ T)}
     assert abs(mean_psnr(builder, moved, KEYFRAMES[:1]) - before) < 0.1
-    assert builder.refined() == {}, "who moved it knows"
+    assert builder.refined() == {}, "moves from outside are not reported"
 
 
-def test_moved_keyframes_are_told_once(posed: dict) -> None:
+def test_refined_poses_are_reported_once(posed_frames: dict) -> None:
     config = MapBuilderConfig(
         optimiser=GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
     )
-    builder = built(posed, config, iterations=10)
+    builder = build_map(posed_frames, config, iterations=10)
     refined = builder.refined()
     assert refined
-    assert 0 not in refined, "the first one fixes the place of the map"
+    assert 0 not in refined, "the first keyframe fixes the map frame"
     assert builder.refined() == {}
 
 
-def elsewhere(posed: dict, x_m: float) -> dict:
-    """The same walk in another place: nothing is seen from the first."""
+def displaced_frames(posed_frames: dict, x_m: float) -> dict:
+    """Return the frames at poses displaced by x_m, out of view of the others."""
     T = np.eye(4)
     T[0, 3] = x_m
-    return {i: (frame, T @ pose) for i, (frame, pose) in posed.items()}
+    return {i: (frame, T @ pose) for i, (frame, pose) in posed_frames.items()}
 
 
-def with_sleepers(posed: dict, **options) -> MapBuilder:
-    """A map whose first half, seen from the first keyframes, sleeps for the most part."""
+def map_with_offloaded(posed_frames: dict, **options) -> MapBuilder:
+    """Return a map with most Gaussians of its first half offloaded."""
     config = MapBuilderConfig(sleep=OffloadConfig(max_active=2000, reach_m=20), recent_cameras=2)
-    builder, far = MapBuilder(config, **options), elsewhere(posed, 100.0)
+    builder, displaced = MapBuilder(config, **options), displaced_frames(posed_frames, 100.0)
     for keyframe, i in enumerate(KEYFRAMES):
-        builder.add(*posed[i], keyframe, 2)
+        builder.add(*posed_frames[i], keyframe, 2)
         builder.changes(with_changed=True)
     for keyframe, i in enumerate(KEYFRAMES, len(KEYFRAMES)):
-        builder.add(*far[i], keyframe, 2)
+        builder.add(*displaced[i], keyframe, 2)
         builder.changes(with_changed=True)
         builder.offload_excess()
     return builder
 
 
-def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
-    builder = with_sleepers(posed)
-    asleep = builder.metrics()["gaussians_offloaded"]
-    assert asleep > 1000
-    assert builder.size() == len(builder.gaussians) + asleep
-    whole = np.concatenate([piece.ids for piece in builder.batches()])
-    assert np.all(np.diff(whole) > 0)
-    assert len(whole) == builder.size()
-    see_sleepers = [k for k in builder.views.cameras if not builder.is_resident(k)]
-    assert len(see_sleepers) > 1
+def test_offloaded_gaussians_are_loaded_when_revisited(posed_frames: dict) -> None:
+    builder = map_with_offloaded(posed_frames)
+    offloaded = builder.metrics()["gaussians_offloaded"]
+    assert offloaded > 1000
+    assert builder.size() == len(builder.gaussians) + offloaded
+    all_ids = np.concatenate([batch.ids for batch in builder.batches()])
+    assert np.all(np.diff(all_ids) > 0)
+    assert len(all_ids) == builder.size()
+    keyframes_of_offloaded = [k for k in builder.views.cameras if not builder.is_resident(k)]
+    assert len(keyframes_of_offloaded) > 1
     assert builder.refine(12) == 12
-    assert builder.refine(2, first=see_sleepers[:2]) == 0, "views of what sleeps are left out"
+    assert builder.refine(2, first=keyframes_of_offloaded[:2]) == 0, (
+        "views of offloaded Gaussians are skipped"
+    )
     size = builder.size()
-    builder.add(*posed[KEYFRAMES[0]], 2 * len(KEYFRAMES), 0)  # home again
+    builder.add(*posed_frames[KEYFRAMES[0]], 2 * len(KEYFRAMES), 0)  # Back at the first pose.
     assert builder.metrics()["gaussians_loaded_total"] > 1000
-    assert builder.size() < 1.15 * size, "inserted a second time"
-    assert mean_psnr(builder, posed, KEYFRAMES[:1]) > 20
+    assert builder.size() < 1.15 * size, "the Gaussians are not inserted a second time"
+    assert mean_psnr(builder, posed_frames, KEYFRAMES[:1]) > 20
 
 
-def test_followers_are_told_what_was_lost_on_disk(posed: dict, tmp_path: Path) -> None:
-    builder = with_sleepers(posed, folder=tmp_path)
-    before = np.concatenate([piece.ids for piece in builder.batches()])
+def test_gaussians_lost_on_disk_are_published_as_removed(
+    posed_frames: dict, tmp_path: Path
+) -> None:
+    builder = map_with_offloaded(posed_frames, folder=tmp_path)
+    before = np.concatenate([batch.ids for batch in builder.batches()])
     for file in sorted((tmp_path / "gaussians").iterdir())[:2]:
         file.write_bytes(file.read_bytes()[:-20])
-    after = np.concatenate([piece.ids for piece in builder.batches()])
+    after = np.concatenate([batch.ids for batch in builder.batches()])
     assert len(after) < len(before)
     removed = builder.changes(with_changed=False).removed
     assert np.setdiff1d(before, removed).tolist() == after.tolist()
@@ -199,24 +209,24 @@ def test_followers_are_told_what_was_lost_on_disk(posed: dict, tmp_path: Path) -
         {"min_shared": 1.5},
     ],
 )
-def test_senseless_windows_are_refused(change: dict) -> None:
+def test_invalid_sampling_settings_raise_config_error(change: dict) -> None:
     with pytest.raises(ConfigError):
         ViewSamplingConfig(**change)
 
 
-def test_what_moves_is_neither_mapped_nor_fitted(posed: dict) -> None:
-    frame, T_map_camera = posed[0]
+def test_dynamic_pixels_do_not_affect_the_map(posed_frames: dict) -> None:
+    frame, T_map_camera = posed_frames[0]
     dynamic_mask = np.zeros(frame.depth_m.shape, bool)
     dynamic_mask[15:40, 20:50] = True
     repainted = replace(
         frame, color=np.where(dynamic_mask[..., None], 255 - frame.color, frame.color)
     )
     maps = []
-    for seen in (frame, repainted):
+    for observed in (frame, repainted):
         builder = MapBuilder()
-        builder.add(seen, T_map_camera, 0, 4, dynamic_mask)
+        builder.add(observed, T_map_camera, 0, 4, dynamic_mask)
         maps.append(builder.gaussians.rows)
-    assert maps[0].tobytes() == maps[1].tobytes(), "what moves has a say"
+    assert maps[0].tobytes() == maps[1].tobytes(), "dynamic pixels affect the map"
     p_camera = se3.transform(se3.inverse(T_map_camera), maps[0][:, :3].astype(float))
     u, v = frame.camera.project(p_camera).round().astype(int).T
     inside = (u > 20) & (u < 49) & (v > 15) & (v < 39)
@@ -224,14 +234,14 @@ def test_what_moves_is_neither_mapped_nor_fitted(posed: dict) -> None:
     assert len(maps[0]) > 100
 
 
-def test_a_keyframe_without_images_is_known_by_its_pose_alone(posed: dict, tmp_path: Path) -> None:
-    """And a successor goes on with the same bits."""
+def test_keyframe_without_images_keeps_only_its_pose(posed_frames: dict, tmp_path: Path) -> None:
+    """A restored builder continues bitwise equal."""
     config = MapBuilderConfig(
         store=KeyframeStoreConfig(cache_mb=0.0, most=2, newest_kept=1), prune_keyframes=2
     )
     first, second = (MapBuilder(config, folder=tmp_path / name) for name in ("first", "second"))
     for keyframe, i in enumerate(KEYFRAMES[:3]):
-        first.add(*posed[i], keyframe, 5)
+        first.add(*posed_frames[i], keyframe, 5)
     assert list(first.views.cameras) == [0, 2]
     assert list(first.views.poses) == [0, 1, 2]
     assert first.deduplicate_keyframe(1, 5) == 0
@@ -241,8 +251,8 @@ def test_a_keyframe_without_images_is_known_by_its_pose_alone(posed: dict, tmp_p
     T_new_old = se3.exp(np.full(6, 0.01))
     for builder in (first, second):
         builder.move(dict.fromkeys(range(3), T_new_old))
-        builder.add(*posed[KEYFRAMES[3]], 3, 5)
+        builder.add(*posed_frames[KEYFRAMES[3]], 3, 5)
         builder.refine(5)
         assert builder.refined().keys() <= {0, 3}
     assert first.gaussians.rows.tobytes() == second.gaussians.rows.tobytes()
-    np.testing.assert_array_equal(first.views.poses[1], T_new_old @ posed[KEYFRAMES[1]][1])
+    np.testing.assert_array_equal(first.views.poses[1], T_new_old @ posed_frames[KEYFRAMES[1]][1])

@@ -7,6 +7,8 @@ from ldo_service.errors import DataError
 from ldo_service.gaussians import GaussianMap, render
 from ldo_service.geometry import Camera, se3
 
+from .conftest import labels_of
+
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 
 
@@ -23,7 +25,7 @@ def rows_of(n: int, seed: int = 0) -> np.ndarray:
 
 
 def map_of(*counts: int) -> GaussianMap:
-    """A map with that many labelled Gaussians on keyframes 0, 1, ..."""
+    """Return a map with these numbers of labelled Gaussians at keyframes 0, 1, ..."""
     out = GaussianMap(capacity=2)
     for keyframe, n in enumerate(counts):
         out.add(rows_of(n, keyframe), keyframe)
@@ -31,79 +33,75 @@ def map_of(*counts: int) -> GaussianMap:
     return out
 
 
-def labels_of(n: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (n, 32), np.uint8)
-
-
-def test_added_rows_come_back_bit_for_bit_after_growing() -> None:
+def test_added_rows_are_bitwise_equal_after_growth() -> None:
     gaussians = GaussianMap(capacity=1)
-    wanted = [rows_of(n, n) for n in (1, 5, 0, 300)]
-    ids = [gaussians.add(rows, keyframe) for keyframe, rows in enumerate(wanted)]
-    assert gaussians.rows.tobytes() == np.concatenate(wanted).tobytes()
+    expected_rows = [rows_of(n, n) for n in (1, 5, 0, 300)]
+    ids = [gaussians.add(rows, keyframe) for keyframe, rows in enumerate(expected_rows)]
+    assert gaussians.rows.tobytes() == np.concatenate(expected_rows).tobytes()
     np.testing.assert_array_equal(np.concatenate(ids), np.arange(306))
     np.testing.assert_array_equal(gaussians.ids, np.arange(306))
     np.testing.assert_array_equal(gaussians.anchors, np.repeat([0, 1, 3], [1, 5, 300]))
 
 
-def test_removal_keeps_order_and_never_gives_an_id_twice() -> None:
+def test_removal_keeps_order_and_ids_are_not_reused() -> None:
     gaussians = map_of(4, 4)
     before = gaussians.rows.copy()
-    drop = np.array([1, 0, 0, 1, 0, 0, 0, 1], bool)
-    assert gaussians.remove(drop) == 3
+    is_dropped = np.array([1, 0, 0, 1, 0, 0, 0, 1], bool)
+    assert gaussians.remove(is_dropped) == 3
     np.testing.assert_array_equal(gaussians.ids, [1, 2, 4, 5, 6])
-    np.testing.assert_array_equal(gaussians.rows, before[~drop])
+    np.testing.assert_array_equal(gaussians.rows, before[~is_dropped])
     np.testing.assert_array_equal(gaussians.anchors, [0, 0, 1, 1, 1])
-    labels = np.concatenate([labels_of(4, 0), labels_of(4, 1)])[~drop]
+    labels = np.concatenate([labels_of(4, 0), labels_of(4, 1)])[~is_dropped]
     np.testing.assert_array_equal(gaussians.labels, labels)
     np.testing.assert_array_equal(gaussians.add(rows_of(2), 7), [8, 9])
-    assert not gaussians.labels[5:].any(), "nobody has seen what is new"
+    assert not gaussians.labels[5:].any(), "new Gaussians have no labels"
 
 
-def test_what_was_taken_out_comes_back_bit_for_bit() -> None:
+def test_reinserted_gaussians_are_bitwise_equal() -> None:
     gaussians, untouched = map_of(4, 5, 6), map_of(4, 5, 6)
-    taken = gaussians.extract(gaussians.anchors == 1)
-    np.testing.assert_array_equal(taken.ids, np.arange(4, 9))
-    np.testing.assert_array_equal(taken.anchors, 1)
-    assert taken.rows.tobytes() == rows_of(5, 1).tobytes()
-    assert taken.labels.tobytes() == labels_of(5, 1).tobytes()
+    extracted = gaussians.extract(gaussians.anchors == 1)
+    np.testing.assert_array_equal(extracted.ids, np.arange(4, 9))
+    np.testing.assert_array_equal(extracted.anchors, 1)
+    assert extracted.rows.tobytes() == rows_of(5, 1).tobytes()
+    assert extracted.labels.tobytes() == labels_of(5, 1).tobytes()
     np.testing.assert_array_equal(gaussians.ids, [*range(4), *range(9, 15)])
-    gaussians.reinsert(*taken)
+    gaussians.reinsert(*extracted)
     for name in ("rows", "ids", "anchors", "labels"):
         assert getattr(gaussians, name).tobytes() == getattr(untouched, name).tobytes()
 
 
-def test_those_taken_out_are_copies() -> None:
+def test_extracted_gaussians_are_copies() -> None:
     gaussians = map_of(3, 3)
-    taken = gaussians.extract(np.ones(6, bool))
+    extracted = gaussians.extract(np.ones(6, bool))
     gaussians.add(rows_of(6, 9), 2)
-    assert taken.rows.tobytes() == np.concatenate([rows_of(3, 0), rows_of(3, 1)]).tobytes()
+    assert extracted.rows.tobytes() == np.concatenate([rows_of(3, 0), rows_of(3, 1)]).tobytes()
 
 
 @given(masks=st.lists(st.integers(1, 2**12 - 1), min_size=1, max_size=4), data=st.data())
 @settings(deadline=None)
-def test_any_order_of_leaving_and_returning_ends_with_the_same_map(masks, data) -> None:
+def test_any_order_of_extraction_and_reinsertion_restores_the_map(masks, data) -> None:
     gaussians, untouched = map_of(5, 7), map_of(5, 7)
-    away = []
+    extracted = []
     for bits in masks:
         mask = (bits >> gaussians.ids) & 1 == 1
-        away.append(gaussians.extract(mask))
+        extracted.append(gaussians.extract(mask))
         assert np.all(np.diff(gaussians.ids) > 0)
-    for each in (gaussians, untouched):
-        each.add(rows_of(2, 9), 2)
-    for k in data.draw(st.permutations(range(len(away)))):
-        shuffled = data.draw(st.permutations(range(len(away[k][0]))))
-        gaussians.reinsert(*(part[list(shuffled)] for part in away[k]))
+    for gaussian_map in (gaussians, untouched):
+        gaussian_map.add(rows_of(2, 9), 2)
+    for k in data.draw(st.permutations(range(len(extracted)))):
+        shuffled = data.draw(st.permutations(range(len(extracted[k][0]))))
+        gaussians.reinsert(*(part[list(shuffled)] for part in extracted[k]))
     for name in ("rows", "ids", "anchors", "labels"):
         assert getattr(gaussians, name).tobytes() == getattr(untouched, name).tobytes()
 
 
-def test_only_absent_gaussians_of_this_map_come_back() -> None:
+def test_invalid_reinsertion_raises_and_changes_nothing() -> None:
     gaussians = map_of(6)
     ids, rows, anchors, labels = gaussians.extract(np.array([0, 1, 1, 0, 0, 0], bool))
     before = gaussians.snapshot()
-    for wrong, reason in (([1, 3], "id 3 is in"), ([1, 6], "this map, 0 to 5"), ([2, 2], "twice")):
+    for wrong_ids, reason in (([1, 3], "id 3 is in"), ([1, 6], "this map, 0 to 5"), ([2, 2], "twice")):
         with pytest.raises(ValueError, match=reason):
-            gaussians.reinsert(np.array(wrong), rows, anchors)
+            gaussians.reinsert(np.array(wrong_ids), rows, anchors)
     with pytest.raises(ValueError, match="NaN"):
         gaussians.reinsert(ids, np.full_like(rows, np.nan), anchors)
     with pytest.raises(ValueError, match="shape"):
@@ -114,7 +112,7 @@ def test_only_absent_gaussians_of_this_map_come_back() -> None:
     assert all(before[name].tobytes() == after[name].tobytes() for name in before)
 
 
-def test_every_row_fills_one_cache_line() -> None:
+def test_each_row_fills_one_cache_line() -> None:
     gaussians = map_of(3, 500)
     assert gaussians.rows.ctypes.data % 64 == 0
     assert gaussians.rows.strides == (64, 4)
@@ -128,25 +126,25 @@ def test_columns_are_views_of_the_rows() -> None:
     np.testing.assert_array_equal(gaussians.rows[:, :14], 0.25)
 
 
-def test_version_grows_with_every_change() -> None:
+def test_version_increases_with_every_change() -> None:
     gaussians = GaussianMap()
-    seen = [gaussians.version]
+    versions = [gaussians.version]
     gaussians.add(rows_of(3), 0)
-    seen.append(gaussians.version)
+    versions.append(gaussians.version)
     gaussians.remove(np.array([True, False, False]))
-    seen.append(gaussians.version)
-    taken = gaussians.extract(np.array([True, False]))
-    seen.append(gaussians.version)
-    gaussians.reinsert(*taken)
-    seen.append(gaussians.version)
+    versions.append(gaussians.version)
+    extracted = gaussians.extract(np.array([True, False]))
+    versions.append(gaussians.version)
+    gaussians.reinsert(*extracted)
+    versions.append(gaussians.version)
     gaussians.move_anchors({0: se3.exp(np.full(6, 0.1))})
-    seen.append(gaussians.version)
+    versions.append(gaussians.version)
     gaussians.touch()
-    seen.append(gaussians.version)
-    assert seen == sorted(set(seen))
+    versions.append(gaussians.version)
+    assert versions == sorted(set(versions))
 
 
-def test_correction_moves_the_gaussians_of_its_keyframe_only() -> None:
+def test_correction_moves_only_gaussians_of_its_keyframe() -> None:
     gaussians = map_of(10, 20, 30)
     before = gaussians.rows.copy()
     gaussians.move_anchors({1: se3.exp(np.array([0.1, 0.2, 0.3, 1, 2, 3])), 99: np.eye(4)})
@@ -155,7 +153,7 @@ def test_correction_moves_the_gaussians_of_its_keyframe_only() -> None:
     np.testing.assert_array_equal(gaussians.log_scales, before[:, 3:6])
 
 
-def test_moved_gaussian_has_the_transformed_mean_and_covariance() -> None:
+def test_moved_gaussian_has_transformed_mean_and_rotation() -> None:
     gaussians = map_of(7)
     before = gaussians.rows.astype(float)
     T = se3.exp(np.array([0.4, -1.1, 0.7, 0.5, -0.6, 0.2]))
@@ -175,7 +173,7 @@ def test_move_and_inverse_move_restore_the_rows() -> None:
     np.testing.assert_allclose(gaussians.rows, before, atol=1e-6)
 
 
-def test_camera_that_moves_along_sees_the_same() -> None:
+def test_moved_camera_renders_moved_map_unchanged() -> None:
     gaussians = map_of(300)
     T_map_camera = se3.exp(np.array([0.05, -0.1, 0.02, 0.1, 0.0, -0.2]))
     before = render(gaussians.rows, CAMERA, se3.inverse(T_map_camera))
@@ -187,7 +185,7 @@ def test_camera_that_moves_along_sees_the_same() -> None:
     np.testing.assert_allclose(after.weighted_depth_m, before.weighted_depth_m, atol=5e-4)
 
 
-def test_restored_map_continues_as_the_original() -> None:
+def test_restored_map_continues_bitwise_equal() -> None:
     gaussians = map_of(30, 40)
     gaussians.remove(np.arange(70) % 3 == 0)
     copy = GaussianMap.restore(gaussians.snapshot())
@@ -199,7 +197,7 @@ def test_restored_map_continues_as_the_original() -> None:
     assert all(a[name].tobytes() == b[name].tobytes() for name in a)
 
 
-def test_snapshot_does_not_follow_the_map() -> None:
+def test_snapshot_is_independent_of_later_changes() -> None:
     gaussians = map_of(5)
     state = gaussians.snapshot()
     gaussians.means[...] = 0
@@ -208,14 +206,14 @@ def test_snapshot_does_not_follow_the_map() -> None:
     assert state["labels"].tobytes() == labels_of(5).tobytes()
 
 
-def test_a_state_without_labels_says_who_made_it() -> None:
+def test_state_without_labels_raises_with_its_origin() -> None:
     state = map_of(5).snapshot()
     del state["labels"]
     with pytest.raises(DataError, match="an earlier version saved it"):
         GaussianMap.restore(state)
 
 
-def test_bad_arguments_are_refused_and_change_nothing() -> None:
+def test_invalid_arguments_raise_and_change_nothing() -> None:
     gaussians = map_of(5)
     before = gaussians.snapshot()
     with pytest.raises(ValueError, match="shape"):

@@ -20,7 +20,7 @@ from ldo_service.geometry import se3
 
 @pytest.fixture(scope="module")
 def start(small_room) -> tuple[GaussianMap, list[TrainingView]]:
-    """A map of three views of the synthetic room."""
+    """Return a map of three views of the synthetic room, and the views."""
     gaussians, views = GaussianMap(), []
     for i in (0, 4, 8):
         frame, T_map_camera = small_room(i)
@@ -33,8 +33,8 @@ def copied(gaussians: GaussianMap) -> GaussianMap:
     return GaussianMap.restore(gaussians.snapshot())
 
 
-def in_turns(iterations: int) -> list[int]:
-    """The last view first."""
+def alternating(iterations: int) -> list[int]:
+    """Return view indices in turn, starting with the last view."""
     return [2 - k % 3 for k in range(iterations)]
 
 
@@ -45,37 +45,35 @@ def optimized(
     plan: list[int] | None = None,
     threads: int = 1,
 ) -> tuple[GaussianMap, list[TrainingView], list[ImageLoss]]:
-    """Map and views after it, and the losses on the way."""
+    """Return map and views after the optimization, and the losses of its iterations."""
     gaussians, views = copied(start[0]), list(start[1])
-    plan = in_turns(30) if plan is None else plan
+    plan = alternating(30) if plan is None else plan
     optimizer = GaussianOptimizer(config, threads=threads)
     return gaussians, views, optimizer.optimize(gaussians, views, plan, fixed=0)
 
 
 def mean_psnr(gaussians: GaussianMap, views: list[TrainingView]) -> float:
-    """Of the whole images, exposures applied."""
+    """Return the mean PSNR of the whole images with exposures applied."""
     errors = []
     for view in views:
-        seen = render(gaussians.rows, view.camera, se3.inverse(view.T_map_camera))
+        rendering = render(gaussians.rows, view.camera, se3.inverse(view.T_map_camera))
         truth = view.color.transpose(1, 2, 0) / 255
-        errors.append(np.mean((view.exposure.applied(seen.color) - truth) ** 2))
+        errors.append(np.mean((view.exposure.applied(rendering.color) - truth) ** 2))
     return float(np.mean(-10 * np.log10(errors)))
 
 
-def test_views_look_better_after_optimization(start: tuple) -> None:
-    gaussians, views, losses = optimized(start, plan=in_turns(60))
+def test_optimization_improves_psnr_of_the_views(start: tuple) -> None:
+    gaussians, views, losses = optimized(start, plan=alternating(60))
     assert mean_psnr(gaussians, views) > mean_psnr(*start) + 3
     assert losses[-3].total < 0.7 * losses[0].total
     assert gaussians.version > start[0].version
 
 
 @pytest.mark.parametrize("threads", [2, 3])
-def test_same_inputs_give_the_same_bits_for_any_number_of_threads(
-    start: tuple, threads: int
-) -> None:
+def test_result_is_bitwise_equal_for_any_thread_count(start: tuple, threads: int) -> None:
     config = GaussianOptimizerConfig(rotation_rate_rad=1e-4, translation_rate_m=1e-4)
-    one, a, losses = optimized(start, config, plan=in_turns(6))
-    many, b, same_losses = optimized(start, config, plan=in_turns(6), threads=threads)
+    one, a, losses = optimized(start, config, plan=alternating(6))
+    many, b, same_losses = optimized(start, config, plan=alternating(6), threads=threads)
     assert one.rows.tobytes() == many.rows.tobytes()
     assert [x.total for x in losses] == [x.total for x in same_losses]
     for left, right in zip(a, b, strict=True):
@@ -83,15 +81,15 @@ def test_same_inputs_give_the_same_bits_for_any_number_of_threads(
         assert left.exposure.matrix.tobytes() == right.exposure.matrix.tobytes()
 
 
-def test_restored_optimizer_continues_as_the_original(start: tuple) -> None:
+def test_restored_optimizer_continues_bitwise_equal(start: tuple) -> None:
     gaussians, views = copied(start[0]), list(start[1])
     config = GaussianOptimizerConfig(rotation_rate_rad=1e-4)
     original = GaussianOptimizer(config)
-    original.optimize(gaussians, views, in_turns(5))
+    original.optimize(gaussians, views, alternating(5))
     copy, other, other_views = GaussianOptimizer(config), copied(gaussians), list(views)
     copy.restore(original.snapshot())
-    original.optimize(gaussians, views, in_turns(5))
-    copy.optimize(other, other_views, in_turns(5))
+    original.optimize(gaussians, views, alternating(5))
+    copy.optimize(other, other_views, alternating(5))
     assert gaussians.rows.tobytes() == other.rows.tobytes()
     assert views[2].T_map_camera.tobytes() == other_views[2].T_map_camera.tobytes()
     before, after = original.snapshot(), copy.snapshot()
@@ -99,75 +97,75 @@ def test_restored_optimizer_continues_as_the_original(start: tuple) -> None:
     assert all(before[name].tobytes() == after[name].tobytes() for name in before)
 
 
-def test_brightness_of_a_frame_goes_into_its_exposure(start: tuple) -> None:
+def test_brightness_of_a_frame_changes_its_exposure(start: tuple) -> None:
     darker = replace(start[1][2], color=(start[1][2].color * 0.8).astype(np.uint8))
     config = GaussianOptimizerConfig(adam=AdamConfig(color=0.001))
-    _, views, _ = optimized((start[0], [*start[1][:2], darker]), config, plan=in_turns(90))
-    shown = views[2].exposure.applied(np.full((1, 1, 3), 0.5, np.float32))
-    assert np.abs(shown - 0.4).max() < 0.04
+    _, views, _ = optimized((start[0], [*start[1][:2], darker]), config, plan=alternating(90))
+    adjusted_gray = views[2].exposure.applied(np.full((1, 1, 3), 0.5, np.float32))
+    assert np.abs(adjusted_gray - 0.4).max() < 0.04
     assert views[0].exposure.matrix.tobytes() == Exposure().matrix.tobytes()
 
 
-def test_wrong_pose_comes_back_to_the_true_one(start: tuple) -> None:
-    gaussians, views = optimized(start, plan=in_turns(150))[0], start[1]
-    off = se3.exp(np.array([0.004, -0.003, 0.002, 0.01, -0.008, 0.006]))
-    moved = [*views[:2], replace(views[2], T_map_camera=views[2].T_map_camera @ off)]
+def test_displaced_pose_converges_to_the_true_pose(start: tuple) -> None:
+    gaussians, views = optimized(start, plan=alternating(150))[0], start[1]
+    offset = se3.exp(np.array([0.004, -0.003, 0.002, 0.01, -0.008, 0.006]))
+    moved = [*views[:2], replace(views[2], T_map_camera=views[2].T_map_camera @ offset)]
     config = GaussianOptimizerConfig(
         adam=AdamConfig(0, 0, 0, 0, 0),
         rotation_rate_rad=3e-4,
         translation_rate_m=5e-4,
     )
-    _, found, _ = optimized((gaussians, moved), config, plan=[2] * 150)
-    left = se3.inverse(views[2].T_map_camera) @ found[2].T_map_camera
-    assert np.linalg.norm(left[:3, 3]) < 0.15 * np.linalg.norm(off[:3, 3])
-    assert se3.rotation_angle(left) < 0.15 * se3.rotation_angle(off)
+    _, refined_views, _ = optimized((gaussians, moved), config, plan=[2] * 150)
+    remaining = se3.inverse(views[2].T_map_camera) @ refined_views[2].T_map_camera
+    assert np.linalg.norm(remaining[:3, 3]) < 0.15 * np.linalg.norm(offset[:3, 3])
+    assert se3.rotation_angle(remaining) < 0.15 * se3.rotation_angle(offset)
 
 
-def test_steps_shrink_to_the_final_rate(start: tuple) -> None:
+def test_steps_decrease_to_the_final_rate(start: tuple) -> None:
     gaussians, views = copied(start[0]), list(start[1])
     before = gaussians.colors.copy()
     GaussianOptimizer().optimize(gaussians, views, [2])
     first = np.abs(gaussians.colors - before).max()
     optimizer = GaussianOptimizer()
-    optimizer.optimize(gaussians, views, in_turns(20), rates=(1.0, 0.01))
+    optimizer.optimize(gaussians, views, alternating(20), rates=(1.0, 0.01))
     before = gaussians.colors.copy()
     optimizer.step(gaussians, views[2], rate=0.01)
     assert np.abs(gaussians.colors - before).max() < 0.05 * first
 
 
-def test_poses_stay_unless_they_are_to_be_refined(start: tuple) -> None:
+def test_poses_are_not_changed_at_zero_pose_rates(start: tuple) -> None:
     config = GaussianOptimizerConfig(rotation_rate_rad=0.0, translation_rate_m=0.0)
-    _, views, _ = optimized(start, config, plan=in_turns(4))
+    _, views, _ = optimized(start, config, plan=alternating(4))
     for before, after in zip(start[1], views, strict=True):
         assert before.T_map_camera is after.T_map_camera
 
 
-def test_without_a_plan_nothing_changes(start: tuple) -> None:
+def test_empty_plan_changes_nothing(start: tuple) -> None:
     gaussians, _, losses = optimized(start, plan=[])
     assert losses == []
     assert gaussians.rows.tobytes() == start[0].rows.tobytes()
 
 
-def test_gaussians_come_and_go_between_two_calls(start: tuple) -> None:
+def test_gaussians_may_change_between_two_calls(start: tuple) -> None:
     gaussians, views = copied(start[0]), list(start[1])
     optimizer = GaussianOptimizer()
-    optimizer.optimize(gaussians, views, in_turns(3))
+    optimizer.optimize(gaussians, views, alternating(3))
     gaussians.remove(gaussians.ids % 3 == 0)
     gaussians.add(start[0].rows[:50].copy(), 9)
     before = mean_psnr(gaussians, views)
-    optimizer.optimize(gaussians, views, in_turns(30))
+    optimizer.optimize(gaussians, views, alternating(30))
     assert np.isfinite(gaussians.rows).all()
     assert mean_psnr(gaussians, views) > before
 
 
-def test_gaussians_that_changed_are_those_whose_steps_grew(start: tuple) -> None:
+def test_step_counts_increase_exactly_for_changed_gaussians(start: tuple) -> None:
     gaussians, views = copied(start[0]), list(start[1])
     optimizer = GaussianOptimizer()
     before, rows = optimizer.steps(gaussians).copy(), gaussians.rows.copy()
     optimizer.optimize(gaussians, views, [2])
-    grew = optimizer.steps(gaussians) != before
-    np.testing.assert_array_equal(grew, (gaussians.rows != rows).any(axis=1))
-    assert 0 < grew.mean() < 1
+    has_new_steps = optimizer.steps(gaussians) != before
+    np.testing.assert_array_equal(has_new_steps, (gaussians.rows != rows).any(axis=1))
+    assert 0 < has_new_steps.mean() < 1
 
 
 @pytest.mark.parametrize(
@@ -180,15 +178,15 @@ def test_gaussians_that_changed_are_those_whose_steps_grew(start: tuple) -> None
         {"max_sigma_px": 0.0},
     ],
 )
-def test_senseless_configuration_is_refused(change: dict) -> None:
+def test_invalid_settings_raise_config_error(change: dict) -> None:
     with pytest.raises(ConfigError):
         GaussianOptimizerConfig(**change)
 
 
-def test_effort_counts_iterations_by_what_they_reach(start: tuple) -> None:
+def test_effort_weights_iterations_by_visible_gaussians(start: tuple) -> None:
     lengths = []
     for usual_reach in (500, 5_000, 50_000):
         gaussians, views = copied(start[0]), list(start[1])
         optimizer = GaussianOptimizer(GaussianOptimizerConfig(usual_reach=usual_reach))
-        lengths.append(len(optimizer.optimize(gaussians, views, in_turns(30), effort=8)))
+        lengths.append(len(optimizer.optimize(gaussians, views, alternating(30), effort=8)))
     assert 1 <= lengths[0] < lengths[1] < lengths[2] <= 16

@@ -1,4 +1,4 @@
-"""Judges of what is written: plyfile and gsply. What is read comes from plyfile."""
+"""PLY files, checked with plyfile and gsply."""
 
 import logging
 from pathlib import Path
@@ -21,7 +21,7 @@ def ply(tmp_path: Path, some_rows: np.ndarray) -> Path:
 def write_with_plyfile(
     path: Path, rows: np.ndarray, properties: list[tuple[str, str]], **options: object
 ) -> None:
-    """The Gaussians with these properties (name, type) in this order, by another program."""
+    """Write Gaussians with properties (name, type) in the given order, using plyfile."""
     table = np.ones(len(rows), properties)
     for name, _ in properties:
         if name in COLUMNS:
@@ -31,39 +31,39 @@ def write_with_plyfile(
     plyfile.PlyData([plyfile.PlyElement.describe(table, "vertex")], **options).write(str(path))
 
 
-def unit(quats: np.ndarray) -> np.ndarray:
+def normalized(quats: np.ndarray) -> np.ndarray:
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
-def test_every_attribute_comes_back(ply: Path, some_rows: np.ndarray) -> None:
+def test_every_attribute_is_restored(ply: Path, some_rows: np.ndarray) -> None:
     read = read_ply(ply)
     assert read.dtype == np.float32
     np.testing.assert_array_equal(read[:, [*range(6), 10]], some_rows[:, [*range(6), 10]])
-    np.testing.assert_allclose(read[:, 6:10], unit(some_rows[:, 6:10]), atol=2e-7)
+    np.testing.assert_allclose(read[:, 6:10], normalized(some_rows[:, 6:10]), atol=2e-7)
     np.testing.assert_allclose(read[:, 11:], some_rows[:, 11:], atol=2e-7)
 
 
-def test_an_empty_map_comes_back_empty(tmp_path: Path) -> None:
+def test_empty_map_is_restored(tmp_path: Path) -> None:
     write_ply(tmp_path / "map.ply", np.zeros((0, 16), np.float32))
     assert read_ply(tmp_path / "map.ply").shape == (0, 16)
 
 
-def test_another_reader_finds_what_3dgs_writes(ply: Path, some_rows: np.ndarray) -> None:
+def test_plyfile_reads_the_3dgs_properties(ply: Path, some_rows: np.ndarray) -> None:
     vertices = plyfile.PlyData.read(str(ply))["vertex"]
     assert [prop.name for prop in vertices.properties] == list(PROPERTIES)
     np.testing.assert_array_equal(vertices["scale_1"], some_rows[:, 4])
-    np.testing.assert_allclose(vertices["rot_0"], unit(some_rows[:, 6:10])[:, 0], atol=2e-7)
+    np.testing.assert_allclose(vertices["rot_0"], normalized(some_rows[:, 6:10])[:, 0], atol=2e-7)
     np.testing.assert_array_equal(vertices["opacity"], some_rows[:, 10])
     green = 0.5 + 0.28209479177387814 * vertices["f_dc_1"]
     np.testing.assert_allclose(green, some_rows[:, 12], atol=1e-6)
 
 
-def test_gsply_reads_the_same_gaussians(ply: Path, some_rows: np.ndarray) -> None:
+def test_gsply_reads_equal_gaussians(ply: Path, some_rows: np.ndarray) -> None:
     gsply = pytest.importorskip("gsply", reason="pip install 'ldo-slam[viewer]'")
     data = gsply.plyread(str(ply))
     np.testing.assert_array_equal(data.means, some_rows[:, 0:3])
     np.testing.assert_array_equal(data.scales, some_rows[:, 3:6])
-    np.testing.assert_allclose(data.quats, unit(some_rows[:, 6:10]), atol=2e-7)
+    np.testing.assert_allclose(data.quats, normalized(some_rows[:, 6:10]), atol=2e-7)
     np.testing.assert_array_equal(data.opacities, some_rows[:, 10])
     np.testing.assert_allclose(gsply.sh2rgb(data.sh0), some_rows[:, 11:14], atol=1e-6)
 
@@ -98,7 +98,7 @@ def without(header: bytes, name: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("broken", "said"),
+    ("damage", "message"),
     [
         (lambda b: b[:-1], "cut off"),
         (lambda b: b[: b.index(b"property")], "header has no end"),
@@ -119,14 +119,14 @@ def without(header: bytes, name: bytes) -> bytes:
         (lambda _: bytes(range(256)) * 999, "does not start"),
     ],
 )
-def test_a_broken_file_is_refused_in_one_sentence(ply: Path, broken, said: str) -> None:
-    ply.write_bytes(broken(ply.read_bytes()))
-    with pytest.raises(DataError, match=said) as refused:
+def test_damaged_file_raises_with_its_path(ply: Path, damage, message: str) -> None:
+    ply.write_bytes(damage(ply.read_bytes()))
+    with pytest.raises(DataError, match=message) as caught:
         read_ply(ply)
-    assert str(ply) in str(refused.value)
+    assert str(ply) in str(caught.value)
 
 
-def test_words_among_the_numbers_are_refused(tmp_path: Path, some_rows: np.ndarray) -> None:
+def test_text_between_numbers_raises(tmp_path: Path, some_rows: np.ndarray) -> None:
     path = tmp_path / "text.ply"
     write_with_plyfile(path, some_rows, [(name, "f4") for name in COLUMNS], text=True)
     path.write_text(path.read_text().rsplit(" ", 1)[0] + " zero\n")
@@ -134,6 +134,6 @@ def test_words_among_the_numbers_are_refused(tmp_path: Path, some_rows: np.ndarr
         read_ply(path)
 
 
-def test_a_missing_file_is_said(tmp_path: Path) -> None:
+def test_missing_file_raises(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="cannot be read"):
         read_ply(tmp_path / "absent.ply")

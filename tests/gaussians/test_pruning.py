@@ -15,26 +15,26 @@ def cloud(n: int = 50, *, sigma_m: float = 0.01) -> GaussianMap:
     return gaussians
 
 
-def test_ordinary_map_loses_nothing() -> None:
+def test_ordinary_map_is_not_pruned() -> None:
     assert not prunable_mask(cloud().rows).any()
     assert prunable_mask(GaussianMap().rows).shape == (0,)
 
 
-def test_transparent_and_broken_gaussians_go() -> None:
+def test_transparent_and_non_finite_gaussians_are_pruned() -> None:
     gaussians = cloud()
     gaussians.opacity_logits[3] = -6
     gaussians.means[7, 1] = np.nan
     np.testing.assert_array_equal(np.flatnonzero(prunable_mask(gaussians.rows)), [3, 7])
 
 
-def test_gaussian_far_larger_than_its_neighbors_goes() -> None:
+def test_gaussian_much_larger_than_its_neighbors_is_pruned() -> None:
     gaussians = cloud()
     gaussians.log_scales[5, 2] = np.log(0.2)
     gaussians.log_scales[6, 2] = np.log(0.05)
     np.testing.assert_array_equal(np.flatnonzero(prunable_mask(gaussians.rows)), [5])
 
 
-def test_lone_gaussian_has_nobody_to_be_compared_with() -> None:
+def test_isolated_gaussian_is_not_pruned() -> None:
     gaussians = cloud()
     far = gaussians.rows[:1].copy()
     far[0, :3], far[0, 3:6] = 50, np.log(3)
@@ -45,6 +45,6 @@ def test_lone_gaussian_has_nobody_to_be_compared_with() -> None:
 @pytest.mark.parametrize(
     "change", [{"min_opacity": 1.0}, {"max_relative_scale": 0.5}, {"neighbourhood_m": 0.0}]
 )
-def test_senseless_configuration_is_refused(change: dict) -> None:
+def test_invalid_settings_raise_config_error(change: dict) -> None:
     with pytest.raises(ConfigError):
         PruningConfig(**change)

@@ -16,7 +16,7 @@ def disc(x: float, y: float, z: float, *, sigma_m: float = 0.2, opacity_logit: f
     return row
 
 
-def test_gaussian_appears_where_the_camera_projects_its_mean() -> None:
+def test_gaussian_is_rendered_at_its_projected_mean() -> None:
     T_camera_map = se3.exp(np.array([0.1, -0.2, 0.3, 0.1, 0.1, 0.3]))
     mean_camera = CAMERA.rays()[7, 22] * 2.0
     mean_map = se3.transform(se3.inverse(T_camera_map), mean_camera)
@@ -26,7 +26,7 @@ def test_gaussian_appears_where_the_camera_projects_its_mean() -> None:
     np.testing.assert_allclose(rendering.opacity[7, 22], 1 / (1 + np.exp(-2.0)), atol=1e-4)
 
 
-def test_depths_of_one_surface_agree_and_of_nothing_are_zero() -> None:
+def test_depths_of_a_surface_agree_and_are_zero_elsewhere() -> None:
     rendering = render(disc(0, 0, 2.0)[None], CAMERA, np.eye(4))
     seen = rendering.opacity > 0.5
     assert 0 < seen.sum() < seen.size
@@ -37,20 +37,20 @@ def test_depths_of_one_surface_agree_and_of_nothing_are_zero() -> None:
     np.testing.assert_allclose(rendering.weighted_depth_m, 2 * rendering.opacity, atol=1e-6)
 
 
-def test_median_depth_lies_on_a_surface_where_the_mean_lies_between() -> None:
+def test_median_depth_lies_on_a_surface_unlike_mean_depth() -> None:
     rows = np.stack([disc(0, 0, 1.0, opacity_logit=1.0), disc(0, 0, 3.0, opacity_logit=4.0)])
     rendering = render(rows, CAMERA, np.eye(4))
     assert rendering.median_depth_m[11, 15] == 1.0
     assert 1.2 < rendering.depth_m[11, 15] < 2.0
 
 
-def test_camera_with_lens_distortion_is_refused() -> None:
+def test_camera_with_lens_distortion_raises() -> None:
     camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, (0.1, 0.0, 0.0, 0.0))
     with pytest.raises(DataError, match="rectified"):
         render(disc(0, 0, 1.0)[None], camera, np.eye(4))
 
 
-def test_plain_twin_can_be_differentiated() -> None:
+def test_reference_renderer_is_differentiable() -> None:
     anp = pytest.importorskip("autograd.numpy", reason="pip install autograd")
     from autograd import grad
 

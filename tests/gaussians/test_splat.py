@@ -7,7 +7,7 @@ from ldo_service.geometry import se3
 
 
 def parse(file: bytes) -> list[tuple]:
-    """A reader of its own, from the format's description: mean, scale, RGBA, wxyz."""
+    """Return mean, scale, RGBA and quaternion wxyz of each Gaussian, as the format describes."""
     gaussians = []
     for start in range(0, len(file), 32):
         numbers = np.frombuffer(file, "<f4", 6, start)
@@ -16,7 +16,7 @@ def parse(file: bytes) -> list[tuple]:
     return gaussians
 
 
-def written(folder: Path, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+def write_and_parse(folder: Path, rows: np.ndarray) -> tuple[np.ndarray, ...]:
     write_splat(folder / "map.splat", rows)
     file = (folder / "map.splat").read_bytes()
     assert len(file) == 32 * len(rows)
@@ -29,8 +29,10 @@ def by_weight(rows: np.ndarray) -> np.ndarray:
     return rows[np.argsort(-weight)]
 
 
-def test_every_attribute_is_there_within_its_byte(tmp_path: Path, some_rows: np.ndarray) -> None:
-    means, scales, rgba, quats = written(tmp_path, some_rows)
+def test_every_attribute_is_restored_within_quantization(
+    tmp_path: Path, some_rows: np.ndarray
+) -> None:
+    means, scales, rgba, quats = write_and_parse(tmp_path, some_rows)
     rows = by_weight(some_rows)
     np.testing.assert_array_equal(means, rows[:, 0:3])
     np.testing.assert_allclose(scales, np.exp(rows[:, 3:6]), rtol=1e-6)
@@ -41,7 +43,7 @@ def test_every_attribute_is_there_within_its_byte(tmp_path: Path, some_rows: np.
     assert np.rad2deg(angles).max() < 1.0
 
 
-def test_colors_beyond_the_range_are_clipped(tmp_path: Path, some_rows: np.ndarray) -> None:
+def test_colors_out_of_range_are_clipped(tmp_path: Path, some_rows: np.ndarray) -> None:
     some_rows[:, 11:14] = [-0.2, 0.5, 1.3]
-    _, _, rgba, _ = written(tmp_path, some_rows)
+    _, _, rgba, _ = write_and_parse(tmp_path, some_rows)
     np.testing.assert_allclose(rgba[:, :3], np.tile([0, 0.5, 1], (200, 1)), atol=1 / 255)

@@ -1,4 +1,4 @@
-"""Judges: a parser from the format's description, and gsply's own reader."""
+"""SPZ files, checked with a parser of the format and with gsply."""
 
 import gzip
 import struct
@@ -12,7 +12,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.gaussians.file_formats import write_spz
 from ldo_service.geometry import se3
 
-TURN = np.diag([1.0, -1.0, -1.0])  # between x right, y down, z forward and OpenGL's axes
+R_OPENGL = np.diag([1.0, -1.0, -1.0])  # Rotation of x right, y down, z forward to OpenGL.
 
 
 def covariances(log_scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
@@ -26,7 +26,10 @@ def angles_deg(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def smallest_three(packed: int) -> list[float]:
-    """Quaternion wxyz: two bits name the largest of xyzw, then sign and nine bits of each other."""
+    """Return the quaternion wxyz of a packed one.
+
+    Two bits give the largest of xyzw; the others have a sign and nine bits each.
+    """
     largest, others = packed >> 30, [packed >> shift & 1023 for shift in (20, 10, 0)]
     values = [(o & 511) / 511 / 2**0.5 * (-1 if o & 512 else 1) for o in others]
     values.insert(largest, max(0.0, 1 - sum(v * v for v in values)) ** 0.5)
@@ -57,9 +60,9 @@ def spz(tmp_path: Path, some_rows: np.ndarray) -> Path:
     return tmp_path / "map.spz"
 
 
-def test_every_attribute_is_there_within_its_steps(spz: Path, some_rows: np.ndarray) -> None:
+def test_every_attribute_is_restored_within_quantization(spz: Path, some_rows: np.ndarray) -> None:
     read = parse(spz)
-    np.testing.assert_allclose(read["means"] @ TURN, some_rows[:, 0:3], atol=0.5 / 4096 + 1e-6)
+    np.testing.assert_allclose(read["means"] @ R_OPENGL, some_rows[:, 0:3], atol=0.5 / 4096 + 1e-6)
     np.testing.assert_allclose(read["log_scales"], some_rows[:, 3:6], atol=0.5 / 16 + 1e-6)
     opacities = 1 / (1 + np.exp(-some_rows[:, 10]))
     np.testing.assert_allclose(read["opacities"], opacities, atol=0.5 / 255 + 1e-6)
@@ -67,26 +70,26 @@ def test_every_attribute_is_there_within_its_steps(spz: Path, some_rows: np.ndar
     assert angles_deg(read["quats"] * [1, 1, -1, -1], some_rows[:, 6:10]).max() < 0.3
 
 
-def test_gaussians_are_turned_as_a_whole(spz: Path, some_rows: np.ndarray) -> None:
-    """Covariances in OpenGL's axes are those of the map between two turns, up to quantisation."""
+def test_covariances_are_rotated_to_opengl_axes(spz: Path, some_rows: np.ndarray) -> None:
+    """Covariances in OpenGL axes are the rotated ones of the map, up to quantization."""
     read = parse(spz)
-    expected = TURN @ covariances(read["log_scales"], some_rows[:, 6:10]) @ TURN
-    found = covariances(read["log_scales"], read["quats"])
-    error = np.linalg.norm(found - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
+    expected = R_OPENGL @ covariances(read["log_scales"], some_rows[:, 6:10]) @ R_OPENGL
+    actual = covariances(read["log_scales"], read["quats"])
+    error = np.linalg.norm(actual - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
     assert error.max() < 0.01
 
 
-def test_gsply_reads_what_the_description_says(spz: Path) -> None:
-    gsply, ours = pytest.importorskip("gsply"), parse(spz)
+def test_gsply_matches_the_parser(spz: Path) -> None:
+    gsply, parsed = pytest.importorskip("gsply"), parse(spz)
     data = gsply.read_spz(spz)
-    np.testing.assert_allclose(data.means, ours["means"], atol=1e-6)
-    np.testing.assert_allclose(data.scales, ours["log_scales"], atol=1e-6)
-    np.testing.assert_allclose(gsply.sh2rgb(data.sh0), ours["colors"], atol=1e-5)
-    np.testing.assert_allclose(gsply.sigmoid(data.opacities), ours["opacities"], atol=1e-5)
-    assert angles_deg(data.quats, ours["quats"]).max() < 0.05
+    np.testing.assert_allclose(data.means, parsed["means"], atol=1e-6)
+    np.testing.assert_allclose(data.scales, parsed["log_scales"], atol=1e-6)
+    np.testing.assert_allclose(gsply.sh2rgb(data.sh0), parsed["colors"], atol=1e-5)
+    np.testing.assert_allclose(gsply.sigmoid(data.opacities), parsed["opacities"], atol=1e-5)
+    assert angles_deg(data.quats, parsed["quats"]).max() < 0.05
 
 
-def test_without_gsply_the_command_that_brings_it_is_said(
+def test_missing_gsply_raises_with_install_command(
     tmp_path: Path, some_rows: np.ndarray, monkeypatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "gsply", None)

@@ -1,4 +1,4 @@
-"""A wall that was mapped twice is one wall again, and nothing else is touched."""
+"""Detection of duplicate Gaussians on a wall that was mapped twice."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def wall(
     z_m: float = 1.5,
     gray: float = 0.5,
 ) -> np.ndarray:
-    """Flat Gaussians on a grid in the plane z, as insertion makes them."""
+    """Return flat Gaussians on a grid in the plane z, like those of densification."""
     x, y = np.meshgrid(
         np.arange(left_m, left_m + width_m, SPACING_M), np.arange(0, height_m, SPACING_M)
     )
@@ -30,8 +30,8 @@ def wall(
     return rows
 
 
-def turned(rows: np.ndarray, angle_rad: float) -> np.ndarray:
-    """About the y axis through the middle of the wall."""
+def rotated(rows: np.ndarray, angle_rad: float) -> np.ndarray:
+    """Return the rows rotated about the y axis through the center of the wall."""
     T = se3.exp(np.array([0, angle_rad, 0, 0, 0, 0]))
     center, rows = np.array([0, 0, 1.5]), rows.copy()
     rows[:, :3] = (rows[:, :3] - center) @ T[:3, :3].T + center
@@ -39,16 +39,16 @@ def turned(rows: np.ndarray, angle_rad: float) -> np.ndarray:
     return rows
 
 
-def of_two(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def joined(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     anchors = np.repeat([3, 90], [len(first), len(second)]).astype(np.int32)
     return np.concatenate([first, second]), anchors
 
 
-def test_the_newer_copy_goes_where_the_older_one_covers_it() -> None:
+def test_newer_duplicates_of_older_gaussians_are_found() -> None:
     first = wall(1.0, 1.0)
     second = wall(1.0, 1.0, left_m=0.5, z_m=1.512)
     second[:, :2] += 0.4 * SPACING_M
-    rows, anchors = of_two(first, second)
+    rows, anchors = joined(first, second)
     mask = find_duplicates(rows, anchors, 90)
     assert not mask[: len(first)].any()
     inside = second[:, 0] < first[:, 0].max() + SPACING_M
@@ -57,9 +57,9 @@ def test_the_newer_copy_goes_where_the_older_one_covers_it() -> None:
     np.testing.assert_array_equal(mask[len(first) :][beyond], False)
 
 
-def test_no_hole_is_left() -> None:
+def test_removal_of_duplicates_leaves_no_holes() -> None:
     second = wall(1.0, 1.0, left_m=0.5, z_m=1.51)
-    rows, anchors = of_two(wall(1.0, 1.0), second)
+    rows, anchors = joined(wall(1.0, 1.0), second)
     kept = rows[~find_duplicates(rows, anchors, 90)]
     opacity_before, opacity_after = (
         render(np.ascontiguousarray(r), CAMERA, np.eye(4)).opacity for r in (rows, kept)
@@ -70,21 +70,21 @@ def test_no_hole_is_left() -> None:
     assert opacity_after[solid].min() > 0.9
 
 
-def test_what_only_lies_near_stays() -> None:
+def test_nearby_surfaces_are_no_duplicates() -> None:
     first = wall(1.0, 1.0)
     others = {
-        "the other side of a door": wall(1.0, 1.0, z_m=1.55),
-        "a wall that meets it": turned(wall(1.0, 1.0), np.pi / 2),
+        "the back of a door": wall(1.0, 1.0, z_m=1.55),
+        "a perpendicular wall": rotated(wall(1.0, 1.0), np.pi / 2),
         "a picture on it": wall(1.0, 1.0, gray=0.9),
     }
     for name, other in others.items():
-        rows, anchors = of_two(first, other)
+        rows, anchors = joined(first, other)
         mask = find_duplicates(rows, anchors, 90)
         assert mask.mean() < 0.02, name
 
 
-def test_keyframes_of_one_passage_are_left_alone() -> None:
-    rows, anchors = of_two(wall(1.0, 1.0), wall(1.0, 1.0, z_m=1.51))
+def test_gaussians_of_recent_keyframes_are_no_duplicates() -> None:
+    rows, anchors = joined(wall(1.0, 1.0), wall(1.0, 1.0, z_m=1.51))
     assert not find_duplicates(rows, anchors, 90, DeduplicationConfig(keyframes_apart=100)).any()
     assert not find_duplicates(rows, anchors, 4).any()
     assert not find_duplicates(rows[:0], anchors[:0], 4).any()
