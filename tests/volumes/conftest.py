@@ -1,4 +1,4 @@
-"""The synthetic room as a map, and points on its true surface."""
+"""Fixtures of the synthetic room: its map and points on its true surface."""
 
 from dataclasses import dataclass
 
@@ -11,30 +11,30 @@ from ldo_service.geometry import se3
 from ldo_service.volumes import Viewpoint
 
 KEYFRAMES = range(0, 120, 15)
-# what is judged here is made from the map, not the map
+# A fine map, because these tests check what is derived from it.
 FINE = DensificationConfig(max_contrast=0.2)
 
 
 @dataclass(frozen=True)
-class Mapped:
+class MappedRoom:
     rows: np.ndarray
     viewpoints: list[Viewpoint]
-    frames: range  # of the room, one for each viewpoint
+    frames: range  # Frame index of each viewpoint.
 
 
 @pytest.fixture(scope="package")
-def mapped(room: Sequence) -> Mapped:
-    """Gaussians inserted from eight frames at their true poses; the map is the world."""
+def mapped_room(room: Sequence) -> MappedRoom:
+    """Return a map from eight frames at their true poses; the map frame is the world frame."""
     T_world_camera, gaussians = room.truth().T_world_camera, GaussianMap()
     for keyframe, index in enumerate(KEYFRAMES):
         densify(gaussians, room[index], T_world_camera[index], keyframe, FINE)
     viewpoints = [Viewpoint(room.camera, T_world_camera[index]) for index in KEYFRAMES]
-    return Mapped(gaussians.rows, viewpoints, KEYFRAMES)
+    return MappedRoom(gaussians.rows, viewpoints, KEYFRAMES)
 
 
 @pytest.fixture(scope="package")
 def p_true(room: Sequence) -> np.ndarray:
-    """Points [P, 3] that rays cast from every fifth pose meet, about a centimetre apart."""
+    """Return surface points [P, 3] of rays from every fifth pose, about 1 cm apart."""
     T_world_camera = room.truth().T_world_camera
     points = [
         se3.transform(T_world_camera[i], room.camera.backproject(room[i].depth_m).reshape(-1, 3))

@@ -12,7 +12,7 @@ TETRAHEDRON = Mesh(
 )
 
 
-def test_another_reader_finds_vertices_colors_and_triangles(tmp_path: Path) -> None:
+def test_trimesh_reads_vertices_colors_and_triangles(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh", reason="pip install trimesh")
     write_mesh(tmp_path / "mesh.ply", TETRAHEDRON)
     read = trimesh.load(tmp_path / "mesh.ply", process=False)
@@ -23,7 +23,7 @@ def test_another_reader_finds_vertices_colors_and_triangles(tmp_path: Path) -> N
     assert read.area == pytest.approx(TETRAHEDRON.area_m2)
 
 
-def test_the_file_is_a_plain_binary_ply(tmp_path: Path) -> None:
+def test_file_is_a_binary_little_endian_ply(tmp_path: Path) -> None:
     plyfile = pytest.importorskip("plyfile", reason="pip install plyfile")
     write_mesh(tmp_path / "mesh.ply", TETRAHEDRON)
     read = plyfile.PlyData.read(str(tmp_path / "mesh.ply"))
