@@ -1,4 +1,4 @@
-"""Messages of a map that changes at random, as a mapper sends them."""
+"""Map messages of a mapper with random changes."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from ldo_service.schemas import AnchorMotion, Array, Gaussians, MapDelta, MapSna
 
 
 def random_rows(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Gaussian rows [N, 16] of centimetres, in a room."""
+    """Return Gaussian rows [N, 16] of some centimeters in size, within 4 m."""
     rows = aligned_rows(count)
     rows[:, 0:3] = rng.uniform(-2, 2, (count, 3))
     rows[:, 3:6] = rng.uniform(-6, -3, (count, 3))
@@ -21,24 +21,26 @@ def random_rows(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 class ChangingMap:
-    """The truth; each call changes it, and is told as a message."""
+    """Reference map that changes at random and gives the messages of its changes."""
 
     def __init__(self, seed: int = 0) -> None:
         self.map, self.version = GaussianMap(), 0
         self._rng = np.random.default_rng(seed)
 
     def delta(self) -> MapDelta:
-        """A keyframe moves, some Gaussians go, some change, some come."""
+        """Move a keyframe, remove, change and add Gaussians, and return the map delta."""
         motion = self._move(int(self._rng.integers(4)))
-        removed = self.map.ids[self._some(0.1)].copy()
+        removed = self.map.ids[self._random_mask(0.1)].copy()
         self.map.remove(np.isin(self.map.ids, removed))
-        changed = np.flatnonzero(self._some(0.3))
+        changed = np.flatnonzero(self._random_mask(0.3))
         self.map.rows[changed] = random_rows(self._rng, len(changed))
         first = len(self.map)
         self.map.add(random_rows(self._rng, 50), anchor=int(self._rng.integers(4)))
-        return self._told((motion,), removed, self._at(changed), self._at(slice(first, None)))
+        return self._delta(
+            (motion,), removed, self._gaussians_at(changed), self._gaussians_at(slice(first, None))
+        )
 
-    def _told(
+    def _delta(
         self,
         motions: tuple[AnchorMotion, ...] = (),
         removed: np.ndarray = NO_IDS,
@@ -58,7 +60,7 @@ class ChangingMap:
         )
 
     def snapshot(self, parts: int = 3) -> list[MapSnapshot]:
-        pieces = rechunk([self.map.all()], parts, -(-len(self.map) // parts))
+        batches = rechunk([self.map.all()], parts, -(-len(self.map) // parts))
         return [
             MapSnapshot(
                 stamp_ns=0,
@@ -68,7 +70,7 @@ class ChangingMap:
                 parts=parts,
                 gaussians=gaussians,
             )
-            for part, gaussians in enumerate(pieces)
+            for part, gaussians in enumerate(batches)
         ]
 
     def _move(self, keyframe: int) -> AnchorMotion:
@@ -77,8 +79,8 @@ class ChangingMap:
         self.map.move_anchors({keyframe: T})
         return AnchorMotion(keyframe=keyframe, T_new_old=pose)
 
-    def _some(self, share: float) -> np.ndarray:
-        return self._rng.uniform(size=len(self.map)) < share
+    def _random_mask(self, ratio: float) -> np.ndarray:
+        return self._rng.uniform(size=len(self.map)) < ratio
 
-    def _at(self, where: np.ndarray | slice) -> Gaussians:
+    def _gaussians_at(self, where: np.ndarray | slice) -> Gaussians:
         return gaussians_message(self.map.all().at(where))

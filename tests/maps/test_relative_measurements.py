@@ -1,4 +1,4 @@
-"""The renderer's poses become measurements, of old keyframes too, in little memory."""
+"""Relative-pose measurements of refined keyframes, with bounded memory."""
 
 from collections.abc import Iterator
 
@@ -15,17 +15,18 @@ from ldo_service.schemas.frames import CameraModel
 
 RECENT = 4
 STEP = se3.exp(np.array([0.01, 0.02, 0.0, 0.1, 0.0, 0.02]))
-OF_REFERENCE, OF_WINDOW = matrix6_to_message(3.0 * np.eye(6)), matrix6_to_message(2.0 * np.eye(6))
+REFERENCE_INFORMATION = matrix6_to_message(3.0 * np.eye(6))
+WINDOW_INFORMATION = matrix6_to_message(2.0 * np.eye(6))
 
 
 def keyframe(k: int) -> Keyframe:
-    """Measured from the one before, and from the one before that."""
+    """Return a keyframe measured from the previous two."""
     window = [
         MeasuredPose(
             reference=reference,
             keyframe=k,
             T_reference_keyframe=pose_to_message(STEP @ STEP),
-            information=OF_WINDOW,
+            information=WINDOW_INFORMATION,
         )
         for reference in range(max(0, k - 2), k - 1)
     ]
@@ -38,57 +39,62 @@ def keyframe(k: int) -> Keyframe:
         depth_m=Array.of(np.zeros((1, 1), np.float32)),
         reference=k - 1 if k else None,
         T_reference_keyframe=pose_to_message(STEP if k else np.eye(4)),
-        information=OF_REFERENCE,
+        information=REFERENCE_INFORMATION,
         T_odom_keyframe=pose_to_message(np.eye(4)),
         overlap=1.0,
         window_measurements=tuple(window),
     )
 
 
-def followed(count: int) -> tuple[KeyframePoses, RelativeMeasurements]:
+def measurements_of(count: int) -> tuple[KeyframePoses, RelativeMeasurements]:
     poses = KeyframePoses()
-    links = RelativeMeasurements(poses, RECENT)
+    measurements = RelativeMeasurements(poses, RECENT)
     for k in range(count):
         poses.add(k, k - 1 if k else None, STEP if k else np.eye(4), np.eye(4))
-        links.add(keyframe(k))
-    return poses, links
+        measurements.add(keyframe(k))
+    return poses, measurements
 
 
-def told(links: RelativeMeasurements, moved: dict[int, np.ndarray]) -> Iterator[tuple]:
-    refinement = links.refined(moved, 0)
+def measured_poses(
+    measurements: RelativeMeasurements, moved: dict[int, np.ndarray]
+) -> Iterator[tuple]:
+    refinement = measurements.refined(moved, 0)
     assert refinement is not None
     return ((p.keyframe, p.reference, p.information) for p in refinement.poses)
 
 
-def test_of_a_recent_keyframe_every_measurement_is_taken_anew() -> None:
-    poses, links = followed(10)
-    assert list(told(links, {8: poses[8]})) == [
-        (8, 7, OF_REFERENCE),
-        (8, 6, OF_WINDOW),
-        (9, 8, OF_REFERENCE),
+def test_all_measurements_of_a_recent_keyframe_are_updated() -> None:
+    poses, measurements = measurements_of(10)
+    assert list(measured_poses(measurements, {8: poses[8]})) == [
+        (8, 7, REFERENCE_INFORMATION),
+        (8, 6, WINDOW_INFORMATION),
+        (9, 8, REFERENCE_INFORMATION),
     ]
 
 
-def test_of_an_old_one_those_along_the_path_are() -> None:
-    poses, links = followed(10)
-    assert list(told(links, {3: poses[3]})) == [(3, 2, OF_REFERENCE), (4, 3, OF_REFERENCE)]
+def test_only_path_measurements_of_an_old_keyframe_are_updated() -> None:
+    poses, measurements = measurements_of(10)
+    assert list(measured_poses(measurements, {3: poses[3]})) == [
+        (3, 2, REFERENCE_INFORMATION),
+        (4, 3, REFERENCE_INFORMATION),
+    ]
 
 
 @pytest.mark.parametrize("moved", [3, 8])
-def test_a_restored_one_says_the_same(moved: int) -> None:
-    poses, links = followed(10)
-    links.refined({7: poses[7]}, 0)
-    twin = RelativeMeasurements(poses, RECENT)
-    twin.restore(links.snapshot())
-    assert twin.acknowledged(0) == links.acknowledged(0) == {7}
-    T_map = {moved: poses[moved] @ STEP}
-    said = [one.refined(T_map, 0) for one in (links, twin)]
-    assert said[0] is not None
-    assert said[0].number == 2
-    assert msgspec.msgpack.encode(said[0]) == msgspec.msgpack.encode(said[1])
+def test_restored_measurements_give_an_equal_message(moved: int) -> None:
+    poses, measurements = measurements_of(10)
+    measurements.refined({7: poses[7]}, 0)
+    restored = RelativeMeasurements(poses, RECENT)
+    restored.restore(measurements.snapshot())
+    assert restored.acknowledged(0) == measurements.acknowledged(0) == {7}
+    T_refined = {moved: poses[moved] @ STEP}
+    refinements = [one.refined(T_refined, 0) for one in (measurements, restored)]
+    assert refinements[0] is not None
+    assert refinements[0].number == 2
+    assert msgspec.msgpack.encode(refinements[0]) == msgspec.msgpack.encode(refinements[1])
 
 
-def test_an_old_keyframe_takes_some_hundred_bytes() -> None:
-    _, links = followed(2000)
-    assert len(links._recent) == RECENT
-    assert links._older._room.nbytes < 130 * 2000
+def test_old_keyframe_uses_at_most_130_bytes() -> None:
+    _, measurements = measurements_of(2000)
+    assert len(measurements._recent) == RECENT
+    assert measurements._older._room.nbytes < 130 * 2000

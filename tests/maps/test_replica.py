@@ -1,4 +1,4 @@
-"""A bounded replica of the map against the exact one."""
+"""Bounded map replica against the exact map."""
 
 import numpy as np
 import pytest
@@ -8,83 +8,83 @@ from ldo_service.maps.replica import SLACK, MapReplica
 
 from .streams import ChangingMap
 
-PLENTY = 1_000_000
+UNLIMITED = 1_000_000
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_with_room_for_all_it_is_the_followers_map(seed: int) -> None:
-    changing, known, follower = ChangingMap(seed), MapReplica(PLENTY), MapReplica()
+def test_replica_below_its_limit_equals_unbounded_replica(seed: int) -> None:
+    mapper, replica, unbounded = ChangingMap(seed), MapReplica(UNLIMITED), MapReplica()
     for step in range(20):
-        messages = [changing.delta(), *(changing.snapshot() if step % 6 == 5 else ())]
+        messages = [mapper.delta(), *(mapper.snapshot() if step % 6 == 5 else ())]
         for message in messages:
-            assert known.apply(message) == follower.apply(message)
-        np.testing.assert_array_equal(known.map.rows, follower.map.rows)
-        assert not known.is_behind
+            assert replica.apply(message) == unbounded.apply(message)
+        np.testing.assert_array_equal(replica.map.rows, unbounded.map.rows)
+        assert not replica.is_behind
 
 
-def test_who_comes_late_has_it_from_the_snapshot() -> None:
-    changing = ChangingMap()
+def test_late_replica_is_complete_after_the_snapshot() -> None:
+    mapper = ChangingMap()
     for _ in range(10):
-        changing.delta()
-    known, snapshot = MapReplica(PLENTY), changing.snapshot()
-    for message in (*snapshot, changing.delta(), changing.delta()):
-        assert known.apply(message)
-    np.testing.assert_array_equal(known.map.rows, changing.map.rows)
+        mapper.delta()
+    replica, snapshot = MapReplica(UNLIMITED), mapper.snapshot()
+    for message in (*snapshot, mapper.delta(), mapper.delta()):
+        assert replica.apply(message)
+    np.testing.assert_array_equal(replica.map.rows, mapper.map.rows)
 
 
 @pytest.mark.parametrize("parts", [1, 4])
-def test_what_was_missed_is_wrong_until_the_next_snapshot(parts: int) -> None:
-    changing, known = ChangingMap(), MapReplica(PLENTY)
+def test_replica_is_behind_after_lost_deltas_until_the_next_snapshot(parts: int) -> None:
+    mapper, replica = ChangingMap(), MapReplica(UNLIMITED)
     for _ in range(4):
-        known.apply(changing.delta())
+        replica.apply(mapper.delta())
     for _ in range(3):
-        changing.delta()  # lost
-    assert known.apply(changing.delta())
-    assert known.is_behind
-    assert len(known.map.rows)  # goes on
-    for message in changing.snapshot(parts):
-        known.apply(message)
-    assert not known.is_behind
-    np.testing.assert_array_equal(known.map.rows, changing.map.rows)
+        mapper.delta()  # Lost messages.
+    assert replica.apply(mapper.delta())
+    assert replica.is_behind
+    assert len(replica.map.rows)  # The replica keeps its map.
+    for message in mapper.snapshot(parts):
+        replica.apply(message)
+    assert not replica.is_behind
+    np.testing.assert_array_equal(replica.map.rows, mapper.map.rows)
 
 
-def test_an_old_message_changes_nothing() -> None:
-    changing, known = ChangingMap(), MapReplica(PLENTY)
-    first, early = changing.delta(), changing.snapshot()
-    second = changing.delta()
-    late = changing.snapshot()
+def test_old_messages_are_ignored() -> None:
+    mapper, replica = ChangingMap(), MapReplica(UNLIMITED)
+    first, early_snapshot = mapper.delta(), mapper.snapshot()
+    second = mapper.delta()
+    late_snapshot = mapper.snapshot()
     for message in (first, second):
-        known.apply(message)
-    before = known.map.rows.copy()
-    assert not any(known.apply(message) for message in (second, *early, *late))
-    np.testing.assert_array_equal(known.map.rows, before)
+        replica.apply(message)
+    before = replica.map.rows.copy()
+    assert not any(replica.apply(message) for message in (second, *early_snapshot, *late_snapshot))
+    np.testing.assert_array_equal(replica.map.rows, before)
 
 
-def test_a_mapper_that_begins_anew_is_followed() -> None:
-    known = MapReplica(PLENTY)
-    before, anew = ChangingMap(1), ChangingMap(2)
-    for changing in (before, before, before, anew, anew):
-        assert known.apply(changing.delta())
-    np.testing.assert_array_equal(known.map.rows, anew.map.rows)
+def test_replica_follows_a_restarted_mapper() -> None:
+    replica = MapReplica(UNLIMITED)
+    before, restarted = ChangingMap(1), ChangingMap(2)
+    for mapper in (before, before, before, restarted, restarted):
+        assert replica.apply(mapper.delta())
+    np.testing.assert_array_equal(replica.map.rows, restarted.map.rows)
 
 
-def test_it_holds_the_weightiest_and_no_more_than_there_is_room_for() -> None:
-    changing, known, most = ChangingMap(), MapReplica(100), 100
+def test_replica_keeps_the_heaviest_gaussians_within_its_limit() -> None:
+    mapper, replica, limit = ChangingMap(), MapReplica(100), 100
     for step in range(40):
-        for message in [changing.delta(), *(changing.snapshot() if step % 10 == 9 else ())]:
-            known.apply(message)
-            assert len(known.map.rows) <= SLACK * most
-    truth = changing.map.rows  # of which there was a snapshot just now
-    best = truth[weightiest(truth, most)]
-    assert {row.tobytes() for row in best} <= {row.tobytes() for row in known.map.rows}
+        for message in [mapper.delta(), *(mapper.snapshot() if step % 10 == 9 else ())]:
+            replica.apply(message)
+            assert len(replica.map.rows) <= SLACK * limit
+    expected_rows = mapper.map.rows  # The last message was a snapshot.
+    heaviest = expected_rows[weightiest(expected_rows, limit)]
+    assert {row.tobytes() for row in heaviest} <= {row.tobytes() for row in replica.map.rows}
 
 
-def test_an_empty_map_is_told_of_too() -> None:
-    known = MapReplica(PLENTY)
-    known.apply(ChangingMap().delta())
-    known.is_behind = True
+def test_snapshot_of_an_empty_map_clears_the_replica() -> None:
+    replica = MapReplica(UNLIMITED)
+    replica.apply(ChangingMap().delta())
+    replica.is_behind = True
     empty = ChangingMap()
     empty.version = 5
     for message in empty.snapshot(parts=1):
-        known.apply(message)
-    assert len(known.map.rows) == 0
+        replica.apply(message)
+    assert len(replica.map.rows) == 0
