@@ -99,7 +99,11 @@ def test_invalid_reinsertion_raises_and_changes_nothing() -> None:
     gaussians = map_of(6)
     ids, rows, anchors, labels = gaussians.extract(np.array([0, 1, 1, 0, 0, 0], bool))
     before = gaussians.snapshot()
-    for wrong_ids, reason in (([1, 3], "id 3 is in"), ([1, 6], "this map, 0 to 5"), ([2, 2], "twice")):
+    for wrong_ids, reason in (
+        ([1, 3], "id 3 is in"),
+        ([1, 6], "this map, 0 to 5"),
+        ([2, 2], "twice"),
+    ):
         with pytest.raises(ValueError, match=reason):
             gaussians.reinsert(np.array(wrong_ids), rows, anchors)
     with pytest.raises(ValueError, match="NaN"):
