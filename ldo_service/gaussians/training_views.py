@@ -216,7 +216,7 @@ class _Stored(msgspec.Struct, frozen=True):
 
 
 def pack(images: KeyframeImages) -> bytes:
-    """Compress images without loss to about a quarter of their size (docs/benchmarks/storage.md)."""
+    """Compress images without loss to about a quarter of their size."""
     depth, is_differences = _packed_depth(images.depth_m)
     stored = _Stored(
         images.keyframe,
