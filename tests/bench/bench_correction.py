@@ -106,7 +106,7 @@ def measure_journey(keyframes: int) -> None:
     graph.add_first(0, truth[0])
     receiver.add(0, None, np.eye(4), truth[0])
     keyframe_ms, closure_ms, take_ms, size_kb = [], [], [], 0.0
-    for measured in odometry(truth, 0, window=3, drift_share=0.005, drift_rad_per_m=0.004):
+    for measured in odometry(truth, 0, window=3, drift_ratio=0.005, drift_rad_per_m=0.004):
         b, version = measured[0].b, version + 1
         receiver.add(b, b - 1, measured[0].T_a_b, truth[b])
         start = time.process_time()

@@ -1,4 +1,4 @@
-"""True walks, and what drifting odometry and a loop closer say of them."""
+"""Ground-truth trajectories, with drifting odometry and loop closures of them."""
 
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -8,12 +8,12 @@ from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
 
-ODOMETRY = np.diag([2e3**2] * 3 + [5e2**2] * 3)  # as alignment states it: 0.5 mrad, 2 mm
-REFINED = np.diag([2e2**2] * 3 + [1e2**2] * 3)  # of a closure: 5 mrad, 1 cm
+ODOMETRY = np.diag([2e3**2] * 3 + [5e2**2] * 3)  # 0.5 mrad and 2 mm, as from alignment.
+REFINED = np.diag([2e2**2] * 3 + [1e2**2] * 3)  # 5 mrad and 1 cm, as of a closure.
 
 
 def looking_along(positions: np.ndarray, ahead: np.ndarray) -> list[np.ndarray]:
-    """T_map_camera [4, 4] of each, z towards `ahead` [N, 3], y down (the map's y)."""
+    """Return T_map_camera [4, 4] of each position, z along `ahead` [N, 3], y down as in the map."""
     z = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -24,7 +24,7 @@ def looking_along(positions: np.ndarray, ahead: np.ndarray) -> list[np.ndarray]:
 
 
 def kitchen(count: int = 180) -> list[np.ndarray]:
-    """A camera held in the hand that sways about a room of 3 m and comes back again and again."""
+    """Return poses of a handheld camera that sways through a room of 3 m and often comes back."""
     t = np.linspace(0, 1, count)
     positions = np.column_stack(
         [
@@ -39,7 +39,7 @@ def kitchen(count: int = 180) -> list[np.ndarray]:
 
 
 def round_trips(count: int, each: int, radius_m: float = 3.0) -> list[np.ndarray]:
-    """Along a circle, `each` keyframes a round, looking ahead."""
+    """Return poses along a circle, `each` keyframes per round, looking ahead."""
     angle = 2 * np.pi * np.arange(count) / each
     positions = radius_m * np.column_stack([np.sin(angle), 0.1 * np.sin(5 * angle), np.cos(angle)])
     ahead = np.column_stack([np.cos(angle), np.zeros(count), -np.sin(angle)])
@@ -56,11 +56,14 @@ def odometry(
     *,
     window: int = 1,
     sigma: float = 2e-3,
-    drift_share: float = 0.0,
+    drift_ratio: float = 0.0,
     drift_rad_per_m: float = 0.0,
 ) -> Iterator[list[RelativePose]]:
-    """What each keyframe but the first is measured from: `window` before it, with noise, and with
-    one drift for the whole walk: longer steps, and a turn about a fixed axis."""
+    """Yield the odometry measurements of each keyframe but the first.
+
+    Each keyframe is measured from the `window` keyframes before it, with noise. One drift holds
+    for the whole walk: longer steps, and a rotation about a fixed axis.
+    """
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
@@ -70,7 +73,7 @@ def odometry(
             T = between(truth, a, b)
             path_m = np.linalg.norm(T[:3, 3])
             T = T @ se3.exp(np.r_[drift_rad_per_m * path_m * axis, np.zeros(3)])
-            T[:3, 3] *= 1 + drift_share
+            T[:3, 3] *= 1 + drift_ratio
             T = T @ se3.exp(rng.normal(scale=sigma, size=6))
             measured.append(RelativePose(a, b, T, ODOMETRY))
         yield measured
@@ -79,13 +82,17 @@ def odometry(
 def closures(
     truth: Sequence[np.ndarray], every: int, apart: int, seed: int, *, near_m: float = 0.6
 ) -> dict[int, RelativePose]:
-    """By newer keyframe: true ones, of every so many keyframes with the nearest old one in view."""
+    """Return true closures by newer keyframe.
+
+    Each `every`-th keyframe closes with the nearest one that is at least `apart` older, where
+    translation (m) plus rotation (rad) is below `near_m`.
+    """
     rng, found = np.random.default_rng(seed), {}
     for b in range(apart, len(truth), every):
         T = [between(truth, a, b) for a in range(b - apart)]
-        off = [np.linalg.norm(one[:3, 3]) + se3.rotation_angle(one) for one in T]
-        a = int(np.argmin(off)) if off else 0
-        if off and off[a] < near_m:
+        distances = [np.linalg.norm(T_a_b[:3, 3]) + se3.rotation_angle(T_a_b) for T_a_b in T]
+        a = int(np.argmin(distances)) if distances else 0
+        if distances and distances[a] < near_m:
             noise = rng.normal(size=6) * ([5e-3] * 3 + [1e-2] * 3)
             found[b] = RelativePose(a, b, T[a] @ se3.exp(noise), REFINED)
     return found
@@ -94,7 +101,7 @@ def closures(
 def false_closures(
     truth: Sequence[np.ndarray], newer: Iterable[int], apart: int, seed: int
 ) -> dict[int, RelativePose]:
-    """By newer keyframe: with an old one that shows another place, as if it were the same."""
+    """Return false closures by newer keyframe, with an old keyframe of another place."""
     rng, found = np.random.default_rng(seed), {}
     for b in newer:
         far = [a for a in range(b - apart) if np.linalg.norm(between(truth, a, b)[:3, 3]) > 1.0]
@@ -109,18 +116,20 @@ def walked(
     *loops: dict[int, RelativePose],
     config: PoseGraphConfig | None = None,
 ) -> PoseGraph:
+    """Return the pose graph of odometry measurements, with closures by newer keyframe."""
     graph = PoseGraph(config or PoseGraphConfig())
     graph.add_first(0, first)
-    for one in measured:
-        graph.add(*one)
+    for measurements in measured:
+        graph.add(*measurements)
+        newest = measurements[0].b
         for found in loops:
-            if one[0].b in found:
-                graph.add_loop_closure(found[one[0].b])
+            if newest in found:
+                graph.add_loop_closure(found[newest])
     return graph
 
 
 def ate_m(graph: PoseGraph, truth: Sequence[np.ndarray]) -> float:
-    """RMSE after the best rigid alignment of the positions."""
+    """Return the RMSE of the positions after the best rigid alignment."""
     keyframes, T_map = graph.all_poses()
     estimated, true = T_map[:, :3, 3], np.array([truth[k] for k in keyframes])[:, :3, 3]
     a, b = estimated - estimated.mean(axis=0), true - true.mean(axis=0)
