@@ -1,4 +1,4 @@
-"""What a map has to say of a pose."""
+"""Tests of the check of loop candidates against the keyframe poses."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +18,7 @@ def view(keyframe: int, path_m: float, submap: int = 0) -> Any:
     return SimpleNamespace(keyframe=keyframe, path_m=path_m, place=place)
 
 
-def poses_of(*twists: tuple[float, ...]) -> KeyframePoses:
+def keyframe_poses(*twists: tuple[float, ...]) -> KeyframePoses:
     poses = KeyframePoses()
     for number, xi in enumerate(twists):
         poses.add(number, None, np.eye(4), se3.exp(np.array(xi, float)))
@@ -28,23 +28,23 @@ def poses_of(*twists: tuple[float, ...]) -> KeyframePoses:
 @pytest.mark.parametrize(
     ("xi", "expected"),
     [
-        ((0, 0, 0, 5.4, 0, 0), True),  # 0.5 m + 10 % of 10 m, and two depths of 2 m: 5.5 m
+        ((0, 0, 0, 5.4, 0, 0), True),  # Limit 5.5 m: 0.5 m + 10 % of 10 m + twice the depth of 2 m.
         ((0, 0, 0, 5.6, 0, 0), False),
-        ((0, 2.0, 0, 0, 0, 0), True),  # 0.35 + 0.2 + 1.5 rad
+        ((0, 2.0, 0, 0, 0, 0), True),  # Limit 2.05 rad: 0.35 + 0.2 + 1.5.
         ((0, 2.1, 0, 0, 0, 0), False),
     ],
 )
-def test_a_place_beyond_drift_and_view_is_not_asked(xi, expected) -> None:
-    known = ConsistencyChecker(poses_of((0,) * 6, xi), {}, CONFIG)
-    assert known.possible_matches([view(0, 0.0)], view(1, 10.0)).tolist() == [expected]
+def test_keyframe_beyond_drift_and_view_is_no_possible_match(xi, expected) -> None:
+    checker = ConsistencyChecker(keyframe_poses((0,) * 6, xi), {}, CONFIG)
+    assert checker.possible_matches([view(0, 0.0)], view(1, 10.0)).tolist() == [expected]
 
 
-def test_where_the_map_knows_nothing_everything_may_be() -> None:
+def test_keyframes_without_a_known_relative_pose_are_possible_matches() -> None:
     far = (0, 3.0, 0, 100, 0, 0)
     new = view(1, 10.0)
-    poses = poses_of((0,) * 6, far)
-    apart, joined = (ConsistencyChecker(poses, j, CONFIG) for j in ({}, {1: 0}))
-    assert apart.possible_matches([view(0, 0.0, submap=1)], new).tolist() == [True]
-    assert joined.possible_matches([view(0, 0.0, submap=1)], new).tolist() == [False]
-    assert apart.possible_matches([view(7, 0.0), view(0, 0.0)], new).tolist() == [True, False]
-    assert apart.possible_matches([], new).tolist() == []
+    poses = keyframe_poses((0,) * 6, far)
+    separate, merged = (ConsistencyChecker(poses, j, CONFIG) for j in ({}, {1: 0}))
+    assert separate.possible_matches([view(0, 0.0, submap=1)], new).tolist() == [True]
+    assert merged.possible_matches([view(0, 0.0, submap=1)], new).tolist() == [False]
+    assert separate.possible_matches([view(7, 0.0), view(0, 0.0)], new).tolist() == [True, False]
+    assert separate.possible_matches([], new).tolist() == []

@@ -1,46 +1,48 @@
-"""Histograms by TF-IDF, against figures worked out by hand and a plain twin."""
+"""Tests of TF-IDF histograms against values by hand and a NumPy reference."""
 
 import numpy as np
 
 from ldo_service.loop_closing.place_database import Histograms
 
 
-def known(*rows: list[float]) -> Histograms:
+def histograms_of(*rows: list[float]) -> Histograms:
     histograms = Histograms(len(rows[0]))
     for row in rows:
         histograms.add(np.array(row))
     return histograms
 
 
-def twin(rows: np.ndarray, row: np.ndarray) -> np.ndarray:
+def reference_cosines(rows: np.ndarray, row: np.ndarray) -> np.ndarray:
     idf = np.log(1 + len(rows) / np.maximum((rows > 0).sum(axis=0), 1))
     a, b = rows * idf, row * idf
     return np.array([x @ b / (np.linalg.norm(x) * np.linalg.norm(b)) for x in a])
 
 
-def test_a_word_that_few_hold_weighs_more() -> None:
-    """Three rooms with a chair, one of them with a sink: idf is log 2 and log 4 = 2 log 2."""
-    rooms = known([1, 0], [1, 0], [1, 1])
+def test_word_in_few_histograms_weighs_more() -> None:
+    """Three rooms have a chair and one of them a sink: idf is log 2 and log 4 = 2 log 2."""
+    rooms = histograms_of([1, 0], [1, 0], [1, 1])
     np.testing.assert_allclose(rooms.idf(), [np.log(2), np.log(4)], rtol=1e-6)
-    # of (1, 1): cos between (1, 0) and (1, 2) is 1 / sqrt(5)
+    # The query (1, 1) is weighted to (1, 2); its cosine to (1, 0) is 1 / sqrt(5).
     np.testing.assert_allclose(rooms.cosines(np.array([1, 1])), [5**-0.5, 5**-0.5, 1], rtol=1e-6)
 
 
-def test_the_weights_are_learned_as_rows_come_and_forgotten_as_they_go() -> None:
+def test_cosines_follow_added_and_removed_histograms() -> None:
     rng = np.random.default_rng(0)
     rows = rng.poisson(0.7, (40, 30)).astype(np.float32)
-    histograms, kept = Histograms(30), list(rows)
+    histograms, remaining = Histograms(30), list(rows)
     for row in rows:
         histograms.add(row)
     for index in (39, 17, 0, 5):
         histograms.remove(index)
-        del kept[index]
+        del remaining[index]
     row = rng.poisson(0.7, 30)
-    np.testing.assert_allclose(histograms.cosines(row), twin(np.array(kept), row), rtol=1e-5)
+    np.testing.assert_allclose(
+        histograms.cosines(row), reference_cosines(np.array(remaining), row), rtol=1e-5
+    )
     assert len(histograms) == 36
 
 
-def test_what_is_empty_is_like_nothing() -> None:
-    assert known([0, 0], [1, 0]).cosines(np.array([1, 0])).tolist() == [0, 1]
-    assert known([0, 0], [1, 0]).cosines(np.array([0, 0])).tolist() == [0, 0]
+def test_empty_histogram_has_zero_cosine_to_all() -> None:
+    assert histograms_of([0, 0], [1, 0]).cosines(np.array([1, 0])).tolist() == [0, 1]
+    assert histograms_of([0, 0], [1, 0]).cosines(np.array([0, 0])).tolist() == [0, 0]
     assert Histograms(2).cosines(np.array([1, 0])).shape == (0,)
