@@ -1,11 +1,11 @@
-"""One message of every type, small and with every field set.
+"""Small example messages of every type, with every field set.
 
-A new type gets a golden file with
+The golden file of a new type is written by
 
     python tests/schemas/examples.py
 
-which writes the files that are missing and never touches one that is there: a golden file is what
-an earlier version has sent, and every later one must still read it.
+It writes the missing files and never changes an existing one. A golden file is a message that an
+earlier version sent, and every later version must still read it.
 """
 
 from pathlib import Path
@@ -75,8 +75,8 @@ def gaussians(ids: list[int]) -> Gaussians:
     )
 
 
-def labelled(ids: list[int]) -> Gaussians:
-    """Three quarters chair, of 0.5 m."""
+def labelled_gaussians(ids: list[int]) -> Gaussians:
+    """Return Gaussians that are chair with probability 0.75, observed at 0.5 m."""
     row = np.zeros(32, np.uint8)
     row[:24] = np.array([0.75, 0, 0, 0, 0, 1.5], "<f4").view(np.uint8)
     row[24:26], row[27] = np.array([500], "<u2").view(np.uint8), 58
@@ -301,7 +301,7 @@ EXAMPLES: dict[str, Message] = {
         graph_version=3,
         motions=(),
         removed=Array.of(np.zeros(0, np.int64)),
-        changed=labelled([1, 5]),
+        changed=labelled_gaussians([1, 5]),
         added=gaussians([8]),
         label_names=LABEL_NAMES,
     ),
@@ -311,7 +311,7 @@ EXAMPLES: dict[str, Message] = {
         graph_version=3,
         part=0,
         parts=2,
-        gaussians=labelled([1, 8]),
+        gaussians=labelled_gaussians([1, 8]),
         label_names=LABEL_NAMES,
     ),
     "map_snapshot": MapSnapshot(
@@ -445,6 +445,7 @@ EXAMPLES: dict[str, Message] = {
 
 
 def write_missing() -> None:
+    """Write the golden files that do not exist yet."""
     for name, message in EXAMPLES.items():
         path = GOLDEN / f"{name}.msgpack"
         if not path.exists():

@@ -1,4 +1,4 @@
-"""Whatever arrives, a body is a valid message or a DecodeError."""
+"""Fuzz tests: every body decodes to a valid message or raises a DecodeError."""
 
 import msgspec
 import numpy as np
@@ -12,11 +12,12 @@ from ldo_service.schemas.array import DTYPES
 
 from .examples import CAMERA, EXAMPLES
 
-example = st.sampled_from(list(EXAMPLES.values()))
-number = st.floats(allow_nan=False, allow_infinity=False)
+examples = st.sampled_from(list(EXAMPLES.values()))
+finite_numbers = st.floats(allow_nan=False, allow_infinity=False)
 
 
-def decode_or_refuse(body: bytes, message: type[Message]) -> None:
+def assert_valid_or_rejected(body: bytes, message: type[Message]) -> None:
+    """Assert that a body raises a DecodeError or gives a message that survives a round trip."""
     try:
         decoded = decode(body, message)
     except msgspec.DecodeError:
@@ -25,11 +26,11 @@ def decode_or_refuse(body: bytes, message: type[Message]) -> None:
 
 
 def has_nan(message: Message) -> bool:
-    return "nan" in repr(message)  # NaN differs from itself: equality cannot judge
+    return "nan" in repr(message)  # A message with NaN differs from itself.
 
 
-@given(example, st.data())
-def test_a_truncated_body_is_refused(message: Message, data: st.DataObject) -> None:
+@given(examples, st.data())
+def test_truncated_body_raises_a_decode_error(message: Message, data: st.DataObject) -> None:
     body = encode(message)
     length = data.draw(st.integers(0, len(body) - 1))
     with pytest.raises(msgspec.DecodeError):
@@ -37,29 +38,29 @@ def test_a_truncated_body_is_refused(message: Message, data: st.DataObject) -> N
 
 
 @settings(max_examples=500)
-@given(example, st.lists(st.tuples(st.integers(0), st.integers(0, 255)), min_size=1, max_size=4))
+@given(examples, st.lists(st.tuples(st.integers(0), st.integers(0, 255)), min_size=1, max_size=4))
 def test_flipped_bytes_give_a_valid_message_or_a_decode_error(
     message: Message, flips: list[tuple[int, int]]
 ) -> None:
     body = bytearray(encode(message))
     for position, value in flips:
         body[position % len(body)] = value
-    decode_or_refuse(bytes(body), type(message))
+    assert_valid_or_rejected(bytes(body), type(message))
 
 
-@given(st.binary(max_size=200), example)
-def test_noise_is_a_decode_error(noise: bytes, message: Message) -> None:
+@given(st.binary(max_size=200), examples)
+def test_random_bytes_raise_a_decode_error(noise: bytes, message: Message) -> None:
     with pytest.raises(msgspec.DecodeError):
         decode(noise, type(message))
 
 
-def test_a_body_nested_too_deeply_is_a_decode_error() -> None:
+def test_deeply_nested_body_raises_a_decode_error() -> None:
     body = b"\x81\xa1y" + b"\x91" * 100_000
     with pytest.raises(msgspec.DecodeError, match="cannot be decoded"):
         decode(body, FrameRgbd)
 
 
-def test_a_message_of_another_type_is_a_decode_error() -> None:
+def test_message_of_another_type_raises_a_decode_error() -> None:
     for message in EXAMPLES.values():
         for other in EXAMPLES.values():
             if type(other) is not type(message):
@@ -77,7 +78,7 @@ def test_any_array_survives_the_round_trip(dtype: str, data: st.DataObject) -> N
 
 
 @given(
-    st.tuples(number, number, number),
+    st.tuples(finite_numbers, finite_numbers, finite_numbers),
     st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
     st.integers(0, 2**63 - 1),
 )

@@ -1,4 +1,4 @@
-"""What an earlier version has sent, every later one reads: with our structs and without them."""
+"""Tests that messages of earlier versions decode, with and without our structs."""
 
 from dataclasses import dataclass
 
@@ -15,6 +15,8 @@ from .examples import EXAMPLES, GOLDEN
 
 @dataclass(frozen=True)
 class Golden:
+    """A golden file and the message that it must decode to."""
+
     body: bytes
     expected: Message
 
@@ -23,46 +25,46 @@ class Golden:
 def golden(request: pytest.FixtureRequest) -> Golden:
     path = GOLDEN / f"{request.param}.msgpack"
     if not path.exists():
-        pytest.fail(f"{path} is missing: python tests/schemas/examples.py writes it")
+        pytest.fail(f"{path} is missing; run: python tests/schemas/examples.py")
     return Golden(path.read_bytes(), EXAMPLES[request.param])
 
 
-def plain(value: object) -> object:
-    """What a MessagePack library without our structs sees."""
+def plain_values(value: object) -> object:
+    """Return a message as a MessagePack library without our structs decodes it."""
     if isinstance(value, msgspec.Struct):
-        fields = {name: plain(getattr(value, name)) for name in value.__struct_fields__}
+        fields = {name: plain_values(getattr(value, name)) for name in value.__struct_fields__}
         tag = type(value).__struct_config__.tag
         return {"type": tag, **fields} if tag else fields
     if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: plain_values(item) for key, item in value.items()}
     if isinstance(value, tuple):
-        return [plain(item) for item in value]
+        return [plain_values(item) for item in value]
     return bytes(value) if isinstance(value, memoryview) else value
 
 
-def assert_holds(whole: object, part: object) -> None:
-    """Equal, but for fields that an earlier version did not have."""
-    if isinstance(whole, dict) and isinstance(part, dict):
-        for key, item in part.items():
-            assert_holds(whole[key], item)
-    elif isinstance(whole, list) and isinstance(part, list):
-        assert len(whole) == len(part)
-        for one, other in zip(whole, part, strict=True):
-            assert_holds(one, other)
+def assert_contains(expected_value: object, golden_value: object) -> None:
+    """Assert equality, except for fields that an earlier version did not have."""
+    if isinstance(expected_value, dict) and isinstance(golden_value, dict):
+        for key, item in golden_value.items():
+            assert_contains(expected_value[key], item)
+    elif isinstance(expected_value, list) and isinstance(golden_value, list):
+        assert len(expected_value) == len(golden_value)
+        for expected_item, golden_item in zip(expected_value, golden_value, strict=True):
+            assert_contains(expected_item, golden_item)
     else:
-        assert whole == part
+        assert expected_value == golden_value
 
 
 def test_golden_file_decodes_to_the_expected_message(golden: Golden) -> None:
     assert decode(golden.body, type(golden.expected)) == golden.expected
 
 
-def test_golden_file_reads_the_same_with_a_plain_messagepack_library(golden: Golden) -> None:
-    assert_holds(plain(golden.expected), msgpack.unpackb(golden.body))
+def test_golden_file_has_the_same_values_in_a_plain_messagepack_library(golden: Golden) -> None:
+    assert_contains(plain_values(golden.expected), msgpack.unpackb(golden.body))
 
 
-def test_what_a_plain_messagepack_library_writes_decodes(golden: Golden) -> None:
-    body = msgpack.packb(plain(golden.expected))
+def test_body_written_by_a_plain_messagepack_library_decodes(golden: Golden) -> None:
+    body = msgpack.packb(plain_values(golden.expected))
     assert decode(body, type(golden.expected)) == golden.expected
 
 
@@ -76,14 +78,14 @@ def test_every_message_type_has_a_golden_file() -> None:
     assert {path.stem for path in GOLDEN.iterdir()} == set(EXAMPLES)
 
 
-def test_an_array_on_the_wire_opens_as_the_readme_says() -> None:
+def test_array_on_the_wire_opens_as_documented_in_the_readme() -> None:
     frame = msgpack.unpackb((GOLDEN / "frame_rgbd.msgpack").read_bytes())
     depth = frame["depth_m"]
     opened = np.frombuffer(depth["data"], depth["dtype"]).reshape(depth["shape"])
     np.testing.assert_array_equal(opened, [[0, 1.5, 2], [0.25, 4, 0]])
 
 
-def test_an_array_opens_without_a_copy_and_cannot_be_written() -> None:
+def test_decoded_array_shares_the_body_and_is_read_only() -> None:
     body = (GOLDEN / "frame_rgbd.msgpack").read_bytes()
     depth = decode(body, type(EXAMPLES["frame_rgbd"])).depth_m.numpy()  # type: ignore[attr-defined]
     assert np.shares_memory(depth, np.frombuffer(body, np.uint8))
@@ -91,7 +93,7 @@ def test_an_array_opens_without_a_copy_and_cannot_be_written() -> None:
         depth[0, 0] = 1.0
 
 
-def test_a_message_does_not_follow_later_changes_to_the_array_it_was_made_of() -> None:
+def test_array_message_ignores_later_changes_of_its_source() -> None:
     values = np.zeros(3, np.float32)
     array = Array.of(values)
     values[:] = 7

@@ -1,4 +1,4 @@
-"""The JSON Schema, for programs that are not written in Python."""
+"""Tests of the JSON Schema for programs in other languages."""
 
 import json
 
@@ -6,23 +6,23 @@ from ldo_service.schemas.json_schema import json_schema
 from ldo_service.schemas.topics import TOPICS
 
 
-def test_the_schema_is_json_and_names_every_topic_with_a_format() -> None:
+def test_schema_is_valid_json_and_lists_every_topic_with_its_message() -> None:
     schema = json.loads(json.dumps(json_schema()))
-    with_format = {topic.name for topic in TOPICS}
-    assert set(schema["topics"]) == with_format
+    topic_names = {topic.name for topic in TOPICS}
+    assert set(schema["topics"]) == topic_names
     for reference in schema["topics"].values():
         name = reference["$ref"].removeprefix("#/$defs/")
         assert "stamp_ns" in schema["$defs"][name]["properties"]
 
 
-def test_every_reference_in_the_schema_leads_somewhere() -> None:
+def test_every_reference_in_the_schema_resolves() -> None:
     schema = json_schema()
     text = json.dumps(schema)
     names = {part.split('"')[0] for part in text.split('"#/$defs/')[1:]}
     assert names <= set(schema["$defs"])  # type: ignore[call-overload]
 
 
-def test_each_message_type_travels_on_one_topic() -> None:
+def test_each_message_type_belongs_to_one_topic() -> None:
     types = [topic.message for topic in TOPICS]
     assert len(set(types)) == len(types)
 

@@ -1,4 +1,4 @@
-"""A message that exists is a valid one, whether built or received."""
+"""Tests of message validation, when built and when received."""
 
 from typing import Any
 
@@ -46,13 +46,13 @@ def changed(name: str, **fields: Any) -> Message:
 
 
 def received(message: Message, **fields: Any) -> Message:
-    """The message with raw fields replaced behind the back of its checks."""
+    """Return the message decoded after its encoded fields were replaced."""
     body = msgpack.packb({**msgpack.unpackb(encode(message)), **fields})
     return decode(body, type(message))
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_a_negative_stamp_is_refused(name: str) -> None:
+def test_negative_stamp_is_rejected(name: str) -> None:
     with pytest.raises(ValueError, match="stamp_ns is -1"):
         changed(name, stamp_ns=-1)
     with pytest.raises(msgspec.ValidationError, match="stamp_ns is -1"):
@@ -62,7 +62,7 @@ def test_a_negative_stamp_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("translation", "quaternion", "complaint"),
+    ("translation", "quaternion", "error"),
     [
         ((NAN, 0, 0), (1, 0, 0, 0), "NaN"),
         ((0, INF, 0), (1, 0, 0, 0), "infinity"),
@@ -72,24 +72,24 @@ def test_a_negative_stamp_is_refused(name: str) -> None:
         ((0, 0, 0), (1e200, 0, 0, 0), "norm inf"),
     ],
 )
-def test_an_impossible_pose_is_refused(translation: Any, quaternion: Any, complaint: str) -> None:
-    with pytest.raises(ValueError, match=complaint):
+def test_invalid_pose_is_rejected(translation: Any, quaternion: Any, error: str) -> None:
+    with pytest.raises(ValueError, match=error):
         Pose(translation, quaternion)
-    with pytest.raises(msgspec.ValidationError, match=complaint):
+    with pytest.raises(msgspec.ValidationError, match=error):
         received(
             EXAMPLES["tracked_pose"],
             T_map_odom={"translation": translation, "quaternion": quaternion},
         )
 
 
-def test_a_quaternion_normalized_in_float32_is_taken() -> None:
+def test_quaternion_normalized_in_float32_is_accepted() -> None:
     q = np.array([0.1, 0.7, -0.3, 0.2], np.float32)
     q /= np.linalg.norm(q)
     assert Pose((0, 0, 0), tuple(q.tolist())).quaternion[0] > 0
 
 
 @pytest.mark.parametrize(
-    ("fields", "complaint"),
+    ("fields", "error"),
     [
         ({"width": 0}, "image size"),
         ({"height": -2}, "image size"),
@@ -102,13 +102,13 @@ def test_a_quaternion_normalized_in_float32_is_taken() -> None:
         ({"distortion": (0.1, 0.1, NAN, 0.1)}, "NaN"),
     ],
 )
-def test_impossible_intrinsics_are_refused(fields: dict[str, Any], complaint: str) -> None:
-    with pytest.raises(ValueError, match=complaint):
+def test_invalid_intrinsics_are_rejected(fields: dict[str, Any], error: str) -> None:
+    with pytest.raises(ValueError, match=error):
         msgspec.structs.replace(CAMERA, **fields)
 
 
 @pytest.mark.parametrize(
-    ("fields", "complaint"),
+    ("fields", "error"),
     [
         ({"shape": [2, 2]}, "needs 16 bytes, has 24"),
         ({"shape": [3, 4]}, "needs 48 bytes, has 24"),
@@ -121,28 +121,28 @@ def test_impossible_intrinsics_are_refused(fields: dict[str, Any], complaint: st
         ({"data": b""}, "has 0"),
     ],
 )
-def test_an_array_whose_buffer_does_not_fit_is_refused(
-    fields: dict[str, Any], complaint: str
+def test_array_with_a_buffer_of_the_wrong_size_is_rejected(
+    fields: dict[str, Any], error: str
 ) -> None:
     depth = {**msgpack.unpackb(encode(EXAMPLES["frame_rgbd"]))["depth_m"], **fields}
-    with pytest.raises(msgspec.ValidationError, match=complaint):
+    with pytest.raises(msgspec.ValidationError, match=error):
         received(EXAMPLES["frame_rgbd"], depth_m=depth)
 
 
 @pytest.mark.parametrize("dtype", [bool, np.float16, np.uint64, object, "U3"])
-def test_an_array_of_a_type_that_does_not_travel_cannot_be_made(dtype: Any) -> None:
+def test_array_of_an_unsupported_type_is_rejected(dtype: Any) -> None:
     with pytest.raises(ValueError, match="are not supported"):
         Array.of(np.zeros(2, dtype))
 
 
-def test_a_big_endian_transposed_array_travels_as_what_it_holds() -> None:
+def test_big_endian_transposed_array_keeps_its_values() -> None:
     values = np.arange(6, dtype=">f4").reshape(2, 3).T
     np.testing.assert_array_equal(Array.of(values).numpy(), values)
 
 
 @pytest.mark.parametrize("name", ["frame_rgbd", "keyframe"])
 @pytest.mark.parametrize(
-    ("fields", "complaint"),
+    ("fields", "error"),
     [
         ({"depth_m": array([[1.0, 2, 3]], np.float32)}, "must be f4"),
         ({"depth_m": array(np.zeros((2, 3)), np.float64)}, "must be f4"),
@@ -155,21 +155,21 @@ def test_a_big_endian_transposed_array_travels_as_what_it_holds() -> None:
         ({"frame": -1}, "frame is -1"),
     ],
 )
-def test_a_frame_that_contradicts_its_camera_is_refused(
-    name: str, fields: dict[str, Any], complaint: str
+def test_frame_that_contradicts_its_camera_is_rejected(
+    name: str, fields: dict[str, Any], error: str
 ) -> None:
-    with pytest.raises(ValueError, match=complaint):
+    with pytest.raises(ValueError, match=error):
         changed(name, **fields)
 
 
 @pytest.mark.parametrize("reference", [4, 5, -1])
-def test_a_keyframe_refers_to_an_older_one(reference: int) -> None:
+def test_keyframe_without_an_older_reference_is_rejected(reference: int) -> None:
     with pytest.raises(ValueError, match="not an older one"):
         changed("keyframe", reference=reference)
 
 
 @pytest.mark.parametrize("information", [(1.0,) * 35, (*(1.0,) * 35, NAN)])
-def test_a_matrix_of_the_wrong_size_or_with_nan_is_refused(information: Any) -> None:
+def test_matrix_of_the_wrong_size_or_with_nan_is_rejected(information: Any) -> None:
     with pytest.raises(ValueError, match="information"):
         changed("keyframe", information=information)
     with pytest.raises(ValueError, match="covariance"):
@@ -187,13 +187,13 @@ def test_a_matrix_of_the_wrong_size_or_with_nan_is_refused(information: Any) -> 
         lambda: image(width=1 << 20, height=1 << 20),
     ],
 )
-def test_an_image_whose_bytes_do_not_fit_its_size_is_refused(make: Any) -> None:
+def test_image_with_bytes_that_do_not_fit_its_size_is_rejected(make: Any) -> None:
     with pytest.raises(ValueError, match="image"):
         make()
 
 
 @pytest.mark.parametrize(
-    ("fields", "complaint"),
+    ("fields", "error"),
     [
         ({"depth_scale": 0.0}, "depth_scale"),
         ({"depth_scale": NAN}, "depth_scale"),
@@ -203,10 +203,10 @@ def test_an_image_whose_bytes_do_not_fit_its_size_is_refused(make: Any) -> None:
         ({"color": image(width=1, data=bytes(3))}, "differ in size"),
     ],
 )
-def test_an_exposure_that_contradicts_itself_is_refused(
-    fields: dict[str, Any], complaint: str
+def test_inconsistent_color_and_depth_images_are_rejected(
+    fields: dict[str, Any], error: str
 ) -> None:
-    with pytest.raises(ValueError, match=complaint):
+    with pytest.raises(ValueError, match=error):
         changed("camera_rgbd", **fields)
 
 
@@ -214,7 +214,7 @@ IDENTITIES = [[0, 0, 0, 1, 0, 0, 0], [1, 0, 0, 1, 0, 0, 0]]
 
 
 @pytest.mark.parametrize(
-    ("name", "fields", "complaint"),
+    ("name", "fields", "error"),
     [
         ("camera_color", {"frame": -1}, "frame is -1"),
         ("camera_color", {"image": image("rgb8", 2, 1, bytes(6))}, "differ in size"),
@@ -226,15 +226,15 @@ IDENTITIES = [[0, 0, 0, 1, 0, 0, 0], [1, 0, 0, 1, 0, 0, 0]]
         ("camera_depth", {"image": image("rgb8", 2, 1, bytes(6))}, "depth cannot"),
     ],
 )
-def test_half_an_exposure_that_contradicts_itself_is_refused(
-    name: str, fields: dict[str, Any], complaint: str
+def test_inconsistent_color_or_depth_message_is_rejected(
+    name: str, fields: dict[str, Any], error: str
 ) -> None:
-    with pytest.raises(ValueError, match=complaint):
+    with pytest.raises(ValueError, match=error):
         changed(name, **fields)
 
 
 @pytest.mark.parametrize(
-    ("keyframes", "poses", "complaint"),
+    ("keyframes", "poses", "error"),
     [
         ([4, 0], IDENTITIES, "ascending"),
         ([4, 4], IDENTITIES, "ascending"),
@@ -246,10 +246,10 @@ def test_half_an_exposure_that_contradicts_itself_is_refused(
         ([0], [[NAN, 0, 0, 1, 0, 0, 0]], "NaN"),
     ],
 )
-def test_a_correction_out_of_order_or_with_impossible_poses_is_refused(
-    keyframes: list[int], poses: Any, complaint: str
+def test_correction_out_of_order_or_with_invalid_poses_is_rejected(
+    keyframes: list[int], poses: Any, error: str
 ) -> None:
-    with pytest.raises(ValueError, match=complaint):
+    with pytest.raises(ValueError, match=error):
         GraphCorrection(
             stamp_ns=0,
             graph_version=1,
@@ -258,7 +258,7 @@ def test_a_correction_out_of_order_or_with_impossible_poses_is_refused(
         )
 
 
-def test_a_correction_of_no_keyframes_is_a_correction() -> None:
+def test_correction_without_keyframes_is_accepted() -> None:
     empty = GraphCorrection(
         stamp_ns=0,
         graph_version=0,
@@ -269,7 +269,7 @@ def test_a_correction_of_no_keyframes_is_a_correction() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ids", "params", "anchors", "complaint"),
+    ("ids", "params", "anchors", "error"),
     [
         ([2, 1], np.zeros((2, 16)), [0, 0], "ascending"),
         ([1, 2], np.zeros((3, 16)), [0, 0], "params"),
@@ -278,10 +278,10 @@ def test_a_correction_of_no_keyframes_is_a_correction() -> None:
         ([1, 2], np.zeros((2, 16)), [0], "anchors"),
     ],
 )
-def test_gaussians_whose_arrays_do_not_fit_are_refused(
-    ids: Any, params: Any, anchors: Any, complaint: str
+def test_gaussians_with_inconsistent_arrays_are_rejected(
+    ids: Any, params: Any, anchors: Any, error: str
 ) -> None:
-    with pytest.raises(ValueError, match=complaint):
+    with pytest.raises(ValueError, match=error):
         Gaussians(
             ids=array(ids, np.int64),
             params=array(params, np.float32),
@@ -296,7 +296,7 @@ def label_rows(count: int, width: int = 32, weight: float = 0.5) -> Array:
 
 
 @pytest.mark.parametrize(
-    ("labels", "complaint"),
+    ("labels", "error"),
     [
         (label_rows(1), "labels is"),
         (label_rows(2, width=31), "labels is"),
@@ -304,39 +304,39 @@ def label_rows(count: int, width: int = 32, weight: float = 0.5) -> Array:
         (label_rows(2, weight=-0.5), "negative"),
     ],
 )
-def test_labels_that_are_none_are_refused(labels: Array, complaint: str) -> None:
-    two = {"ids": array([1, 2], np.int64), "params": array(np.zeros((2, 16)), np.float32)}
-    with pytest.raises(ValueError, match=complaint):
-        Gaussians(**two, anchors=array([0, 0], np.int32), labels=labels)
+def test_invalid_label_rows_are_rejected(labels: Array, error: str) -> None:
+    arrays = {"ids": array([1, 2], np.int64), "params": array(np.zeros((2, 16)), np.float32)}
+    with pytest.raises(ValueError, match=error):
+        Gaussians(**arrays, anchors=array([0, 0], np.int32), labels=labels)
 
 
 @pytest.mark.parametrize(
-    ("names", "complaint"), [(("a",) * 257, "257 label_names"), (("a" * 101,), "101 characters")]
+    ("names", "error"), [(("a",) * 257, "257 label_names"), (("a" * 101,), "101 characters")]
 )
-def test_label_names_are_few_and_short(names: tuple[str, ...], complaint: str) -> None:
+def test_too_many_or_too_long_label_names_are_rejected(names: tuple[str, ...], error: str) -> None:
     for example in ("map_delta", "map_snapshot"):
-        with pytest.raises(ValueError, match=complaint):
+        with pytest.raises(ValueError, match=error):
             changed(example, label_names=names)
 
 
 @pytest.mark.parametrize("since", [5, 6, -1])
-def test_a_delta_leads_to_a_newer_version(since: int) -> None:
+def test_map_delta_to_an_older_version_is_rejected(since: int) -> None:
     with pytest.raises(ValueError, match="goes back"):
         changed("map_delta", base_version=since)
 
 
 @pytest.mark.parametrize(("part", "parts"), [(2, 2), (-1, 2), (0, 0)])
-def test_a_part_of_a_snapshot_is_one_of_its_parts(part: int, parts: int) -> None:
+def test_snapshot_part_outside_its_parts_is_rejected(part: int, parts: int) -> None:
     with pytest.raises(ValueError, match="does not exist"):
         changed("map_snapshot", part=part, parts=parts)
 
 
-def test_a_health_message_with_nan_is_refused() -> None:
+def test_health_message_with_nan_is_rejected() -> None:
     with pytest.raises(ValueError, match="NaN"):
         changed("health", metrics={"loss": NAN})
 
 
-def test_every_type_above_is_checked_on_the_way_in_as_well() -> None:
+def test_received_messages_are_validated_too() -> None:
     for name, kind in [
         ("camera_rgbd", CameraRgbd),
         ("keyframe", Keyframe),
@@ -353,14 +353,14 @@ def test_every_type_above_is_checked_on_the_way_in_as_well() -> None:
     assert isinstance(EXAMPLES["map_snapshot"], MapSnapshot)
 
 
-def test_a_camera_with_a_distortion_model_of_opencv_is_taken() -> None:
+def test_camera_with_an_opencv_distortion_model_is_accepted() -> None:
     for count in (4, 5, 8):
         camera = CameraModel(width=3, height=2, fx=1, fy=1, cx=0, cy=0, distortion=(0.1,) * count)
         assert len(camera.distortion) == count
 
 
 @pytest.mark.parametrize(
-    ("fields", "complaint"),
+    ("fields", "error"),
     [
         ({"label": ""}, "0 characters"),
         ({"label": "x" * 101}, "101 characters"),
@@ -371,31 +371,31 @@ def test_a_camera_with_a_distortion_model_of_opencv_is_taken() -> None:
         ({"box_px": (0.0, 1.0, 1.0, 0.5)}, "empty"),
     ],
 )
-def test_a_detection_is_a_named_box_with_a_score(fields: dict, complaint: str) -> None:
-    with pytest.raises(ValueError, match=complaint):
+def test_invalid_detection_is_rejected(fields: dict, error: str) -> None:
+    with pytest.raises(ValueError, match=error):
         Detection(**{"label": "cup", "score": 0.5, "box_px": (0.0, 0.0, 1.0, 1.0), **fields})
 
 
 @pytest.mark.parametrize(
     "box_px", [(-0.6, 0, 1, 1), (0, -0.6, 1, 1), (0, 0, 2.6, 1), (0, 0, 1, 1.6)]
 )
-def test_a_box_lies_in_the_image(box_px: tuple[float, ...]) -> None:
-    whole = (-0.5, -0.5, 2.5, 1.5)
-    changed("detection_boxes", detections=(Detection(label="cup", score=1, box_px=whole),))
+def test_box_outside_the_image_is_rejected(box_px: tuple[float, ...]) -> None:
+    full_image = (-0.5, -0.5, 2.5, 1.5)
+    changed("detection_boxes", detections=(Detection(label="cup", score=1, box_px=full_image),))
     outside = Detection(label="cup", score=1, box_px=box_px)
     with pytest.raises(ValueError, match="leaves the image of 3x2"):
         changed("detection_boxes", detections=(outside,))
 
 
-def test_boxes_come_from_a_network() -> None:
+def test_boxes_without_the_name_of_a_network_are_rejected() -> None:
     with pytest.raises(ValueError, match="no network that made them"):
         changed("detection_boxes", network="")
-    nobody = changed("detection_boxes", network="", detections=())
-    assert isinstance(nobody, DetectionBoxes)
+    without_network = changed("detection_boxes", network="", detections=())
+    assert isinstance(without_network, DetectionBoxes)
 
 
 @pytest.mark.parametrize(
-    ("fields", "complaint"),
+    ("fields", "error"),
     [
         ({"object": -1}, "object is -1"),
         ({"keyframe": -1}, "keyframe is -1"),
@@ -411,15 +411,13 @@ def test_boxes_come_from_a_network() -> None:
         ({"distribution": (("", 0.5),)}, "characters"),
     ],
 )
-def test_an_observation_of_an_object_is_a_box_and_a_distribution(
-    fields: dict, complaint: str
-) -> None:
-    with pytest.raises(ValueError, match=complaint):
+def test_invalid_object_observation_is_rejected(fields: dict, error: str) -> None:
+    with pytest.raises(ValueError, match=error):
         changed("object_observation", **fields)
 
 
 @pytest.mark.parametrize(
-    ("fields", "complaint"),
+    ("fields", "error"),
     [
         ({"id": -1}, "id is -1"),
         ({"observation_count": -1}, "observation_count is -1"),
@@ -431,15 +429,15 @@ def test_an_observation_of_an_object_is_a_box_and_a_distribution(
         ({"size": (1.0, -1.0, 1.0)}, "negative"),
     ],
 )
-def test_an_object_that_cannot_be_is_refused(fields: dict, complaint: str) -> None:
+def test_invalid_object_is_rejected(fields: dict, error: str) -> None:
     message = EXAMPLES["map_objects"]
     assert isinstance(message, MapObjects)
-    with pytest.raises(ValueError, match=complaint):
+    with pytest.raises(ValueError, match=error):
         msgspec.structs.replace(message.objects[0], **fields)
 
 
 @pytest.mark.parametrize(
-    ("example", "fields", "message"),
+    ("example", "fields", "error"),
     [
         ("loop_closure", {"overlap": 1.5}, "overlap is 1.5"),
         ("loop_closure", {"overlap": NAN}, "overlap is nan"),
@@ -451,20 +449,22 @@ def test_an_object_that_cannot_be_is_refused(fields: dict, complaint: str) -> No
         ("loop_candidate", {"rejected_reason": "", "evidence": ""}, "without evidence"),
     ],
 )
-def test_an_impossible_loop_is_refused(example: str, fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+def test_invalid_loop_closure_or_candidate_is_rejected(
+    example: str, fields: dict[str, Any], error: str
+) -> None:
+    with pytest.raises(ValueError, match=error):
         changed(example, **fields)
 
 
-def test_a_loop_closes_with_an_older_keyframe() -> None:
+def test_loop_closure_with_a_newer_reference_is_rejected() -> None:
     message = EXAMPLES["loop_closure"]
     assert isinstance(message, LoopClosure)
-    turned = msgspec.structs.replace(message.pose, reference=9, keyframe=1)
+    reversed_pose = msgspec.structs.replace(message.pose, reference=9, keyframe=1)
     with pytest.raises(ValueError, match="newer 9"):
-        changed("loop_closure", pose=turned)
+        changed("loop_closure", pose=reversed_pose)
 
 
-def test_objects_come_by_id_and_each_once() -> None:
+def test_repeated_object_ids_are_rejected() -> None:
     message = EXAMPLES["map_objects"]
     assert isinstance(message, MapObjects)
     with pytest.raises(ValueError, match="ascending"):
@@ -472,7 +472,7 @@ def test_objects_come_by_id_and_each_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("others", "complaint"),
+    ("others", "error"),
     [
         ((("cup", 1.5),), "must be within 0..1"),
         ((("cup", NAN),), "holds NaN"),
@@ -483,8 +483,8 @@ def test_objects_come_by_id_and_each_once() -> None:
         (tuple((f"name {k}", 0.1) for k in range(9)), "9 alternatives, must have at most 8"),
     ],
 )
-def test_guesses_that_cannot_be_are_refused(others: tuple, complaint: str) -> None:
-    with pytest.raises(ValueError, match=complaint):
+def test_invalid_label_alternatives_are_rejected(others: tuple, error: str) -> None:
+    with pytest.raises(ValueError, match=error):
         changed("label_result", alternatives=others)
     with pytest.raises(ValueError, match="none is empty"):
         changed("label_result", label="", confidence=0.0, alternatives=(("cup", 0.1),))
