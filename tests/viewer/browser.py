@@ -1,4 +1,4 @@
-"""A headless Chromium, driven by its DevTools protocol: a page, keys, screenshots."""
+"""Headless Chromium controlled over its DevTools protocol: pages, keys and screenshots."""
 
 import base64
 import json
@@ -20,46 +20,49 @@ from websockets.sync.client import ClientConnection, connect
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
     "--headless=new",
-    "--no-sandbox",  # tests may run as root
+    "--no-sandbox",  # Tests may run as root.
     "--no-first-run",
     "--disable-dev-shm-usage",
-    "--use-gl=angle",  # WebGL on the CPU
+    "--use-gl=angle",  # WebGL on the CPU.
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--remote-debugging-port=0",
     "--window-size=960,600",
 )
-STARTS_WITHIN_S = 60
-MAX_ANSWER_BYTES = 64_000_000  # a screenshot
+START_TIMEOUT_S = 60
+MAX_ANSWER_BYTES = 64_000_000  # Size of the largest screenshot.
 
 
 class Page:
-    def __init__(self, socket: ClientConnection) -> None:
-        self._socket, self._asked = socket, 0
+    """Page of a browser."""
 
-    def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
-        self._asked += 1
-        message = {"id": self._asked, "method": method, "params": parameters}
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket, self._last_id = socket, 0
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Call a method of the DevTools protocol and return its result."""
+        self._last_id += 1
+        message = {"id": self._last_id, "method": method, "params": parameters}
         self._socket.send(json.dumps(message))
-        while True:  # events come between
-            answer = json.loads(self._socket.recv(timeout=STARTS_WITHIN_S))
-            if answer.get("id") == self._asked:
-                return answer["result"]
+        while True:  # Events arrive in between.
+            response = json.loads(self._socket.recv(timeout=START_TIMEOUT_S))
+            if response.get("id") == self._last_id:
+                return response["result"]
 
     def open(self, url: str) -> None:
-        self.ask("Page.navigate", url=url)
+        self.call("Page.navigate", url=url)
 
     def evaluate(self, script: str) -> Any:
-        return self.ask("Runtime.evaluate", expression=script, returnByValue=True)["result"].get(
+        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get(
             "value"
         )
 
     def text(self) -> str:
-        """What the page says in words."""
+        """Return the text of the page."""
         return self.evaluate("document.body ? document.body.innerText : ''") or ""
 
     def click_checkbox(self, label: str) -> None:
-        """Of the panel, beside this text."""
+        """Click the checkbox of the panel with this label."""
         clicked = self.evaluate(
             f"""(() => {{
                 const labels = [...document.querySelectorAll('label')];
@@ -72,11 +75,11 @@ class Page:
         assert clicked, f"no checkbox {label!r} in {self.text()}"
 
     def type_into(self, selector: str, text: str) -> None:
-        """Text in place of what is there, then Enter."""
+        """Replace the text of an input field and press Enter."""
         self.evaluate(f"document.querySelector({selector!r}).select()")
-        self.ask("Input.insertText", text=text)
+        self.call("Input.insertText", text=text)
         for kind in ("keyDown", "keyUp"):
-            self.ask(
+            self.call(
                 "Input.dispatchKeyEvent",
                 type=kind,
                 key="Enter",
@@ -86,22 +89,22 @@ class Page:
             )
 
     def screenshot(self) -> np.ndarray:
-        """[H, W, 3] uint8 RGB."""
-        png = base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
+        """Return a screenshot, RGB uint8 [H, W, 3]."""
+        png = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
         return image[..., ::-1]
 
-    def wait_for(self, true: Callable[[], bool], what: str, timeout_s: float = 60) -> None:
+    def wait_for(self, condition: Callable[[], bool], what: str, timeout_s: float = 60) -> None:
         until_s = time.monotonic() + timeout_s
-        while not true():
-            assert time.monotonic() < until_s, f"not {what} within {timeout_s} s: {self.text()}"
+        while not condition():
+            assert time.monotonic() < until_s, f"no {what} within {timeout_s} s: {self.text()}"
             time.sleep(0.2)
 
 
 @contextmanager
 def browser(folder: Path) -> Iterator[Page]:
-    """A page of a fresh browser. Skips the test where there is none."""
+    """Open a page in a new browser; skip the test if none is installed."""
     path = next(filter(None, map(shutil.which, NAMES)), None)
     if path is None:
         pytest.skip("needs a headless Chromium: `apt-get install chromium`")
@@ -118,12 +121,12 @@ def browser(folder: Path) -> Iterator[Page]:
 
 
 def _address(process: subprocess.Popen[bytes], log: Path) -> str:
-    """Of the first page's socket."""
-    until_s = time.monotonic() + STARTS_WITHIN_S
+    """Return the address of the first page's socket."""
+    until_s = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < until_s and process.poll() is None:
         if found := re.search(r"ws://(127\.0\.0\.1:\d+)/", log.read_text()):
-            with urllib.request.urlopen(f"http://{found[1]}/json/list") as answer:
-                pages = [one for one in json.load(answer) if one["type"] == "page"]
+            with urllib.request.urlopen(f"http://{found[1]}/json/list") as response:
+                pages = [target for target in json.load(response) if target["type"] == "page"]
             if pages:
                 return pages[0]["webSocketDebuggerUrl"]
         time.sleep(0.1)

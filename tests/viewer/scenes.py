@@ -1,4 +1,4 @@
-"""A scene that a test sets."""
+"""Scenes and sources that tests set by hand."""
 
 from typing import get_args
 
@@ -15,8 +15,8 @@ RED, GREEN = (0.9, 0.05, 0.05), (0.05, 0.9, 0.05)
 EVERY_LAYER: set[Layer] = set(get_args(Layer))
 
 
-class Staged:
-    """What is changed by hand is shown when it is told."""
+class ManualSource:
+    """Source of a scene that reports the layers that a test marks as changed."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -28,7 +28,7 @@ class Staged:
 
 
 def wall(color: tuple[float, float, float], half_m: float = 3.0, z_m: float = 3.0) -> np.ndarray:
-    """Rows [N, 16] of an opaque wall in front of the first camera."""
+    """Return rows [N, 16] of an opaque wall in front of the first camera."""
     x, y = np.meshgrid(*2 * [np.arange(-half_m, half_m, 0.1)])
     rows = aligned_rows(x.size)
     rows[:, 0], rows[:, 1], rows[:, 2] = x.ravel(), y.ravel(), z_m
@@ -40,7 +40,7 @@ def wall(color: tuple[float, float, float], half_m: float = 3.0, z_m: float = 3.
 
 
 def chair(x_m: float) -> MapObject:
-    """Seen from keyframe 1."""
+    """Return a chair that keyframe 1 observes."""
     found = EXAMPLES["map_objects"]
     assert isinstance(found, MapObjects)
     return msgspec.structs.replace(
@@ -55,7 +55,7 @@ def chair(x_m: float) -> MapObject:
 
 
 def scene_of(rows: np.ndarray, *objects: MapObject) -> Scene:
-    """The camera went a metre to the right, with three keyframes."""
+    """Return the scene of a camera that moved one meter to the right, with three keyframes."""
     path = np.linspace([0, 0, 0], [1, 0, 0], 11)
     keyframes = {k: np.eye(4) for k in range(3)}
     for k, T in keyframes.items():

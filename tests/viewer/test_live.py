@@ -1,4 +1,4 @@
-"""A service on the network as a source of a scene, over TLS with a viewer's keys."""
+"""Tests of the scene of a service on the network, over TLS with the keys of a viewer."""
 
 import time
 from collections.abc import Iterator
@@ -36,19 +36,20 @@ from tests.service.conftest import wait_until
 
 
 class Robot:
-    """A router with the keys of a service: says what it is told to say."""
+    """Router with the keys of a service that publishes given messages."""
 
     def __init__(self, network: Endpoint, session: zenoh.Session) -> None:
         self._network, self._session = network, session
 
-    def says(self, topic: Topic, *messages: Message, below: str = "") -> None:
+    def publish(self, topic: Topic, *messages: Message, below: str = "") -> None:
         for message in messages:
             self._session.put(self._network.expression(topic.name) + below, encode(message))
 
     def publisher(self, topic: Topic) -> zenoh.Publisher:
         return self._session.declare_publisher(self._network.expression(topic.name))
 
-    def answers(self, topic: Topic, *messages: Message) -> zenoh.Queryable[None]:
+    def serve(self, topic: Topic, *messages: Message) -> zenoh.Queryable[None]:
+        """Answer queries of a topic with the messages."""
         key = self._network.expression(topic.name)
 
         def reply(query: zenoh.Query) -> None:
@@ -65,8 +66,8 @@ def network(tmp_path: Path) -> Endpoint:
     authority = CertificateAuthority.new(tmp_path / "keys", days=2)
     for role in ("service", "viewer"):
         authority.add(role, role, "robot", days=1)
-    here = free_endpoint().replace("tcp/", "tls/")
-    return Endpoint("robot", here, TlsKeys.of(tmp_path / "keys" / "service"))
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    return Endpoint("robot", endpoint, TlsKeys.of(tmp_path / "keys" / "service"))
 
 
 @pytest.fixture
@@ -76,7 +77,7 @@ def robot(network: Endpoint) -> Iterator[Robot]:
 
 
 @contextmanager
-def looked_at(network: Endpoint, tmp_path: Path) -> Iterator[LiveSource]:
+def live_source(network: Endpoint, tmp_path: Path) -> Iterator[LiveSource]:
     with (
         connect("robot", network.endpoint, tmp_path / "keys" / "viewer") as service,
         live(service, ViewerConfig()) as source,
@@ -86,119 +87,125 @@ def looked_at(network: Endpoint, tmp_path: Path) -> Iterator[LiveSource]:
 
 @pytest.fixture
 def source(robot: Robot, network: Endpoint, tmp_path: Path) -> Iterator[LiveSource]:  # noqa: ARG001
-    with looked_at(network, tmp_path) as source:
+    with live_source(network, tmp_path) as source:
         yield source
 
 
-def test_all_that_it_says_is_seen(robot: Robot, source: LiveSource) -> None:
-    changing = ChangingMap()
-    robot.says(KEYFRAME_NEW, EXAMPLES["keyframe"])
-    robot.says(POSE_TRACKED, EXAMPLES["tracked_pose"])
-    robot.says(MAP_DELTA, changing.delta(), changing.delta(), changing.delta())
-    robot.says(LOOP_CLOSURE, EXAMPLES["loop_closure"])
-    robot.says(MAP_OBJECTS, EXAMPLES["map_objects"])
-    robot.says(DETECTION_BOXES, EXAMPLES["detection_boxes"])
-    robot.says(GRAPH_CORRECTION, EXAMPLES["graph_correction"])
-    robot.says(HEALTH, EXAMPLES["health"], below="/tracker")
-    seen: set[str] = set()
+def test_messages_of_all_topics_reach_the_scene(robot: Robot, source: LiveSource) -> None:
+    published = ChangingMap()
+    robot.publish(KEYFRAME_NEW, EXAMPLES["keyframe"])
+    robot.publish(POSE_TRACKED, EXAMPLES["tracked_pose"])
+    robot.publish(MAP_DELTA, published.delta(), published.delta(), published.delta())
+    robot.publish(LOOP_CLOSURE, EXAMPLES["loop_closure"])
+    robot.publish(MAP_OBJECTS, EXAMPLES["map_objects"])
+    robot.publish(DETECTION_BOXES, EXAMPLES["detection_boxes"])
+    robot.publish(GRAPH_CORRECTION, EXAMPLES["graph_correction"])
+    robot.publish(HEALTH, EXAMPLES["health"], below="/tracker")
+    changed: set[str] = set()
 
-    def all_of_it() -> bool:
-        seen.update(source.update())
+    def is_complete() -> bool:
+        changed.update(source.update())
         scene = source.scene
-        alone = (scene.camera, scene.T_map_camera, scene.objects)
-        many = (scene.sights, scene.keyframes, scene.loops)
-        told = EXAMPLES["health"].actor in scene.facts
-        return told and all(many) and not any(one is None for one in alone)
+        single = (scene.camera, scene.T_map_camera, scene.objects)
+        collections = (scene.sights, scene.keyframes, scene.loops)
+        has_health = EXAMPLES["health"].actor in scene.facts
+        return has_health and all(collections) and not any(value is None for value in single)
 
-    wait_until(all_of_it, 10, "all of it seen")
-    assert {"gaussians", "camera", "keyframes", "objects", "loops"} <= seen
-    np.testing.assert_array_equal(source.scene.rows, changing.map.rows)
+    wait_until(is_complete, 10, "every layer of the scene")
+    assert {"gaussians", "camera", "keyframes", "objects", "loops"} <= changed
+    np.testing.assert_array_equal(source.scene.rows, published.map.rows)
 
 
-def test_who_comes_late_is_told_what_there_is(
+def test_late_viewer_gets_the_current_state_and_later_changes(
     robot: Robot, network: Endpoint, tmp_path: Path
 ) -> None:
-    changing = ChangingMap()
+    published = ChangingMap()
     for _ in range(5):
-        changing.delta()
+        published.delta()
     with (
-        robot.answers(MAP_SNAPSHOT, *changing.snapshot(parts=3)),
-        robot.answers(GRAPH_CORRECTION, EXAMPLES["graph_correction"]),
-        robot.answers(MAP_OBJECTS, EXAMPLES["map_objects"]),
-        looked_at(network, tmp_path) as source,
+        robot.serve(MAP_SNAPSHOT, *published.snapshot(parts=3)),
+        robot.serve(GRAPH_CORRECTION, EXAMPLES["graph_correction"]),
+        robot.serve(MAP_OBJECTS, EXAMPLES["map_objects"]),
+        live_source(network, tmp_path) as source,
     ):
         assert source.update() >= {"gaussians", "keyframes", "objects"}
-        np.testing.assert_array_equal(source.scene.rows, changing.map.rows)
+        np.testing.assert_array_equal(source.scene.rows, published.map.rows)
         assert source.scene.keyframes
-        robot.says(MAP_DELTA, changing.delta())
+        robot.publish(MAP_DELTA, published.delta())
         wait_until(lambda: "gaussians" in source.update(), 10, "the next change")
-        np.testing.assert_array_equal(source.scene.rows, changing.map.rows)
+        np.testing.assert_array_equal(source.scene.rows, published.map.rows)
 
 
-@pytest.mark.parametrize("first", [1, 4], ids=["from its beginning", "from later on"])
-def test_a_service_that_is_started_again_with_an_empty_map_is_followed(
+@pytest.mark.parametrize("first", [1, 4], ids=["from the first delta", "from a later delta"])
+def test_scene_follows_a_service_restarted_with_an_empty_map(
     robot: Robot, source: LiveSource, first: int
 ) -> None:
-    """Its versions begin at 0, and what is heard first may be any of them."""
+    """The versions restart at 0, and the first delta that is received can have any of them."""
     old, new = ChangingMap(1), ChangingMap(2)
     for _ in range(5):
-        robot.says(MAP_DELTA, old.delta())
-    robot.says(GRAPH_CORRECTION, EXAMPLES["graph_correction"])
-    lives(robot, epoch=1)
-    wait_until(lambda: shows(source, old) and bool(source.scene.keyframes), 10, "the old map")
+        robot.publish(MAP_DELTA, old.delta())
+    robot.publish(GRAPH_CORRECTION, EXAMPLES["graph_correction"])
+    publish_health(robot, epoch=1)
+    wait_until(lambda: has_map(source, old) and bool(source.scene.keyframes), 10, "the old map")
     deltas = [new.delta() for _ in range(6)][first - 1 : 4]
-    robot.says(MAP_DELTA, *deltas[:1])
-    told = new.snapshot(parts=2)
-    with robot.answers(MAP_SNAPSHOT, *told):
-        lives(robot, epoch=2)
-        wait_until(lambda: shows(source, new), 10, "the new map")
-    assert not source.scene.keyframes, "those of the old one are gone"
+    robot.publish(MAP_DELTA, *deltas[:1])
+    snapshot = new.snapshot(parts=2)
+    with robot.serve(MAP_SNAPSHOT, *snapshot):
+        publish_health(robot, epoch=2)
+        wait_until(lambda: has_map(source, new), 10, "the new map")
+    assert not source.scene.keyframes, "keyframes of the old map are removed"
 
 
-def test_an_actor_that_was_started_again_alone_goes_on_with_the_map(
-    robot: Robot, source: LiveSource
-) -> None:
+def test_restart_of_one_actor_keeps_the_map_and_the_path(robot: Robot, source: LiveSource) -> None:
     old = ChangingMap(1)
-    robot.says(POSE_TRACKED, EXAMPLES["tracked_pose"])
-    robot.says(MAP_DELTA, old.delta(), old.delta())
-    lives(robot, epoch=1)
-    wait_until(lambda: shows(source, old), 10, "the map")
-    lives(robot, epoch=2, actors=("mapper",))
-    robot.says(MAP_DELTA, old.delta())
-    wait_until(lambda: shows(source, old), 10, "it goes on")
-    assert len(source.scene.online) == 1, "and the path is kept"
+    robot.publish(POSE_TRACKED, EXAMPLES["tracked_pose"])
+    robot.publish(MAP_DELTA, old.delta(), old.delta())
+    publish_health(robot, epoch=1)
+    wait_until(lambda: has_map(source, old), 10, "the map")
+    publish_health(robot, epoch=2, actors=("mapper",))
+    robot.publish(MAP_DELTA, old.delta())
+    wait_until(lambda: has_map(source, old), 10, "the next delta")
+    assert len(source.scene.online) == 1, "the path is kept"
 
 
-def lives(robot: Robot, epoch: int, actors: tuple[str, ...] = ("tracker", "mapper")) -> None:
+def publish_health(
+    robot: Robot, epoch: int, actors: tuple[str, ...] = ("tracker", "mapper")
+) -> None:
     health = EXAMPLES["health"]
     assert isinstance(health, Health)
     for actor in actors:
         beat = msgspec.structs.replace(health, actor=actor, epoch=epoch)
-        robot.says(HEALTH, beat, below=f"/{actor}")
+        robot.publish(HEALTH, beat, below=f"/{actor}")
 
 
-def shows(source: LiveSource, changing: ChangingMap) -> bool:
+def has_map(source: LiveSource, published: ChangingMap) -> bool:
     source.update()
-    return np.array_equal(source.scene.rows, changing.map.rows)
+    return np.array_equal(source.scene.rows, published.map.rows)
 
 
-def test_what_nobody_watches_is_not_worked_out_and_not_lost(
+def test_messages_without_a_watcher_are_deferred_and_not_lost(
     robot: Robot, source: LiveSource
 ) -> None:
-    changing = ChangingMap()
-    robot.says(POSE_TRACKED, EXAMPLES["tracked_pose"])
-    robot.says(MAP_DELTA, changing.delta())
+    published = ChangingMap()
+    robot.publish(POSE_TRACKED, EXAMPLES["tracked_pose"])
+    robot.publish(MAP_DELTA, published.delta())
     for _ in range(20):
         assert source.update(is_watched=False) == set()
         time.sleep(0.05)
     assert len(source.scene.online) == 0
-    wait_until(lambda: shows(source, changing) and len(source.scene.online) == 1, 10, "all of it")
+    wait_until(
+        lambda: has_map(source, published) and len(source.scene.online) == 1,
+        10,
+        "the map and the path",
+    )
 
 
-def test_only_one_keyframe_is_fetched_for_its_lens(robot: Robot, source: LiveSource) -> None:
-    """They are large, and nothing else is taken from them."""
+def test_keyframe_subscription_ends_after_one_keyframe(robot: Robot, source: LiveSource) -> None:
+    """Keyframes are large, and only their intrinsics are used."""
     publisher = robot.publisher(KEYFRAME_NEW)
-    wait_until(lambda: publisher.matching_status.matching, 10, "heard")
+    wait_until(lambda: publisher.matching_status.matching, 10, "the subscription")
     publisher.put(encode(EXAMPLES["keyframe"]))
-    wait_until(lambda: bool(source.update()) and source.scene.camera is not None, 10, "learnt")
-    wait_until(lambda: not publisher.matching_status.matching, 10, "left alone")
+    wait_until(
+        lambda: bool(source.update()) and source.scene.camera is not None, 10, "the intrinsics"
+    )
+    wait_until(lambda: not publisher.matching_status.matching, 10, "the end of the subscription")

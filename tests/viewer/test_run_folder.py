@@ -1,4 +1,4 @@
-"""What a run left, or has left so far."""
+"""Tests of the scene of a run folder, finished or in progress."""
 
 import json
 import shutil
@@ -20,23 +20,23 @@ from ldo_service.viewer.view_config import ViewerConfig
 from tests.schemas.examples import EXAMPLES
 
 CONFIG = ViewerConfig()
-FOUND = EXAMPLES["map_objects"]
-assert isinstance(FOUND, MapObjects)
+EXAMPLE_OBJECTS = EXAMPLES["map_objects"]
+assert isinstance(EXAMPLE_OBJECTS, MapObjects)
 
 
 @pytest.fixture
 def run(finished_run: Path, tmp_path: Path) -> Path:
-    """A copy, to be changed."""
+    """Copy of a finished run that a test may change."""
     return shutil.copytree(finished_run, tmp_path / "run")
 
 
-def test_all_that_a_run_left_is_shown(run: Path) -> None:
+def test_scene_holds_all_results_of_a_finished_run(run: Path) -> None:
     folder = RunFolder(run, CONFIG)
     assert folder.update() >= {"gaussians", "online", "final", "keyframes", "loops", "facts"}
     scene, summary = folder.scene, json.loads((run / "summary.json").read_text())
     keyframes = json.loads((run / "keyframes.json").read_text())
     assert len(scene.rows) == summary["gaussians"]
-    assert list(scene.keyframes) == [one["keyframe"] for one in keyframes]
+    assert list(scene.keyframes) == [entry["keyframe"] for entry in keyframes]
     np.testing.assert_allclose(scene.keyframes[0], keyframes[0]["T_map_camera"])
     assert scene.camera is not None
     assert scene.camera.width == keyframes[0]["camera"]["width"]
@@ -48,18 +48,18 @@ def test_all_that_a_run_left_is_shown(run: Path) -> None:
     assert folder.update() == set()
 
 
-def test_objects_and_the_keyframes_that_show_them(run: Path) -> None:
+def test_objects_have_boxes_in_the_keyframes_that_show_them(run: Path) -> None:
     view = ObjectView(keyframe=0, box_px=(1.0, 2.0, 3.0, 4.0))
-    one = msgspec.structs.replace(FOUND.objects[0], views=(view,))
-    write_objects(run, msgspec.structs.replace(FOUND, objects=(one,)))
+    map_object = msgspec.structs.replace(EXAMPLE_OBJECTS.objects[0], views=(view,))
+    write_objects(run, msgspec.structs.replace(EXAMPLE_OBJECTS, objects=(map_object,)))
     folder = RunFolder(run, CONFIG)
     folder.update()
     assert folder.scene.objects is not None
     (sight,) = folder.scene.sights[0]
-    assert (sight.name, sight.box_px) == (one.name, view.box_px)
+    assert (sight.name, sight.box_px) == (map_object.name, view.box_px)
 
 
-def test_loops_are_lines_between_keyframes(run: Path) -> None:
+def test_loops_are_pairs_of_keyframes(run: Path) -> None:
     closure = {
         "keyframe": 3,
         "reference": 0,
@@ -73,30 +73,30 @@ def test_loops_are_lines_between_keyframes(run: Path) -> None:
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_what_is_not_there_is_left_out(run: Path, name: str) -> None:
+def test_missing_file_is_skipped_without_a_complaint(run: Path, name: str) -> None:
     (run / name).unlink(missing_ok=True)
     folder = RunFolder(run, CONFIG)
     shown = folder.update()
     others = [layers for other, (layers, _) in PARTS.items() if (run / other).is_file()]
     assert shown == {"facts"}.union(*others)
-    assert escaped(str(run)) not in folder.scene.facts  # no complaint
+    assert escaped(str(run)) not in folder.scene.facts
 
 
-def test_a_run_under_way_is_shown_as_it_comes(run: Path, tmp_path: Path) -> None:
-    young = tmp_path / "young"
-    young.mkdir()
+def test_unfinished_run_is_shown_as_its_files_appear(run: Path, tmp_path: Path) -> None:
+    unfinished = tmp_path / "unfinished"
+    unfinished.mkdir()
     for name in ("config.yaml", "frames.csv"):
-        shutil.copy(run / name, young)
-    folder = RunFolder(young, CONFIG)
+        shutil.copy(run / name, unfinished)
+    folder = RunFolder(unfinished, CONFIG)
     assert folder.update() == {"facts"}
     assert "in progress**: 16 frames" in folder.scene.facts
     for name in ("trajectory.txt", "map.ply"):
-        shutil.copy(run / name, young)
+        shutil.copy(run / name, unfinished)
     assert folder.update() == {"facts", "camera", "final", "gaussians"}
     assert len(folder.scene.rows)
 
 
-def test_a_map_that_changes_is_read_again(run: Path) -> None:
+def test_changed_map_is_read_again(run: Path) -> None:
     folder = RunFolder(run, CONFIG)
     folder.update()
     rows = read_ply(run / "map.ply")[:10]
@@ -105,9 +105,9 @@ def test_a_map_that_changes_is_read_again(run: Path) -> None:
     np.testing.assert_array_equal(folder.scene.rows[:, 0:6], rows[:, 0:6])
 
 
-def test_a_run_that_is_written_anew_leaves_nothing_of_the_old_one(run: Path) -> None:
-    """As `ldo run --overwrite` does it, one file after the other; there are no objects yet."""
-    write_objects(run, FOUND)
+def test_overwritten_run_replaces_everything_of_the_old_one(run: Path) -> None:
+    """`ldo run --overwrite` removes one file after the other and writes the objects last."""
+    write_objects(run, EXAMPLE_OBJECTS)
     folder = RunFolder(run, CONFIG)
     folder.update()
     assert folder.scene.objects is not None
@@ -122,14 +122,14 @@ def test_a_run_that_is_written_anew_leaves_nothing_of_the_old_one(run: Path) -> 
     assert "in progress" in scene.facts
 
 
-def test_a_folder_is_not_read_while_nobody_watches(run: Path) -> None:
+def test_folder_is_not_read_without_a_watcher(run: Path) -> None:
     folder = RunFolder(run, CONFIG)
     assert folder.update(is_watched=False) == set()
     assert len(folder.scene.rows) == 0
     assert "gaussians" in folder.update()
 
 
-def test_what_was_refined_is_shown_in_place_of_the_runs_own(run: Path) -> None:
+def test_refined_map_replaces_the_map_of_the_run(run: Path) -> None:
     folder = RunFolder(run, CONFIG)
     folder.update()
     (run / "refined").mkdir()
@@ -141,21 +141,21 @@ def test_what_was_refined_is_shown_in_place_of_the_runs_own(run: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in PARTS if name != "frames.csv"])
-def test_a_broken_file_is_told_of_until_it_is_mended(run: Path, name: str) -> None:
+def test_broken_file_is_reported_until_it_is_repaired(run: Path, name: str) -> None:
     path = run / name
     good = path.read_bytes() if path.is_file() else None
     path.write_bytes(b"\xffbroken")
     folder = RunFolder(run, CONFIG)
     shown = folder.update()
     assert escaped(str(path)) in folder.scene.facts
-    assert len(shown) > 3  # the others are there
+    assert len(shown) > 3  # The other parts are shown.
     if good is not None:
         path.write_bytes(good)
         folder.update()
         assert escaped(str(path)) not in folder.scene.facts
 
 
-def test_limits_hold_for_a_run_too(run: Path) -> None:
+def test_viewer_limits_apply_to_a_run(run: Path) -> None:
     folder = RunFolder(run, ViewerConfig(most_gaussians=100, most_poses=5))
     folder.update()
     rows = read_ply(run / "map.ply")
@@ -165,7 +165,7 @@ def test_limits_hold_for_a_run_too(run: Path) -> None:
     assert f"100 of {len(rows):,} Gaussians are drawn" in folder.scene.facts
 
 
-def test_a_folder_that_no_run_wrote_is_refused(tmp_path: Path) -> None:
+def test_folder_without_a_run_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="is not a folder"):
         RunFolder(tmp_path / "absent", CONFIG)
     (tmp_path / "holiday.jpg").write_bytes(b"")
