@@ -1,12 +1,12 @@
-"""What a loop closure costs those who must not wait, and a keyframe in a long journey.
+"""CPU time of a loop closure in mapper and optimizer, and of a keyframe in a long pose graph.
 
     python -m tests.bench.bench_correction [--gaussians 300000] [--keyframes 300] [--repeats 10]
 
-First the mapper's side, in the thread that maps: a correction that moves every keyframe of a map,
-from the message to moved Gaussians, and the mending of one keyframe, 12 of which lie over each
-place. Then the optimizer's side as a journey grows: CPU ms of a keyframe (solve, poses, message),
-of a closure, and of taking such a correction over at a receiver. CPU ms of this process; the median
-and the worst.
+The first part measures the mapping thread. A correction moves every keyframe of a map, from the
+message to the moved Gaussians. Then one keyframe is deduplicated where 12 keyframes cover each
+surface. The second part measures the optimizer as the pose graph grows. It times a keyframe
+(solution, poses, message), a loop closure, and a receiver that applies the correction. All times
+are CPU ms of this process, median and maximum.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from ldo_service.schemas import GraphCorrection, decode, encode
 from tests.pose_graph.trajectories import REFINED, between, odometry, round_trips
 
 ROOM_M, SPACING_M, OVER_EACH_OTHER = 6.0, 0.02, 12
-EVERY = 200  # keyframes, between measurements of a journey
+EVERY = 200  # Keyframes between two rows of the table.
 
 
 def main() -> None:
@@ -35,11 +35,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--journey", type=int, default=10_000)
     options = parser.parse_args()
-    print(
-        f"{options.gaussians} Gaussians on {options.keyframes} keyframes: CPU ms, median and worst"
-    )
+    print(f"{options.gaussians} Gaussians on {options.keyframes} keyframes; CPU ms, median and max")
     measure_mapper(options.gaussians, options.keyframes, options.repeats)
-    print("\n| keyframes | variables | keyframe ms | closure ms | taking over ms | message kB |")
+    print("\n| keyframes | variables | keyframe ms | closure ms | apply ms | message kB |")
     print("|---|---|---|---|---|---|")
     measure_journey(options.journey)
 
@@ -72,12 +70,12 @@ def measure_mapper(gaussians: int, keyframes: int, repeats: int) -> None:
         find_duplicates(world.rows, world.anchors, newest[0])[world.anchors == newest[0]]
     )
     print(
-        f"mend one keyframe  {np.median(times):7.1f} {max(times):7.1f}   {share:.0%} of it merged"
+        f"deduplicate        {np.median(times):7.1f} {max(times):7.1f}   {share:.0%} of it merged"
     )
 
 
 def walls(gaussians: int, keyframes: int, rng: np.random.Generator) -> GaussianMap:
-    """Stretches of wall, one a keyframe, each mapped in several passages."""
+    """Return a map of wall patches, one per keyframe, each place covered by several keyframes."""
     world, each = GaussianMap(gaussians), gaussians // keyframes
     side, places = int(np.sqrt(each)), keyframes // OVER_EACH_OTHER
     for k in range(keyframes):

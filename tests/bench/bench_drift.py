@@ -1,13 +1,14 @@
-"""What closing loops is worth where odometry drifts, and how long a correction keeps others.
+"""Accuracy with and without loop closing on drifting odometry, and actor time per correction.
 
     python -m tests.bench.bench_drift [SOURCE] [--scale 0.01] [--aside 0] [--turn 0.5] [--only RUN]
         [--set KEY=VALUE ...]
 
-The whole graph over SOURCE (synthetic:flat), every fifth frame held out: as it is; with odometry
-that drifts by --scale of the way along it, by --aside of it to one side of the world and by --turn
-degrees for each metre of it; and that without closing loops. `odometry` is the track by itself,
-`online` what was published at the time. Pauses: CPU ms of each actor over one correction, the worst
-of the run, beside the Gaussians in memory at its end.
+All actors run over SOURCE (synthetic:flat) with every fifth frame held out. There are three runs:
+without drift, with drift, and with drift but without loop closing. The drift is a fraction --scale
+of the path along it, a fraction --aside to one side of the world, and --turn degrees per meter.
+`odometry` is the trajectory before corrections, and `online` is the one published during the run. A
+pause is the maximum CPU time of an actor for one correction. The last column has the Gaussians in
+memory at the end.
 """
 
 import argparse
@@ -42,10 +43,12 @@ NONE = Drift(scale=0.0, aside=0.0, turn_rad_per_m=0.0)
 
 @dataclass
 class Watched:
-    """An actor, what it says of poses, and CPU ms of each correction that it takes."""
+    """Actor with its published poses and its CPU time for each correction."""
 
     actor: Actor
-    odometry: list[tuple[float, np.ndarray]] = field(default_factory=list)  # s, T_odom_camera
+    odometry: list[tuple[float, np.ndarray]] = field(
+        default_factory=list
+    )  # Time in s and T_odom_camera.
     pauses_ms: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -67,7 +70,7 @@ class Watched:
 
 
 def row(sequence: Sequence, config: Config, drift: Drift, folder: Path) -> str:
-    """A run, judged."""
+    """Run all actors once and return the row of the table."""
     config = with_all_cores(config)
     parameters = actor_parameters(config)
     actors = {actor.name: actor for actor in make_actors(parameters)}

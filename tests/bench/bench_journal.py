@@ -1,4 +1,4 @@
-"""What recording costs: on the event loop, in the writer's thread, on the disk.
+"""Time of recording on the event loop and in the writer's thread, and bytes on disk.
 
 python tests/bench/bench_journal.py [FOLDER]
 """
@@ -49,15 +49,17 @@ def main(folder: Path) -> None:
         recorder.record_input(delivery, i)
         recorder.record_step("done", FlowStatus(), [Produced(FRAME_RGBD, messages[i % 8], body)])
         loop_s += time.perf_counter() - started_s
-        time.sleep(1 / 60)  # the loop has other work, at twice the rate of a camera
+        time.sleep(1 / 60)  # Twice the rate of a camera; the loop also has other work.
     recorder.close().result()
     cpu_s, wall_s = time.process_time() - cpu_s, time.perf_counter() - wall_s
     size = path.stat().st_size
     path.unlink()
-    print(f"{os.uname().machine}, {FRAMES} frames of {WIDTH}x{HEIGHT}, one taken and one made each")
+    print(
+        f"{os.uname().machine}, {FRAMES} frames of {WIDTH}x{HEIGHT}, one input and one output each"
+    )
     print(f"event loop   {1e3 * loop_s / FRAMES:.3f} ms per frame")
-    print(f"CPU, all     {1e3 * cpu_s / FRAMES:.2f} ms per frame (digests of both included)")
-    print(f"on disk      {size / FRAMES:.0f} bytes per frame, of which {len(bodies[0])} message")
+    print(f"CPU, total   {1e3 * cpu_s / FRAMES:.2f} ms per frame (digests of both included)")
+    print(f"on disk      {size / FRAMES:.0f} bytes per frame, {len(bodies[0])} bytes of message")
     print(f"wall         {wall_s:.2f} s")
 
 

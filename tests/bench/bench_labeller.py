@@ -1,17 +1,21 @@
-"""What a labeller that takes 5 s for each call costs a live service, and where its names lie.
+"""Effect of a labeller with 5 s per call on a live service, and the accuracy of its labels.
 
     python -m tests.bench.bench_labeller [--delay-s 5] [--rates 2 6] [--seconds 30] [--rest-s 40]
 
-`ldo serve` with the built-in detector, in the flat at 320x240; a camera goes through a part of it,
-there and back, for `seconds`, at each of the rates; then it rests, and answers still come. Once
-without a labeller, and once with one behind HTTP that says after `delay-s` which thing a picture
-shows, by a name of its own; a region is two calls.
+`ldo serve` runs with the built-in detector in the synthetic flat at 320x240. A camera moves to and
+fro through a part of it for `seconds` at each of the rates. Then it rests, and label results still
+arrive. Each rate runs once without a labeller and once with one behind HTTP. After `delay-s` the
+labeller returns the true object of an image under a name of its own; a region takes two calls.
 
-Poses: those that are OK. Latency: from a frame's sending to its pose. ATE: of T_map_camera as it
-was told, each frame at its own time. Apart: the farthest that T_odom_camera of a frame is from that
-without a labeller; stamps differ a little, and keyframes where frames were dropped. Late:
-keyframes made between the one that a region was asked of and its answer. Right: of the Gaussians
-with a name that frames see, those that lie on the very thing.
+The columns are:
+
+- poses/s: poses with the status OK.
+- latency: time from sending a frame to receiving its pose.
+- ATE: error of the published T_map_camera, each frame at its own time.
+- apart: maximum distance of T_odom_camera from the run without a labeller. Stamps differ a little,
+  and keyframes differ where frames were dropped.
+- late: keyframes between the label request of a region and its label result.
+- right: fraction of the visible Gaussians with a name that lie on the named object.
 """
 
 import argparse
@@ -41,7 +45,7 @@ from tests.service.conftest import LiveService, live_service
 from tests.service.failure_artifacts import Guide, Placed, flat, placed
 from tests.service.message_inbox import Heard
 
-PART = range(120)  # frames of the flat that are gone through, there and back
+PART = range(120)  # Frames of the flat, sent forward and backward.
 SETTINGS: tuple[str, ...] = ("detector.model=demo",)
 HEADER = """\
 | labeller | sent Hz | poses/s | latency ms p50 | p95 | dropped | ATE cm | apart mm | answers | \
@@ -51,10 +55,10 @@ late p50 | max | right % |
 
 @dataclass
 class Live:
-    """A service, what is heard of it, and when its poses came."""
+    """Service with its received messages and the arrival times of its poses."""
 
     heard: Heard
-    sent_ns: list[int] = field(default_factory=list)  # by frame
+    sent_ns: list[int] = field(default_factory=list)  # Index is the frame number.
     came_ns: dict[int, int] = field(default_factory=dict)
 
     def arrived(self, sample: zenoh.Sample) -> None:
@@ -66,7 +70,7 @@ class Live:
 
 
 class Camera:
-    """Sends frames in a thread, with the time of sending for a stamp."""
+    """Thread that sends frames, stamped with the time of sending."""
 
     def __init__(self, live: Live, tape: list[CameraRgbd], rate_hz: float) -> None:
         self._live, self._tape, self._rate_hz = live, tape, rate_hz
@@ -99,7 +103,7 @@ def listen_for(heard: Heard, seconds: float) -> None:
 
 @dataclass(frozen=True)
 class Scene:
-    """The flat, and its frames in the order in which a camera sends them again and again."""
+    """Synthetic flat and the order in which a camera repeats its frames."""
 
     sequence: FlatSequence
     order: list[int]
@@ -118,23 +122,23 @@ class Scene:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one run."""
+    """Result of one run."""
 
     live: Live
-    dropped: int  # frames
-    lie: Placed | None  # names in the map
+    dropped: int  # Frames.
+    lie: Placed | None  # Labels in the map.
     rate_hz: float
     seconds: float
     scene: Scene
-    delay_s: float | None  # None: without a labeller
+    delay_s: float | None  # Seconds per call; None without a labeller.
 
     def T_odom_camera(self) -> dict[int, np.ndarray]:
-        """By frame."""
+        """Return T_odom_camera by frame."""
         return {pose.frame: pose_from_message(pose.T_odom_camera) for pose in self.live.heard.poses}
 
     def row(self, alone: "Outcome") -> str:
         poses = [p for p in self.live.heard.poses if p.status == "OK" and p.submap == 0]
-        who = "none" if self.delay_s is None else f"{self.delay_s:g} s a call"
+        who = "none" if self.delay_s is None else f"{self.delay_s:g} s per call"
         p50, p95 = np.percentile(self.live.latencies_ms(), (50, 95))
         rate = f"{len(poses) / self.seconds:.1f}"
         frames, stamps_s = [p.frame for p in poses], np.array([1e-9 * p.stamp_ns for p in poses])
@@ -160,7 +164,7 @@ class Outcome:
         yield f"{len(heard.answers)} of {len(heard.requests)}"
         yield f"{np.median(heard.late):.0f}"
         yield f"{max(heard.late)}"
-        yield f"{100 * self.lie.share:.1f}, {len(self.lie.names)} things"
+        yield f"{100 * self.lie.share:.1f}, {len(self.lie.names)} objects"
 
 
 def measured(
@@ -197,7 +201,7 @@ def where_names_lie(scene: Scene, heard: Heard) -> Placed:
 
 
 def dropped(heard: Heard) -> int:
-    """Frames, by the time they would have been tracked."""
+    """Return the number of frames dropped or lost before the tracker."""
     inputs = heard.input("frame_source", "camera/rgbd"), heard.input("tracker", "frame/rgbd")
     return sum(count.dropped + count.lost for count in inputs)
 

@@ -1,21 +1,21 @@
-"""How well the map's labels agree with the truth, by rule, beside painting each frame alone.
+"""Accuracy of the map's labels by fusion rule, compared with painting each frame on its own.
 
     LDO_WEIGHTS=... python tests/bench/bench_labels.py [SOURCE] [--only TEXT] [--pictures DIR]
                                                        [--fusion P] [--background NAME ...]
     python tests/bench/bench_labels.py synthetic:flat --detectors demo --painted
 
-SOURCE: labelled, with true poses. Every second frame is a keyframe, where it really was; labels are
-fused as the map grows and judged at the end, on all frames, as `ldo eval` judges them: background
-and the classes of COCO, those that have 0.2 % of the pixels, in brackets all that occur.
-`--background` names classes that count as background whatever the synonyms say. `--detectors` are
-names or files, as `detector.model`, in place of those in LDO_WEIGHTS; with `--painted` there is no
+SOURCE needs true labels and true poses. Every second frame is a keyframe at its true pose. Labels
+are fused as the map grows. At the end they are evaluated on all frames as by `ldo eval`. The
+classes are background and the COCO classes with at least 0.2 % of the pixels, in brackets all that
+occur. `--background` names classes that count as background, whatever their synonyms. `--detectors`
+are names or files as in `detector.model`, in place of those in LDO_WEIGHTS. `--painted` skips the
 map.
 
-"true boxes" are those of the true objects that cover 0.5 % of the pixels, each of score 1.
+"true boxes" are the boxes of the true objects that cover 0.5 % of the pixels, each with score 1.
 
-`--fusion P` adds an oracle in the labeller's place, which knows the truth, and errs: of each region
-that the detector is less than 0.6 sure of, it says at once, and P sure, the true name of what most
-of its foreground shows, with probability P (seeded); else any other name of the source.
+`--fusion P` adds an oracle in place of the labeller. It labels each region with a detector score
+below 0.6 at once, with confidence P. With probability P (seeded) the label is the true name of most
+of the region's foreground, otherwise any name of the source.
 """
 
 import argparse
@@ -65,7 +65,7 @@ DEFAULT = "foreground coverage corrected"
 
 @dataclass(frozen=True)
 class Scene:
-    """frames, where they truly were, what they truly show; names of the labels."""
+    """Frames with their true poses and labels, and the vocabulary of the labels."""
 
     frames: list[RgbdFrame]
     T_map_camera: np.ndarray
@@ -74,7 +74,7 @@ class Scene:
 
     @cached_property
     def pairs(self) -> list[Correspondences]:
-        """Of each frame and the one that comes three later."""
+        """Correspondences of each frame and the one three frames later."""
         T, frames = self.T_map_camera, self.frames
         return [
             correspondences(frames[k], frames[k + APART], se3.inverse(T[k + APART]) @ T[k])
@@ -85,8 +85,8 @@ class Scene:
     def of(source: str, most: int | None, background: Sequence[str]) -> "Scene":
         sequence = open_source(source)
         poses, truth = sequence.truth(), sequence.true_labels()
-        assert poses is not None, "needs true poses"
-        assert truth is not None, "needs true labels"
+        assert poses is not None, f"{source} has no true poses"
+        assert truth is not None, f"{source} has no true labels"
         frames = [sequence[k] for k in range(len(sequence))[:most]]
         T = np.asarray(poses.T_world_camera)[: len(frames)]
         names = tuple("wall" if name in background else name for name in truth.class_names)
@@ -94,7 +94,7 @@ class Scene:
         return Scene(frames, se3.inverse(T[0]) @ T, known, Vocabulary())
 
 
-# --- what is claimed ------------------------------------------------------------------------------
+# --- detections -----------------------------------------------------------------------------------
 def detected(scene: Scene, model: str) -> list[RegionDetections]:
     network = open_detector(model, NetworkConfig())
     index = np.array([scene.vocabulary.index(name) for name in network.labels])
@@ -134,7 +134,7 @@ def _least(image: np.ndarray) -> float:
 def asked(
     scene: Scene, claims: list[RegionDetections], reliability: float
 ) -> list[RegionDetections]:
-    """With the answers of the oracle to what the detector is unsure of."""
+    """Return the detections with the oracle's labels where the detector is uncertain."""
     rng, names = np.random.default_rng(0), scene.truth.class_names
     usable = [k for k, name in enumerate(names) if not is_void(name)]
     out = []
@@ -154,7 +154,7 @@ def asked(
 
 
 def region(box: np.ndarray, frame: RgbdFrame, found: SmoothSurfaces) -> np.ndarray:
-    """[H, W] bool: the foreground in a box; all of the box where there is none."""
+    """Return the mask [H, W] of the foreground in a box, or of the whole box if it has none."""
     part = foreground(box, frame.depth_m, found, frame.camera, ForegroundConfig())
     mask = part.image(frame.depth_m.shape)
     if not mask.any():
@@ -176,7 +176,7 @@ def variants() -> dict[str, SemanticFusionConfig]:
 
 
 class Follower:
-    """Labels of a map that grows and loses Gaussians."""
+    """Labels of a map that follow added and removed Gaussians."""
 
     def __init__(
         self, name: str, what: str, claims: list[RegionDetections], config: SemanticFusionConfig
@@ -191,7 +191,7 @@ class Follower:
 
     @property
     def is_summed(self) -> bool:
-        """Whether it is judged by the sum over all Gaussians of a pixel too, which takes longer."""
+        """True if the sum over all Gaussians of a pixel is evaluated too, which takes longer."""
         return self.what == DEFAULT
 
 
@@ -205,7 +205,7 @@ def followers(
         if reliability is not None and name != TRUE_BOXES:
             answered = asked(scene, said, reliability)
             calls = np.mean([np.any(c.open_confidences > 0) for c in answered])
-            print(f"{name}: the oracle is asked on {calls:.0%} of the frames")
+            print(f"{name}: the oracle labels regions on {calls:.0%} of the frames")
             for rule in ("fixed", "adaptive"):
                 config = SemanticFusionConfig(fusion=FusionConfig(rule=rule))
                 yield Follower(name, f"{DEFAULT}, {rule} fusion", answered, config)
@@ -227,7 +227,7 @@ def grown(scene: Scene, runs: list[Follower], iterations: int) -> MapBuilder:
 
 
 def painted(claims: RegionDetections, frame: RgbdFrame, area: str) -> np.ndarray:
-    """The regions of one frame, the surest on top."""
+    """Return the label image of one frame's regions, the most confident on top."""
     image, config = np.zeros(frame.depth_m.shape, np.uint8), ForegroundConfig()
     found = surfaces(frame.depth_m, frame.camera, config) if area == "foreground" else None
     for box, label in zip(claims.boxes[::-1], claims.labels[::-1], strict=True):
@@ -239,11 +239,11 @@ def painted(claims: RegionDetections, frame: RgbdFrame, area: str) -> np.ndarray
     return image
 
 
-# --- what is printed ------------------------------------------------------------------------------
+# --- report ---------------------------------------------------------------------------------------
 class Report:
     def __init__(self, scene: Scene, pictures: Path | None) -> None:
         self._scene, self._pictures = scene, pictures
-        print("| claims | rule | mIoU | all names | consistency | beyond COCO | labelled |")
+        print("| detections | rule | mIoU | all names | consistency | beyond COCO | labelled |")
         print("|---|---|---|---|---|---|---|")
 
     def line(self, name: str, what: str, image: Callable[[int], np.ndarray], share: str) -> None:
@@ -283,8 +283,10 @@ class Report:
 
 
 def top_image(labels: np.ndarray, shown: Rendering) -> np.ndarray:
-    """[H, W] uint8, per pixel the likeliest label of the Gaussian that made most of it; background
-    where none did."""
+    """Return per pixel the most likely label of the Gaussian with the largest contribution.
+
+    The image is uint8 [H, W]; pixels without a Gaussian are background.
+    """
     assert shown.contributions is not None
     top = shown.contributions.top
     return np.where(top >= 0, top_labels(labels)[top], BACKGROUND).astype(np.uint8)
@@ -315,11 +317,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("source", nargs="?", default="synthetic:flat")
     parser.add_argument("--pictures", type=Path)
-    parser.add_argument("--only", default="", help="rules whose name holds this")
+    parser.add_argument("--only", default="", help="only rules with this text in their name")
     parser.add_argument("--fusion", type=float, metavar="P")
     parser.add_argument("--background", nargs="+", default=(), metavar="NAME")
     parser.add_argument("--detectors", nargs="+", default=(), metavar="MODEL")
-    parser.add_argument("--painted", action="store_true", help="frame by frame alone")
+    parser.add_argument(
+        "--painted", action="store_true", help="only paint single frames, without a map"
+    )
     parser.add_argument("--max-frames", type=int)
     parser.add_argument("--iterations", type=int, default=6)
     arguments = parser.parse_args()

@@ -1,11 +1,12 @@
-"""Time per keyframe and memory over laps of a closed walk: both must stay flat.
+"""Time per keyframe and memory over laps of a closed trajectory; both must stay constant.
 
     python tests/bench/bench_laps.py [SOURCE] [--laps 10] [--stride 1] [--true-poses] [--out DIR]
 
-Every frame of SOURCE again and again, with stamps that go on. Writes keyframes.csv (a line of what
-`Mapped` says of each keyframe) and laps.png, and prints each lap: means, and what was at its end.
-CPU time is that of the mapper's thread with one thread of the renderer. With --true-poses keyframes
-are those of the tracker, mapped where they really were: what then grows is not owed to drift.
+The frames of SOURCE repeat, with stamps that continue from lap to lap. The program writes laps.png
+and keyframes.csv, which has a line of `Mapped` for each keyframe. It prints the means and the final
+values of each lap. CPU time is that of the mapper's thread with one thread of the renderer. With
+--true-poses the tracker's keyframes are mapped at their true poses, so that growth cannot come from
+drift.
 """
 
 import argparse
@@ -39,8 +40,8 @@ from ldo_service.schemas import (
 )
 
 COLUMNS = (
-    *("lap", "keyframes", "CPU ms", "awake", "asleep", "over cap"),
-    *("inserted", "pruned", "woken", "images MB", "MB"),
+    *("lap", "keyframes", "CPU ms", "resident", "offloaded", "over cap"),
+    *("inserted", "pruned", "loaded", "images MB", "MB"),
 )
 PANEL_PX, MARGIN_PX = (900, 220), 60
 
@@ -53,20 +54,20 @@ class Mapped:
     frame: int
     lap: int
     cpu_ms: float
-    gaussians: int  # awake
-    asleep: int
-    over_cap: int  # awake because they may be looked at
-    pruned: int  # so far
-    woken: int  # so far
-    images_mb: float  # of keyframes, in memory
+    gaussians: int  # Gaussians in memory.
+    asleep: int  # Offloaded to disk.
+    over_cap: int  # Gaussians in memory beyond the limit, as they may be visible.
+    pruned: int  # Total since the start.
+    woken: int  # Loaded from disk since the start.
+    images_mb: float  # Keyframe images in memory.
     resident_mb: float
 
 
 class TimedMapper(Mapper):
-    """A mapper that notes what each keyframe cost.
+    """Mapper that records the cost of each keyframe.
 
-    T_world_camera [K, 4, 4] of the frames of a lap: keyframes are mapped there. None: where the
-    tracker and the optimizer say.
+    It maps keyframes at T_world_camera [K, 4, 4] of the frames of a lap. Without them it uses the
+    poses of tracker and optimizer.
     """
 
     def __init__(
@@ -116,7 +117,7 @@ class TimedMapper(Mapper):
 
 
 def laps_of(sequence: Sequence, laps: int, stride: int) -> Iterator[CameraRgbd]:
-    """Frames and stamps go on from lap to lap."""
+    """Yield the frames of all laps; frame numbers and stamps continue from lap to lap."""
     indices = range(0, len(sequence), stride)
     stamps_ns = sequence.stamps_ns
     lap_ns = int(stamps_ns[-1] - stamps_ns[0] + stride * (stamps_ns[1] - stamps_ns[0]))
@@ -129,7 +130,7 @@ def laps_of(sequence: Sequence, laps: int, stride: int) -> Iterator[CameraRgbd]:
 
 
 def plot(mapped: list[Mapped]) -> np.ndarray:
-    """Three panels over the keyframes."""
+    """Return an image of three curves over the keyframes."""
     columns = {
         "CPU ms per keyframe": [m.cpu_ms for m in mapped],
         "Gaussians in memory": [m.gaussians for m in mapped],
@@ -189,16 +190,21 @@ def main() -> None:
 
 
 def true_poses(sequence: Sequence) -> np.ndarray:
-    """T_world_camera [len, 4, 4]."""
+    """Return T_world_camera [len, 4, 4] of all frames."""
     truth = sequence.truth()
     if truth is None or len(truth) != len(sequence):
-        raise SystemExit(f"{sequence.name} does not say where each frame was taken.")
+        raise SystemExit(
+            f"{sequence.name} has no true pose for each frame; run without --true-poses."
+        )
     return truth.T_world_camera
 
 
 def report(mapped: list[Mapped], lap: int) -> None:
-    """`inserted`, `pruned` and `woken` are per keyframe; times and `MB` are means, else what was
-    at the end."""
+    """Print the row of a lap.
+
+    `inserted`, `pruned` and `loaded` are per keyframe. Times and `MB` are means, other columns are
+    values at the end of the lap.
+    """
     of_lap = [m for m in mapped if m.lap == lap]
     first, last, count = mapped[mapped.index(of_lap[0]) - 1], of_lap[-1], len(of_lap)
     cpu_ms = float(np.mean([m.cpu_ms for m in of_lap]))

@@ -4,12 +4,16 @@
     python -m tests.bench.bench_load --robots 1 --minutes 30 --times 0.8 --plot docs/soak.png
     python -m tests.bench.bench_load --robots 1 --minutes 1 --hz 3 --busy 2
 
-Each robot is a service of its own that joins the router, all its actors but none of its networks in
-one process; two mapping iterations a keyframe leave the time to the runtime. Its camera sends
---times what it tracked in a first half minute of 30 Hz, and later of what it tracked in the last
-minute, if that is more; or --hz frames a second. --busy programs want a core each all the time. A
-tenth of the subscribers is slow, a tenth is stopped. Told are memory, the latency of every pose and
-the rate in thirds of the time, and what became of each frame.
+Each robot is a service that connects to the router. It runs all its actors in one process, without
+neural networks. Two mapping iterations per keyframe leave the CPU time to the runtime.
+
+The camera of a robot first sends 30 Hz for half a minute, which gives the rate that the robot can
+track. Then it sends --times that rate, and more if the robot tracked more in the last minute. With
+--hz it sends this rate instead. --busy programs each occupy a core. A tenth of the subscribers is
+slow and a tenth is stopped.
+
+The output has the memory, the latency of all poses and the rate in thirds of the time. It also has
+the number of frames that were tracked, dropped or lost.
 """
 
 import argparse
@@ -42,32 +46,32 @@ from tests.ports import free_endpoint
 # A robot has one process.
 LIGHT = ("mapper.iterations=2", "mapper.threads=1", "service.process_actors=[]")
 SAMPLE_S = 2.0
-RECENT = 30  # samples: a minute
-SETTLE_S = 30.0  # to find the rate that can be sustained
+RECENT = 30  # Samples in a minute.
+SETTLE_S = 30.0  # Time to find the rate that a robot can track.
 QUICK_IN_ONE_PROCESS = 8
 ACTORS = 7
 
 
 @dataclass
 class Robot:
-    """One service, its camera and what is known of both."""
+    """Service with its camera and the measurements of both."""
 
     name: str
     process: subprocess.Popen[bytes]
     client: Client
     sent: int = 0
-    since_ns: int = 0  # frames before are not judged: they found the rate, and may come very late
+    since_ns: int = 0  # Earlier frames do not count; they find the rate.
     poses: int = 0
-    judged: int = 0  # poses, and how many of them are sure
+    judged: int = 0  # Poses that count; judged_ok of them have the status OK.
     judged_ok: int = 0
-    latest_ms: list[float] = field(default_factory=list)  # since the last sample
-    latencies_ms: list[list[float]] = field(default_factory=list)  # of each sample
+    latest_ms: list[float] = field(default_factory=list)  # Since the last sample.
+    latencies_ms: list[list[float]] = field(default_factory=list)  # Latencies by sample.
     health: dict[str, Health] = field(default_factory=dict)
     samples: list[tuple[float, float, float, float]] = field(default_factory=list)
     lock: Lock = field(default_factory=Lock)
 
     def sample(self, elapsed_s: float, span_s: float) -> None:
-        """Time, resident MB of the service, median latency in ms, poses per second."""
+        """Add a sample: time in s, resident MB, median latency in ms, and poses per second."""
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
         with self.lock:
             latest, self.latest_ms = self.latest_ms, []
@@ -77,7 +81,7 @@ class Robot:
         self.latencies_ms.append(latest)
 
     def told(self) -> int:
-        """Poses that its tracker has sent, as it counts them."""
+        """Return how many poses the tracker has sent by its own count."""
         (poses,) = [o for o in self.health["tracker"].outputs if o.topic == "pose/tracked"]
         return poses.sent
 
@@ -97,7 +101,7 @@ class Robot:
 
 
 class Camera:
-    """Sends `rate_hz` frames to a robot, stamped with the time of sending."""
+    """Thread that sends `rate_hz` frames to a robot, stamped with the time of sending."""
 
     def __init__(self, robot: Robot, scene: list[CameraRgbd], rate_hz: float) -> None:
         self._robot, self._scene, self.rate_hz = robot, scene, rate_hz
@@ -119,7 +123,7 @@ class Camera:
             self._robot.sent += 1
 
 
-# --- the company ----------------------------------------------------------------------------------
+# --- robots and subscribers -----------------------------------------------------------------------
 @contextmanager
 def robots_on(
     network: Endpoint, count: int, folder: Path, settings: tuple[str, ...]
@@ -130,7 +134,7 @@ def robots_on(
         until_s = time.monotonic() + 60 + 20 * count
         while any(len(robot.health) < ACTORS for robot in robots):
             if time.monotonic() > until_s:
-                raise TimeoutError("not all actors report")
+                raise TimeoutError("not all actors sent a health message in time")
             time.sleep(0.2)
         yield robots
 
@@ -163,7 +167,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 class Crowd:
-    """Subscribers in processes of their own."""
+    """Subscribers in processes of their own: quick, slow and stopped ones."""
 
     def __init__(self, endpoint: str, count: int, stack: ExitStack) -> None:
         slow = dead = count // 10
@@ -192,14 +196,14 @@ class Crowd:
         return process
 
     def poses(self) -> list[int]:
-        """That came to each quick one; ends them."""
+        """End the quick subscribers and return how many poses each received."""
         said = [json.loads(process.communicate(timeout=60)[0]) for process in self._quick]
         return [counts["ldo/*/pose/tracked"] for of_one in said for counts in of_one]
 
 
 @contextmanager
 def busy(count: int) -> Iterator[None]:
-    """Other programs that want a core each."""
+    """Run programs that occupy a core each."""
     with ExitStack() as stack:
         for _ in range(count):
             program = subprocess.Popen([sys.executable, "-c", "while True: pass"])
@@ -229,7 +233,7 @@ def loaded(
         stack.enter_context(open_session(network, router=True))
         robots = stack.enter_context(robots_on(network, count, folder, settings))
         rate_hz = hz or times * _sustained(robots, scene)
-        print(f"{count} robots are sent {rate_hz:.1f} Hz each", flush=True)
+        print(f"{count} robots receive {rate_hz:.1f} Hz each", flush=True)
         crowd = Crowd(network.endpoint, subscribers, stack)
         before = sum(robot.told() for robot in robots)
         cameras = [Camera(robot, scene, rate_hz) for robot in robots]
@@ -249,13 +253,13 @@ def loaded(
         heard = crowd.poses()
         told = sum(robot.told() for robot in robots) - before
         rates = sorted(camera.rate_hz for camera in cameras)
-        print(f"poses told {told}, heard by quick subscribers {sorted(heard)}")
+        print(f"poses published {told}, received by quick subscribers {sorted(heard)}")
         print(f"sent at the end, Hz: {rates[0]:.1f} to {rates[-1]:.1f}")
         return Outcome(robots)
 
 
 def _sustained(robots: list[Robot], scene: list[CameraRgbd]) -> float:
-    """Poses per second and robot, of frames that come faster."""
+    """Return the poses per second and robot when frames arrive faster than they are tracked."""
     cameras = [Camera(robot, scene, 30.0) for robot in robots]
     time.sleep(SETTLE_S / 2)
     before, started_s = sum(robot.poses for robot in robots), time.monotonic()
@@ -273,7 +277,7 @@ def _sustained(robots: list[Robot], scene: list[CameraRgbd]) -> float:
 
 
 def _settle(robots: list[Robot]) -> None:
-    """Until what waits is handled, and heartbeats have told."""
+    """Wait until all queues are empty and heartbeats have reported it."""
     time.sleep(3.0)
     until_s = time.monotonic() + 60
     while time.monotonic() < until_s and any(
@@ -283,34 +287,34 @@ def _settle(robots: list[Robot]) -> None:
     time.sleep(2.0)
 
 
-# --- what came of it ------------------------------------------------------------------------------
+# --- results --------------------------------------------------------------------------------------
 def accounts(robot: Robot) -> dict[str, int]:
-    """Frames: what the camera sent, and what became of them."""
+    """Return the number of frames that a robot was sent, tracked, dropped and lost."""
     (camera,) = [i for i in robot.health["frame_source"].inputs if i.topic == "camera/rgbd"]
     (made,) = [o for o in robot.health["frame_source"].outputs if o.topic == "frame/rgbd"]
     (taken,) = [i for i in robot.health["tracker"].inputs if i.topic == "frame/rgbd"]
     return {
         "sent": robot.sent,
-        "taken": camera.delivered,
+        "received": camera.delivered,
         "dropped": camera.dropped,
-        "lost on the way": camera.lost,
+        "lost to the frame source": camera.lost,
         "unaccounted for": robot.sent - camera.delivered - camera.dropped - camera.lost,
-        "handed on": made.sent,
+        "forwarded": made.sent,
         "tracked": taken.delivered,
         "dropped by the tracker": taken.dropped,
-        "lost in between": taken.lost,
-        "of these unaccounted for": made.sent - taken.delivered - taken.dropped - taken.lost,
+        "lost to the tracker": taken.lost,
+        "forwarded and unaccounted for": made.sent - taken.delivered - taken.dropped - taken.lost,
     }
 
 
 def table(outcome: Outcome) -> str:
-    """Of all robots together, in thirds of the time."""
+    """Return the table of all robots together, in thirds of the time."""
     samples = np.array([robot.samples for robot in outcome.robots])  # [R, S, 4]
     head = (
         "third",
-        "memory of a service MB, most",
+        "max memory of a service MB",
         "pose latency ms p50 / p95 / max",
-        "poses/s, each",
+        "poses/s per robot",
     )
     lines = [f"| {' | '.join(head)} |", "|---|---|---|---|"]
     for number, which in enumerate(np.array_split(np.arange(samples.shape[1]), 3), 1):
@@ -334,7 +338,7 @@ WIDTH, HEIGHT, LEFT = 640, 130, 70
 
 
 def plot(robot: Robot) -> np.ndarray:
-    """Memory, latency and rate over time, one above the other."""
+    """Return an image of memory, latency and rate over time."""
     samples = np.array(robot.samples)
     names = ("memory, MB", "pose latency, ms", "poses per second")
     panels = [
@@ -368,13 +372,17 @@ def main() -> None:
     parser.add_argument("--subscribers", type=int, default=50)
     parser.add_argument("--minutes", type=float, default=10.0)
     rate = parser.add_mutually_exclusive_group()
-    rate.add_argument("--times", type=float, default=2.0, help="of the rate that is sustained")
-    rate.add_argument("--hz", type=float, help="of frames sent to each robot")
-    parser.add_argument("--busy", type=int, default=0, help="programs that compute all the time")
-    parser.add_argument(
-        "--set", nargs="+", default=[], help="of each service, as `ldo serve` has it"
+    rate.add_argument(
+        "--times", type=float, default=2.0, help="factor of the rate that a robot can track"
     )
-    parser.add_argument("--plot", type=Path, help="PNG of the first robot's time")
+    rate.add_argument("--hz", type=float, help="rate of the frames sent to each robot")
+    parser.add_argument(
+        "--busy", type=int, default=0, help="number of programs that occupy a core each"
+    )
+    parser.add_argument(
+        "--set", nargs="+", default=[], help="settings of each service, as for `ldo serve`"
+    )
+    parser.add_argument("--plot", type=Path, help="PNG file of the first robot's curves")
     arguments = parser.parse_args()
     scene = frames()
     for count in arguments.robots:

@@ -1,14 +1,14 @@
-"""What grows with keyframes, and whose it is: a camera that goes to and fro in a room, without end.
+"""Memory growth per keyframe by owner, for a camera that moves to and fro in a room.
 
     python -m tests.bench.bench_long_term [--keyframes 3000] [--laps 1000] [--csv FILE]
         [--set actor.field=value ...]
     python -m tests.bench.bench_long_term --plot PNG --beside OLD.csv NEW.csv
 
-All actors on the logical clock at 160x120. After each to and fro each actor is walked through,
-attribute by attribute, and its state is encoded as it is saved. Told are bytes per keyframe (per
-lap, where the camera tracks against known ones alone) over the second half, when caches are full: a
-line for what grows, and sums. `unseen` is what the process grew by beyond what was found: gtsam,
-allocators, fragments.
+All actors run on the logical clock at 160x120. After each lap (to and fro) the attributes of each
+actor are measured recursively, and its state is encoded as in a checkpoint. The report has bytes
+per keyframe over the second half, when caches are full. It has bytes per lap if the camera only
+reuses known keyframes. It lists every attribute that grows, and sums. `not found` is the growth of
+the process beyond the measured objects: gtsam, allocators, fragmentation.
 """
 
 import argparse
@@ -35,13 +35,13 @@ from ldo_service.storage.state_codec import encode_state
 from tests.faults.camera import PERIOD_NS, frames
 
 LIGHT = ("mapper.iterations=2", "mapper.threads=1")
-SHARED = (type, ModuleType, FunctionType, MethodType)  # belong to no actor
-DEEP = 4  # attributes in a name
-MIN_BYTES = 1.0  # per keyframe, to be told
+SHARED = (type, ModuleType, FunctionType, MethodType)  # Types of objects that belong to no actor.
+DEEP = 4  # Maximum number of attributes in a path.
+MIN_BYTES = 1.0  # Minimum growth per keyframe of a reported path.
 
 
 class Mallinfo2(ctypes.Structure):
-    """glibc's, over all arenas; bytes."""
+    """Result of glibc's mallinfo2 over all arenas, in bytes."""
 
     _fields_ = [
         *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "mapped")),
@@ -52,15 +52,15 @@ class Mallinfo2(ctypes.Structure):
 @dataclass(frozen=True, slots=True)
 class Sample:
     keyframes: int
-    held: dict[str, int]  # bytes in memory, by the path of attributes
-    saved: dict[str, int]  # bytes of the state, by actor
-    resident: float  # bytes of the process
-    in_use: int  # bytes that glibc gave out, but small objects of Python
-    free: int  # and that it keeps for later
+    held: dict[str, int]  # Bytes in memory by the path of attributes.
+    saved: dict[str, int]  # Bytes of the encoded state by actor.
+    resident: float  # Resident bytes of the process.
+    in_use: int  # Bytes allocated from glibc, without small Python objects.
+    free: int  # Free bytes that glibc keeps.
 
 
 def lap(scene: list[CameraRgbd], number: int) -> Iterator[CameraRgbd]:
-    """There and back, with frame numbers and stamps that go on from lap to lap."""
+    """Yield the frames of one lap; numbers and stamps continue from lap to lap."""
     for index, frame in enumerate(scene, start=number * len(scene)):
         stamp_ns = 1_000_000_000 + index * PERIOD_NS
         yield msgspec.structs.replace(frame, frame=index, stamp_ns=stamp_ns)
@@ -68,7 +68,7 @@ def lap(scene: list[CameraRgbd], number: int) -> Iterator[CameraRgbd]:
 
 # --- what an actor holds --------------------------------------------------------------------------
 def held_by(actors: list[Actor]) -> dict[str, int]:
-    """Bytes by path; what several hold counts for the first."""
+    """Return the bytes by path; an object with several owners counts for the first."""
     seen: set[int] = set()
     held: dict[str, int] = {}
     for actor in actors:
@@ -77,7 +77,10 @@ def held_by(actors: list[Actor]) -> dict[str, int]:
 
 
 def _walk(thing: object, path: str, depth: int, seen: set[int], held: dict[str, int]) -> None:
-    """Attributes of our own classes get a name each; all below counts for the last of them."""
+    """Add the bytes of an object to `held`.
+
+    Attributes of our own classes get a path each; everything below counts for the last of them.
+    """
     if id(thing) in seen or isinstance(thing, SHARED):
         return
     if depth < DEEP and type(thing).__module__.startswith("ldo_service"):
@@ -116,7 +119,7 @@ def _referents(one: object) -> list[object]:
     return gc.get_referents(one)
 
 
-# --- the journey ----------------------------------------------------------------------------------
+# --- the run --------------------------------------------------------------------------------------
 def journey(keyframes: int, most_laps: int, settings: list[str]) -> Iterator[Sample]:
     config, scene = load_config(settings=[*LIGHT, *settings]), frames()
     actors, made, laps = make_actors(actor_parameters(config)), 0, 0
@@ -136,7 +139,7 @@ def journey(keyframes: int, most_laps: int, settings: list[str]) -> Iterator[Sam
 
 
 def keep_state(actor: Actor) -> None:
-    """Ask for its state after each message, as a stage does: it may be kept."""
+    """Make an actor save its state after each message, as a stage may do."""
     handle = actor.handle
 
     def handled(message: Message) -> Iterator[Message]:
@@ -162,8 +165,14 @@ def allocated() -> tuple[int, int]:
 
 
 def growth(samples: list[Sample]) -> tuple[str, dict[str, float], dict[str, float], float]:
-    """Bytes per keyframe, or where none was made, per lap, over the second half: what it is per,
-    by path, of saved states by actor, resident."""
+    """Return the growth in bytes per keyframe over the second half.
+
+    Without new keyframes the growth is per lap.
+
+    Returns:
+        The unit ("keyframe" or "lap"), the growth by path, that of the saved states by actor, and
+        that of the resident memory.
+    """
     half = len(samples) // 2 - 1
     first, last = samples[half], samples[-1]
     n = last.keyframes - first.keyframes
@@ -182,13 +191,13 @@ def report(samples: list[Sample]) -> None:
             print(f"| {path} | {slope:.0f} | {samples[-1].held[path] / 1e3:.0f} |")
     for actor, slope in saved.items():
         mine = sum(s for path, s in held.items() if path.split(".")[0] == actor)
-        print(f"| {actor}, in all; saved {slope:.0f} | {mine:.0f} | |")
-    print(f"| resident, and unseen {resident - sum(held.values()):.0f} | {resident:.0f} | |")
+        print(f"| {actor}, total; saved state {slope:.0f} | {mine:.0f} | |")
+    print(f"| resident, of it not found {resident - sum(held.values()):.0f} | {resident:.0f} | |")
 
 
-# --- beside each other ----------------------------------------------------------------------------
+# --- comparison of runs ---------------------------------------------------------------------------
 WIDTH, HEIGHT, MARGIN = 640, 260, 50
-COLORS = ((200, 80, 40), (31, 111, 235), (40, 140, 60))  # RGB, one a file
+COLORS = ((200, 80, 40), (31, 111, 235), (40, 140, 60))  # RGB, one per file.
 
 
 def save(path: Path, samples: list[Sample]) -> None:
@@ -200,7 +209,7 @@ def save(path: Path, samples: list[Sample]) -> None:
 
 
 def plot(files: list[Path]) -> np.ndarray:
-    """What was found in memory over keyframes, a line a file."""
+    """Return an image of the measured memory over keyframes, one curve per file."""
     image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     runs = [np.loadtxt(path, delimiter=",", skiprows=1) for path in files]
     most = np.max([run.max(axis=0) for run in runs], axis=0)
@@ -224,11 +233,15 @@ def write(
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--keyframes", type=int, default=3000)
-    parser.add_argument("--laps", type=int, default=1000, help="at most, to and fro")
-    parser.add_argument("--set", nargs="+", default=[], help="as `ldo serve` has it")
+    parser.add_argument(
+        "--laps", type=int, default=1000, help="maximum number of laps, each to and fro"
+    )
+    parser.add_argument("--set", nargs="+", default=[], help="settings, as for `ldo serve`")
     parser.add_argument("--csv", type=Path)
     parser.add_argument("--plot", type=Path)
-    parser.add_argument("--beside", type=Path, nargs="+", default=[], help="CSV files")
+    parser.add_argument(
+        "--beside", type=Path, nargs="+", default=[], help="CSV files that --plot compares"
+    )
     arguments = parser.parse_args()
     if arguments.plot:
         cv2.imwrite(str(arguments.plot), plot(arguments.beside)[..., ::-1])
@@ -239,7 +252,7 @@ def main() -> None:
         total = sum(one.held.values())
         print(
             f"{one.keyframes} keyframes: {total / 1e6:.1f} MB found, "
-            f"{one.resident / 1e6:.0f} MB resident, {one.in_use / 1e6:.1f} MB of glibc's in use, "
+            f"{one.resident / 1e6:.0f} MB resident, {one.in_use / 1e6:.1f} MB of glibc in use, "
             f"{one.free / 1e6:.1f} MB free",
             flush=True,
         )

@@ -1,14 +1,14 @@
-"""What recognising places costs, and what it finds.
+"""CPU time and accuracy of loop closing.
 
     OMP_NUM_THREADS=1 python tests/bench/bench_loops.py [SOURCE ...] [--model FILE.onnx]
         [--stages two_stage geometric semantic]
 
 SOURCE: data sets or synthetic sequences; default: tum/kitchen and replica/apartment_floor1 in
-LDO_DATA, and synthetic:flat. Coarse: one subgraph among 1000 of random histograms. Fine: each
-source is tracked once, its keyframes are looked at by the detector, if one is named, and are given
-to the loop closer; CPU time is of one core, per candidate, with the finding of its pose and the
-proof. What is found is judged as by `ldo eval`. Retrieved: subgraphs with a true partner among the
-candidates of theirs.
+LDO_DATA, and synthetic:flat. The first value is the time of a query of the place database with 1000
+subgraphs of random histograms. Then each source is tracked once. The loop closer gets its
+keyframes, with detections if --model names a detector. CPU time is that of one core per candidate,
+with pose estimation and verification. Closures are evaluated as by `ldo eval`. `retrieved` is the
+number of subgraphs with a true partner among their candidates.
 """
 
 import argparse
@@ -52,12 +52,12 @@ from ldo_service.schemas import DetectionBoxes, GraphCorrection, Keyframe, LoopC
 from ldo_service.semantics.gaussian_labels import MAX_LABELS
 
 SUBGRAPHS = 1000
-Taken = Keyframe | DetectionBoxes | GraphCorrection  # by the loop closer
+Taken = Keyframe | DetectionBoxes | GraphCorrection  # Inputs of the loop closer.
 STAGES: tuple[Stages, ...] = ("two_stage", "geometric", "semantic")
 
 
 def coarse_ms(repeats: int = 20) -> float:
-    """CPU time of one search among 1000 subgraphs, in the median."""
+    """Return the median CPU time of one query among 1000 subgraphs."""
     rng = np.random.default_rng(0)
     config, poses = LoopsConfig(), KeyframePoses()
     memory = PlaceDatabase(config.words.count, "two_stage", RetrievalConfig(count=SUBGRAPHS))
@@ -89,7 +89,7 @@ def coarse_ms(repeats: int = 20) -> float:
 
 
 def tracked(sequence: Sequence, model: str) -> list[Taken]:
-    """What the loop closer would be given."""
+    """Return the messages that the loop closer receives for a sequence."""
     config = load_config()
     parameters = actor_parameters(config)
     taken: list[Taken] = []
@@ -163,7 +163,7 @@ def main() -> None:
     parser.add_argument("--stages", nargs="*", default=STAGES, choices=STAGES)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    print(f"coarse: {coarse_ms():.2f} ms CPU among {SUBGRAPHS} subgraphs\n")
+    print(f"place database: {coarse_ms():.2f} ms CPU per query of {SUBGRAPHS} subgraphs\n")
     print("| source | stages | candidates | retrieved | closures | precision | closed ", end="")
     print("| recall | cm p50 / max | deg p50 / max | CPU ms p50 / p95 |\n|" + "---|" * 11)
     for source in arguments.sources or default_sources():

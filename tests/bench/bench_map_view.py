@@ -1,12 +1,12 @@
-"""Tracking against depth as the map shows it, beside tracking against the sensor's own.
+"""Tracking against depth rendered from the map, compared with depth of the sensor.
 
     python tests/bench/bench_map_view.py [SOURCE ...] [--frames N]
 
 SOURCE: data sets or synthetic sequences; default: tum/kitchen and replica/apartment_floor1 in
-LDO_DATA, and synthetic:flat. The map is that of the mapper, grown and fitted at each keyframe
-before the next frame is tracked, so that its view comes earlier than any service could send it. In
-a keyframe that is tracked against, the median depth of the map stands where the map is opaque and
-within 3 % of what the sensor measured; `mean` is half of each.
+LDO_DATA, and synthetic:flat. The mapper densifies and optimizes the map at each keyframe before the
+next frame is tracked. A rendering is therefore newer than in any service. In a reference keyframe
+the median depth of the map replaces that of the sensor where the map is opaque and within 3 % of
+it. `mean` is the mean of both.
 """
 
 import argparse
@@ -26,8 +26,8 @@ from ldo_service.tracking import Odometry, OdometryConfig, TrackingStatus
 from ldo_service.tracking.tracking_result import TrackedFrame
 from ldo_service.tracking.window import WindowConfig
 
-MIN_OPACITY, NEAR = 0.9, 0.03  # NEAR: share of the depth
-ITERATIONS = 10  # of the mapper, per keyframe
+MIN_OPACITY, NEAR = 0.9, 0.03  # NEAR is a fraction of the depth.
+ITERATIONS = 10  # Iterations of the mapper per keyframe.
 MODELS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray] | None] = {
     "sensor": None,
     "map": lambda of_map, _of_sensor: of_map,
@@ -36,7 +36,7 @@ MODELS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray] | None] = {
 
 
 class MapViewOdometry(Odometry):
-    """Odometry that tracks against keyframes with other depth than the sensor's."""
+    """Odometry that tracks against keyframes with depth rendered from the map."""
 
     def __init__(self, model: str) -> None:
         super().__init__(OdometryConfig(window=WindowConfig(measurements=0)))
@@ -69,7 +69,7 @@ class MapViewOdometry(Odometry):
 
 
 def _agrees(seen: Rendering, frame: RgbdFrame) -> np.ndarray:
-    """[H, W] bool: where the map is opaque and shows the surface that the sensor measured."""
+    """Return a mask [H, W] of where the map is opaque and agrees with the sensor's depth."""
     apart_m = np.abs(seen.median_depth_m - frame.depth_m)
     return (seen.opacity > MIN_OPACITY) & (frame.depth_m > 0) & (apart_m < NEAR * frame.depth_m)
 
@@ -77,7 +77,7 @@ def _agrees(seen: Rendering, frame: RgbdFrame) -> np.ndarray:
 def row(sequence: Sequence, frames: int, model: str) -> str:
     truth = sequence.truth()
     if truth is None:
-        raise SystemExit(f"{sequence.name} has no true trajectory to compare with.")
+        raise SystemExit(f"{sequence.name} has no true trajectory to evaluate against.")
     odometry, poses, trusted = MapViewOdometry(model), [], 0
     for index in range(frames):
         result = odometry.process(sequence[index])
@@ -99,7 +99,9 @@ def main() -> None:
     parser.add_argument("sources", nargs="*", metavar="SOURCE")
     parser.add_argument("--frames", type=int, default=120)
     arguments = parser.parse_args()
-    print("| source | frames | depth of keyframes | ATE RMSE cm | trusted |\n|---|---|---|---|---|")
+    print(
+        "| source | frames | depth of keyframes | ATE RMSE cm | status OK |\n|---|---|---|---|---|"
+    )
     for source in arguments.sources or default_sources():
         sequence = open_sequence(source)
         for model in MODELS:

@@ -1,12 +1,12 @@
-"""Time of a keyframe's objects, and of looking one up: 1000 objects, 100 000 Gaussians in view.
+"""Time of the object steps of a keyframe and of a text search: 1000 objects, 100,000 Gaussians.
 
     python tests/bench/bench_objects.py [--in-view 60] [--regions 20] [--repeats 30]
 
-Rooms in a row, each with a wall and `in-view` things of 400 Gaussians; every thing is an object.
-Then the first room is seen again, with `regions` of its things detected; all objects are derived
-anew, as after a correction, and told. CPU ms of this thread, the
-median and the least; `assign_gaussians` of the same Gaussians is measured beside it, to compare
-with where other work slows both. The search is for a class of COCO in the 1000 objects.
+The scene is a row of rooms with a wall in the first one. Each room has `in-view` objects of 400
+Gaussians. Then a keyframe observes the first room again, with `regions` of its objects detected.
+All objects are computed again, as after a correction, and published. Times are CPU ms of this
+thread, median and minimum. `assign_gaussians` of the same Gaussians is measured for comparison on a
+busy machine. The search looks for a COCO class among the 1000 objects.
 """
 
 import argparse
@@ -32,7 +32,7 @@ ROOM_M, AWAY_M = 20.0, 3.0
 
 
 class Rooms:
-    """Gaussians of things, those of a thing together, and of the first room's wall."""
+    """Gaussians of the objects, one object after the other, and of the wall of the first room."""
 
     def __init__(self, in_view: int) -> None:
         rng, side = np.random.default_rng(0), int(np.ceil(np.sqrt(in_view)))
@@ -93,7 +93,7 @@ def main() -> None:
             objects.observe(rooms.view(room, 64, keyframe))
             keyframe += 1
     view = rooms.view(0, given.regions, keyframe)
-    print(f"{len(objects)} objects, {len(view.indices)} Gaussians in view; ms, median and least")
+    print(f"{len(objects)} objects, {len(view.indices)} Gaussians in view; ms, median and minimum")
     depth, regions = view.depth_m, Regions.of_boxes(view.boxes, np.ones(len(view.boxes)))
     look = rooms.rows, view.indices, CAMERA, se3.inverse(view.T_map_camera), depth, regions
     print(
@@ -111,14 +111,14 @@ def main() -> None:
     told = milliseconds(
         lambda _: encode(ObjectPublisher().message(objects, names, 0, 0, 0)), given.repeats
     )
-    print("tell   ", told)
+    print("publish", told)
     teller = ObjectPublisher()
 
     def observe_and_tell(number: int) -> None:
         observe(given.repeats + number)
         encode(teller.message(objects, names, 0, 0, 0))
 
-    print("observe and tell", milliseconds(observe_and_tell, given.repeats))
+    print("observe and publish", milliseconds(observe_and_tell, given.repeats))
     found = ObjectPublisher().message(objects, names, 0, 0, 0).objects
     print("search ", milliseconds(lambda n: search(COCO[n], _named(found)), given.repeats))
 

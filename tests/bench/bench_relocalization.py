@@ -1,13 +1,13 @@
-"""Single frames looked for in maps of their own and of other places.
+"""Relocalization of single frames in the map of their own and of other sequences.
 
     OMP_NUM_THREADS=1 python tests/bench/bench_relocalization.py [SOURCE ...] [--every N]
 
 SOURCE: data sets or synthetic sequences; default: tum/kitchen in LDO_DATA, and synthetic:flat.
-Each is tracked once, and its keyframes are the places of its map. Every N-th frame of each source
-is then looked for once in each map; in that of its own source, places within 30 frames of it are
-left out. What is found is right within 10 cm and 5 degrees of the truth between frame and keyframe
-(the kitchen's truth is 3 cm off itself) and false otherwise; in another source's map all finds are
-false. CPU time is that of the search, with the pyramid of the frame.
+Each source is tracked once, and its keyframes form its keyframe database. Every N-th frame of each
+source is then searched once in each database. In the database of its own source, keyframes within
+30 frames are excluded. A result is right within 10 cm and 5 degrees of the true pose between frame
+and keyframe; the kitchen's ground truth has an error of 3 cm. In the map of another source every
+result is false. CPU time is that of the search, with the pyramid of the frame.
 """
 
 import argparse
@@ -37,7 +37,7 @@ SEARCH = Relocalizer(
 
 @dataclass(frozen=True)
 class Mapped:
-    """A sequence with the places along it, whose ids are frame indices."""
+    """Sequence with its keyframe database; record ids are frame indices."""
 
     sequence: Sequence
     places: KeyframeDatabase
@@ -51,10 +51,12 @@ class Mapped:
 
 @dataclass
 class Tally:
-    """Of the frames of one source in one map."""
+    """Results of the frames of one source in the map of one source."""
 
     queries: int = 0
-    errors: list[tuple[float, float]] = field(default_factory=list)  # m, rad; inf: another source
+    errors: list[tuple[float, float]] = field(
+        default_factory=list
+    )  # Meters and radians; inf in the map of another source.
     times_ms: list[float] = field(default_factory=list)
 
     @property
@@ -92,7 +94,7 @@ def mapped(source: str) -> Mapped:
 def search(
     frame: RgbdFrame, places: KeyframeDatabase, turn: int, history: ResidualHistory, tally: Tally
 ):
-    """(frame index of the keyframe, T_keyframe_camera), or None."""
+    """Return the frame index of the found keyframe and T_keyframe_camera, or None."""
     start_s = time.process_time()
     found = SEARCH.find(pyramid_of(frame, CONFIG.pyramid), places, turn, history)
     tally.times_ms.append(1e3 * (time.process_time() - start_s))
@@ -101,7 +103,7 @@ def search(
 
 
 def true_poses(sequence: Sequence) -> np.ndarray:
-    """T_world_camera [F, 4, 4] of each frame: the nearest stamp's."""
+    """Return T_world_camera [F, 4, 4] of all frames, by the nearest stamp."""
     truth = sequence.truth()
     assert truth is not None, f"{sequence.name} has no ground truth"
     gaps_s = np.abs(truth.stamps_s[None] - 1e-9 * sequence.stamps_ns[:, None])
@@ -140,7 +142,7 @@ def main() -> None:
     for model in models:
         sizes = [place.nbytes for place in model.places.all]
         name, kilobytes = model.sequence.name, np.mean(sizes) / 1e3
-        print(f"{name}: {len(sizes)} places of {kilobytes:.0f} kB on average")
+        print(f"{name}: {len(sizes)} keyframe records of {kilobytes:.0f} kB on average")
     print("\n| frames of | in the map of | searched | found | right | false ", end="")
     print("| error cm p50 | max | CPU ms p50 | p95 |\n|" + "---|" * 10)
     for model in models:

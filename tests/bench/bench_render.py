@@ -1,17 +1,18 @@
-"""Time of one iteration of the optimiser, and against the prototype that set the bar.
+"""Time of one iteration of the Gaussian optimizer, compared with the prototype.
 
     LDO_SKETCHES=.../sketches python tests/bench/bench_render.py [--repeats 30] [--threads 1]
 
-Without LDO_SKETCHES the prototype is left out. Both run in turns in this process, so that other
-work on the machine slows both: read the ratio, not the milliseconds. The prototype is compiled
-here with the flags of its README, and the instruction sets are matched through LDO_ISA: for AVX2
-it is compiled for a machine that has no more, where `-march=native` would lend it the 32 registers
-and the masks of AVX-512 on a machine that has those.
+Without LDO_SKETCHES only our code runs. Both run in turns in this process, so that other work on
+the machine slows both: read the ratio, not the milliseconds. The prototype is compiled here with
+the flags of its README, for the instruction set that LDO_ISA selects. For AVX2 it is compiled
+without AVX-512, as `-march=native` would give it the 32 registers and masks of AVX-512 where they
+exist.
 
-`render` is what the service shows: colour, depth, median depth, opacity. The other rows are one
-iteration: forward (no median), loss with its derivative, descent (backward to the parameters and
-the pose, with a step of Adam). The prototype's loss is given the windowed means of the frame, which
-ours computes. `ldo bench render` measures the same scene and steps without a prototype.
+`render` is the rendering of the service: color, depth, median depth and opacity. The other rows are
+the steps of one iteration: forward (no median), loss with its derivative, and descent. Descent is
+the backward pass to the parameters and the pose, with a step of Adam. The prototype's loss receives
+the windowed means of the frame, which ours computes. `ldo bench render` measures the same scene and
+steps without a prototype.
 """
 
 import argparse
@@ -44,7 +45,7 @@ BETA1, BETA2, EPSILON = 0.9, 0.95, 1e-15
 
 
 def aligned(shape: tuple[int, ...]) -> np.ndarray:
-    """Zeros, float32, on a cache line."""
+    """Return float32 zeros that start on a cache line."""
     memory = np.zeros(int(np.prod(shape)) + 16, np.float32)
     skip = (-memory.ctypes.data % 64) // 4
     return memory[skip : skip + int(np.prod(shape))].reshape(shape)
@@ -124,17 +125,19 @@ def prototype(library: ctypes.CDLL, rows: np.ndarray, view: Camera, threads: int
 
 
 def check_agreement(mine: Steps, theirs: Steps) -> None:
-    """Leave if the two compute something else: then the times mean nothing."""
+    """Exit if the two compute different results, as their times are then not comparable."""
     for name, tolerance in (("render", 1e-3), ("forward", 2e-3), ("loss", 1e-8)):
         a, b = mine[name](), theirs[name]()
         assert isinstance(a, np.ndarray)
         assert isinstance(b, np.ndarray)
-        if name == "forward":  # the prototype's last plane is the transmittance
+        if name == "forward":  # The prototype's last plane is the transmittance.
             a, b = a[:4], b[:4]
-        if name == "loss":  # its depth loss counts the pixels without depth
+        if name == "loss":  # The prototype's depth loss counts pixels without depth.
             a, b = a[:3], b[:3]
         if np.abs(a - b).mean() > tolerance:
-            sys.exit(f"the two differ in {name}: the times mean nothing.")
+            sys.exit(
+                f"the results of {name} differ by more than {tolerance}; times are not comparable."
+            )
 
 
 def report(n: int, size: str, mine: dict[str, float], theirs: dict[str, float] | None) -> None:
@@ -148,8 +151,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--sizes", type=int, default=len(SIZES), help="how many of the scenes")
-    parser.add_argument("--cpu", action="store_true", help="CPU time, for a busy machine")
+    parser.add_argument("--sizes", type=int, default=len(SIZES), help="number of scenes to run")
+    parser.add_argument("--cpu", action="store_true", help="measure CPU time, for a busy machine")
     arguments = parser.parse_args()
     isa, threads = _rasterize.isa(), arguments.threads
     clock = time.process_time if arguments.cpu else time.perf_counter
@@ -170,7 +173,7 @@ def main() -> None:
 
 
 def time_the_twin() -> None:
-    """The plain twin beside the kernel, at a size where it takes a second or so."""
+    """Print the times of the kernel and of the NumPy reference for a small image."""
     iteration = Iteration(300, bench_camera(48, 36))
     rows, camera = iteration.gaussians.rows, iteration.camera
     runs: list[Steps] = [
@@ -178,7 +181,7 @@ def time_the_twin() -> None:
         {"render": lambda: render_reference(rows.astype(float), camera, np.eye(4))},
     ]
     kernel, twin = medians_ms(runs, repeats=3)
-    both = f"kernel {kernel['render']:.2f} ms, plain twin {twin['render']:.0f} ms"
+    both = f"kernel {kernel['render']:.2f} ms, NumPy reference {twin['render']:.0f} ms"
     print(f"300 Gaussians, 48x36: {both}")
 
 

@@ -1,9 +1,9 @@
-"""How fast lossless links are, and how soon a killed consumer lets go.
+"""Throughput of lossless links, and the time until a killed consumer releases its producer.
 
     python tests/bench/bench_runtime.py
 
-Producer and consumer have sessions of their own to a router on loopback; the consumer that gets
-killed is a process. The first figure's ideal is the time the consumer computes.
+Producer and consumer have sessions of their own to a router on loopback. The consumer to be killed
+is a process. The ideal of the total time is the computing time of the consumer.
 """
 
 import asyncio
@@ -75,7 +75,7 @@ async def throughput(network: Endpoint) -> Throughput:
 
 
 async def release_ms(network: Endpoint) -> float:
-    """From the kill of a consumer that holds the window to the next message's leaving."""
+    """Return the time from the kill of a consumer with a full window to the next sent message."""
     with open_session(network) as session:
         outlet = Outlet(Out(BLOCKS), "producer", 1, ZenohTransport(session, network))
         child = subprocess.Popen([sys.executable, __file__, "--stuck-consumer", network.endpoint])
@@ -122,16 +122,14 @@ async def main() -> None:
         releases = sorted([await release_ms(network) for _ in range(5)])
     best = min(runs, key=lambda run: run.total_s)
     mb = MESSAGE_BYTES / 1e6
-    print(f"{MESSAGES} messages of {mb:g} MB, {1e3 * STEP_S:g} ms a step, window {WINDOW}")
-    print("| figure | value |\n|---|---|")
+    print(f"{MESSAGES} messages of {mb:g} MB, {1e3 * STEP_S:g} ms per step, window {WINDOW}")
+    print("| measure | value |\n|---|---|")
     print(f"| total, 3 runs | {', '.join(f'{run.total_s:.2f} s' for run in runs)} |")
     print(f"| ideal | {MESSAGES * STEP_S:.2f} s |")
     print(f"| deepest queue | {max(run.deepest for run in runs)} |")
     print(f"| memory growth | {max(run.growth_mb for run in runs):.0f} MB |")
-    print(f"| sent again | {best.repeated} |")
-    print(
-        f"| killed consumer lets go, median of 5 | {releases[2]:.1f} ms (worst {releases[4]:.1f}) |"
-    )
+    print(f"| retransmitted | {best.repeated} |")
+    print(f"| release after a kill, median of 5 | {releases[2]:.1f} ms (max {releases[4]:.1f}) |")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""What strangers and careless programs may try, what must come of it, and what does.
+"""Table of attacks on the service, with the expected and the observed result.
 
     python -m tests.bench.bench_security
 
-The attempts are those of `tests/security`, where they decide; here they are a table.
+The attempts are those of the tests in `tests/security`.
 """
 
 import sys
@@ -24,7 +24,7 @@ def row(attempt: Attempt[Where], where: Where) -> bool:
 
 
 def main() -> None:
-    print("| attempt | expected | seen |\n|---|---|---|")
+    print("| attempt | expected | observed |\n|---|---|---|")
     results = []
     with tempfile.TemporaryDirectory() as folder:
         with lab(Path(folder) / "keys") as here:

@@ -1,12 +1,12 @@
-"""Time of labelling one keyframe: 100 000 Gaussians in view, one thread, and against the twins.
+"""Time of labelling one keyframe with 100,000 Gaussians, compared with the NumPy reference.
 
     python tests/bench/bench_semantics.py [--gaussians 100000] [--repeats 15]
 
-A wall at 3 m with twelve things before it, a quarter of the image, as surfels at random pixels of
-640x480; each thing has a box. CPU ms of this thread, the median; the whole is one call of
-`label_keyframe`, from boxes and depth to labels, whose steps do not find in the cache what they
-left there the last time. The twins run in the same process, those of Gaussians on every 100th: read
-the ratio of equal work, where other work slows both.
+The scene has a wall at 3 m and twelve objects in front of it that cover a quarter of the image. Its
+Gaussians are surfels at random pixels of 640x480, and each object has a box. Times are median CPU
+ms of this thread. The whole is one call of `fuse_detections`, from boxes and depth to labels,
+without data of the previous call in the cache. The references run in the same process, those over
+Gaussians on every 100th one. On a busy machine read the ratio, which is for equal work.
 """
 
 import argparse
@@ -43,7 +43,7 @@ SIDE_PX, MARGIN_PX = 80, 10
 
 
 def scene(n: int) -> tuple[np.ndarray, np.ndarray, RegionDetections]:
-    """Rows [n, 16], depth [H, W], and what is claimed."""
+    """Return rows [n, 16], depth [H, W] and the detections."""
     rng, depth_m = np.random.default_rng(0), np.full((480, 640), 3.0, np.float32)
     corners = [(60 + 150 * k, 40 + 150 * j) for j in range(3) for k in range(4)]
     for k, (u, v) in enumerate(corners):
@@ -74,10 +74,10 @@ class Step:
     name: str
     ours: Callable[[], object]
     twin: Callable[[], object] | None = None
-    share: float = 1.0  # of our work, that the twin does
+    share: float = 1.0  # Fraction of our work that the reference does.
 
     def told(self, repeats: int) -> float:
-        """Prints a line of the table; ms."""
+        """Print a line of the table and return the time in ms."""
         ms = cpu_ms(self.ours, repeats)
         ratio = f"{cpu_ms(self.twin, 3) / self.share / ms:.0f}x" if self.twin else ""
         print(f"| {self.name} | {ms:.2f} | {ratio} |", flush=True)
@@ -89,7 +89,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=100_000)
     parser.add_argument("--repeats", type=int, default=15)
     arguments = parser.parse_args()
-    cv2.setNumThreads(1)  # so that the CPU time of this thread is all that a twin takes
+    cv2.setNumThreads(1)  # This thread then has all CPU time of a reference.
     n, repeats = arguments.gaussians, arguments.repeats
     rows, depth_m, claims = scene(n)
     labels, indices, T = new_labels(n), np.arange(n, dtype=np.uint32), np.eye(4)
@@ -108,7 +108,7 @@ def main() -> None:
     where_few = assign_gaussians(rows, few, CAMERA, T, depth_m, regions, CONFIG.assignment)
     seen_few = observations(where_few, few, CAMERA, claims, CONFIG)
     view = CAMERA, T, depth_m, claims.boxes, claims.scores(), masks, CONFIG.assignment
-    # labels of its own: `smooth_labels` alone, again and again, spreads those of the steps
+    # The whole has its own labels: repeated calls of `smooth_labels` spread those of the steps.
     keyframe = rows, new_labels(n), indices, CAMERA, T, depth_m, claims, CONFIG
     steps = [
         Step("surfaces", lambda: surfaces(*image), lambda: surfaces_reference(*image)),
@@ -138,9 +138,9 @@ def main() -> None:
             0.01,
         ),
     ]
-    print(f"{n} Gaussians, {len(touched)} seen, {np.mean(seen.labels >= 0):.0%} in regions")
-    print("| step | ms | the twin, of equal work |\n|---|---|---|")
-    print(f"| together | {sum(step.told(repeats) for step in steps):.2f} | |")
+    print(f"{n} Gaussians, {len(touched)} observed, {np.mean(seen.labels >= 0):.0%} in regions")
+    print("| step | ms | reference, for equal work |\n|---|---|---|")
+    print(f"| sum | {sum(step.told(repeats) for step in steps):.2f} | |")
     Step("whole", lambda: fuse_detections(*keyframe)).told(repeats)
 
 

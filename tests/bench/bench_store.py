@@ -1,8 +1,8 @@
-"""Milliseconds and bytes of keyframes, and of anchors' Gaussians that sleep, on disk.
+"""Time and size of keyframes and of offloaded Gaussians on disk.
 
 python tests/bench/bench_store.py [SOURCE] [--keyframes 50] [--stride 10] [--active N] [--folder F]
 
-CPU milliseconds of one thread, medians; the disk's own time shows in the wall column.
+Times are median CPU milliseconds of one thread; the wall column includes the time of the disk.
 """
 
 import argparse
@@ -31,7 +31,7 @@ def timed_ms(do: Callable[[], object]) -> tuple[float, float]:
 def report(what: str, times_ms: list[tuple[float, float]]) -> None:
     cpu_ms, wall_ms = np.median(times_ms, axis=0)
     worst_ms = max(wall for _, wall in times_ms)
-    print(f"{what:>12} {cpu_ms:8.2f} ms CPU {wall_ms:8.2f} ms wall, worst {worst_ms:.2f}")
+    print(f"{what:>12} {cpu_ms:8.2f} ms CPU {wall_ms:8.2f} ms wall, max {worst_ms:.2f}")
 
 
 def bench_keyframes(source: str, count: int, stride: int, folder: Path) -> None:
@@ -39,15 +39,15 @@ def bench_keyframes(source: str, count: int, stride: int, folder: Path) -> None:
     frames = [sequence[i] for i in range(0, len(sequence), stride)][:count]
     images = [KeyframeImages.of(TrainingView.of(f, np.eye(4), k)) for k, f in enumerate(frames)]
     memory_mb = sum(one.nbytes for one in images) / 1e6
-    store = KeyframeStore(folder, KeyframeStoreConfig(cache_mb=memory_mb / 2))  # too little for all
+    store = KeyframeStore(folder, KeyframeStoreConfig(cache_mb=memory_mb / 2))  # Too small for all.
     puts = [timed_ms(lambda one=one: store.put(one)) for one in images]
     gets = [timed_ms(lambda one=one: store.get(one.keyframe)) for one in images]
     if store.metrics()["keyframes_read"] < len(images):
-        sys.exit("some came from memory: the times mean nothing.")
+        sys.exit("some keyframes were read from the cache, which is faster; use more keyframes.")
     for one in images:
         got = store.get(one.keyframe)
         if got is None or got.depth_m.tobytes() != one.depth_m.tobytes():
-            sys.exit(f"keyframe {one.keyframe} did not come back: the times mean nothing.")
+            sys.exit(f"keyframe {one.keyframe} differs after reading; the store is broken.")
     disk_mb = store.metrics()["keyframes_disk_mb"]
     print(f"{source}: {len(images)} keyframes of {sequence.camera.width}x{sequence.camera.height}")
     report("put", puts)
@@ -59,7 +59,7 @@ def bench_keyframes(source: str, count: int, stride: int, folder: Path) -> None:
 
 
 def bench_sleep(source: str, count: int, stride: int, active: int, folder: Path) -> None:
-    """A map of `active` Gaussians: those of the first keyframes, at true poses, over and over."""
+    """Measure offloading in a map of `active` Gaussians, repeated from the first keyframes."""
     rows, anchors, poses = mapped(source, count, stride)
     times = -(-active // len(rows))
     gaussians = GaussianMap(active)
@@ -75,17 +75,17 @@ def bench_sleep(source: str, count: int, stride: int, active: int, folder: Path)
 
     report("spheres", [timed_ms(spheres)])
     report(
-        "half sleep",
+        "offload half",
         [timed_ms(lambda: sleeping.offload_from(gaussians, gaussians.anchors, asleep))],
     )
     chunks, memory_mb = len(sleeping.numbers()), len(sleeping) * 64 / 1e6
     disk_mb = sum(file.stat().st_size for file in folder.iterdir()) / 1e6
     camera = PlacedCamera(open_sequence(source).camera, poses[0])
     sleeping.visible_chunks(camera)
-    report("who is seen", [timed_ms(lambda: sleeping.visible_chunks(camera)) for _ in range(9)])
-    report("half wake", [timed_ms(lambda: sleeping.load_into(gaussians, sleeping.numbers()))])
+    report("visibility", [timed_ms(lambda: sleeping.visible_chunks(camera)) for _ in range(9)])
+    report("load half", [timed_ms(lambda: sleeping.load_into(gaussians, sleeping.numbers()))])
     if gaussians.rows.tobytes() != before.tobytes():
-        sys.exit("the Gaussians did not come back: the times mean nothing.")
+        sys.exit("the Gaussians differ after loading; offloading is broken.")
     print(
         f"{chunks} chunks of {1e3 * memory_mb / chunks:.0f} kB in memory, "
         f"{memory_mb / disk_mb:.2f} to 1 on disk"
@@ -95,7 +95,7 @@ def bench_sleep(source: str, count: int, stride: int, active: int, folder: Path)
 def mapped(
     source: str, count: int, stride: int
 ) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
-    """Rows and anchors of the Gaussians of the first keyframes, and where those stood."""
+    """Return rows and anchors of the Gaussians of the first keyframes, and the true poses."""
     sequence = open_sequence(source)
     truth, gaussians, poses = sequence.truth(), GaussianMap(), {}
     if truth is None:
@@ -114,7 +114,7 @@ def main() -> None:
     parser.add_argument("--keyframes", type=int, default=50)
     parser.add_argument("--stride", type=int, default=10, help="frames between two keyframes")
     parser.add_argument("--active", type=int, default=1_500_000, help="Gaussians in the map")
-    parser.add_argument("--folder", type=Path, help="on the disk to measure")
+    parser.add_argument("--folder", type=Path, help="folder on the disk to measure")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         chosen = arguments.source, arguments.keyframes, arguments.stride

@@ -1,13 +1,14 @@
-"""Our odometry beside OpenCV's, small_gicp's and Open3D's, on the same frames, one thread each.
+"""Our odometry compared with OpenCV, small_gicp and Open3D on the same frames, one thread each.
 
     python -m tests.bench.bench_tracking [SOURCE] [--frames N] [--stride N] [--json]
         [--without NAME ...]
 
 SOURCE: a data set or synthetic sequence; default: tum/kitchen in LDO_DATA, else synthetic:tour.
-ATE and RPE as `ldo eval` has them, over all frames, found or not. Trusted: what the method itself
-says of a frame. Time: CPU ms per frame of the whole process, decoding excluded; each frame is
-given to all methods in turn, so other load on the machine meets all alike. `tracking_peers.py`
-says what each peer is. `keyframe graph`: our frames again, on the optimizer's final poses.
+ATE and RPE are those of `ldo eval`, over all frames, tracked or lost. `trusted` is the fraction of
+frames that the method itself reports as tracked. Time is CPU ms per frame of the whole process,
+without decoding. Each frame goes to all methods in turn, so that other load affects all equally.
+`tracking_peers.py` describes each peer. `keyframe graph` has our frames on the pose-graph
+optimizer's final keyframe poses.
 """
 
 import argparse
@@ -35,7 +36,7 @@ from ldo_service.tracking import Odometry, OdometryConfig, TrackingStatus
 from ldo_service.tracking.window import WindowConfig
 from tests.bench.tracking_peers import Step, peers
 
-WARM_UP = 5  # frames left out of the times
+WARM_UP = 5  # First frames, which the times exclude.
 OURS = "ours"
 HEADER = """\
 | | ATE RMSE cm | RPE 1 s cm | deg | trusted % | CPU ms p50 | p95 |
@@ -44,7 +45,7 @@ HEADER = """\
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One method over one sequence."""
+    """Results of one method on one sequence."""
 
     method: str
     ate_cm: float
@@ -71,7 +72,7 @@ class Row:
 
 @dataclass(slots=True)
 class Runner:
-    """A method, and what it gave so far."""
+    """Method with its results so far."""
 
     step: Step
     T_world_camera: list[np.ndarray] = field(default_factory=list)
@@ -98,7 +99,7 @@ class Runner:
 
 
 def ours() -> Step:
-    """Track as the service does: every keyframe is allowed. The pose graph's window is left out."""
+    """Return our tracking as in the service, without the window measurements of the pose graph."""
     odometry = Odometry(OdometryConfig(window=WindowConfig(measurements=0)))
 
     def step(frame: RgbdFrame) -> tuple[np.ndarray, bool]:
@@ -121,7 +122,7 @@ def measure(
 
 
 def corrected(sequence: Sequence, indices: range) -> Trajectory:
-    """T_map_camera of our tracker's frames, hung on the optimizer's last keyframe poses."""
+    """Return T_map_camera of our tracker's frames on the optimizer's last keyframe poses."""
     tracker, optimizer = Tracker(), Optimizer()
     poses: list[TrackedPose] = []
     T_map: dict[int, np.ndarray] = {}
@@ -140,7 +141,7 @@ def corrected(sequence: Sequence, indices: range) -> Trajectory:
 
 
 def _reference(pose: TrackedPose) -> int:
-    """The first frame is the first keyframe, which refers to itself."""
+    """Return the reference keyframe of a pose; the first keyframe refers to itself."""
     return pose.keyframe or 0 if pose.reference is None else pose.reference
 
 
@@ -150,7 +151,7 @@ def default_source() -> str:
 
 
 def on_one_thread() -> None:
-    """Start anew with one thread of OpenMP and BLAS, which read this when they are loaded."""
+    """Restart the program with one thread of OpenMP and BLAS, which read this when loaded."""
     if os.environ.get("OMP_NUM_THREADS") != "1":
         os.execve(
             sys.executable, [sys.executable, *sys.argv], os.environ | {"OMP_NUM_THREADS": "1"}
@@ -163,7 +164,9 @@ def main() -> None:
     parser.add_argument("source", nargs="?", default=default_source())
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--stride", type=int, default=1)
-    parser.add_argument("--without", nargs="*", default=[], help="leave out methods named so")
+    parser.add_argument(
+        "--without", nargs="*", default=[], help="skip methods with this text in their name"
+    )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     on_one_thread()
@@ -171,7 +174,7 @@ def main() -> None:
     indices = range(len(sequence))[: arguments.frames : arguments.stride]
     truth = sequence.truth()
     if truth is None:
-        parser.error(f"{sequence.name} has no ground truth: nothing to compare with.")
+        parser.error(f"{sequence.name} has no ground truth to evaluate against.")
     chosen = [(OURS, ours())]
     for name, step in peers(sequence.camera):
         if not any(word in name for word in arguments.without):

@@ -1,13 +1,13 @@
-"""What a window that nobody looks at costs a service that has more frames than it can handle.
+"""Cost of an unwatched viewer window for a service with more frames than it can handle.
 
     python -m tests.bench.bench_viewer [SOURCE] [--pairs N] [--rate HZ] [--frames N]
 
-SOURCE: default tum/kitchen in LDO_DATA, else synthetic:room. A service, a camera and a viewer, in
-processes of their own. Each round begins with an empty map and is sent the same frames, by default
-faster than they can be handled; a pair is a round with the viewer connected, its window open and no
-browser, and one without, in turn the one or the other first. CPU time is that of the service's
-processes, per frame that it handled, and that of the viewer's. On a machine that does other things
-`--rate 2 --frames 60` says more: the same frames are handled in every round, and CPU time counts.
+SOURCE: default tum/kitchen in LDO_DATA, else synthetic:room. Service, camera and viewer run in
+processes of their own. Each round starts with an empty map and the same frames, by default faster
+than the service can handle them. A pair is a round with the viewer connected, its window open and
+no browser, and a round without; the order alternates. The output has CPU time of the service per
+handled frame, and CPU time of the viewer. On a busy machine use `--rate 2 --frames 60`: then every
+round handles the same frames, and the CPU times are comparable.
 """
 
 import argparse
@@ -34,19 +34,19 @@ from ldo_service.viewer.window import open_window
 from tests.service.conftest import LiveService, live_service
 
 TICKS = os.sysconf("SC_CLK_TCK")
-DETAILS = 8192  # poses that are kept until they are counted
+DETAILS = 8192  # Poses that the inbox holds until they are counted.
 CONFIG = ViewerConfig(port=0)
 
 
 @dataclass(frozen=True)
 class Round:
     poses_hz: float
-    cpu_ms: float  # of the service, per frame handled
-    viewer_share: float  # CPU seconds of the viewer per second
+    cpu_ms: float  # CPU time of the service per handled frame.
+    viewer_share: float  # CPU seconds of the viewer per second.
 
 
 def look(endpoint: str, wanted: Event, is_ready: Event) -> None:
-    """The viewer's process: connected while it is wanted."""
+    """Run the viewer's process, connected while `wanted` is set."""
     while wanted.wait():
         with (
             connect("robot", endpoint) as service,
@@ -68,7 +68,7 @@ class Frames:
 
 
 def send(endpoint: str, frames: Frames, wanted: Event) -> None:
-    """The camera's process: the frames once, whenever it is wanted."""
+    """Run the camera's process, which sends all frames once each time `wanted` is set."""
     sequence = open_sequence(frames.source)
     messages = [raw_frame_to_message(sequence.read(index)) for index in range(frames.count)]
     with connect("robot", endpoint) as service:
@@ -81,7 +81,7 @@ def send(endpoint: str, frames: Frames, wanted: Event) -> None:
 
 
 def measured(service: LiveService, client: Client, sending: Event, viewer_pid: int) -> Round:
-    """One round on an empty map."""
+    """Measure one round on an empty map."""
     assert client.control("reset").ok
     pids = family(service.process.pid)
     with client.poller(POSE_TRACKED.name, TrackedPose, keep=DETAILS) as inbox:
@@ -97,7 +97,7 @@ def measured(service: LiveService, client: Client, sending: Event, viewer_pid: i
 
 
 def family(pid: int) -> list[int]:
-    """The process and those that it started."""
+    """Return the ids of a process and of its descendants."""
     children = Path(f"/proc/{pid}/task").glob("*/children")
     started = [int(word) for file in children for word in file.read_text().split()]
     return [pid, *(one for child in started for one in family(child))]
@@ -109,7 +109,7 @@ def cpu_s(pids: list[int]) -> float:
 
 
 def pairs_of(count: int, frames: Frames) -> list[tuple[Round, Round]]:
-    """(with, without)"""
+    """Return pairs of rounds, with and without the viewer."""
     context, pairs = multiprocessing.get_context("spawn"), []
     wanted, is_ready, sending = context.Event(), context.Event(), context.Event()
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
@@ -122,7 +122,7 @@ def pairs_of(count: int, frames: Frames) -> list[tuple[Round, Round]]:
             stack.callback(process.kill)
         client = stack.enter_context(connect("robot", service.endpoint))
         assert viewer.pid is not None
-        for number in range(-1, count):  # the first pair warms up
+        for number in range(-1, count):  # The first pair is for warm-up.
             rounds = {}
             for has_viewer in (True, False) if number % 2 else (False, True):
                 (wanted.set if has_viewer else wanted.clear)()
@@ -156,7 +156,7 @@ def main() -> None:
     frames = Frames(arguments.source, arguments.frames, arguments.rate)
     pairs = pairs_of(arguments.pairs, frames)
     with_, without = ([pair[side] for pair in pairs] for side in (0, 1))
-    print("| median (quartiles) | without | with | with / without, by pairs |\n|---|---|---|---|")
+    print("| median (quartiles) | without | with | with / without, per pair |\n|---|---|---|---|")
     for name, of in (
         ("frames handled, Hz", lambda one: one.poses_hz),
         ("CPU of the service per frame, ms", lambda one: one.cpu_ms),
@@ -165,7 +165,7 @@ def main() -> None:
         cells = (quartiles([of(one) for one in rounds]) for rounds in (without, with_))
         print(f"| {name} | {' | '.join(cells)} | {quartiles(ratios)} |")
     shares = (quartiles([one.viewer_share for one in rounds]) for rounds in (without, with_))
-    print(f"| CPU of the viewer, of a core | {' | '.join(shares)} | |")
+    print(f"| CPU of the viewer, fraction of a core | {' | '.join(shares)} | |")
 
 
 if __name__ == "__main__":

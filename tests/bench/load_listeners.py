@@ -1,8 +1,9 @@
-"""Subscribers in one process, for bench_load: arguments endpoint, count, kind (quick, slow, dead).
+"""Subscribers of bench_load in one process: arguments endpoint, count, kind (quick, slow, dead).
 
-Each has a session of its own and subscribes to poses, map and health of all robots. A slow one
-sleeps a second at each message, in the callback, so that its receive buffers fill up; a dead one is
-stopped by bench_load. When its input ends, a process of quick ones prints what came as JSON.
+Each subscriber has its own session and subscribes to poses, map and health of all robots. A slow
+one waits a second in each callback, so that its receive buffers fill up. bench_load stops the
+process of dead ones. At the end of its input, a process of quick ones prints its message counts as
+JSON.
 """
 
 import json

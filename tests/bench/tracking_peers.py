@@ -1,8 +1,8 @@
-"""Other people's odometry behind one call, each at its documented defaults, on one thread.
+"""Odometry of other libraries behind one interface, at documented defaults, on one thread.
 
-A peer is a `Step`: it takes the next frame and gives T_world_camera, and whether it says that it
-found it. Where a peer gives no pose, or one more than 1 m from the last, the pose stays as it was:
-otherwise some run away to infinity.
+A peer is a `Step`: it takes the next frame and returns T_world_camera, and True if it reports the
+frame as tracked. If a peer returns no pose, or one more than 1 m from the previous one, the pose
+stays the same; otherwise some diverge to infinity.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,33 +16,33 @@ import small_gicp
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
 Step = Callable[[RgbdFrame], tuple[np.ndarray, bool]]
-T = TypeVar("T")  # a frame made ready
-Found = tuple[np.ndarray, bool]  # T_previous_current, and whether it was found
+T = TypeVar("T")  # Prepared frame.
+Found = tuple[np.ndarray, bool]  # T_previous_current, and True if it was found.
 
-# small_gicp's defaults are for a lidar in a street: points 0.25 m apart, voxels of 1 m, partners
-# within 1 m. A room is smaller than a street by about 5.
+# small_gicp's defaults are for a lidar in a street: points 0.25 m apart, voxels of 1 m,
+# correspondences within 1 m. A room is about 5 times smaller than a street.
 STREET, ROOM = 1.0, 0.2
-FARTHEST_M = 1.0  # from frame to frame
+FARTHEST_M = 1.0  # Maximum motion between two frames.
 SPACING_M, VOXEL_M, REACH_M = 0.25, 1.0, 1.0
 
-OPEN3D_VOXEL_M, OPEN3D_BLOCKS = 3.0 / 512, 40_000  # of its dense SLAM example
-OPEN3D_DEPTH_MAX_M = 3.0  # its default
+OPEN3D_VOXEL_M, OPEN3D_BLOCKS = 3.0 / 512, 40_000  # Values of the dense SLAM example.
+OPEN3D_DEPTH_MAX_M = 3.0  # Default of Open3D.
 DEPTH_SCALE = 1000.0
 
 
 def peers(camera: Camera) -> Iterator[tuple[str, Step]]:
-    """Names and steps of all that are installed; what is not is said."""
+    """Yield names and steps of the installed peers, and print which are missing."""
     if hasattr(cv2, "Odometry"):
         yield "OpenCV RGB-D, frame to frame", opencv(camera)
     else:
-        print(f"OpenCV is left out: {cv2.__version__} has no cv2.Odometry.")
+        print(f"OpenCV is skipped: version {cv2.__version__} has no cv2.Odometry.")
     for scale, name in ((STREET, "defaults"), (ROOM, "a fifth of them")):
         yield f"small_gicp, frame to frame, {name}", gicp_frames(camera, scale)
         yield f"small_gicp, voxel map, {name}", gicp_voxels(camera, scale)
     try:
         import open3d  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        print(f"Open3D is left out ({error}): pip install --group bench.")
+        print(f"Open3D is skipped ({error}); install it with: pip install --group bench.")
         return
     yield "Open3D hybrid, frame to frame", open3d_frames(open3d, camera)
     yield "Open3D hybrid tensor, frame to frame", open3d_tensors(open3d, camera)
@@ -50,7 +50,7 @@ def peers(camera: Camera) -> Iterator[tuple[str, Step]]:
 
 
 def frame_to_frame(prepare: Callable[[RgbdFrame], T], align: Callable[[T, T], Found]) -> Step:
-    """Poses chained from `align(previous, current)`."""
+    """Return a step that chains the poses of `align(previous, current)`."""
     previous: list[T] = []
     T_world_camera = np.eye(4)
 
@@ -69,12 +69,12 @@ def frame_to_frame(prepare: Callable[[RgbdFrame], T], align: Callable[[T, T], Fo
 
 
 def is_possible(T_previous_current: np.ndarray) -> bool:
-    return bool(np.linalg.norm(T_previous_current[:3, 3]) < FARTHEST_M)  # False for NaN
+    return bool(np.linalg.norm(T_previous_current[:3, 3]) < FARTHEST_M)  # False for NaN.
 
 
 # --- OpenCV ---------------------------------------------------------------------------------------
 def opencv(camera: Camera) -> Step:
-    """cv2.Odometry with colour and depth."""
+    """Return cv2.Odometry with color and depth."""
     settings = cv2.OdometrySettings()
     settings.setCameraMatrix(camera.matrix.astype(np.float32))
     odometry = cv2.Odometry(cv2.OdometryType_RGB_DEPTH, settings, cv2.OdometryAlgoType_COMMON)
@@ -94,7 +94,7 @@ def opencv(camera: Camera) -> Step:
 
 # --- small_gicp -----------------------------------------------------------------------------------
 def gicp_frames(camera: Camera, scale: float) -> Step:
-    """GICP from the motion before, as its scan-to-scan example does."""
+    """Return GICP that starts at the previous motion, as in the scan-to-scan example."""
     T_previous_current = np.eye(4)
 
     def align(previous: tuple, current: tuple) -> Found:
@@ -114,7 +114,7 @@ def gicp_frames(camera: Camera, scale: float) -> Step:
 
 
 def gicp_voxels(camera: Camera, scale: float) -> Step:
-    """GICP against a voxel map of the last 100 frames, as its scan-to-model example does."""
+    """Return GICP against a voxel map of the last 100 frames, as in the scan-to-model example."""
     voxels = small_gicp.GaussianVoxelMap(scale * VOXEL_M)
     voxels.set_lru(horizon=100, clear_cycle=10)
     T_world_camera, T_motion = np.eye(4), np.eye(4)
@@ -126,7 +126,7 @@ def gicp_voxels(camera: Camera, scale: float) -> Step:
         if voxels.size():
             guess, reach_m = T_world_camera @ T_motion, scale * REACH_M
             found = small_gicp.align(voxels, cloud, guess, max_correspondence_distance=reach_m)
-            # rounding would grow from guess to guess
+            # Rounding errors would accumulate over the initial guesses.
             T_motion = se3.orthonormalize(se3.inverse(T_world_camera) @ found.T_target_source)
             is_sane = is_possible(T_motion)
             is_found, T_motion = found.converged and is_sane, T_motion if is_sane else np.eye(4)
@@ -138,7 +138,7 @@ def gicp_voxels(camera: Camera, scale: float) -> Step:
 
 
 def _sampled(camera: Camera, frame: RgbdFrame, scale: float) -> tuple:
-    """Point cloud with covariances, and its tree."""
+    """Return the point cloud with covariances, and its tree."""
     seen = frame.depth_m > 0
     points = (camera.rays() * frame.depth_m[..., None])[seen]
     return small_gicp.preprocess_points(points, scale * SPACING_M)
@@ -146,7 +146,7 @@ def _sampled(camera: Camera, frame: RgbdFrame, scale: float) -> tuple:
 
 # --- Open3D ---------------------------------------------------------------------------------------
 def open3d_frames(o3d: ModuleType, camera: Camera) -> Step:
-    """The RGB-D odometry of the tutorial, with the hybrid term; depth beyond 3 m is cut off."""
+    """Return the RGB-D odometry of the tutorial, with the hybrid term and depth up to 3 m."""
     size = camera.width, camera.height
     pinhole = o3d.camera.PinholeCameraIntrinsic(*size, camera.fx, camera.fy, camera.cx, camera.cy)
     odometry = o3d.pipelines.odometry
@@ -164,7 +164,7 @@ def open3d_frames(o3d: ModuleType, camera: Camera) -> Step:
 
 
 def open3d_tensors(o3d: ModuleType, camera: Camera) -> Step:
-    """The newer, multi-scale RGB-D odometry, whose default method is the hybrid one."""
+    """Return the newer multi-scale RGB-D odometry, which uses the hybrid method by default."""
     matrix, odometry = o3d.core.Tensor(camera.matrix), o3d.t.pipelines.odometry
 
     def prepare(frame: RgbdFrame) -> object:
@@ -178,7 +178,7 @@ def open3d_tensors(o3d: ModuleType, camera: Camera) -> Step:
 
 
 def open3d_model(o3d: ModuleType, camera: Camera) -> Step:
-    """Its dense SLAM example: depth against a ray cast of the volume that was fused so far."""
+    """Return the dense SLAM example: depth against a ray cast of the fused volume."""
     slam, device = o3d.t.pipelines.slam, o3d.core.Device("CPU:0")
     T_world_camera, count = np.eye(4), 0
     start, shape = o3d.core.Tensor(T_world_camera), (camera.height, camera.width)
@@ -205,7 +205,7 @@ def open3d_model(o3d: ModuleType, camera: Camera) -> Step:
 
 
 def _tracked(align: Callable[[], Any]) -> Found:
-    """What Open3D's tensor odometry found; it raises where its system is singular."""
+    """Return the result of Open3D's tensor odometry, which raises if its system is singular."""
     try:
         found = align()
     except RuntimeError:
