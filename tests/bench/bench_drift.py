@@ -110,7 +110,7 @@ def main() -> None:
     parser.add_argument("--hold-out-every", type=int, default=5)
     options = parser.parse_args()
     sequence = open_sequence(options.source)
-    settings = (f"tracker.hold_out={options.hold_out}", *options.set)
+    settings = (f"tracker.hold_out={options.hold_out_every}", *options.set)
     drift = Drift(options.scale, options.aside, np.radians(options.turn))
     runs = {
         "no drift": (settings, NONE),
