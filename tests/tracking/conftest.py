@@ -1,4 +1,4 @@
-"""A room whose every image is known exactly: four walls and a block, textured with noise."""
+"""A room with exact images: four walls and a block, textured with noise."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ from scipy.ndimage import map_coordinates
 
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
-CELL_M = 0.12  # of the texture: ten pixels or so
+CELL_M = 0.12  # Size of a texture cell; about ten pixels.
 TEXTURE = np.random.default_rng(7).uniform(20, 235, (64, 64, 64)).astype(np.float32)
-BOXES = (  # low and high corners, m; the first is seen from inside
+BOXES = (  # Low and high corners, m; the camera is inside the first.
     (np.array([-2.0, -1.3, -1.5]), np.array([2.0, 1.2, 3.2])),
     (np.array([-0.9, 0.3, 1.6]), np.array([0.1, 1.2, 2.4])),
 )
@@ -46,7 +46,7 @@ class Room:
 
 
 def _depth(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Distance along rays [H, W, 3] with camera z = 1, so depth: the slab method."""
+    """Return the depth along rays [H, W, 3] of camera z = 1, by the slab method."""
     entries, exits = [], []
     for low, high in BOXES:
         with np.errstate(divide="ignore"):
@@ -78,7 +78,7 @@ def make_room() -> Callable[[int, int], Room]:
 
 
 def walk(frames: int, step_m: float = 0.02, step_rad: float = 0.01) -> list[np.ndarray]:
-    """Poses along a gentle curve."""
+    """Return poses along a gentle curve."""
     twist = np.array([0.3 * step_rad, step_rad, 0.1 * step_rad, step_m, 0.2 * step_m, 0.4 * step_m])
     return [se3.exp(k * twist) for k in range(frames)]
 

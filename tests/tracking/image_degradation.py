@@ -1,8 +1,8 @@
-"""Frames that went bad, and what tracking makes of them.
+"""Degraded camera frames, and tracking through them.
 
-    python -m tests.tracking.image_degradation SOURCE [FRAMES]      prints the table of all troubles
+    python -m tests.tracking.image_degradation SOURCE [FRAMES]    prints a table of them all
 
-A `Degrader` is a pure function: what the camera shows in place of frame k while there is trouble.
+A `Degrader` is a pure function that returns the frame that replaces frame k.
 """
 
 import sys
@@ -18,12 +18,12 @@ from ldo_service.geometry import RawFrame, RgbdFrame, associate, rectify, se3
 from ldo_service.tracking import Odometry, TrackingStatus
 
 Frames = Callable[[int], RgbdFrame]
-Degrader = Callable[[Frames, int], RgbdFrame | None]  # None: nothing arrives
+Degrader = Callable[[Frames, int], RgbdFrame | None]  # Gives None if no frame arrives.
 
-BLOCKS = (6, 8)  # rows and columns of depth that is missing or not
+BLOCKS = (6, 8)  # Rows and columns of the blocks of depth.
 TRUTH_WITHIN_S = 0.020
 HEADER = """\
-| trouble | OK % | OK % meanwhile | worst cm (frame) | ATE cm | OK again after |
+| degradation | OK % | OK % meanwhile | worst cm (frame) | ATE cm | OK again after |
 |---|---|---|---|---|---|"""
 
 
@@ -33,13 +33,13 @@ def dropped(_frames: Frames, _k: int) -> None:
 
 
 def covered(frames: Frames, k: int) -> RgbdFrame:
-    """A hand over the lens: black, no depth."""
+    """Return a black frame without depth, as with a hand over the lens."""
     frame = frames(k)
     return replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m))
 
 
 def without_depth_in_blocks(frames: Frames, k: int) -> RgbdFrame:
-    """Half of the blocks, others in every frame."""
+    """Remove the depth of about half of the blocks; each frame has other blocks."""
     frame = frames(k)
     height, width = frame.depth_m.shape
     is_kept = np.random.default_rng(k).random(BLOCKS) < 0.5
@@ -55,14 +55,14 @@ def without_depth_on_the_left(frames: Frames, k: int) -> RgbdFrame:
 
 
 def amplified(gain: float, frames: Frames, k: int) -> RgbdFrame:
-    """Another exposure; what is too bright is white."""
+    """Scale the brightness as another exposure would; bright pixels clip at white."""
     frame = frames(k)
     color = np.minimum(np.rint(gain * frame.color.astype(np.float32)), 255).astype(np.uint8)
     return replace(frame, color=color)
 
 
 def frozen(start: int, frames: Frames, k: int) -> RgbdFrame:
-    """The frame before `start` again; its index says what is shown."""
+    """Return the frame before `start` with the stamp of frame k; its index is not changed."""
     return replace(frames(start - 1), stamp_ns=frames(k).stamp_ns)
 
 
@@ -71,7 +71,7 @@ def with_late_color(frames: Frames, k: int) -> RgbdFrame:
 
 
 def with_impossible_depth(frames: Frames, k: int) -> RgbdFrame:
-    """A third of the pixels is NaN, infinite or negative, as some drivers send it."""
+    """Set a third of the depth to NaN, infinity or -1, as some drivers send it."""
     frame, rng = frames(k), np.random.default_rng(k)
     is_bad = rng.random(frame.depth_m.shape) < 1 / 3
     bad = rng.choice(np.array([np.nan, np.inf, -np.inf, -1.0], np.float32), is_bad.sum())
@@ -81,45 +81,50 @@ def with_impossible_depth(frames: Frames, k: int) -> RgbdFrame:
     return rectify(raw, None)
 
 
-def troubles(start: int, lasting: int = 60) -> dict[str, tuple[Degrader, range]]:
-    """Every trouble by its name, with the frames that it lasts from `start` on."""
+def degradations(start: int, duration: int = 60) -> dict[str, tuple[Degrader, range]]:
+    """Return each degradation by name, with the frames that it covers from `start` on."""
     return {
         "5 frames dropped": (dropped, range(start, start + 5)),
         "20 frames covered": (covered, range(start, start + 20)),
         "half of depth missing, in blocks": (
             without_depth_in_blocks,
-            range(start, start + lasting),
+            range(start, start + duration),
         ),
-        "left half without depth": (without_depth_on_the_left, range(start, start + lasting)),
-        "twice as bright": (partial(amplified, 2.0), range(start, start + lasting)),
-        "half as bright": (partial(amplified, 0.5), range(start, start + lasting)),
+        "left half without depth": (without_depth_on_the_left, range(start, start + duration)),
+        "twice as bright": (partial(amplified, 2.0), range(start, start + duration)),
+        "half as bright": (partial(amplified, 0.5), range(start, start + duration)),
         "one frame repeated": (partial(frozen, start), range(start, start + 1)),
         "frozen for 10 frames": (partial(frozen, start), range(start, start + 10)),
-        "colour one frame late": (with_late_color, range(start, start + lasting)),
-        "impossible depth": (with_impossible_depth, range(start, start + lasting)),
+        "color one frame late": (with_late_color, range(start, start + duration)),
+        "impossible depth": (with_impossible_depth, range(start, start + duration)),
     }
 
 
-def shown(frames: Frames, count: int, degrade: Degrader, trouble: range) -> Iterator[RgbdFrame]:
+def degraded_frames(
+    frames: Frames, count: int, degrade: Degrader, degraded: range
+) -> Iterator[RgbdFrame]:
     for k in range(count):
-        frame = degrade(frames, k) if k in trouble else frames(k)
+        frame = degrade(frames, k) if k in degraded else frames(k)
         if frame is not None:
             yield frame
 
 
-# --- what tracking makes of them ------------------------------------------------------------------
+# --- tracking -------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Of tracking through a trouble. Errors are those of OK frames alone.
+    """Result of tracking through a degradation. Errors are those of OK frames only.
 
-    ok_percent        of the frames outside the trouble
-    worst_m           how far a camera was from the truth, aligned as without the trouble
-    ate_m             RMSE after alignment
-    recovered_after   frames after the trouble until the first that is OK; None: never
+    Attributes:
+        ok_percent: Fraction of OK frames outside the degradation, percent.
+        ok_percent_meanwhile: The same during the degradation; None if no frame arrived.
+        worst_m: Largest position error, aligned as without the degradation.
+        worst_frame: Time index of the largest error.
+        ate_m: RMSE after alignment.
+        recovered_after: Frames from the end of the degradation to the first OK frame, if any.
     """
 
     ok_percent: float
-    ok_percent_meanwhile: float | None  # None: nothing arrived
+    ok_percent_meanwhile: float | None
     worst_m: float
     worst_frame: int
     ate_m: float
@@ -136,14 +141,14 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    k: int  # when
-    source: int  # which frame of the sequence was shown
+    k: int  # Time index.
+    source: int  # Index of the frame of the sequence that was shown.
     status: TrackingStatus
     T_odom_camera: np.ndarray
 
 
-def follow(frames: Iterator[RgbdFrame], stamps_ns: np.ndarray) -> list[Step]:
-    """Track as the service does."""
+def track(frames: Iterator[RgbdFrame], stamps_ns: np.ndarray) -> list[Step]:
+    """Track the frames as the service does."""
     odometry, steps = Odometry(), []
     for frame in frames:
         result = odometry.process(frame)
@@ -153,16 +158,17 @@ def follow(frames: Iterator[RgbdFrame], stamps_ns: np.ndarray) -> list[Step]:
 
 
 def outcome(
-    steps: list[Step], trouble: range, T_true: Mapping[int, np.ndarray], T_true_odom: np.ndarray
+    steps: list[Step], degraded: range, T_true: Mapping[int, np.ndarray], T_true_odom: np.ndarray
 ) -> Outcome:
-    outside = [s for s in steps if s.k not in trouble]
-    meanwhile = [s.status is TrackingStatus.OK for s in steps if s.k in trouble]
+    """Return the OK fractions and the errors of tracked steps."""
+    outside = [s for s in steps if s.k not in degraded]
+    meanwhile = [s.status is TrackingStatus.OK for s in steps if s.k in degraded]
     p_odom, p_true, times = ok_positions(steps, T_true)
     errors_m = np.linalg.norm(se3.transform(T_true_odom, p_odom) - p_true, axis=1)
     residuals_m = np.linalg.norm(
         se3.transform(fit_rigid_transform(p_odom, p_true), p_odom) - p_true, axis=1
     )
-    after = [s.k for s in outside if s.k >= trouble.stop and s.status is TrackingStatus.OK]
+    after = [s.k for s in outside if s.k >= degraded.stop and s.status is TrackingStatus.OK]
     worst = int(np.argmax(errors_m))
     return Outcome(
         100 * float(np.mean([s.status is TrackingStatus.OK for s in outside])),
@@ -170,33 +176,36 @@ def outcome(
         float(errors_m[worst]),
         times[worst],
         float(np.sqrt(np.mean(residuals_m**2))),
-        after[0] - trouble.stop if after else None,
+        after[0] - degraded.stop if after else None,
     )
 
 
 def ok_positions(
     steps: list[Step], T_true: Mapping[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Estimated and true [M, 3] of the OK frames that have a true pose, and their times k."""
-    judged = [s for s in steps if s.status is TrackingStatus.OK and s.source in T_true]
-    p_odom = np.array([s.T_odom_camera[:3, 3] for s in judged])
-    p_true = np.array([T_true[s.source][:3, 3] for s in judged])
-    return p_odom, p_true, [s.k for s in judged]
+    """Return estimated and true positions [M, 3] of OK frames with ground truth, and their k."""
+    evaluated = [s for s in steps if s.status is TrackingStatus.OK and s.source in T_true]
+    p_odom = np.array([s.T_odom_camera[:3, 3] for s in evaluated])
+    p_true = np.array([T_true[s.source][:3, 3] for s in evaluated])
+    return p_odom, p_true, [s.k for s in evaluated]
 
 
-def undisturbed(
+def track_undisturbed(
     sequence: Sequence, count: int, T_true: Mapping[int, np.ndarray]
 ) -> tuple[Outcome, np.ndarray]:
-    """Without any trouble, and T_true_odom of its alignment. Odometry starts at the same place
-    with a trouble, so the same alignment shows what a trouble did, jumps included."""
-    none = range(count // 3, count // 3)
-    steps = follow(map(sequence.__getitem__, range(count)), sequence.stamps_ns)
+    """Track without a degradation; return the outcome and its alignment T_true_odom.
+
+    Odometry starts at the same pose with a degradation. The same alignment therefore shows what
+    a degradation changed, jumps included.
+    """
+    no_frames = range(count // 3, count // 3)
+    steps = track(map(sequence.__getitem__, range(count)), sequence.stamps_ns)
     T_true_odom = fit_rigid_transform(*ok_positions(steps, T_true)[:2])
-    return outcome(steps, none, T_true, T_true_odom), T_true_odom
+    return outcome(steps, no_frames, T_true, T_true_odom), T_true_odom
 
 
 def truth_by_frame(sequence: Sequence) -> dict[int, np.ndarray]:
-    """T_world_camera of the frames that have a true pose."""
+    """Return T_world_camera of the frames that have a ground-truth pose."""
     truth = sequence.truth()
     assert truth is not None
     pairs = associate(sequence.stamps_ns * 1e-9, truth.stamps_s, TRUTH_WITHIN_S)
@@ -207,11 +216,13 @@ def main() -> None:
     sequence = open_sequence(sys.argv[1])
     count = min(len(sequence), int(sys.argv[2]) if len(sys.argv) > 2 else 300)
     T_true = truth_by_frame(sequence)
-    baseline, T_true_odom = undisturbed(sequence, count, T_true)
+    baseline, T_true_odom = track_undisturbed(sequence, count, T_true)
     print(f"{HEADER}\n| none | {baseline} |", flush=True)
-    for name, (degrade, trouble) in troubles(count // 3).items():
-        steps = follow(shown(sequence.__getitem__, count, degrade, trouble), sequence.stamps_ns)
-        print(f"| {name} | {outcome(steps, trouble, T_true, T_true_odom)} |", flush=True)
+    for name, (degrade, degraded) in degradations(count // 3).items():
+        steps = track(
+            degraded_frames(sequence.__getitem__, count, degrade, degraded), sequence.stamps_ns
+        )
+        print(f"| {name} | {outcome(steps, degraded, T_true, T_true_odom)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from ldo_service.tracking import (
 )
 from ldo_service.tracking.alignment import normal_equations
 
-XI = np.array([0.01, -0.03, 0.02, 0.05, -0.03, 0.04])  # 2.1 degrees, 7 cm
+XI = np.array([0.01, -0.03, 0.02, 0.05, -0.03, 0.04])  # 2.1 degrees and 7 cm.
 T_REFERENCE_CAMERA = se3.exp(XI)
 
 
@@ -29,7 +29,7 @@ def aligned(reference: RgbdFrame, frame: RgbdFrame, guess: np.ndarray | None = N
 
 
 def errors(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Metres and degrees."""
+    """Return the errors of T in meters and degrees."""
     difference = se3.inverse(truth) @ T
     return float(np.linalg.norm(difference[:3, 3])), np.degrees(se3.rotation_angle(difference))
 
@@ -65,7 +65,7 @@ def test_exposure_change_is_estimated_and_does_not_move_the_pose(room) -> None:
 
 
 @pytest.mark.parametrize("gain", [0.4, 2.0])
-def test_an_exposure_that_clips_a_third_of_the_image_does_not_move_the_pose(room, gain) -> None:
+def test_exposure_that_clips_a_third_of_the_image_does_not_move_the_pose(room, gain) -> None:
     frame = room.view(T_REFERENCE_CAMERA, gain=gain)
     assert gain < 1 or np.mean(frame.color[..., 0] == 255) > 0.3
     result = aligned(room.view(np.eye(4)), frame)
@@ -81,7 +81,7 @@ def test_color_alone_aligns_a_frame_without_depth(room) -> None:
 
 
 def wall(T_wall_camera: np.ndarray, camera: Camera, is_textured: bool) -> RgbdFrame:
-    """A view of the plane z = 0 of the frame `wall`, 2 m ahead of its pose at identity."""
+    """Return a view of the plane z = 0 of the frame `wall`, 2 m ahead of its pose at identity."""
     T = T_wall_camera.copy()
     T[2, 3] -= 2.0
     rays = camera.rays() @ T[:3, :3].T
@@ -92,7 +92,7 @@ def wall(T_wall_camera: np.ndarray, camera: Camera, is_textured: bool) -> RgbdFr
     return RgbdFrame(np.repeat(gray[..., None], 3, 2), depth_m.astype(np.float32), camera)
 
 
-def test_color_fixes_what_a_plane_leaves_open(room) -> None:
+def test_texture_constrains_motion_within_a_plane(room) -> None:
     views = [wall(T, room.camera, is_textured=True) for T in (np.eye(4), T_REFERENCE_CAMERA)]
     assert_close(aligned(*views).T_reference_camera, T_REFERENCE_CAMERA)
 
@@ -100,12 +100,12 @@ def test_color_fixes_what_a_plane_leaves_open(room) -> None:
 def test_information_of_a_plain_wall_is_rotation_first_and_singular(room) -> None:
     result = aligned(*[wall(np.eye(4), room.camera, is_textured=False)] * 2)
     information = np.diag(result.information)
-    sees = information > 1e-6 * information.max()
-    np.testing.assert_array_equal(sees, [True, True, False, False, False, True])
+    is_constrained = information > 1e-6 * information.max()
+    np.testing.assert_array_equal(is_constrained, [True, True, False, False, False, True])
     assert result.condition > 1e5
 
 
-def test_information_leaves_gain_and_bias_unknown(room) -> None:
+def test_information_marginalizes_gain_and_bias(room) -> None:
     config = AlignConfig()
     reference = build_reference(pyramid_of(room.view(np.eye(4)), PyramidConfig()))
     view = pyramid_of(room.view(T_REFERENCE_CAMERA), PyramidConfig())
@@ -119,23 +119,23 @@ def test_information_leaves_gain_and_bias_unknown(room) -> None:
     ).hessian
     covariance = np.linalg.inv(hessian)[:6, :6] / config.independent_fraction
     product = covariance @ result.information
-    np.testing.assert_allclose(product, np.eye(6), atol=0.02)  # the brightness prior is weak
+    np.testing.assert_allclose(product, np.eye(6), atol=0.02)  # The brightness prior is weak.
 
 
-def test_guess_close_to_the_truth_takes_fewer_iterations(room) -> None:
+def test_close_initial_guess_takes_fewer_iterations(room) -> None:
     views = room.view(np.eye(4)), room.view(T_REFERENCE_CAMERA)
     informed = aligned(*views, se3.inverse(T_REFERENCE_CAMERA))
     assert informed.iterations < aligned(*views).iterations
 
 
-def test_nothing_to_align_is_reported_not_raised(room) -> None:
+def test_blank_frame_gives_a_finite_pose_without_pairs(room) -> None:
     for pair in ((room.blank(), room.view(np.eye(4))), (room.view(np.eye(4)), room.blank())):
         result = aligned(*pair)
         assert np.isfinite(result.T_reference_camera).all()
         assert result.paired == 0
 
 
-def test_noise_is_measured_not_assumed(room) -> None:
+def test_depth_noise_raises_its_scale_and_lowers_the_information(room) -> None:
     rng = np.random.default_rng(3)
     view = room.view(T_REFERENCE_CAMERA)
     noisy = replace(

@@ -12,11 +12,11 @@ T_CAMERA_REFERENCE = se3.exp(np.array([0.02, -0.03, 0.01, 0.04, -0.02, 0.03]))
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_kernel_equals_its_plain_twin(room, level: int) -> None:
+def test_kernel_equals_the_reference_implementation(room, level: int) -> None:
     pyramid = pyramid_of(room.view(np.eye(4)), PyramidConfig())
     view = room.view(se3.inverse(T_CAMERA_REFERENCE))
-    view.depth_m[30:50, 40:90] = 0  # a hole
-    view.color[60:80, 20:60] = 255  # clipped
+    view.depth_m[30:50, 40:90] = 0  # A hole in the depth.
+    view.color[60:80, 20:60] = 255  # Clipped to white.
     view.color[100:, 100:] = 0
     target = pyramid_of(view, PyramidConfig()).levels[level]
     points = build_reference(pyramid).points[level]
@@ -24,7 +24,7 @@ def test_kernel_equals_its_plain_twin(room, level: int) -> None:
     arguments = (points, target, guess, APPEARANCE, ResidualConfig())
     fast, plain = normal_equations(*arguments), alignment.normal_equations(*arguments)
     scale = np.abs(plain.hessian).max(axis=1)
-    assert fast.visible == pytest.approx(plain.visible, abs=2)  # rounding at the image border
+    assert fast.visible == pytest.approx(plain.visible, abs=2)  # Rounding at the image border.
     for a, b in ((fast.photometric, plain.photometric), (fast.geometric, plain.geometric)):
         assert a.count > 50
         assert a.count == pytest.approx(b.count, abs=2)
@@ -36,7 +36,7 @@ def test_kernel_equals_its_plain_twin(room, level: int) -> None:
 
 
 def perturbed(xi: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple:
-    """Camera points and normals under T_reference_camera * exp(xi)."""
+    """Return camera points and normals under T_reference_camera * exp(xi)."""
     T_reference_camera = se3.inverse(T_CAMERA_REFERENCE) @ se3.exp(xi)
     T = se3.inverse(T_reference_camera)
     return se3.transform(T, points), normals @ T[:3, :3].T
@@ -72,7 +72,7 @@ def test_photometric_jacobian_is_the_derivative() -> None:
     camera = Camera(160, 120, 130.0, 125.0, 79.0, 61.0)
     v, u = np.mgrid[:120, :160]
     flat = np.ones_like(u, float)
-    image = 0.7 * u - 0.4 * v + 30  # bilinear samples of a ramp are exact, and so is its gradient
+    image = 0.7 * u - 0.4 * v + 30  # Bilinear samples of a ramp are exact.
     level = Level(np.stack([image, 0.7 * flat, -0.4 * flat, flat], axis=-1), camera)
     points, normals = surface(np.random.default_rng(1))
     shade = np.linspace(10, 200, len(points))

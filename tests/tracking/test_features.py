@@ -14,10 +14,10 @@ from ldo_service.tracking.features import (
 )
 
 CONFIG = FeatureConfig()
-T_REFERENCE_CAMERA = se3.exp(np.array([0.05, -0.2, 0.05, 0.2, 0.1, 0.15]))  # 12 degrees, 27 cm
+T_REFERENCE_CAMERA = se3.exp(np.array([0.05, -0.2, 0.05, 0.2, 0.1, 0.15]))  # 12 degrees and 27 cm.
 
 
-def test_large_motion_is_found_within_the_reach_of_direct_alignment(large_room) -> None:
+def test_feature_pose_of_a_large_motion_is_within_reach_of_alignment(large_room) -> None:
     reference, frame = (
         detect(pyramid_of(large_room.view(T), PyramidConfig()), CONFIG)
         for T in (np.eye(4), T_REFERENCE_CAMERA)
@@ -32,7 +32,7 @@ def test_large_motion_is_found_within_the_reach_of_direct_alignment(large_room) 
     np.testing.assert_array_equal(poses[0].T_camera_reference, poses[1].T_camera_reference)
 
 
-def test_points_are_the_surface_under_the_pixels(large_room) -> None:
+def test_feature_points_project_to_their_pixels(large_room) -> None:
     view = pyramid_of(large_room.view(np.eye(4)), PyramidConfig())
     features = detect(view, CONFIG)
     assert len(features.pixels) > 100
@@ -41,19 +41,21 @@ def test_points_are_the_surface_under_the_pixels(large_room) -> None:
     )
 
 
-def test_gradients_are_matched_as_opencv_matches_them(large_room) -> None:
-    there, here = (
+def test_sift_matches_agree_with_opencv(large_room) -> None:
+    reference, frame = (
         detect_sift(view.gray, view.depth_m, view.camera, 300, CONFIG)
         for view in (
             pyramid_of(large_room.view(T), PyramidConfig()) for T in (np.eye(4), T_REFERENCE_CAMERA)
         )
     )
-    pairs = match(there, here, CONFIG)
-    nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(there.descriptors, here.descriptors, k=2)
-    told = {(m.queryIdx, m.trainIdx) for m, n in nearest if m.distance < CONFIG.ratio * n.distance}
+    pairs = match(reference, frame, CONFIG)
+    nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(reference.descriptors, frame.descriptors, k=2)
+    expected = {
+        (m.queryIdx, m.trainIdx) for m, n in nearest if m.distance < CONFIG.ratio * n.distance
+    }
     assert len(pairs) > 100
-    assert set(map(tuple, pairs.tolist())) <= told
-    assert len(set(pairs[:, 1])) == len({index for _, index in told})
+    assert set(map(tuple, pairs.tolist())) <= expected
+    assert len(set(pairs[:, 1])) == len({index for _, index in expected})
 
 
 def test_every_feature_is_matched_at_most_once(large_room) -> None:
@@ -69,10 +71,10 @@ def test_every_feature_is_matched_at_most_once(large_room) -> None:
 
 def test_blank_image_has_no_features_and_no_pose(large_room) -> None:
     blank = detect(pyramid_of(large_room.blank(), PyramidConfig()), CONFIG)
-    seen = detect(pyramid_of(large_room.view(np.eye(4)), PyramidConfig()), CONFIG)
+    textured = detect(pyramid_of(large_room.view(np.eye(4)), PyramidConfig()), CONFIG)
     assert len(blank.pixels) == 0
-    assert estimate_pose(seen, blank, large_room.camera, CONFIG) is None
-    assert estimate_pose(blank, seen, large_room.camera, CONFIG) is None
+    assert estimate_pose(textured, blank, large_room.camera, CONFIG) is None
+    assert estimate_pose(blank, textured, large_room.camera, CONFIG) is None
 
 
 def test_ratio_above_one_is_refused() -> None:

@@ -10,9 +10,7 @@ from ldo_service.tracking.keyframes import KeyframeConfig, ReferenceKeyframe, ne
 CONFIG = KeyframeConfig()
 TURNED = se3.exp(np.array([0, np.radians(16), 0, 0, 0, 0]))
 MOVED = se3.exp(np.array([0, 0, 0, 0.2, 0, 0]))
-
-
-SLIGHTLY = se3.exp(np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))
+SLIGHTLY_MOVED = se3.exp(np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize(
@@ -22,15 +20,15 @@ SLIGHTLY = se3.exp(np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))
         (np.eye(4), 0.84, 2.0, 5, True),
         (TURNED, 1.0, 2.0, 5, True),
         (MOVED, 1.0, 2.0, 5, True),
-        (MOVED, 1.0, 3.0, 5, False),  # the same way means less in a larger room
-        (TURNED, 0.2, 2.0, 1, False),  # at most every 2nd frame
-        (SLIGHTLY, 1.0, 2.0, 30, True),  # at least every 30th
-        (SLIGHTLY, 1.0, 2.0, 29, False),
-        (np.eye(4), 1.0, 2.0, 3000, False),  # a camera that stands still fills no map
-        (np.eye(4), 0.9, 2.0, 30, True),  # unless what it sees has changed
+        (MOVED, 1.0, 3.0, 5, False),  # The same distance changes less in a larger room.
+        (TURNED, 0.2, 2.0, 1, False),  # The limit is every second frame.
+        (SLIGHTLY_MOVED, 1.0, 2.0, 30, True),  # Every 30th frame is a keyframe.
+        (SLIGHTLY_MOVED, 1.0, 2.0, 29, False),
+        (np.eye(4), 1.0, 2.0, 3000, False),  # A camera at rest adds no keyframes.
+        (np.eye(4), 0.9, 2.0, 30, True),  # A changed view needs a keyframe also at rest.
     ],
 )
-def test_keyframe_is_due_when_the_view_has_changed(
+def test_keyframe_is_needed_when_the_view_has_changed(
     T: np.ndarray, overlap: float, median_depth_m: float, frames: int, expected: bool
 ) -> None:
     assert needs_keyframe(T, overlap, median_depth_m, frames, CONFIG) is expected

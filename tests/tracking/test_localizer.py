@@ -19,18 +19,20 @@ CONFIG = OdometryConfig(submaps=SubmapConfig(begin_after_s=0.06, look_every=4, c
 
 
 @pytest.fixture(scope="module")
-def places(large_room, make_walk) -> KeyframeDatabase:
-    """A map in a frame of its own."""
-    made = []
+def database(large_room, make_walk) -> KeyframeDatabase:
+    """Return a keyframe database in a map frame of its own."""
+    records = []
     for number, T_world_camera in enumerate(make_walk(3, 0.15, 0.1)):
         view = pyramid_of(large_room.view(T_world_camera), PyramidConfig())
         keyframe = ReferenceKeyframe(view, T_MAP_WORLD @ T_world_camera, number)
-        made.append(make_keyframe_record(keyframe, FeatureConfig(), KeyframeDatabaseConfig()))
-    return KeyframeDatabase(tuple(made))
+        records.append(make_keyframe_record(keyframe, FeatureConfig(), KeyframeDatabaseConfig()))
+    return KeyframeDatabase(tuple(records))
 
 
-def located(localizer: Localizer, room, truth: list[np.ndarray]) -> list[float | None]:
-    """Errors in the map, m; None where the camera is not found."""
+def localization_errors_m(
+    localizer: Localizer, room, truth: list[np.ndarray]
+) -> list[float | None]:
+    """Return position errors in the map, m; None where the camera is LOST."""
     errors: list[float | None] = []
     for index, T_world_camera in enumerate(truth):
         frame = room.view(T_world_camera, stamp_ns=index * 33_333_333, index=index)
@@ -46,32 +48,34 @@ def located(localizer: Localizer, room, truth: list[np.ndarray]) -> list[float |
     return errors
 
 
-def test_a_camera_is_found_at_the_second_look_and_followed(large_room, make_walk, places) -> None:
-    first, *rest = located(Localizer(places, CONFIG), large_room, make_walk(14))
-    assert first is None, "one look is not believed"
+def test_camera_is_localized_at_the_second_match_and_tracked(
+    large_room, make_walk, database
+) -> None:
+    first, *rest = localization_errors_m(Localizer(database, CONFIG), large_room, make_walk(14))
+    assert first is None, "one match alone is not accepted"
     assert max(error for error in rest if error is not None) < 5e-3
     assert None not in rest
 
 
-def test_a_camera_in_a_strange_place_is_not_found(large_room, make_walk, places) -> None:
-    strange = [T_BEHIND @ T for T in make_walk(8)]
-    assert located(Localizer(places, CONFIG), large_room, strange) == [None] * 8
+def test_camera_in_an_unknown_place_is_not_localized(large_room, make_walk, database) -> None:
+    unknown = [T_BEHIND @ T for T in make_walk(8)]
+    assert localization_errors_m(Localizer(database, CONFIG), large_room, unknown) == [None] * 8
 
 
-def test_after_a_kidnap_the_old_fix_is_forgotten(large_room, make_walk, places) -> None:
-    here, there = make_walk(6), [T_BEHIND @ T for T in make_walk(8)]
-    localizer = Localizer(places, CONFIG)
-    errors = located(localizer, large_room, [*here, *there, *here])
-    assert errors[6:14] == [None] * 8, "the new submap of odometry was not found in the map"
+def test_map_fix_is_dropped_after_a_jump(large_room, make_walk, database) -> None:
+    in_map, outside_map = make_walk(6), [T_BEHIND @ T for T in make_walk(8)]
+    localizer = Localizer(database, CONFIG)
+    errors = localization_errors_m(localizer, large_room, [*in_map, *outside_map, *in_map])
+    assert errors[6:14] == [None] * 8, "the new odometry submap has no fix in the map"
     back = [error for error in errors[14:] if error is not None]
     assert len(back) >= 4
     assert max(back) < 5e-3
 
 
-def test_a_fix_survives_packing(large_room, make_walk, places) -> None:
-    localizer = Localizer(places, CONFIG)
-    located(localizer, large_room, make_walk(4))
-    fix, again = localizer._fix, MapFix.unpack(localizer.snapshot()["fix"])
-    np.testing.assert_array_equal(again.T_map_odom, fix.T_map_odom)
-    assert again.pending_match is not None
-    assert again.frames_since_search == fix.frames_since_search
+def test_map_fix_survives_packing(large_room, make_walk, database) -> None:
+    localizer = Localizer(database, CONFIG)
+    localization_errors_m(localizer, large_room, make_walk(4))
+    fix, restored = localizer._fix, MapFix.unpack(localizer.snapshot()["fix"])
+    np.testing.assert_array_equal(restored.T_map_odom, fix.T_map_odom)
+    assert restored.pending_match is not None
+    assert restored.frames_since_search == fix.frames_since_search

@@ -8,7 +8,7 @@ TWIST = np.array([0.02, -0.1, 0.05, 0.1, 0.02, -0.03])
 STEP_NS = 33_000_000
 
 
-def test_constant_velocity_is_continued_over_any_interval() -> None:
+def test_constant_velocity_is_extrapolated_over_any_interval() -> None:
     motion = ConstantVelocity().moved_to(np.eye(4), STEP_NS).moved_to(se3.exp(TWIST), 2 * STEP_NS)
     for steps in (0.5, 1.0, 3.0):
         stamp_ns = int((2 + steps) * STEP_NS)
@@ -34,12 +34,12 @@ def test_ten_thousand_predictions_stay_rotations() -> None:
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
-def test_stopped_motion_predicts_the_same_place() -> None:
+def test_stopped_motion_predicts_the_same_pose() -> None:
     motion = ConstantVelocity().moved_to(se3.exp(TWIST), STEP_NS).without_velocity()
     np.testing.assert_allclose(motion.predicted(9 * STEP_NS), se3.exp(TWIST), atol=1e-12)
 
 
-def test_extent_adds_rotation_and_parallax() -> None:
+def test_image_motion_adds_rotation_and_parallax() -> None:
     T = se3.exp(np.array([0, 0.1, 0, 0, 0, 0]))
     T[0, 3] = 0.4
     assert image_motion_rad(T, 2.0) == pytest.approx(0.3)

@@ -1,4 +1,4 @@
-"""The judge is the true mask of somebody who walks through the synthetic room."""
+"""Motion segmentation, compared with the true mask of a person in the synthetic room."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -24,14 +24,14 @@ from ldo_service.tracking.motion_segmentation import (
 )
 from ldo_service.tracking.pyramid import DepthNoise, Level, Pyramid, PyramidConfig, pyramid_of
 
-# images of 160 pixels, as the level that is looked at otherwise
+# The images have 160 pixels, as the level that is used otherwise.
 CONFIG = MotionSegmentationConfig(level=0)
-EMPTY, LATE = 0, 70  # frames: before anybody came, and in the middle of the way
+EMPTY, OCCUPIED = 0, 70  # Frames before the person appears and in the middle of the walk.
 NOISE_SCALE = 2.0
 
 
-class Walked:
-    """Frames of the walk that tests ask for."""
+class PersonWalk:
+    """Frames of a walk past a person, rendered on request."""
 
     def __init__(self) -> None:
         config = SyntheticConfig(
@@ -56,30 +56,30 @@ class Walked:
     def T(self, a: int, b: int) -> np.ndarray:
         return se3.inverse(self._T_world_camera[a]) @ self._T_world_camera[b]
 
-    def watched(
+    def segment(
         self, keyframe: int, frames: list[int], moved_mask: np.ndarray | None = None
     ) -> MotionMasks:
-        """Of the last of several frames."""
-        suspicion, seen = None, None
+        """Return the masks of the last of several frames."""
+        evidence, masks = None, None
         for k in frames:
-            seen = segment_motion(
+            masks = segment_motion(
                 self.view(k),
                 self.view(keyframe),
                 moved_mask,
                 self.T(keyframe, k),
                 NOISE_SCALE,
-                suspicion,
+                evidence,
                 CONFIG,
                 DepthNoise(),
             )
-            suspicion, moved_mask = seen.suspicion, seen.moved_mask
-        assert seen is not None
-        return seen
+            evidence, moved_mask = masks.suspicion, masks.moved_mask
+        assert masks is not None
+        return masks
 
 
 @pytest.fixture(scope="module")
-def walked() -> Walked:
-    return Walked()
+def walk() -> PersonWalk:
+    return PersonWalk()
 
 
 def recall_and_precision(mask: np.ndarray, true: np.ndarray) -> tuple[float, float]:
@@ -87,51 +87,51 @@ def recall_and_precision(mask: np.ndarray, true: np.ndarray) -> tuple[float, flo
     return hit / max(np.count_nonzero(true), 1), hit / max(np.count_nonzero(mask), 1)
 
 
-def test_who_came_since_the_keyframe_is_found(walked: Walked) -> None:
-    seen = walked.watched(EMPTY, [LATE - 1, LATE])
-    whole = grow_mask(seen.dynamic_mask, walked.view(LATE), CONFIG)
-    recall, precision = recall_and_precision(whole, walked.person(LATE))
+def test_person_that_appears_after_the_keyframe_is_segmented(walk: PersonWalk) -> None:
+    masks = walk.segment(EMPTY, [OCCUPIED - 1, OCCUPIED])
+    whole = grow_mask(masks.dynamic_mask, walk.view(OCCUPIED), CONFIG)
+    recall, precision = recall_and_precision(whole, walk.person(OCCUPIED))
     assert recall > 0.95
-    assert precision > 0.7  # the rim is wanted
-    assert not seen.moved_mask.any()
+    assert precision > 0.7  # The mask includes a rim on purpose.
+    assert not masks.moved_mask.any()
 
 
-def test_who_has_gone_since_the_keyframe_is_found_in_it(walked: Walked) -> None:
-    seen = walked.watched(LATE, [230, 231])
-    recall, precision = recall_and_precision(seen.moved_mask, walked.person(LATE))
+def test_person_that_left_is_masked_in_the_keyframe(walk: PersonWalk) -> None:
+    masks = walk.segment(OCCUPIED, [230, 231])
+    recall, precision = recall_and_precision(masks.moved_mask, walk.person(OCCUPIED))
     assert recall > 0.9
     assert precision > 0.9
-    assert not seen.dynamic_mask.any()
+    assert not masks.dynamic_mask.any()
 
 
-def test_one_frame_alone_does_not_make_a_point_gone(walked: Walked) -> None:
-    assert not walked.watched(LATE, [230]).moved_mask.any()
+def test_one_frame_alone_masks_nothing_in_the_keyframe(walk: PersonWalk) -> None:
+    assert not walk.segment(OCCUPIED, [230]).moved_mask.any()
 
 
-def test_what_moved_before_stays_left_out_while_it_stands_still(walked: Walked) -> None:
-    person = walked.person(LATE)
-    assert not walked.watched(LATE, [LATE, LATE]).dynamic_mask.any()
-    seen = walked.watched(LATE, [LATE, LATE], person)
-    assert recall_and_precision(seen.dynamic_mask, person)[0] > 0.9
+def test_moved_pixels_stay_masked_while_the_person_stands_still(walk: PersonWalk) -> None:
+    person = walk.person(OCCUPIED)
+    assert not walk.segment(OCCUPIED, [OCCUPIED, OCCUPIED]).dynamic_mask.any()
+    masks = walk.segment(OCCUPIED, [OCCUPIED, OCCUPIED], person)
+    assert recall_and_precision(masks.dynamic_mask, person)[0] > 0.9
 
 
 @pytest.mark.parametrize(("keyframe", "frame"), [(0, 12), (160, 200), (200, 170)])
-def test_nothing_moves_in_a_room_where_only_the_camera_does(
-    walked: Walked, keyframe: int, frame: int
+def test_static_room_has_empty_masks_while_the_camera_moves(
+    walk: PersonWalk, keyframe: int, frame: int
 ) -> None:
-    seen = walked.watched(keyframe, [frame, frame + 1])
-    assert not seen.dynamic_mask.any()
-    assert not seen.moved_mask.any()
+    masks = walk.segment(keyframe, [frame, frame + 1])
+    assert not masks.dynamic_mask.any()
+    assert not masks.moved_mask.any()
 
 
-def test_gap_is_the_difference_in_depth_where_surfaces_were_measured() -> None:
+def test_depth_gap_is_the_difference_where_both_depths_are_measured() -> None:
     camera = Camera(24, 16, 20.0, 20.0, 11.5, 7.5)
     texels = np.zeros((16, 24, 4), np.float32)
     near, far = texels.copy(), texels.copy()
     near[..., 3], far[..., 3] = 1.5, 2.0
     far[4:8, :4, 3] = 0
     T_far_near = np.eye(4)
-    T_far_near[2, 3] = 0.1  # the camera of `near` stands 0.1 m ahead
+    T_far_near[2, 3] = 0.1  # The camera of `near` is 0.1 m ahead.
     ahead = depth_gap_m(Level(near, camera), Level(far, camera), T_far_near, CONFIG)
     np.testing.assert_allclose(ahead[:, 12], 2.0 - 1.6, atol=1e-6)
     assert np.isnan(ahead[6, 1])
@@ -140,69 +140,69 @@ def test_gap_is_the_difference_in_depth_where_surfaces_were_measured() -> None:
     assert np.isnan(behind[6, 1])
 
 
-def test_spread_takes_what_is_beside_and_as_far_away_but_no_wall_behind(walked: Walked) -> None:
-    person, view = walked.person(LATE), walked.view(LATE)
+def test_mask_grows_at_equal_depth_but_not_onto_the_wall_behind(walk: PersonWalk) -> None:
+    person, view = walk.person(OCCUPIED), walk.view(OCCUPIED)
     half = person.copy()
-    half[60:] = False  # the legs were missed
+    half[60:] = False  # The legs are missing.
     whole = grow_mask(half, view, CONFIG)
     assert recall_and_precision(whole, person)[0] > recall_and_precision(half, person)[0] + 0.05
     assert recall_and_precision(whole, person)[1] > 0.7
 
 
-def test_boxes_of_a_detector_become_the_pixels_of_the_thing(walked: Walked) -> None:
-    person, view = walked.person(LATE), walked.view(LATE)
+def test_detector_box_becomes_the_pixels_of_its_object(walk: PersonWalk) -> None:
+    person, view = walk.person(OCCUPIED), walk.view(OCCUPIED)
     box, other = box_around(person), Box("couch", 0, 0, 160, 120)
     mask = dynamic_class_mask([box, other], view.levels[0].depth_m, DynamicClassConfig())
     recall, precision = recall_and_precision(mask, person)
     assert recall > 0.95
-    assert precision > 0.6  # the sofa stands within reach
+    assert precision > 0.6  # The sofa is within reach.
     assert not dynamic_class_mask([other], view.levels[0].depth_m, DynamicClassConfig()).any()
 
 
-def test_a_box_without_depth_counts_as_a_whole_and_one_outside_the_image_not_at_all() -> None:
+def test_box_without_depth_is_masked_whole_and_one_outside_is_ignored() -> None:
     boxes = [Box("dog", 2, 3, 6, 8), Box("cat", -20, -20, -5, -5)]
     mask = dynamic_class_mask(boxes, np.zeros((12, 16), np.float32), DynamicClassConfig())
     assert mask[3:8, 2:6].all()
     assert np.count_nonzero(mask) == 20
 
 
-@pytest.mark.parametrize("bad", [{"least_m": -1.0}, {"gone_frames": 0}, {"rim_px": -1}])
-def test_impossible_settings_are_refused(bad: dict) -> None:
+@pytest.mark.parametrize("wrong", [{"least_m": -1.0}, {"gone_frames": 0}, {"rim_px": -1}])
+def test_impossible_settings_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError):
-        MotionSegmentationConfig(**bad)
+        MotionSegmentationConfig(**wrong)
 
 
 # --- in the odometry ------------------------------------------------------------------------------
 EACH_FRAME = KeyframeConfig(min_frames=1, max_frames=1, still_motion=0.0)  # Needs a keyframe.
 
 
-def tracked_masks(frames: Iterable[RgbdFrame]) -> list[TrackingResult]:
+def track(frames: Iterable[RgbdFrame]) -> list[TrackingResult]:
     odometry = Odometry(OdometryConfig(keyframes=KeyframeConfig(supporting=2.0)))
     return [odometry.process(frame) for frame in frames]
 
 
-def test_keyframes_of_the_odometry_do_not_track_against_who_walks(walked: Walked) -> None:
+def test_odometry_does_not_track_against_the_walking_person(walk: PersonWalk) -> None:
     config = OdometryConfig(moving=CONFIG, keyframes=EACH_FRAME)
-    odometry, kept = Odometry(config), []
+    odometry, keyframes = Odometry(config), []
     for k in range(56, 84, 2):
-        frame = walked.frame(k)
+        frame = walk.frame(k)
         if k in (80, 82):  # The last frames against their keyframes.
             before = Odometry(config)
             before.restore(odometry.snapshot())
             before.process(frame, may_map=False)
-            left_out = before.snapshot()["keyframe"]["left_out"]
-            assert recall_and_precision(left_out, walked.person(kept[-1]))[0] > 0.5
+            ignore_mask = before.snapshot()["keyframe"]["left_out"]
+            assert recall_and_precision(ignore_mask, walk.person(keyframes[-1]))[0] > 0.5
         result = odometry.process(frame, may_map=k in (56, 80))
         if result.keyframe is not None:
-            kept.append(k)
-    assert kept == [56, 80]
+            keyframes.append(k)
+    assert keyframes == [56, 80]
     assert result.dynamic_mask is not None
-    assert recall_and_precision(result.dynamic_mask, walked.person(k))[0] > 0.5
+    assert recall_and_precision(result.dynamic_mask, walk.person(k))[0] > 0.5
 
 
-def test_whom_a_detector_found_in_a_keyframe_is_not_tracked_against(walked: Walked) -> None:
-    """Before anything was seen to move, and after a restart."""
-    frame, person = walked.frame(LATE), walked.person(LATE)
+def test_odometry_does_not_track_against_a_detected_person(walk: PersonWalk) -> None:
+    """No motion has been observed yet; the mask also holds after a restart."""
+    frame, person = walk.frame(OCCUPIED), walk.person(OCCUPIED)
     odometry = Odometry()
     keyframe = odometry.process(frame).reference
     assert keyframe is not None
@@ -210,13 +210,13 @@ def test_whom_a_detector_found_in_a_keyframe_is_not_tracked_against(walked: Walk
     odometry.mask_dynamic_objects(keyframe + 1, [box_around(person)])
     assert odometry.snapshot()["keyframe"]["movable"] is None
     odometry.mask_dynamic_objects(keyframe, [box_around(person)])
-    kept = odometry.snapshot()
-    assert recall_and_precision(kept["keyframe"]["movable"], person)[0] > 0.95
+    state = odometry.snapshot()
+    assert recall_and_precision(state["keyframe"]["movable"], person)[0] > 0.95
     restored = Odometry()
-    restored.restore(decode_state(encode_state(kept)))
-    for one in (odometry, restored):
-        tracked = one.process(walked.frame(LATE + 6), may_map=False)
-        error = se3.inverse(walked.T(LATE, LATE + 6)) @ tracked.T_odom_camera
+    restored.restore(decode_state(encode_state(state)))
+    for tracker in (odometry, restored):
+        tracked = tracker.process(walk.frame(OCCUPIED + 6), may_map=False)
+        error = se3.inverse(walk.T(OCCUPIED, OCCUPIED + 6)) @ tracked.T_odom_camera
         assert np.linalg.norm(error[:3, 3]) < 0.01
 
 
@@ -227,10 +227,10 @@ def box_around(mask: np.ndarray) -> Box:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_tracking_past_somebody_is_exact_and_never_unsure() -> None:
-    """ATE 0.15 cm and 16 frames WEAK without."""
+def test_tracking_past_a_person_is_accurate_and_always_ok() -> None:
+    """Without segmentation, the ATE is 0.15 cm and 16 frames are WEAK."""
     sequence = SyntheticSequence.named("person-noisy")
-    results = tracked_masks(sequence)
+    results = track(sequence)
     T = np.array([r.T_odom_camera for r in results])
     truth = sequence.truth()
     errors = evaluate_trajectory(Trajectory(truth.stamps_s, T), truth)
@@ -250,16 +250,16 @@ def test_tracking_past_somebody_is_exact_and_never_unsure() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_hardly_anything_moves_in_a_kitchen_where_nobody_is(data: Path) -> None:
+def test_static_kitchen_has_almost_no_dynamic_pixels(data: Path) -> None:
     kitchen = open_sequence(str(data / "tum" / "kitchen"))
-    assert mean_masked(tracked_masks(map(kitchen.__getitem__, range(300)))) < 0.01
+    assert mean_masked(track(map(kitchen.__getitem__, range(300)))) < 0.01
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_hardly_anything_moves_in_the_flat() -> None:
+def test_static_flat_has_almost_no_dynamic_pixels() -> None:
     flat = open_sequence("synthetic:flat")
-    assert mean_masked(tracked_masks(map(flat.__getitem__, range(200)))) < 0.01
+    assert mean_masked(track(map(flat.__getitem__, range(200)))) < 0.01
 
 
 def mean_masked(results: list[TrackingResult]) -> float:

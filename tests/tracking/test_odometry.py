@@ -41,20 +41,20 @@ def assert_bitwise_equal(a: Sequence[TrackingResult], b: Sequence[TrackingResult
         assert became_reference(x) == became_reference(y)
 
 
-def test_walk_is_followed_and_keyframes_are_made(room, make_walk) -> None:
+def test_walk_is_tracked_and_keyframes_are_made(room, make_walk) -> None:
     truth = make_walk(25)
     results = track(Odometry(), [room.view(T, index=k) for k, T in enumerate(truth)])
     assert {r.status for r in results} == {TrackingStatus.OK}
     assert largest_error_m(results, truth) < 5e-3
     assert 2 < sum(map(became_reference, results)) < 14
-    made = [index for index, r in enumerate(results) if r.keyframe is not None]
+    keyframes = [index for index, r in enumerate(results) if r.keyframe is not None]
     last = results[-1]
     assert last.reference is not None
-    between = se3.inverse(truth[made[last.reference]]) @ truth[-1]
+    between = se3.inverse(truth[keyframes[last.reference]]) @ truth[-1]
     np.testing.assert_allclose(last.T_reference_camera, between, atol=2e-3)
 
 
-def test_tracking_survives_when_there_is_never_room_for_a_keyframe(room, make_walk) -> None:
+def test_tracking_continues_when_no_keyframe_may_be_made(room, make_walk) -> None:
     truth = make_walk(16)
     odometry = Odometry()
     odometry.process(room.view(truth[0]))
@@ -65,7 +65,7 @@ def test_tracking_survives_when_there_is_never_room_for_a_keyframe(room, make_wa
     assert all(r.denied_keyframe is KeyframeKind.REFERENCE for r in results[-5:])
 
 
-def test_before_the_first_keyframe_every_usable_frame_is_the_first(room) -> None:
+def test_every_usable_frame_is_first_until_a_keyframe_is_made(room) -> None:
     odometry = Odometry()
     assert odometry.process(room.blank()).status is TrackingStatus.LOST
     for _ in range(2):
@@ -94,7 +94,7 @@ def test_steps_beyond_the_reach_of_direct_alignment_are_found_by_features(large_
     assert "features" in {r.pose_source for r in results}
 
 
-def test_repeated_frame_stays_where_it_is(room, make_walk) -> None:
+def test_repeated_frame_keeps_its_pose(room, make_walk) -> None:
     frames = [room.view(T, stamp_ns=k * 33_000_000) for k, T in enumerate(make_walk(6))]
     odometry = Odometry()
     moving = track(odometry, frames)
@@ -115,7 +115,7 @@ def test_frame_without_depth_is_weak_and_does_not_break_the_track(room, make_wal
     assert largest_error_m(results, truth) < 5e-3
 
 
-def test_blank_frame_is_not_ok_and_the_next_one_is_found_again(large_room, make_walk) -> None:
+def test_blank_frame_is_not_ok_and_the_next_frame_is_tracked(large_room, make_walk) -> None:
     truth = make_walk(8)
     frames = [large_room.view(T) for T in truth]
     frames[5] = large_room.blank()
@@ -125,13 +125,13 @@ def test_blank_frame_is_not_ok_and_the_next_one_is_found_again(large_room, make_
     assert largest_error_m(results[6:], truth[6:]) < 5e-3
 
 
-def test_kidnapped_camera_knows_it_and_relocalizes_on_return(large_room, make_walk) -> None:
+def test_kidnapped_camera_is_lost_and_relocalizes_on_return(large_room, make_walk) -> None:
     odometry = Odometry()
     track(odometry, [large_room.view(T, index=k) for k, T in enumerate(make_walk(8))])
     before = odometry.process(large_room.view(make_walk(8)[-1]), may_map=False)
-    gone = [odometry.process(large_room.view(T_ELSEWHERE @ T)) for T in make_walk(5)]
-    assert {r.status for r in gone} == {TrackingStatus.LOST}
-    for r in gone:  # the pose does not jump
+    elsewhere = [odometry.process(large_room.view(T_ELSEWHERE @ T)) for T in make_walk(5)]
+    assert {r.status for r in elsewhere} == {TrackingStatus.LOST}
+    for r in elsewhere:  # The pose does not jump.
         np.testing.assert_array_equal(r.T_odom_camera, before.T_odom_camera)
         assert not r.information.any()
     T_back = make_walk(3)[-1] @ se3.exp(np.array([0.0, -0.1, 0.05, -0.1, 0.0, 0.05]))
@@ -168,7 +168,7 @@ def test_restored_odometry_continues_bitwise_equal(large_room, make_walk) -> Non
     )
 
 
-def test_state_survives_its_form_on_disk(large_room, make_walk) -> None:
+def test_state_survives_encoding(large_room, make_walk) -> None:
     frames = [large_room.view(T) for T in make_walk(8, 0.05, 0.03)]
     odometry, restored = Odometry(), Odometry()
     track(odometry, frames[:6])
@@ -177,8 +177,8 @@ def test_state_survives_its_form_on_disk(large_room, make_walk) -> None:
     assert_bitwise_equal(track(restored, rest), track(odometry, rest))
 
 
-def test_a_place_left_long_ago_is_found_again(large_room) -> None:
-    """Nine keyframes later; tracking goes on against the old one, after a restart too."""
+def test_camera_relocalizes_in_an_old_keyframe(large_room) -> None:
+    """Tracking continues against the old keyframe, nine keyframes later and after a restart."""
     turns = [se3.exp(np.array([0.0, 0.12 * k, 0.0, 0.0, 0.0, 0.0])) for k in range(20)]
     odometry = Odometry()
     out = track(odometry, [large_room.view(T) for T in turns])
@@ -198,8 +198,8 @@ def test_a_place_left_long_ago_is_found_again(large_room) -> None:
     assert_bitwise_equal(track(restored, frames[1:]), after)
 
 
-def test_a_lost_camera_is_found_by_the_last_frame_mapped(large_room) -> None:
-    """It went on where its keyframe shows nothing any more; after a restart in between too."""
+def test_lost_camera_relocalizes_in_the_last_mapped_frame(large_room) -> None:
+    """The view has left the reference keyframe; the restored tracker finds the same pose."""
     rarely = KeyframeConfig(
         min_overlap=0.0, max_frames=1000, max_rotation_rad=np.pi, max_translation=100.0,
         supporting=0.1,

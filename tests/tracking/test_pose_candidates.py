@@ -10,10 +10,10 @@ from ldo_service.tracking.pose_candidates import (
 )
 
 T_KEYFRAME_CAMERA = se3.exp(np.array([0.0, 0.1, 0.0, 0.1, 0.0, 0.1]))
-T_ASTRAY = se3.exp(np.array([0.0, -0.4, 0.1, -0.6, 0.1, 0.0]))
+T_WRONG = se3.exp(np.array([0.0, -0.4, 0.1, -0.6, 0.1, 0.0]))
 
 
-def chosen_from(room, guesses, second=None):
+def align_and_select(room, guesses, second=None):
     keyframe = ReferenceKeyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), 0)
     view = pyramid_of(room.view(T_KEYFRAME_CAMERA), PyramidConfig())
     align = AlignConfig()
@@ -25,33 +25,33 @@ def chosen_from(room, guesses, second=None):
     )
 
 
-def test_true_pose_wins_over_a_wrong_minimum_that_calls_itself_inliers(room) -> None:
-    (wrong, _), winner = chosen_from(room, [T_ASTRAY, T_KEYFRAME_CAMERA])
-    assert wrong.alignment.photometric_inliers > 0.85  # by its own inflated noise
-    off = se3.inverse(wrong.alignment.T_reference_camera) @ T_KEYFRAME_CAMERA
-    assert np.linalg.norm(off[:3, 3]) > 0.1
+def test_true_pose_wins_over_a_wrong_minimum_with_many_inliers(room) -> None:
+    (wrong, _), winner = align_and_select(room, [T_WRONG, T_KEYFRAME_CAMERA])
+    assert wrong.alignment.photometric_inliers > 0.85  # Relative to its own inflated noise.
+    T_error = se3.inverse(wrong.alignment.T_reference_camera) @ T_KEYFRAME_CAMERA
+    assert np.linalg.norm(T_error[:3, 3]) > 0.1
     assert winner.pose_source == "guess 1"
     assert winner.is_confirmed is None
 
 
-def test_first_of_equals_wins(room) -> None:
-    _, winner = chosen_from(room, [T_KEYFRAME_CAMERA, T_KEYFRAME_CAMERA])
+def test_first_of_equal_hypotheses_wins(room) -> None:
+    _, winner = align_and_select(room, [T_KEYFRAME_CAMERA, T_KEYFRAME_CAMERA])
     assert winner.pose_source == "guess 0"
 
 
-def test_features_at_the_same_pose_agree(room) -> None:
-    _, winner = chosen_from(room, [np.eye(4), T_KEYFRAME_CAMERA], T_KEYFRAME_CAMERA)
+def test_feature_pose_at_the_same_minimum_confirms(room) -> None:
+    _, winner = align_and_select(room, [np.eye(4), T_KEYFRAME_CAMERA], T_KEYFRAME_CAMERA)
     assert winner.is_confirmed is True
 
 
-def test_two_starts_that_met_agree_even_where_the_raw_feature_pose_was_rough(room) -> None:
+def test_converged_starts_confirm_despite_a_rough_feature_pose(room) -> None:
     rough = T_KEYFRAME_CAMERA @ se3.exp(np.array([0.0, 0.05, 0.0, 0.1, 0.0, 0.0]))
     for guesses in ([T_KEYFRAME_CAMERA, rough], [rough, T_KEYFRAME_CAMERA]):
-        _, winner = chosen_from(room, guesses, rough)
+        _, winner = align_and_select(room, guesses, rough)
         assert winner.is_confirmed is True
 
 
-def test_features_that_the_images_refute_have_no_say(room) -> None:
-    _, winner = chosen_from(room, [T_KEYFRAME_CAMERA, T_ASTRAY], T_ASTRAY)
+def test_feature_pose_that_the_images_contradict_is_ignored(room) -> None:
+    _, winner = align_and_select(room, [T_KEYFRAME_CAMERA, T_WRONG], T_WRONG)
     assert winner.pose_source == "guess 0"
     assert winner.is_confirmed is None

@@ -14,11 +14,11 @@ from ldo_service.tracking.pyramid import (
 
 def ramp(height: int, width: int) -> np.ndarray:
     v, u = np.mgrid[:height, :width]
-    return (3.0 * u + 5.0 * v + 1.0).astype(np.float32)  # 0 would be clipped
+    return (3.0 * u + 5.0 * v + 1.0).astype(np.float32)  # 0 would count as clipped.
 
 
 @pytest.mark.parametrize("size", [(8, 12), (9, 13)])
-def test_halving_moves_pixel_centers_as_the_conventions_say(size: tuple[int, int]) -> None:
+def test_halved_pixel_is_centered_between_four_pixels(size: tuple[int, int]) -> None:
     half = halved_image(ramp(*size))
     v, u = np.mgrid[: half.shape[0], : half.shape[1]]
     np.testing.assert_allclose(half, 3.0 * (2 * u + 0.5) + 5.0 * (2 * v + 0.5) + 1.0, rtol=1e-6)
@@ -62,16 +62,16 @@ def test_depth_beyond_any_sensor_is_missing(room) -> None:
     assert all(level.depth_m.max() < 10 for level in levels)
 
 
-def test_a_pyramid_without_levels_is_refused() -> None:
+def test_pyramid_without_levels_is_refused() -> None:
     with pytest.raises(ConfigError, match="at least 1"):
         PyramidConfig(levels=0)
 
 
-def test_clipped_pixels_tell_nothing_on_any_level() -> None:
+def test_clipped_pixels_have_no_intensity_on_any_level() -> None:
     gray = np.full((64, 96), 100, np.uint8)
     gray[:, 20:] = 255
     gray[:, 40:] = 0
-    gray[3, 24] = 130  # one pixel that is not clipped speaks for its block
+    gray[3, 24] = 130  # The only unclipped pixel of its block.
     depth_m = np.ones(gray.shape, np.float32)
     camera = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
     config = PyramidConfig(working_width_px=96, levels=3)

@@ -33,12 +33,12 @@ def test_blank_frame_has_no_points(room) -> None:
     assert reference.median_depth_m == 1.0
 
 
-def test_what_is_left_out_has_no_points_on_any_level(room) -> None:
+def test_masked_pixels_have_no_points_on_any_level(room) -> None:
     pyramid = pyramid_of(room.view(np.eye(4)), PyramidConfig())
-    left_out = np.zeros((120, 160), bool)
-    left_out[30:61, 41:90] = True
+    ignore_mask = np.zeros((120, 160), bool)
+    ignore_mask[30:61, 41:90] = True
     for points, level in zip(
-        build_reference(pyramid, left_out).points, pyramid.levels, strict=True
+        build_reference(pyramid, ignore_mask).points, pyramid.levels, strict=True
     ):
         column, row = level.camera.project(points[:3].T.astype(float)).round().astype(int).T
         scale = 160 / level.camera.width

@@ -1,4 +1,4 @@
-"""Which known keyframes a camera may go on against, and what becomes of odometry then."""
+"""Keyframe reuse: which known keyframes are used, and how odometry continues on them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,13 +19,8 @@ from ldo_service.tracking import (
     TrackingStatus,
     pyramid_of,
 )
-from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.keyframe_database import (
-    KeyframeDatabaseConfig,
-    KeyframeRecord,
-    make_keyframe_record,
-)
-from ldo_service.tracking.keyframes import KeyframeConfig, ReferenceKeyframe
+from ldo_service.tracking.keyframe_database import KeyframeRecord
+from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.map_frame import MapCorrection
 from ldo_service.tracking.relocalization import (
     KeyframeReuse,
@@ -35,22 +30,18 @@ from ldo_service.tracking.relocalization import (
 from ldo_service.tracking.state import KeyframeOrigin
 from ldo_service.tracking.tracking_quality import ResidualHistory, TrackingQualityConfig
 from ldo_service.tracking.tracking_result import KeyframeKind
+from tests.tracking.scenes import record_at
 
-SOON = OdometryConfig(returning=KeyframeReuseConfig(after=1))
+REUSE_EARLY = OdometryConfig(returning=KeyframeReuseConfig(after=1))
 
 
 def moved(x_m: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
     return se3.exp(np.array([0.0, turn_rad, 0.0, x_m, 0.0, 0.0]))
 
 
-def place_at(room, number: int) -> KeyframeRecord:
-    keyframe = ReferenceKeyframe(
-        pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), number
-    )
-    return replace(
-        make_keyframe_record(keyframe, FeatureConfig(), KeyframeDatabaseConfig()),
-        median_depth_m=2.0,
-    )
+def record_of(room, keyframe_id: int) -> KeyframeRecord:
+    """Return a record at the identity with a median depth of 2 m."""
+    return replace(record_at(room, np.eye(4), keyframe_id), median_depth_m=2.0)
 
 
 def correction_of(T_map_keyframe: Mapping[int, np.ndarray]) -> MapCorrection:
@@ -58,69 +49,69 @@ def correction_of(T_map_keyframe: Mapping[int, np.ndarray]) -> MapCorrection:
 
 
 def connect(odometry: Odometry) -> None:
-    """Let the reference count as measured from a known keyframe, as one keyframe more would."""
+    """Mark the reference as measured from a known keyframe, as one more keyframe would."""
     frames = odometry._frames
     frames.state = replace(frames.state, origin=KeyframeOrigin.TIED)
 
 
-def followed(
+def track(
     odometry: Odometry, room, poses: list[np.ndarray]
 ) -> tuple[list[TrackingResult], dict[int, np.ndarray]]:
-    """Track along the poses; also the true T_odom_keyframe [4, 4] of the keyframes made."""
-    results, made = [], {}
+    """Track along poses; also return the true T_odom_keyframe [4, 4] of each new keyframe."""
+    results, keyframes = [], {}
     for index, T in enumerate(poses):
         results.append(odometry.process(room.view(T, index=index)))
         if results[-1].keyframe is not None:
-            made[results[-1].keyframe.id] = T
-    return results, made
+            keyframes[results[-1].keyframe.id] = T
+    return results, keyframes
 
 
-# --- which are near -------------------------------------------------------------------------------
-def test_places_are_near_until_a_keyframe_is_due_the_nearest_first(room) -> None:
-    config = KeyframeConfig(max_translation=0.1, max_rotation_rad=0.2)  # 0.2 m of 2 m
-    places = [place_at(room, number) for number in range(5)]
+# --- nearby records -------------------------------------------------------------------------------
+def test_nearby_records_are_within_keyframe_limits_nearest_first(room) -> None:
+    config = KeyframeConfig(max_translation=0.1, max_rotation_rad=0.2)  # 0.2 m at a depth of 2 m.
+    records = [record_of(room, number) for number in range(5)]
     T_map = {0: moved(0.19), 1: moved(0.21), 2: moved(-0.05), 3: moved(0, 0.15), 4: moved(0, -0.25)}
-    near = find_nearby_keyframes(places, T_map, np.eye(4), config)
-    assert [place.id for place, _ in near] == [2, 3, 0]
-    for place, T_place_camera in near:
-        np.testing.assert_allclose(T_map[place.id] @ T_place_camera, np.eye(4), atol=1e-12)
+    near = find_nearby_keyframes(records, T_map, np.eye(4), config)
+    assert [record.id for record, _ in near] == [2, 3, 0]
+    for record, T_record_camera in near:
+        np.testing.assert_allclose(T_map[record.id] @ T_record_camera, np.eye(4), atol=1e-12)
 
 
-def test_places_that_the_map_does_not_have_are_left_out(room) -> None:
-    places = [place_at(room, number) for number in range(2)]
+def test_records_without_a_map_pose_are_skipped(room) -> None:
+    records = [record_of(room, number) for number in range(2)]
     assert [
-        p.id for p, _ in find_nearby_keyframes(places, {1: np.eye(4)}, np.eye(4), KeyframeConfig())
+        p.id for p, _ in find_nearby_keyframes(records, {1: np.eye(4)}, np.eye(4), KeyframeConfig())
     ] == [1]
-    assert find_nearby_keyframes(places, {}, np.eye(4), KeyframeConfig()) == []
+    assert find_nearby_keyframes(records, {}, np.eye(4), KeyframeConfig()) == []
 
 
-def due_on_the_way_back(
-    odometry: Odometry, room, there: list[np.ndarray]
+def first_frame_that_needs_a_keyframe(
+    odometry: Odometry, room, outward: list[np.ndarray]
 ) -> tuple[TrackingResult, np.ndarray]:
-    """Return the first frame that needs a new reference, and its true pose."""
-    for T in reversed(there[:-1]):
+    """Walk back; return the first frame that needs a new reference, and its true pose."""
+    for T in reversed(outward[:-1]):
         result = odometry.process(room.view(T), may_map=False)
         if result.denied_keyframe is KeyframeKind.REFERENCE:
             return result, T
-    raise AssertionError("no keyframe was due")
+    raise AssertionError("no frame needs a keyframe")
 
 
 # --- odometry -------------------------------------------------------------------------------------
 @dataclass(frozen=True)
-class Back:
-    """A camera that came back to where a keyframe is due, in a map that has the known ones."""
+class ReturnedCamera:
+    """A camera that returned to where it needs a keyframe, in a map of known keyframes."""
 
     odometry: Odometry
     correction: MapCorrection
-    otherwise: TrackingResult  # Of the same frame without a map.
+    without_map: TrackingResult  # Result of the same frame without a map.
     result: TrackingResult
 
 
-def left_and_back(room, make_walk, T_error: np.ndarray) -> Back:
-    """There and back to where a keyframe is due, in a map that is off by T_error."""
-    odometry, alone, there = Odometry(SOON), Odometry(SOON), make_walk(20)
-    _, T_map = followed(odometry, room, there)
-    due, T = due_on_the_way_back(odometry, room, there)
+def walk_out_and_return(room, make_walk, T_error: np.ndarray) -> ReturnedCamera:
+    """Walk out and return to where a keyframe is needed, in a map that is off by T_error."""
+    odometry, alone, outward = Odometry(REUSE_EARLY), Odometry(REUSE_EARLY), make_walk(20)
+    _, T_map = track(odometry, room, outward)
+    due, T = first_frame_that_needs_a_keyframe(odometry, room, outward)
     alone.restore(odometry.snapshot())
     assert due.reference is not None
     T_map[due.reference] = T @ T_error @ se3.inverse(due.T_reference_camera)
@@ -128,52 +119,52 @@ def left_and_back(room, make_walk, T_error: np.ndarray) -> Back:
     assert odometry.correct(correction)
     connect(odometry)
     frame = room.view(T)
-    otherwise = alone.process(frame, may_map=False)
-    return Back(odometry, correction, otherwise, odometry.process(frame, may_map=False))
+    without_map = alone.process(frame, may_map=False)
+    return ReturnedCamera(odometry, correction, without_map, odometry.process(frame, may_map=False))
 
 
-def test_odometry_goes_on_where_it_is_against_the_known_keyframe(room, make_walk) -> None:
-    back = left_and_back(room, make_walk, np.eye(4))
-    returned, otherwise = back.result, back.otherwise
-    assert otherwise.denied_keyframe is KeyframeKind.REFERENCE
+def test_keyframe_reuse_keeps_the_odometry_pose(room, make_walk) -> None:
+    back = walk_out_and_return(room, make_walk, np.eye(4))
+    returned, without_map = back.result, back.without_map
+    assert without_map.denied_keyframe is KeyframeKind.REFERENCE
     assert returned.reused_keyframe is not None
     assert returned.reference == returned.reused_keyframe == back.odometry.reference
-    assert returned.reference != otherwise.reference
+    assert returned.reference != without_map.reference
     assert (returned.status, returned.pose_source) == (TrackingStatus.OK, "reused")
     assert (returned.keyframe, returned.denied_keyframe) == (None, None)
-    np.testing.assert_array_equal(returned.T_odom_camera, otherwise.T_odom_camera)
-    again = back.odometry.process(room.view(returned.T_odom_camera))
-    assert (again.reference, again.keyframe) == (returned.reference, None)
-    np.testing.assert_allclose(again.T_odom_camera, returned.T_odom_camera, atol=3e-3)
+    np.testing.assert_array_equal(returned.T_odom_camera, without_map.T_odom_camera)
+    following = back.odometry.process(room.view(returned.T_odom_camera))
+    assert (following.reference, following.keyframe) == (returned.reference, None)
+    np.testing.assert_allclose(following.T_odom_camera, returned.T_odom_camera, atol=3e-3)
 
 
-def test_what_a_known_keyframe_shows_is_not_mapped_again(room, make_walk) -> None:
-    back = left_and_back(room, make_walk, np.eye(4))
+def test_view_of_a_reused_keyframe_is_not_mapped_again(room, make_walk) -> None:
+    back = walk_out_and_return(room, make_walk, np.eye(4))
     odometry, returned = back.odometry, back.result
-    step = se3.exp(np.array([0, 0.1, 0, 0, 0, 0]))  # worth mapping, but for that
+    step = se3.exp(np.array([0, 0.1, 0, 0, 0, 0]))  # Large enough to be mapped otherwise.
     tracked = odometry.process(room.view(returned.T_odom_camera @ step), may_map=False)
     assert tracked.reference == returned.reference
     assert tracked.status is TrackingStatus.OK
     assert tracked.denied_keyframe in (None, KeyframeKind.REFERENCE)
-    aside = tracked.T_odom_camera @ moved(turn_rad=0.3)  # where no known keyframe is
+    aside = tracked.T_odom_camera @ moved(turn_rad=0.3)  # Away from known keyframes.
     for T in (aside, aside):
-        made = odometry.process(room.view(T))
+        tracked = odometry.process(room.view(T))
     assert odometry.reference is not None
     assert odometry.reference > max(back.correction.read_poses(None))
-    ahead = odometry.process(room.view(made.T_odom_camera @ step))
-    assert ahead.keyframe is not None, "of a new keyframe it is mapped"
+    ahead = odometry.process(room.view(tracked.T_odom_camera @ step))
+    assert ahead.keyframe is not None, "views near a new keyframe are mapped"
 
 
-def test_nobody_returns_where_map_and_images_disagree(room, make_walk) -> None:
-    back = left_and_back(room, make_walk, moved(turn_rad=0.06))
+def test_no_reuse_where_map_and_images_disagree(room, make_walk) -> None:
+    back = walk_out_and_return(room, make_walk, moved(turn_rad=0.06))
     assert back.result.reused_keyframe is None
     assert back.result.denied_keyframe is KeyframeKind.REFERENCE
 
 
-def test_nobody_returns_before_a_keyframe_is_measured_from_a_known_one(room, make_walk) -> None:
-    odometry, there = Odometry(SOON), make_walk(20)
-    _, T_map = followed(odometry, room, there)
-    due, T = due_on_the_way_back(odometry, room, there)
+def test_no_reuse_before_a_keyframe_is_measured_from_a_known_one(room, make_walk) -> None:
+    odometry, outward = Odometry(REUSE_EARLY), make_walk(20)
+    _, T_map = track(odometry, room, outward)
+    due, T = first_frame_that_needs_a_keyframe(odometry, room, outward)
     odometry.correct(correction_of(T_map))
     result = odometry.process(room.view(T))
     assert (result.reused_keyframe, result.reference) == (None, due.reference)
@@ -186,7 +177,7 @@ def test_nobody_returns_before_a_keyframe_is_measured_from_a_known_one(room, mak
     assert odometry._is_connected_to_map
 
 
-def test_nobody_returns_to_what_looks_otherwise_now(room) -> None:
+def test_no_reuse_of_a_keyframe_that_looks_different_now(room) -> None:
     reuse = KeyframeReuse(
         PyramidConfig(),
         AlignConfig(),
@@ -194,31 +185,31 @@ def test_nobody_returns_to_what_looks_otherwise_now(room) -> None:
         TrackingQualityConfig(),
         KeyframeReuseConfig(),
     )
-    near = [(place_at(room, 0), np.eye(4))]
+    near = [(record_of(room, 0), np.eye(4))]
     blank, same = (pyramid_of(f, PyramidConfig()) for f in (room.blank(), room.view(np.eye(4))))
     assert reuse.find(blank, near, ResidualHistory()) is None
     assert reuse.find(same, near, ResidualHistory()) is not None
 
 
-def test_the_next_frames_after_a_return_survive_a_restart_bit_for_bit(room, make_walk) -> None:
-    back = left_and_back(room, make_walk, np.eye(4))
-    odometry, successor = back.odometry, Odometry(SOON)
+def test_restored_tracker_continues_bitwise_equal_after_reuse(room, make_walk) -> None:
+    back = walk_out_and_return(room, make_walk, np.eye(4))
+    odometry, restored = back.odometry, Odometry(REUSE_EARLY)
     assert back.result.reused_keyframe is not None
     state = decode_state(encode_state(odometry.snapshot()))
-    successor.restore(state, back.correction)
+    restored.restore(state, back.correction)
     for step in (0.01, 0.03, 0.06):
         view = room.view(back.result.T_odom_camera @ moved(step))
-        a, b = odometry.process(view), successor.process(view)
+        a, b = odometry.process(view), restored.process(view)
         assert a.T_odom_camera.tobytes() == b.T_odom_camera.tobytes()
         assert a.T_map_odom.tobytes() == b.T_map_odom.tobytes()
         assert (a.reference, a.reused_keyframe) == (b.reference, b.reused_keyframe)
         assert (a.keyframe is None) == (b.keyframe is None)
 
 
-def test_a_keyframe_made_after_a_return_is_measured_from_those_returned_to(room, make_walk) -> None:
-    """Odometry has them elsewhere than before, as after a long way, and the window must know."""
-    odometry, there = Odometry(SOON), make_walk(45)
-    _, T_map = followed(odometry, room, there)
+def test_keyframe_made_after_reuse_is_measured_from_the_reused_ones(room, make_walk) -> None:
+    """Odometry poses of the records have changed, as after drift, and the window must use them."""
+    odometry, outward = Odometry(REUSE_EARLY), make_walk(45)
+    _, T_map = track(odometry, room, outward)
     state = odometry._frames.state
     far = tuple(
         replace(p, T_odom_keyframe=moved(0.4) @ p.T_odom_keyframe) for p in state.places.all
@@ -226,11 +217,11 @@ def test_a_keyframe_made_after_a_return_is_measured_from_those_returned_to(room,
     odometry._frames.state = replace(state, places=replace(state.places, all=far))
     odometry.correct(correction_of(T_map))
     connect(odometry)
-    back = [odometry.process(room.view(T)) for T in reversed(there[:-1])]
+    back = [odometry.process(room.view(T)) for T in reversed(outward[:-1])]
     assert [result.keyframe for result in back] == [None] * len(back)
-    seen = {result.reused_keyframe for result in back if result.reused_keyframe is not None}
-    assert len(seen) > 2
-    aside = room.view(there[0] @ moved(turn_rad=0.3))
+    reused = {result.reused_keyframe for result in back if result.reused_keyframe is not None}
+    assert len(reused) > 2
+    aside = room.view(outward[0] @ moved(turn_rad=0.3))
     for _ in range(2):
         result = odometry.process(aside)
         if result.keyframe is not None:
@@ -238,11 +229,11 @@ def test_a_keyframe_made_after_a_return_is_measured_from_those_returned_to(room,
     assert result.keyframe is not None
     assert result.keyframe.kind is KeyframeKind.REFERENCE
     window = result.keyframe.window
-    assert {measured.a for measured in window} <= seen
+    assert {measured.a for measured in window} <= reused
     assert window
     for measured in window:
         assert measured.b == result.keyframe.id
-        T_true = se3.inverse(T_map[measured.a]) @ there[0] @ moved(turn_rad=0.3)
+        T_true = se3.inverse(T_map[measured.a]) @ outward[0] @ moved(turn_rad=0.3)
         np.testing.assert_allclose(measured.T_a_b, T_true, atol=1e-2)
 
 
@@ -250,25 +241,23 @@ def test_a_keyframe_made_after_a_return_is_measured_from_those_returned_to(room,
     "wrong",
     [{"after": -1}, {"tries": 0}, {"agreement_rad": 0.0}, {"min_geometric_inliers": 1.5}],
 )
-def test_settings_that_cannot_be_are_refused(wrong: dict) -> None:
+def test_impossible_settings_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         KeyframeReuseConfig(**wrong)
 
 
-def test_a_camera_that_moves_slowly_stays_with_the_keyframe_it_returned_to(room, make_walk) -> None:
-    """A new one is due after so many frames; an old one shows the same after a year."""
-    back = left_and_back(room, make_walk, np.eye(4))
+def test_slow_camera_stays_with_the_reused_keyframe(room, make_walk) -> None:
+    """A new keyframe is replaced after some frames; a reused one is not."""
+    back = walk_out_and_return(room, make_walk, np.eye(4))
     assert back.result.reused_keyframe is not None
     steps = [back.result.T_odom_camera @ moved(5e-4 * k, 2e-3 * (k % 2)) for k in range(40)]
-    results, made = followed(back.odometry, room, steps)
-    assert made == {}
+    results, keyframes = track(back.odometry, room, steps)
+    assert keyframes == {}
     assert {result.reference for result in results} == {back.result.reference}
 
 
-def test_what_was_put_there_since_then_is_not_taken_for_something_that_moves(
-    room, make_walk
-) -> None:
-    back = left_and_back(room, make_walk, np.eye(4))
+def test_object_added_after_a_reused_keyframe_is_not_dynamic(room, make_walk) -> None:
+    back = walk_out_and_return(room, make_walk, np.eye(4))
     assert back.result.reused_keyframe is not None
     tracked = back.odometry.process(with_a_box(room.view(back.result.T_odom_camera)))
     assert tracked.status is TrackingStatus.OK
@@ -276,8 +265,8 @@ def test_what_was_put_there_since_then_is_not_taken_for_something_that_moves(
     assert tracked.dynamic_mask is None
 
 
-def test_of_a_new_keyframe_something_that_comes_is_taken_to_move(room) -> None:
-    odometry = Odometry(SOON)
+def test_object_that_appears_after_a_new_keyframe_is_dynamic(room) -> None:
+    odometry = Odometry(REUSE_EARLY)
     odometry.process(room.view(np.eye(4)))
     tracked = odometry.process(with_a_box(room.view(np.eye(4))))
     assert tracked.dynamic_mask is not None
@@ -291,8 +280,8 @@ def with_a_box(frame: RgbdFrame) -> RgbdFrame:
     return replace(frame, color=color, depth_m=depth_m)
 
 
-def test_whom_a_detector_found_is_not_in_the_place_either(room) -> None:
-    odometry = Odometry(SOON)
+def test_detected_person_is_removed_from_the_keyframe_record(room) -> None:
+    odometry = Odometry(REUSE_EARLY)
     frame = room.view(np.eye(4))
     number = odometry.process(frame).reference
     assert number is not None
@@ -303,21 +292,21 @@ def test_whom_a_detector_found_is_not_in_the_place_either(room) -> None:
     assert np.count_nonzero(after.depth_m[50:80, 50:80]) < 300
 
 
-def test_a_lost_camera_that_is_found_again_maps_nothing_anew(room, make_walk) -> None:
-    odometry, there = Odometry(SOON), make_walk(60)
-    followed(odometry, room, there)
+def test_relocalized_camera_maps_no_known_view_again(room, make_walk) -> None:
+    odometry, outward = Odometry(REUSE_EARLY), make_walk(60)
+    track(odometry, room, outward)
     odometry.process(room.blank())
-    found = odometry.process(room.view(there[2]), may_map=False)
+    found = odometry.process(room.view(outward[2]), may_map=False)
     assert (found.status, found.pose_source) == (TrackingStatus.OK, "relocalized")
     assert found.denied_keyframe in (None, KeyframeKind.REFERENCE)
     assert odometry._is_connected_to_map
 
 
-@pytest.mark.parametrize(("after", "may"), [(0, False), (3, False), (2, True)])
-def test_known_keyframes_do_once_there_are_many(room, after: int, may: bool) -> None:
+@pytest.mark.parametrize(("after", "expected"), [(0, False), (3, False), (2, True)])
+def test_keyframes_are_reused_once_there_are_enough(room, after: int, expected: bool) -> None:
     each_frame = KeyframeConfig(min_frames=1, max_frames=1, still_motion=0.0)
     config = OdometryConfig(returning=KeyframeReuseConfig(after=after), keyframes=each_frame)
     odometry = Odometry(config)
-    _, made = followed(odometry, room, [moved(0.02 * number) for number in range(2)])
-    assert len(made) == 2
-    assert odometry._frames.can_reuse_keyframes is may
+    _, keyframes = track(odometry, room, [moved(0.02 * number) for number in range(2)])
+    assert len(keyframes) == 2
+    assert odometry._frames.can_reuse_keyframes is expected

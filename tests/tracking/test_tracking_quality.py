@@ -29,25 +29,25 @@ SOUND = Alignment(
     converged=True,
     condition=50.0,
 )
-PAST = ResidualHistory((3.0, 4.0, 5.0), (0.8, 1.0, 1.2))
+HISTORY = ResidualHistory((3.0, 4.0, 5.0), (0.8, 1.0, 1.2))
 
 
-def candidate(agree: bool | None = None, **changes: Any) -> PoseHypothesis:
-    return PoseHypothesis(replace(SOUND, **changes), "direct", MEDIAN_DEPTH_M, agree)
+def hypothesis(is_confirmed: bool | None = None, **changes: Any) -> PoseHypothesis:
+    return PoseHypothesis(replace(SOUND, **changes), "direct", MEDIAN_DEPTH_M, is_confirmed)
 
 
-def verdict(
-    previous: TrackingStatus = TrackingStatus.OK, agree: bool | None = None, **changes: Any
+def status_of(
+    previous: TrackingStatus = TrackingStatus.OK, is_confirmed: bool | None = None, **changes: Any
 ) -> TrackingStatus:
-    return classify_tracking(candidate(agree, **changes), PAST, previous, CONFIG)
+    return classify_tracking(hypothesis(is_confirmed, **changes), HISTORY, previous, CONFIG)
 
 
-def test_sound_alignment_is_ok_whatever_came_before() -> None:
-    assert [verdict(previous) for previous in TrackingStatus] == [TrackingStatus.OK] * 3
+def test_sound_alignment_is_ok_after_any_status() -> None:
+    assert [status_of(previous) for previous in TrackingStatus] == [TrackingStatus.OK] * 3
 
 
 @pytest.mark.parametrize(
-    "sign",
+    "deviation",
     [
         {"overlap": 0.12},
         {"paired": 0.0},
@@ -57,87 +57,94 @@ def test_sound_alignment_is_ok_whatever_came_before() -> None:
         {"gain": 3.1},
         {"intensity_sigma": 11.0},
         {"depth_noise_scale": 3.0},
-        {"agree": False},
+        {"is_confirmed": False},
     ],
 )
-def test_every_single_sign_makes_a_frame_weak(sign: dict) -> None:
-    assert verdict(**sign) is TrackingStatus.WEAK
+def test_single_deviation_makes_a_frame_weak(deviation: dict) -> None:
+    assert status_of(**deviation) is TrackingStatus.WEAK
 
 
-def test_noise_that_grows_with_the_exposure_is_no_sign() -> None:
-    assert verdict(gain=2.5, intensity_sigma=10.0 * 2.5) is verdict(intensity_sigma=10.0)
-    past = PAST.extended(replace(SOUND, gain=2.0, intensity_sigma=8.0), CONFIG)
+def test_intensity_noise_is_relative_to_the_gain() -> None:
+    assert status_of(gain=2.5, intensity_sigma=10.0 * 2.5) is status_of(intensity_sigma=10.0)
+    past = HISTORY.extended(replace(SOUND, gain=2.0, intensity_sigma=8.0), CONFIG)
     assert past.intensity_sigmas[-1] == 4.0
 
 
-def test_a_frame_that_tells_no_brightness_is_never_accepted() -> None:
-    assert verdict(gain=0.0) is TrackingStatus.LOST
+def test_frame_with_zero_gain_is_lost() -> None:
+    assert status_of(gain=0.0) is TrackingStatus.LOST
 
 
-def test_residual_that_jumps_fivefold_is_never_accepted() -> None:
+def test_fivefold_residual_is_lost_after_any_status() -> None:
     for previous in TrackingStatus:
-        assert verdict(previous, intensity_sigma=20.4) is TrackingStatus.LOST
-        assert verdict(previous, depth_noise_scale=5.1) is TrackingStatus.LOST
+        assert status_of(previous, intensity_sigma=20.4) is TrackingStatus.LOST
+        assert status_of(previous, depth_noise_scale=5.1) is TrackingStatus.LOST
 
 
 def test_view_without_overlap_is_lost() -> None:
-    assert verdict(overlap=0.05) is TrackingStatus.LOST
+    assert status_of(overlap=0.05) is TrackingStatus.LOST
 
 
-def test_recovery_takes_more_than_staying() -> None:
+def test_recovery_needs_smaller_residuals_than_staying_ok() -> None:
     border = {"intensity_sigma": 9.0}
-    assert verdict(TrackingStatus.OK, **border) is TrackingStatus.OK
-    assert verdict(TrackingStatus.WEAK, **border) is TrackingStatus.WEAK
-    assert verdict(TrackingStatus.WEAK, intensity_sigma=7.0) is TrackingStatus.OK
+    assert status_of(TrackingStatus.OK, **border) is TrackingStatus.OK
+    assert status_of(TrackingStatus.WEAK, **border) is TrackingStatus.WEAK
+    assert status_of(TrackingStatus.WEAK, intensity_sigma=7.0) is TrackingStatus.OK
 
 
-def test_features_vouch_for_a_weak_frame_but_not_for_a_lost_one() -> None:
-    assert verdict(TrackingStatus.WEAK, agree=True, intensity_sigma=9.0) is TrackingStatus.OK
-    assert verdict(TrackingStatus.LOST, agree=True, intensity_sigma=9.0) is TrackingStatus.LOST
+def test_confirmation_by_features_recovers_weak_but_not_lost_frames() -> None:
+    assert (
+        status_of(TrackingStatus.WEAK, is_confirmed=True, intensity_sigma=9.0) is TrackingStatus.OK
+    )
+    assert (
+        status_of(TrackingStatus.LOST, is_confirmed=True, intensity_sigma=9.0)
+        is TrackingStatus.LOST
+    )
 
 
-def test_only_ok_leads_back_from_a_loss() -> None:
-    assert verdict(TrackingStatus.LOST, overlap=0.3) is TrackingStatus.LOST
-    assert verdict(TrackingStatus.LOST, overlap=0.4) is TrackingStatus.OK
+def test_lost_camera_recovers_only_to_ok() -> None:
+    assert status_of(TrackingStatus.LOST, overlap=0.3) is TrackingStatus.LOST
+    assert status_of(TrackingStatus.LOST, overlap=0.4) is TrackingStatus.OK
 
 
-def test_a_find_that_features_agree_with_may_show_less() -> None:
-    assert verdict(TrackingStatus.LOST, agree=True, overlap=0.2) is TrackingStatus.OK
-    assert verdict(TrackingStatus.LOST, agree=True, overlap=0.16) is TrackingStatus.LOST
-    assert verdict(TrackingStatus.LOST, agree=False, overlap=0.4) is TrackingStatus.LOST
+def test_relocalization_confirmed_by_features_needs_less_overlap() -> None:
+    assert status_of(TrackingStatus.LOST, is_confirmed=True, overlap=0.2) is TrackingStatus.OK
+    assert status_of(TrackingStatus.LOST, is_confirmed=True, overlap=0.16) is TrackingStatus.LOST
+    assert status_of(TrackingStatus.LOST, is_confirmed=False, overlap=0.4) is TrackingStatus.LOST
 
 
-def test_a_place_found_from_afar_may_fit_worse_than_one_found_where_it_was_seen() -> None:
+def test_relocalization_from_afar_may_have_larger_residuals() -> None:
     afar = np.eye(4)
-    afar[0, 3] = 0.4 * MEDIAN_DEPTH_M  # 0.4 rad of parallax
+    afar[0, 3] = 0.4 * MEDIAN_DEPTH_M  # 0.4 rad of parallax.
     noisy = {"intensity_sigma": 2.0 * 4.0}
-    assert verdict(TrackingStatus.LOST, **noisy) is TrackingStatus.LOST
-    assert verdict(TrackingStatus.LOST, T_reference_camera=afar, **noisy) is TrackingStatus.OK
+    assert status_of(TrackingStatus.LOST, **noisy) is TrackingStatus.LOST
+    assert status_of(TrackingStatus.LOST, T_reference_camera=afar, **noisy) is TrackingStatus.OK
 
 
-def test_no_distance_excuses_more_noise_than_tracking_bears() -> None:
+def test_residuals_beyond_the_weak_limit_are_lost_at_any_distance() -> None:
     far = np.eye(4)
     far[0, 3] = 3.0 * MEDIAN_DEPTH_M
     noisy = {"intensity_sigma": 1.05 * CONFIG.weak_residual * 4.0}
-    assert verdict(TrackingStatus.LOST, T_reference_camera=far, **noisy) is TrackingStatus.LOST
+    assert status_of(TrackingStatus.LOST, T_reference_camera=far, **noisy) is TrackingStatus.LOST
 
 
-def test_noise_below_that_of_any_camera_may_rise_unpunished() -> None:
+def test_residuals_below_usual_camera_noise_may_rise() -> None:
     perfect = ResidualHistory((1.0,) * 5, (0.2,) * 5)
-    textured = candidate(intensity_sigma=4.5, depth_noise_scale=1.0)
+    textured = hypothesis(intensity_sigma=4.5, depth_noise_scale=1.0)
     assert classify_tracking(textured, perfect, TrackingStatus.OK, CONFIG) is TrackingStatus.OK
 
 
-def test_without_a_past_noise_is_compared_with_a_usual_cameras() -> None:
+def test_without_history_residuals_are_compared_with_usual_noise() -> None:
     def first(**changes: float) -> TrackingStatus:
-        return classify_tracking(candidate(**changes), ResidualHistory(), TrackingStatus.OK, CONFIG)
+        return classify_tracking(
+            hypothesis(**changes), ResidualHistory(), TrackingStatus.OK, CONFIG
+        )
 
     assert first() is TrackingStatus.OK
     assert first(intensity_sigma=41.0) is TrackingStatus.LOST
     assert first(depth_noise_scale=6.0) is TrackingStatus.WEAK
 
 
-def test_history_forgets_beyond_its_length() -> None:
+def test_history_keeps_the_newest_residuals() -> None:
     history = ResidualHistory()
     for k in range(100):
         history = history.extended(replace(SOUND, intensity_sigma=float(k)), CONFIG)
