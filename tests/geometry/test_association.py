@@ -26,5 +26,5 @@ def test_tolerance_is_inclusive_in_integers() -> None:
     assert len(associate(np.array([0]), np.array([20_000_001]), 20_000_000)) == 0
 
 
-def test_nothing_pairs_with_nothing() -> None:
+def test_empty_stamps_give_no_pairs() -> None:
     assert associate(np.zeros(0), np.array([1.0]), 1.0).shape == (0, 2)

@@ -1,4 +1,4 @@
-"""Boxes in an image, judged by plain loops."""
+"""Boxes in an image, compared with plain loops."""
 
 import doctest
 
@@ -11,7 +11,7 @@ from ldo_service.geometry import boxes as boxes_module
 from ldo_service.geometry.boxes import ious, non_maximum_suppression
 
 
-def test_the_examples_hold() -> None:
+def test_examples_in_docstrings_hold() -> None:
     assert doctest.testmod(boxes_module).failed == 0
 
 
@@ -25,7 +25,7 @@ def plain_iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def plain_suppression(boxes, scores, class_ids, max_iou: float) -> list[int]:
-    """Kept are those that no kept one before them repeats."""
+    """Keep each box that does not repeat a kept box of higher score."""
     kept: list[int] = []
     for i in sorted(range(len(boxes)), key=lambda i: -scores[i]):
         repeats = (
@@ -37,7 +37,7 @@ def plain_suppression(boxes, scores, class_ids, max_iou: float) -> list[int]:
 
 
 def random_boxes(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Boxes, scores and classes; many boxes overlap, some scores are equal, and some are 0."""
+    """Return boxes, scores and classes; many boxes overlap, some scores are equal or 0."""
     rng = np.random.default_rng(seed)
     centers, sides = rng.uniform(0, 100, (count, 2)), rng.uniform(5, 60, (count, 2))
     boxes = np.hstack((centers - sides / 2, centers + sides / 2)).clip(-0.5)
@@ -66,27 +66,27 @@ def test_intersection_over_union_is_that_of_counted_pixels(
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 40), st.floats(0, 1))
-def test_suppression_keeps_what_plain_loops_keep(seed: int, count: int, max_iou: float) -> None:
+def test_suppression_equals_plain_loops(seed: int, count: int, max_iou: float) -> None:
     boxes, scores, class_ids = random_boxes(seed, count)
     kept = non_maximum_suppression(boxes, scores, class_ids, max_iou)
     assert kept.tolist() == plain_suppression(boxes, scores, class_ids, max_iou)
 
 
-def test_suppression_keeps_what_plain_loops_keep_of_many_boxes() -> None:
+def test_suppression_of_many_boxes_equals_plain_loops() -> None:
     boxes, scores, class_ids = random_boxes(0, 400)
     kept = non_maximum_suppression(boxes, scores, class_ids, 0.45)
     assert kept.tolist() == plain_suppression(boxes, scores, class_ids, 0.45)
     assert 5 < len(kept) < 300
 
 
-def test_boxes_on_the_grid_of_pixels_may_overlap_by_the_limit() -> None:
-    """Of integers and at a limit that a float holds exactly, nothing is rounded."""
+def test_boxes_that_overlap_by_exactly_the_limit_are_kept() -> None:
+    """Integers and a limit that a float holds exactly are not rounded."""
     boxes, scores, class_ids = np.array([[0, 0, 2, 1], [0, 0, 1, 1]]), np.ones(2), np.zeros(2, int)
     assert non_maximum_suppression(boxes, scores, class_ids, 0.5).tolist() == [0, 1]
     assert non_maximum_suppression(boxes, scores, class_ids, 0.499).tolist() == [0]
 
 
-def test_the_same_box_stays_once_for_each_class() -> None:
+def test_equal_boxes_are_kept_once_per_class() -> None:
     boxes = np.tile([[10.0, 10, 20, 20]], (4, 1))
     kept = non_maximum_suppression(
         boxes, np.array([0.5, 0.9, 0.7, 0.6]), np.array([0, 1, 0, 1]), 0.5
@@ -94,8 +94,8 @@ def test_the_same_box_stays_once_for_each_class() -> None:
     assert kept.tolist() == [1, 2]
 
 
-def test_touching_boxes_and_no_boxes_are_left_alone() -> None:
+def test_touching_boxes_are_kept_and_no_boxes_give_none() -> None:
     boxes = np.array([[0.0, 0, 10, 10], [10.0, 0, 20, 10]])
     assert len(non_maximum_suppression(boxes, np.ones(2), np.zeros(2, int), 0.0)) == 2
-    nothing = non_maximum_suppression(np.zeros((0, 4)), np.zeros(0), np.zeros(0, int), 0.5)
-    assert nothing.shape == (0,)
+    no_boxes = non_maximum_suppression(np.zeros((0, 4)), np.zeros(0), np.zeros(0, int), 0.5)
+    assert no_boxes.shape == (0,)

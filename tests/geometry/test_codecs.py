@@ -1,4 +1,4 @@
-"""Images on the wire come back as they were, and broken ones raise FrameError."""
+"""Encoding and decoding of images; broken images raise FrameError."""
 
 import cv2
 import numpy as np
@@ -12,13 +12,13 @@ COLOR = RNG.integers(0, 256, (6, 9, 3), dtype=np.uint8)
 DEPTH = RNG.integers(0, 60000, (6, 9), dtype=np.uint16)
 
 
-def test_raw_color_is_taken_as_it_is() -> None:
+def test_raw_color_is_unchanged() -> None:
     np.testing.assert_array_equal(
         codecs.decode_color("rgb8", 9, 6, memoryview(COLOR.tobytes())), COLOR
     )
 
 
-def test_bgr_is_turned_to_rgb() -> None:
+def test_bgr_is_converted_to_rgb() -> None:
     bgr = np.ascontiguousarray(COLOR[..., ::-1])
     np.testing.assert_array_equal(
         codecs.decode_color("bgr8", 9, 6, memoryview(bgr.tobytes())), COLOR
@@ -31,7 +31,7 @@ def test_png_color_keeps_every_value() -> None:
     np.testing.assert_array_equal(decoded, COLOR)
 
 
-def test_jpeg_color_is_close() -> None:
+def test_jpeg_color_is_within_four_levels() -> None:
     smooth = np.tile(np.arange(64, dtype=np.uint8)[:, None, None] * 3, (1, 64, 3))
     decoded = codecs.decode_color("jpeg", 64, 64, memoryview(codecs.encode_jpeg(smooth)))
     assert np.abs(decoded.astype(int) - smooth).max() <= 4
@@ -56,7 +56,7 @@ def test_an_eight_bit_depth_png_is_refused() -> None:
         codecs.decode_depth("png", 9, 6, memoryview(data.tobytes()))
 
 
-def test_a_size_that_lies_is_refused() -> None:
+def test_image_of_another_size_than_announced_is_refused() -> None:
     _, data = cv2.imencode(".png", COLOR)
     with pytest.raises(FrameError, match="announced as 8x6"):
         codecs.decode_color("png", 8, 6, memoryview(data.tobytes()))
@@ -78,7 +78,7 @@ def test_broken_compression_is_refused() -> None:
         codecs.decode_depth("z16+zstd", 9, 6, memoryview(b"not zstd at all"))
 
 
-def test_a_header_that_asks_for_gigabytes_is_refused_before_decoding() -> None:
+def test_header_that_announces_gigabytes_is_refused_before_decoding() -> None:
     _, data = cv2.imencode(".png", COLOR)
     huge = bytearray(data.tobytes())
     huge[16:24] = (60000).to_bytes(4, "big") * 2

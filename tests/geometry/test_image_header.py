@@ -1,4 +1,4 @@
-"""Sizes are read from the header, and what lies about its size is never decompressed."""
+"""Image sizes from the header; images of another size are never decompressed."""
 
 import struct
 
@@ -21,7 +21,7 @@ def jpeg(*options: int) -> bytes:
 
 
 def bomb(width: int, height: int) -> bytes:
-    """A small JPEG that announces a large image."""
+    """Return a small JPEG that announces a large image."""
     data = bytearray(encode_jpeg(COLOR))
     frame = data.index(b"\xff\xc0")
     data[frame + 5 : frame + 9] = struct.pack(">HH", height, width)
@@ -36,8 +36,8 @@ def bomb(width: int, height: int) -> bytes:
         jpeg(),
         jpeg(cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
         jpeg(cv2.IMWRITE_JPEG_RST_INTERVAL, 4),
-        jpeg()[:2] + b"\xff\xff" + jpeg()[2:],  # fill bytes before a marker
-        jpeg()[:2] + b"\xff\xe1\x00\x06\xff\xc0\x00\x00" + jpeg()[2:],  # a marker within a segment
+        jpeg()[:2] + b"\xff\xff" + jpeg()[2:],  # Fill bytes before a marker.
+        jpeg()[:2] + b"\xff\xe1\x00\x06\xff\xc0\x00\x00" + jpeg()[2:],  # A marker in a segment.
     ],
 )
 def test_the_size_is_that_of_the_decoded_image(data: bytes) -> None:
@@ -45,14 +45,14 @@ def test_the_size_is_that_of_the_decoded_image(data: bytes) -> None:
 
 
 def test_a_png_with_a_chunk_beyond_its_end_has_no_size() -> None:
-    """OpenCV would allocate all of it."""
+    """OpenCV would allocate memory for the whole chunk."""
     data = bytearray(png(COLOR))
     data[33:37] = struct.pack(">I", 4_000_000_000)
     assert data[37:41] == b"IDAT"
     assert read_image_size(memoryview(bytes(data))) is None
 
 
-def test_every_prefix_of_a_header_is_taken_without_an_error() -> None:
+def test_every_prefix_of_a_header_is_read_without_an_error() -> None:
     for data in (png(COLOR), jpeg()):
         for length in range(700):
             assert read_image_size(memoryview(data[:length])) in (None, (53, 37))
@@ -71,7 +71,7 @@ def test_an_image_that_announces_another_size_is_refused(size: tuple[int, int]) 
         decode_color("jpeg", 53, 37, memoryview(bomb(*size)))
 
 
-def test_a_depth_image_that_breaks_off_is_refused() -> None:
+def test_truncated_depth_image_is_refused() -> None:
     data = png(COLOR[..., 0].astype(np.uint16))
     with pytest.raises(FrameError):
         decode_depth("png", 53, 37, memoryview(data[:60]))

@@ -1,4 +1,4 @@
-"""Receivers of keyframes and corrections agree on where keyframes are."""
+"""Keyframe poses of a component that receives keyframes and corrections."""
 
 import numpy as np
 import pytest
@@ -34,18 +34,18 @@ def test_without_corrections_the_map_is_the_odometry(steps) -> None:
 
 
 def test_a_missed_reference_is_bridged_by_odometry(steps) -> None:
-    whole = chained(steps)
-    gappy = KeyframePoses()
+    complete = chained(steps)
+    with_gap = KeyframePoses()
     T_odom = np.eye(4)
     for keyframe, T_reference_keyframe in enumerate(steps):
         T_odom = T_odom @ T_reference_keyframe
         if keyframe != 3:
-            gappy.add(keyframe, keyframe - 1, T_reference_keyframe, T_odom)
+            with_gap.add(keyframe, keyframe - 1, T_reference_keyframe, T_odom)
     for keyframe in (0, 1, 2, 4, 5):
-        np.testing.assert_allclose(gappy[keyframe], whole[keyframe], atol=1e-12)
+        np.testing.assert_allclose(with_gap[keyframe], complete[keyframe], atol=1e-12)
 
 
-def test_a_correction_places_every_keyframe_that_it_names(steps) -> None:
+def test_correction_sets_the_pose_of_every_known_keyframe(steps) -> None:
     poses = chained(steps)
     rng = np.random.default_rng(2)
     new = {k: poses[k] @ random_pose(rng, 0.05) for k in reversed(list(poses))}
@@ -67,7 +67,9 @@ def test_keyframes_newer_than_a_correction_follow_their_references(steps) -> Non
 def test_order_of_correction_and_keyframe_does_not_matter(steps, reference: int) -> None:
     rng = np.random.default_rng(4)
     before, after = chained(steps[:5]), chained(steps[:5])
-    new = {k: before[k] @ random_pose(rng, 0.05) for k in range(5)}  # each moves differently
+    new = {
+        k: before[k] @ random_pose(rng, 0.05) for k in range(5)
+    }  # Each moves differently.
     T_odom_5 = before[reference] @ steps[5]
     before.add(5, reference, steps[5], T_odom_5)
     before.correct(1, new)
@@ -87,17 +89,17 @@ def test_an_older_correction_changes_nothing(steps) -> None:
 
 
 def test_snapshot_and_restore_are_exact(steps) -> None:
-    poses, twin = chained(steps), KeyframePoses()
+    poses, restored = chained(steps), KeyframePoses()
     poses.correct(3, {k: poses[k] @ steps[0] for k in range(4)})
-    twin.restore(poses.snapshot())
-    assert twin.version == 3
-    assert list(twin) == list(poses)
+    restored.restore(poses.snapshot())
+    assert restored.version == 3
+    assert list(restored) == list(poses)
     for keyframe in poses:
-        np.testing.assert_array_equal(twin[keyframe], poses[keyframe])
-        np.testing.assert_array_equal(twin.T_map_odom(keyframe), poses.T_map_odom(keyframe))
+        np.testing.assert_array_equal(restored[keyframe], poses[keyframe])
+        np.testing.assert_array_equal(restored.T_map_odom(keyframe), poses.T_map_odom(keyframe))
 
 
-def test_a_new_submap_is_apart_until_a_correction_joins_it(steps) -> None:
+def test_new_submap_is_far_away_until_a_correction_merges_it(steps) -> None:
     poses = chained(steps)
     T_odom = poses[len(steps) - 1]
     poses.add(50, None, np.eye(4), T_odom, submap=2)
@@ -108,7 +110,7 @@ def test_a_new_submap_is_apart_until_a_correction_joins_it(steps) -> None:
     np.testing.assert_allclose(poses[51], T_odom @ steps[1], atol=1e-12)
 
 
-def test_the_first_of_a_submap_is_joined_though_its_measurement_is_held(steps) -> None:
+def test_first_keyframe_of_a_submap_is_merged_despite_a_held_measurement(steps) -> None:
     poses = chained(steps)
     T_odom = poses[len(steps) - 1]
     poses.add(50, None, np.eye(4), T_odom, submap=2)

@@ -4,8 +4,8 @@ import pytest
 
 from ldo_service.geometry import Camera
 from ldo_service.geometry.camera import project, rays
+from tests.geometry.cameras import FREIBURG1
 
-FREIBURG1 = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
 AZURE_KINECT = (0.52, -2.71, 0.0009, -0.0002, 1.56, 0.40, -2.53, 1.49)
 LENSES = [(), (-0.1, 0.08, 0.002, -0.001), FREIBURG1, AZURE_KINECT]
 
@@ -15,14 +15,14 @@ def camera(distortion: tuple[float, ...]) -> Camera:
 
 
 @pytest.mark.parametrize("distortion", LENSES)
-def test_projection_is_that_of_opencv(distortion: tuple[float, ...]) -> None:
+def test_projection_agrees_with_opencv(distortion: tuple[float, ...]) -> None:
     xy = np.random.default_rng(0).uniform(-0.6, 0.6, (500, 2)).astype(np.float32)
     u, v = project(xy[:, 0], xy[:, 1], camera(distortion))
     points, zero = np.c_[xy, np.ones(500)].astype(float), np.zeros(3)
-    judge = cv2.projectPoints(
+    expected = cv2.projectPoints(
         points, zero, zero, camera(()).matrix, np.array(distortion or [0.0] * 4)
     )
-    np.testing.assert_allclose(np.c_[u, v], judge[0][:, 0], atol=1e-3)
+    np.testing.assert_allclose(np.c_[u, v], expected[0][:, 0], atol=1e-3)
 
 
 @pytest.mark.parametrize("distortion", LENSES)
@@ -42,7 +42,7 @@ def test_rays_are_shared_and_cannot_be_written_to() -> None:
 
 
 def test_direction_beyond_the_lens_has_no_pixel() -> None:
-    """r (1 - 0.3 r^2) is largest at r = 1.054."""
+    """The distorted radius r (1 - 0.3 r^2) is largest at r = 1.054."""
     x, y = np.array([0.0, 1.0, 1.1, 50.0], np.float32), np.zeros(4, np.float32)
     u, _ = project(x, y, camera((-0.3, 0.0, 0.0, 0.0)))
     assert np.isfinite(u).tolist() == [True, True, False, False]

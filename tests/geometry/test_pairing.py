@@ -1,4 +1,4 @@
-"""Halves find the nearest partner within reach, in order, and nothing waits for ever."""
+"""Pairing of two streams by nearest stamps, in order and with bounded waiting."""
 
 from dataclasses import dataclass
 
@@ -23,8 +23,8 @@ def pairing(max_skew_ms: int = 15, buffer: int = 8) -> StreamPairer[Half, Half]:
     return StreamPairer(max_skew_ms * MS, buffer)
 
 
-def fed(pairs: StreamPairer[Half, Half], *events: tuple[str, int]) -> list[tuple[int, int]]:
-    """Stamps in ms of the pairs that come out of halves ("a" or "b", stamp in ms)."""
+def feed(pairs: StreamPairer[Half, Half], *events: tuple[str, int]) -> list[tuple[int, int]]:
+    """Feed halves ("a" or "b", stamp in ms), and return the stamps in ms of the new pairs."""
     out = []
     for stream, stamp_ms in events:
         add = pairs.add_a if stream == "a" else pairs.add_b
@@ -33,7 +33,7 @@ def fed(pairs: StreamPairer[Half, Half], *events: tuple[str, int]) -> list[tuple
 
 
 def at_30_hz(offset_ms: int, count: int = 10) -> list[tuple[str, int]]:
-    """Two streams, b later by an offset, in order of their stamps."""
+    """Return events of two streams in order of their stamps; b is later by an offset."""
     a = [("a", 33 * i) for i in range(count)]
     b = [("b", 33 * i + offset_ms) for i in range(count)]
     return sorted(a + b, key=lambda event: event[1])
@@ -41,70 +41,70 @@ def at_30_hz(offset_ms: int, count: int = 10) -> list[tuple[str, int]]:
 
 def test_equal_stamps_are_paired_at_once() -> None:
     pairs = pairing()
-    assert fed(pairs, ("a", 100)) == []
-    assert fed(pairs, ("b", 100)) == [(100, 100)]
+    assert feed(pairs, ("a", 100)) == []
+    assert feed(pairs, ("b", 100)) == [(100, 100)]
     assert (pairs.pairs, pairs.lost_a, pairs.lost_b, pairs.skews_ms()) == (1, 0, 0, [0.0])
 
 
 @pytest.mark.parametrize("offset_ms", [-12, -3, 0, 4, 15])
-def test_a_pair_within_the_allowed_skew_waits_for_nothing_else(offset_ms: int) -> None:
+def test_pair_within_the_allowed_skew_is_given_at_once(offset_ms: int) -> None:
     pairs = pairing()
     for i in range(5):
-        assert fed(pairs, ("a", 100 + 33 * i)) == []
+        assert feed(pairs, ("a", 100 + 33 * i)) == []
         expected = (100 + 33 * i, 100 + 33 * i + offset_ms)
-        assert fed(pairs, ("b", expected[1])) == [expected]
+        assert feed(pairs, ("b", expected[1])) == [expected]
     assert max(pairs.skews_ms()) == abs(offset_ms)
 
 
 def test_halves_too_far_apart_are_never_paired_and_counted() -> None:
     pairs = pairing(max_skew_ms=5)
-    assert fed(pairs, *at_30_hz(offset_ms=16)) == []
+    assert feed(pairs, *at_30_hz(offset_ms=16)) == []
     assert pairs.lost_a + pairs.lost_b == 19, "the last one still waits"
 
 
-def test_the_nearest_is_taken_though_an_earlier_one_is_within_reach() -> None:
+def test_nearest_half_is_paired_though_an_earlier_one_is_within_reach() -> None:
     pairs = pairing()
     at_90_hz = [("b", 11 * i + 3) for i in range(9)]
-    fed(pairs, *at_90_hz)  # its period is known now
-    assert fed(pairs, ("b", 102), ("a", 112)) == [], "102 is 10 ms away: a nearer one may come"
-    assert fed(pairs, ("b", 113)) == [(112, 113)]
+    feed(pairs, *at_90_hz)  # The period of b is known now.
+    assert feed(pairs, ("b", 102), ("a", 112)) == [], "102 is 10 ms away: a nearer one may come"
+    assert feed(pairs, ("b", 113)) == [(112, 113)]
     assert pairs.lost_a == 0
 
 
-def test_a_dropped_half_costs_its_partner_only() -> None:
+def test_dropped_half_loses_only_its_partner() -> None:
     pairs = pairing()
     events = [event for event in at_30_hz(offset_ms=2) if event not in (("a", 99), ("b", 200))]
-    assert fed(pairs, *events) == [(33 * i, 33 * i + 2) for i in range(10) if i not in (3, 6)]
+    assert feed(pairs, *events) == [(33 * i, 33 * i + 2) for i in range(10) if i not in (3, 6)]
     assert (pairs.lost_a, pairs.lost_b) == (1, 1)
 
 
-def test_one_stream_may_come_much_later_than_the_other() -> None:
+def test_stream_that_arrives_much_later_is_paired() -> None:
     pairs = pairing()
     late = [("a", 33 * i) for i in range(6)] + [("b", 33 * i + 1) for i in range(6)]
-    assert fed(pairs, *late) == [(33 * i, 33 * i + 1) for i in range(6)]
+    assert feed(pairs, *late) == [(33 * i, 33 * i + 1) for i in range(6)]
 
 
-def test_a_stream_alone_keeps_a_bounded_number_waiting() -> None:
+def test_single_stream_buffers_a_bounded_number_of_halves() -> None:
     pairs = pairing(buffer=4)
-    assert fed(pairs, *(("a", 33 * i) for i in range(20))) == []
+    assert feed(pairs, *(("a", 33 * i) for i in range(20))) == []
     assert pairs.lost_a == 16
-    assert fed(pairs, ("b", 33 * 19)) == [(33 * 19, 33 * 19)]
+    assert feed(pairs, ("b", 33 * 19)) == [(33 * 19, 33 * 19)]
 
 
-def test_a_pair_does_not_wait_for_ever_for_a_nearer_half() -> None:
+def test_pair_does_not_wait_forever_for_a_nearer_half() -> None:
     pairs = pairing(buffer=3)
-    fed(pairs, *(("b", 11 * i) for i in range(9)))  # at 90 Hz, and then no more
-    assert fed(pairs, ("a", 98), ("a", 131), ("a", 164)) == []
-    assert fed(pairs, ("a", 197)) == [(98, 88)]
+    feed(pairs, *(("b", 11 * i) for i in range(9)))  # 90 Hz, and then no more.
+    assert feed(pairs, ("a", 98), ("a", 131), ("a", 164)) == []
+    assert feed(pairs, ("a", 197)) == [(98, 88)]
 
 
-def test_stamps_that_go_back_are_refused_and_harm_nothing() -> None:
+def test_decreasing_stamps_are_refused_without_effect() -> None:
     pairs = pairing()
-    fed(pairs, ("a", 100))
+    feed(pairs, ("a", 100))
     for stamp_ms in (100, 67):
         with pytest.raises(FrameError, match="not after the last one"):
-            fed(pairs, ("a", stamp_ms))
-    assert fed(pairs, ("b", 101)) == [(100, 101)]
+            feed(pairs, ("a", stamp_ms))
+    assert feed(pairs, ("b", 101)) == [(100, 101)]
 
 
 @pytest.mark.parametrize(("max_skew_ns", "buffer"), [(-1, 8), (1, 0)])
@@ -117,11 +117,11 @@ stamps = st.lists(st.integers(0, 500), unique=True, max_size=20).map(sorted)
 
 
 @given(stamps, stamps, st.randoms())
-def test_pairs_keep_order_and_reach_and_every_half_is_accounted_for(a, b, random) -> None:
+def test_pairs_are_in_order_and_reach_and_every_half_is_counted(a, b, random) -> None:
     pairs, out, left = pairing(buffer=4), [], {"a": list(a), "b": list(b)}
     while left["a"] or left["b"]:
         stream = random.choice([name for name in left if left[name]])
-        out += fed(pairs, (stream, left[stream].pop(0)))
+        out += feed(pairs, (stream, left[stream].pop(0)))
     for side in (0, 1):
         of_side = [pair[side] for pair in out]
         assert of_side == sorted(set(of_side))
@@ -132,14 +132,14 @@ def test_pairs_keep_order_and_reach_and_every_half_is_accounted_for(a, b, random
 
 
 @given(st.lists(st.integers(-15, 15), min_size=1, max_size=30))
-def test_jitter_below_half_a_period_gives_the_pairs_of_the_offline_judge(jitter) -> None:
+def test_jitter_below_half_a_period_gives_the_pairs_of_associate(jitter) -> None:
     a = [33 * i + 40 for i in range(len(jitter))]
     b = [stamp + j for stamp, j in zip(a, jitter, strict=True)]
     events = sorted([("a", s) for s in a] + [("b", s) for s in b], key=lambda e: (e[1], e[0]))
     if len(set(b)) < len(b) or b != sorted(b):
         return
     pairs = pairing()
-    judge = associate(np.array(a), np.array(b), 15)
-    waiting = fed(pairs, *events)
-    assert waiting == [(a[i], b[j]) for i, j in judge][: len(waiting)]
-    assert len(waiting) >= len(judge) - 1, "only the last may still wait for a nearer one"
+    expected = associate(np.array(a), np.array(b), 15)
+    paired = feed(pairs, *events)
+    assert paired == [(a[i], b[j]) for i, j in expected][: len(paired)]
+    assert len(paired) >= len(expected) - 1, "only the last may still wait for a nearer one"

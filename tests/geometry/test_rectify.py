@@ -4,9 +4,9 @@ import pytest
 
 from ldo_service.errors import FrameError
 from ldo_service.geometry import Camera, RawFrame, Rectifier, rectify, undistortion_maps
+from tests.geometry.cameras import FREIBURG1
 
-LENS = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)  # TUM freiburg1
-CAMERA = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, LENS)
+CAMERA = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, FREIBURG1)
 SMALL = Camera(4, 3, 3, 3, 1.5, 1)
 
 
@@ -15,15 +15,15 @@ def raw_frame(depth: np.ndarray, scale: float = 1000.0, camera: Camera = SMALL) 
 
 
 def seen_through_the_lens(image: np.ndarray) -> np.ndarray:
-    """What the distorted camera sees of an undistorted picture; the judge is cv2.projectPoints."""
+    """Return what the distorted camera sees of an undistorted image, by cv2.projectPoints."""
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
     seen = np.stack([u, v], -1).reshape(-1, 2)
     zero, ideal = np.zeros(3), seen.copy()
-    for _ in range(12):  # p = distort(ideal), solved for ideal by fixed-point steps
+    for _ in range(12):  # Solve p = distort(ideal) by fixed-point steps.
         rays = np.c_[
             (ideal - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy], np.ones(len(u.flat))
         ]
-        bent = cv2.projectPoints(rays, zero, zero, CAMERA.matrix, np.array(LENS))[0][:, 0]
+        bent = cv2.projectPoints(rays, zero, zero, CAMERA.matrix, np.array(FREIBURG1))[0][:, 0]
         ideal += seen - bent
     maps = ideal.reshape(480, 640, 2).astype(np.float32)
     return cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
@@ -38,7 +38,7 @@ def grid() -> np.ndarray:
     return image
 
 
-def test_lines_bent_by_the_lens_come_back_straight() -> None:
+def test_lines_bent_by_the_lens_are_rectified_to_straight_lines() -> None:
     bent = seen_through_the_lens(grid())
     raw = RawFrame(0, 0, bent, np.ones((480, 640), np.float32), 1.0, CAMERA)
     frame = Rectifier()(raw)
@@ -67,7 +67,7 @@ def test_integer_depth_becomes_meters_at_its_scale() -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -1.0, 3e38])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_depth_that_is_no_depth_becomes_missing(bad: float, dtype: type) -> None:
+def test_invalid_depth_becomes_missing(bad: float, dtype: type) -> None:
     depth = np.full((3, 4), 2.0, dtype)
     depth[1, 1] = bad
     depth_m = rectify(raw_frame(depth, 0.5), None).depth_m
@@ -75,7 +75,7 @@ def test_depth_that_is_no_depth_becomes_missing(bad: float, dtype: type) -> None
     assert np.delete(depth_m, 5).tolist() == [4.0] * 11
 
 
-def test_camera_without_lens_is_passed_through() -> None:
+def test_frame_without_distortion_is_unchanged() -> None:
     raw = raw_frame(np.ones((3, 4), np.float32))
     assert undistortion_maps(Camera(4, 3, 3, 3, 1.5, 1, (0.0,) * 5)) is None
     assert rectify(raw, None).color is raw.color
@@ -110,7 +110,7 @@ def test_color_of_another_size_than_depth_is_an_error() -> None:
         ({"depth_scale": float("nan")}, "depth_scale"),
     ],
 )
-def test_parts_that_do_not_fit_are_named(changes: dict, word: str) -> None:
+def test_parts_that_do_not_match_are_named(changes: dict, word: str) -> None:
     parts = {
         "index": 1,
         "stamp_ns": 0,

@@ -5,21 +5,16 @@ import pytest
 from ldo_service.errors import FrameError
 from ldo_service.geometry import Camera, RawFrame, Rectifier, se3
 from ldo_service.geometry.registration import register_depth
-
-CAMERA = Camera(64, 48, 50.0, 50.0, 31.0, 24.0)
-FINER = Camera(130, 97, 101.2, 101.4, 64.7, 48.4)  # as ScanNet's colour to its depth
-COARSER = Camera(32, 24, 25.0, 25.0, 15.25, 11.75)
-LENS = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)  # TUM freiburg1
-SCANNET_LIKE = {"finer": FINER, "coarser": COARSER, "alike": CAMERA}
+from tests.geometry.cameras import CAMERA, COLOR_CAMERAS, FINER, FREIBURG1
 
 
 def moved(x_m: float, *rotation_rad: float) -> np.ndarray:
-    """T_color_depth of a colour camera that stands x_m to the right."""
+    """Return T_color_depth of a color camera that is x_m to the right."""
     return se3.exp(np.array([*(rotation_rad or (0.0, 0.0, 0.0)), -x_m, 0.0, 0.0]))
 
 
 def slanted(camera: Camera, T_camera_depth: np.ndarray) -> np.ndarray:
-    """Exact z [H, W] of a plane 2 m ahead of the depth camera, turned by 40 degrees."""
+    """Return exact z [H, W] of a plane 2 m ahead of the depth camera, turned by 40 degrees."""
     return slanted_along(camera.rays(), T_camera_depth)
 
 
@@ -33,15 +28,15 @@ def slanted_along(rays_camera: np.ndarray, T_camera_depth: np.ndarray) -> np.nda
 
 
 def noise(seed: int, camera: Camera = CAMERA) -> np.ndarray:
-    """Depth without any surface, a third of it missing."""
+    """Return depth without any surface; a third of it is missing."""
     rng = np.random.default_rng(seed)
     depth_m = rng.uniform(0.5, 4.0, (camera.height, camera.width)).astype(np.float32)
     depth_m[rng.random(depth_m.shape) < 0.33] = 0.0
     return depth_m
 
 
-@pytest.mark.parametrize("distortion", [(), LENS])
-def test_one_camera_gives_the_same_image_to_the_bit(distortion: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("distortion", [(), FREIBURG1])
+def test_equal_cameras_leave_depth_bitwise_equal(distortion: tuple[float, ...]) -> None:
     camera = Camera(64, 48, 50.3, 49.7, 31.4, 23.9, distortion)
     registered = register_depth(noise(0), camera, camera, np.eye(4))
     assert registered.dtype == np.float32
@@ -50,7 +45,7 @@ def test_one_camera_gives_the_same_image_to_the_bit(distortion: tuple[float, ...
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_foreground_hides_background_and_uncovers_nothing(side: int) -> None:
-    """A post 1 m away before a wall 2 m away: shifted by 10 and 5 pixels at a baseline of 0.2 m."""
+    """A post at 1 m and a wall at 2 m shift by 10 and 5 pixels at a baseline of 0.2 m."""
     depth_m = np.full((48, 64), 2.0, np.float32)
     depth_m[:, 30:38] = 1.0
     expected = np.zeros_like(depth_m)
@@ -62,7 +57,7 @@ def test_foreground_hides_background_and_uncovers_nothing(side: int) -> None:
     assert np.array_equal(registered, expected)
 
 
-@pytest.mark.parametrize("color_camera", SCANNET_LIKE.values(), ids=SCANNET_LIKE.keys())
+@pytest.mark.parametrize("color_camera", COLOR_CAMERAS.values(), ids=COLOR_CAMERAS.keys())
 def test_plane_is_whole_at_any_resolution(color_camera: Camera) -> None:
     depth_m = np.full((48, 64), 1.5, np.float32)
     registered = register_depth(depth_m, CAMERA, color_camera, moved(0.0))
@@ -86,7 +81,7 @@ def test_slanted_surface_that_widens_has_no_pinholes(color_camera: Camera, x_m: 
 
 
 def test_every_point_is_at_its_pixel_unless_a_nearer_one_is() -> None:
-    """Judged by the camera's own projection, point by point."""
+    """Each point is compared with the projection of the camera."""
     T_color_depth = moved(0.3, 0.05, -0.1, 0.2)
     depth_m = noise(1)
     registered = register_depth(depth_m, CAMERA, FINER, T_color_depth)
@@ -102,20 +97,20 @@ def test_every_point_is_at_its_pixel_unless_a_nearer_one_is() -> None:
     np.testing.assert_allclose(found, nearest, rtol=2e-6)
 
 
-def test_there_and_back_returns_the_surface() -> None:
+def test_registration_to_color_and_back_returns_the_surface() -> None:
     T_color_depth = moved(0.05, 0.01, 0.02, -0.01)
     depth_m = slanted(CAMERA, np.eye(4))
-    there = register_depth(depth_m, CAMERA, FINER, T_color_depth)
-    back = register_depth(there, FINER, CAMERA, se3.inverse(T_color_depth))
+    registered = register_depth(depth_m, CAMERA, FINER, T_color_depth)
+    back = register_depth(registered, FINER, CAMERA, se3.inverse(T_color_depth))
     middle = np.s_[4:-4, 6:-6]
     assert np.all(back[middle] > 0)
     assert np.max(np.abs(back - depth_m)[middle] / depth_m[middle]) < 0.03
 
 
 def test_both_lenses_are_accounted_for() -> None:
-    """Depth through one lens, colour through another; rectified, the plane is where it is."""
+    """Depth and color have different lenses; the plane is at its depth after rectification."""
     depth_camera = Camera(320, 240, 290.0, 290.0, 158.0, 122.0, (-0.1, 0.08, 0.002, -0.001))
-    color_camera = Camera(320, 240, 258.6, 258.2, 159.3, 127.6, LENS)
+    color_camera = Camera(320, 240, 258.6, 258.2, 159.3, 127.6, FREIBURG1)
     T_color_depth = moved(0.025, 0.0, 0.01, 0.0)
     rays = cv2.undistortPoints(
         np.indices((240, 320), float)[::-1].reshape(2, -1).T.reshape(-1, 1, 2).copy(),
@@ -128,20 +123,20 @@ def test_both_lenses_are_accounted_for() -> None:
     depth_m = Rectifier()(raw).depth_m
     truth = slanted(color_camera.rectified(), T_color_depth)
     error = np.abs(depth_m - truth)[40:-40, 50:-50] / truth[40:-40, 50:-50]
-    ignored = register_depth(
+    without_lenses = register_depth(
         measured, depth_camera.rectified(), color_camera.rectified(), T_color_depth
     )
     assert np.all(depth_m[40:-40, 50:-50] > 0)
     assert error.max() < 0.006
-    assert (np.abs(ignored - truth) / truth)[40:-40, 50:-50].max() > 0.012
+    assert (np.abs(without_lenses - truth) / truth)[40:-40, 50:-50].max() > 0.012
 
 
 def test_point_beyond_the_lens_does_not_fold_back_into_the_image() -> None:
-    """This polynomial turns round at a radius of 1.05; the depth camera sees to 2."""
+    """This polynomial folds back at a radius of 1.05; the depth camera sees to 2."""
     wide = Camera(64, 48, 16.0, 16.0, 31.5, 23.5)
     lens = Camera(64, 48, 50.0, 50.0, 31.5, 23.5, (-0.3, 0.0, 0.0, 0.0))
     depth_m = np.full((48, 64), 2.0, np.float32)
-    depth_m[16:32, 12:52] = 0.0  # nothing within a radius of 0.47 in v and 1.2 in u
+    depth_m[16:32, 12:52] = 0.0  # The missing radius is 0.47 in v and 1.2 in u.
     registered = register_depth(depth_m, wide, lens, np.eye(4))
     assert np.all(registered[22:26] == 0)
 
@@ -154,7 +149,7 @@ def test_points_behind_or_in_the_color_camera_are_not_seen(z_m: float) -> None:
     assert not np.any(register_depth(depth_m, CAMERA, CAMERA, T_color_depth))
 
 
-def test_nothing_measured_registers_to_nothing() -> None:
+def test_missing_depth_registers_to_missing_depth() -> None:
     depth_m = np.zeros((48, 64), np.float32)
     assert not np.any(register_depth(depth_m, CAMERA, FINER, moved(0.1)))
 

@@ -4,21 +4,17 @@ import pytest
 from ldo_service.errors import FrameError
 from ldo_service.geometry import Camera
 from ldo_service.geometry.registration import resample_color
-
-CAMERA = Camera(64, 48, 50.0, 50.0, 31.0, 24.0)
-FINER = Camera(130, 97, 101.2, 101.4, 64.7, 48.4)  # as ScanNet's colour to its depth
-COARSER = Camera(32, 24, 25.0, 25.0, 15.25, 11.75)
-OTHERS = {"finer": FINER, "coarser": COARSER, "alike": CAMERA}
+from tests.geometry.cameras import CAMERA, COARSER, COLOR_CAMERAS, FINER
 
 
 def colored_by_ray(camera: Camera) -> np.ndarray:
-    """An image whose red and green say which way a pixel looks."""
+    """Return an image with the ray directions in red and green."""
     rays = camera.rays()
     channels = [100 + 100 * rays[..., 0], 100 + 100 * rays[..., 1], np.zeros(rays.shape[:2])]
     return np.rint(np.stack(channels, -1)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("color_camera", OTHERS.values(), ids=OTHERS.keys())
+@pytest.mark.parametrize("color_camera", COLOR_CAMERAS.values(), ids=COLOR_CAMERAS.keys())
 def test_color_is_resampled_along_its_rays(color_camera: Camera) -> None:
     image, is_seen = resample_color(colored_by_ray(color_camera), color_camera, CAMERA)
     assert image.shape == (48, 64, 3)
@@ -43,7 +39,7 @@ def test_fine_stripes_become_their_mean_and_no_moire() -> None:
     assert np.all(np.abs(image[2:-2, 2:-2].astype(int) - 100) <= 1)
 
 
-def test_pixels_outside_the_color_image_are_told() -> None:
+def test_pixels_outside_the_color_image_are_marked() -> None:
     wide = Camera(64, 48, 25.0, 25.0, 31.5, 23.5)
     narrow = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
     _, is_seen = resample_color(colored_by_ray(narrow), narrow, wide)

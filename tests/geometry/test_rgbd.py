@@ -24,7 +24,7 @@ def test_frame_with_holes_in_its_depth_is_accepted() -> None:
         (COLOR, -DEPTH, "at least 0"),
     ],
 )
-def test_arrays_that_do_not_fit_are_named(
+def test_arrays_that_do_not_match_are_named(
     color: np.ndarray, depth_m: np.ndarray, word: str
 ) -> None:
     with pytest.raises(FrameError, match=f"frame 7.*{word}"):

@@ -1,4 +1,4 @@
-"""Judges: SciPy's matrix exponential and rotations, and the group's laws."""
+"""Rotations and transforms, compared with SciPy and with the group laws."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_quaternions_and_rotations_agree_with_scipy() -> None:
 
 
 @pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0]])
-def test_quaternion_of_a_half_turn_keeps_its_digits(axis: list[float]) -> None:
+def test_quaternion_of_a_half_turn_keeps_its_precision(axis: list[float]) -> None:
     R = Rotation.from_rotvec(np.pi * np.array(axis)).as_matrix()
     np.testing.assert_allclose(se3.rotation(se3.quaternion(R)), R, atol=1e-12)
 
@@ -84,10 +84,10 @@ def test_orthonormalized_finds_the_nearest_rotation() -> None:
     T = se3.exp(tangent(2.0))
     noisy = T.copy()
     noisy[:3, :3] += np.random.default_rng(2).normal(0, 1e-4, (3, 3))
-    mended = se3.orthonormalize(noisy)
-    np.testing.assert_allclose(mended[:3, :3] @ mended[:3, :3].T, np.eye(3), atol=1e-14)
-    assert np.linalg.norm(mended - noisy) <= np.linalg.norm(T - noisy)
-    np.testing.assert_array_equal(mended[:3, 3], noisy[:3, 3])
+    nearest = se3.orthonormalize(noisy)
+    np.testing.assert_allclose(nearest[:3, :3] @ nearest[:3, :3].T, np.eye(3), atol=1e-14)
+    assert np.linalg.norm(nearest - noisy) <= np.linalg.norm(T - noisy)
+    np.testing.assert_array_equal(nearest[:3, 3], noisy[:3, 3])
 
 
 def test_orthonormalized_never_mirrors() -> None:
@@ -105,12 +105,12 @@ def test_rotation_angle_is_the_length_of_the_rotation_vector(angle_rad: float) -
 
 
 def test_transform_applies_rotation_then_translation_to_any_batch() -> None:
-    T = se3.from_quaternion(np.array([1.0, 2, 3]), np.array([1.0, 0, 0, 1]))  # 90 deg about z
+    T = se3.from_quaternion(np.array([1.0, 2, 3]), np.array([1.0, 0, 0, 1]))  # 90 degrees about z.
     points = np.broadcast_to([1.0, 0, 0], (2, 4, 3))
     np.testing.assert_allclose(se3.transform(T, points), np.broadcast_to([1, 3, 3], (2, 4, 3)))
 
 
-def test_transforms_that_differ_are_told_by_distance_or_angle() -> None:
+def test_transforms_differ_by_distance_or_by_angle() -> None:
     rng = np.random.default_rng(0)
     T = np.array([se3.exp(rng.normal(size=6)) for _ in range(4)])
     steps = np.array([[0, 0, 0, 0, 0, 9e-4], [0, 0, 0, 0, 2e-3, 0], [9e-5, 0, 0, 0, 0, 0]])

@@ -14,7 +14,7 @@ def some_trajectory(count: int = 20) -> Trajectory:
     return Trajectory(1305031102.175304 + np.arange(count) / 30, poses)
 
 
-def test_saved_trajectory_loads_as_it_was(tmp_path: Path) -> None:
+def test_saved_trajectory_loads_unchanged(tmp_path: Path) -> None:
     before = some_trajectory()
     before.save(tmp_path / "t.txt")
     after = Trajectory.load(tmp_path / "t.txt")
@@ -45,7 +45,7 @@ def test_lines_out_of_order_are_sorted_and_comments_skipped(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "line", ["1 2 3", "1 0 0 0 0 0 zero 1", "1 nan 0 0 0 0 0 1", "1 0 0 0 0 0 0 0"]
 )
-def test_line_that_does_not_read_is_named(tmp_path: Path, line: str) -> None:
+def test_unreadable_line_is_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "t.txt"
     path.write_text(f"0 0 0 0 0 0 0 1\n{line}\n")
     with pytest.raises(DataError, match="line 2"):
@@ -57,7 +57,7 @@ def test_missing_file_is_a_data_error(tmp_path: Path) -> None:
         Trajectory.load(tmp_path / "nowhere.txt")
 
 
-def test_descending_stamps_and_unlike_lengths_are_refused() -> None:
+def test_descending_stamps_and_unequal_lengths_are_refused() -> None:
     with pytest.raises(DataError, match="ascend"):
         Trajectory(np.array([2.0, 1.0]), np.zeros((2, 4, 4)))
     with pytest.raises(DataError, match="expected"):
