@@ -1,4 +1,4 @@
-"""What the network hears of objects is what the map has."""
+"""Objects and observations of the map as messages."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from ldo_service.semantics.object_landmarks import distributions, entropies
 from tests.semantics.scenes import NAMES, SCENE_OBJECTS, LabelledMap, poses
 
 
-def test_objects_and_observations_travel_as_they_are() -> None:
+def test_object_and_observation_messages_equal_the_map() -> None:
     labelled_map = LabelledMap()
     updates = list(labelled_map.walk(SCENE_OBJECTS, poses(20)[:6]))
     table = labelled_map.objects.landmarks
