@@ -1,4 +1,4 @@
-"""Small data sets written to disk in the layouts under test."""
+"""Small data sets on disk, in the layouts under test."""
 
 import json
 from collections.abc import Callable
@@ -15,7 +15,7 @@ PARAMS = {"w": WIDTH, "h": HEIGHT, "fx": 20.0, "fy": 21.0, "cx": 11.5, "cy": 7.5
 
 
 def _color_image(k: int, size: tuple[int, int] = (HEIGHT, WIDTH)) -> np.ndarray:
-    """RGB: red counts frames."""
+    """Return an RGB image with the frame number in red."""
     image = np.zeros((*size, 3), np.uint8)
     image[..., 0], image[..., 2] = (10 * k + 5) % 256, 200
     return image
@@ -38,7 +38,7 @@ def _write_tum(
     camera: dict | None = CAMERA,
     size: tuple[int, int] = (HEIGHT, WIDTH),
 ) -> Path:
-    """Colour k has red 10 k + 5; depth k is 1000 (k + 1)."""
+    """Write a TUM folder; color k has red 10 k + 5, and depth k is 1000 (k + 1)."""
     for k, stamp in enumerate(color_stamps):
         _write_color(folder / f"rgb/{stamp}.png", _color_image(k, size))
     for k, stamp in enumerate(depth_stamps):
@@ -53,7 +53,10 @@ def _write_tum(
 
 
 def _write_replica(folder: Path, numbers: list[int], params: dict | None = PARAMS) -> Path:
-    """Depth k is 1000 (k + 1); frame k stands at x = k m; cam_params.json is one folder up."""
+    """Write a Replica folder, and cam_params.json to its parent.
+
+    Depth k is 1000 (k + 1), and frame k is at x = k m.
+    """
     for k in numbers:
         _write_color(folder / f"results/frame{k:06d}.jpg", _color_image(k))
         _write_depth(folder / f"results/depth{k:06d}.png", 1000 * (k + 1))
@@ -89,7 +92,10 @@ def _intrinsics(fx: float, fy: float, cx: float, cy: float, size: int) -> np.nda
 def _write_scannet(
     folder: Path, numbers: list[int], T_sensor_depth: np.ndarray | None = None
 ) -> Path:
-    """Colour of twice the size of depth; depth k is 1000 (k + 1); frame k stands at x = k m."""
+    """Write a ScanNet folder with color of twice the size of depth.
+
+    Depth k is 1000 (k + 1), and frame k is at x = k m.
+    """
     for k in numbers:
         _write_color(folder / f"color/{k}.jpg", _color_image(k, (2 * HEIGHT, 2 * WIDTH)))
         _write_depth(folder / f"depth/{k}.png", 1000 * (k + 1))
@@ -104,7 +110,10 @@ def _write_scannet(
 
 
 def _write_seven_scenes(folder: Path, numbers: list[int], suffix: str = "png") -> Path:
-    """Depth k is 1000 (k + 1), frame k stands at x = k m; no intrinsics, so 640x480."""
+    """Write a 7-Scenes folder without intrinsics, in 640x480.
+
+    Depth k is 1000 (k + 1), and frame k is at x = k m.
+    """
     for k in numbers:
         name = f"frame-{k:06d}"
         _write_color(folder / f"{name}.color.{suffix}", _color_image(k, (480, 640)))
@@ -115,13 +124,13 @@ def _write_seven_scenes(folder: Path, numbers: list[int], suffix: str = "png") -
 
 @pytest.fixture
 def scannet_folder(tmp_path: Path) -> Callable[..., Path]:
-    """Call with frame numbers and, optionally, T_sensor_depth."""
+    """Return a writer; call it with frame numbers and, optionally, T_sensor_depth."""
     return partial(_write_scannet, tmp_path / "scene0000_00")
 
 
 @pytest.fixture
 def seven_scenes_folder(tmp_path: Path) -> Callable[..., Path]:
-    """Call with frame numbers and, optionally, the suffix of the colour images."""
+    """Return a writer; call it with frame numbers and, optionally, the suffix of color."""
     return partial(_write_seven_scenes, tmp_path / "seq-01")
 
 
@@ -142,11 +151,11 @@ def write_replica() -> Callable[..., Path]:
 
 @pytest.fixture
 def tum_folder(tmp_path: Path) -> Callable[..., Path]:
-    """Call with colour stamps, depth stamps and, optionally, camera and size."""
+    """Return a writer; call it with color and depth stamps and, optionally, camera and size."""
     return partial(_write_tum, tmp_path / "desk")
 
 
 @pytest.fixture
 def replica_folder(tmp_path: Path) -> Callable[..., Path]:
-    """Call with frame numbers and, optionally, camera parameters."""
+    """Return a writer; call it with frame numbers and, optionally, camera parameters."""
     return partial(_write_replica, tmp_path / "office0")

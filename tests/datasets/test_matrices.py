@@ -10,20 +10,20 @@ from ldo_service.geometry import Camera, se3
 T = se3.exp(np.array([0.1, -0.7, 0.3, 1.0, 2.0, -3.0]))
 
 
-def written(path: Path, matrix: np.ndarray, form: str = "%.6f") -> Path:
+def write(path: Path, matrix: np.ndarray, form: str = "%.6f") -> Path:
     np.savetxt(path, matrix, form)
     return path
 
 
 def test_transform_of_six_decimals_becomes_a_rotation(tmp_path: Path) -> None:
-    found = read_transform(written(tmp_path / "a.txt", T))
+    found = read_transform(write(tmp_path / "a.txt", T))
     assert found is not None
     np.testing.assert_allclose(found, T, atol=2e-6)
     np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-14)
 
 
 @pytest.mark.parametrize("word", ["-inf", "inf", "nan", "-1.#INF", "1.#QNAN", "-1.#IND000"])
-def test_pose_with_what_is_no_number_is_not_known(tmp_path: Path, word: str) -> None:
+def test_pose_with_a_non_finite_number_is_unknown(tmp_path: Path, word: str) -> None:
     path = tmp_path / "a.txt"
     path.write_text(f"{word} 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
     assert read_transform(path) is None
@@ -57,7 +57,7 @@ def test_missing_and_binary_files_are_named(tmp_path: Path) -> None:
 
 
 def test_intrinsics_are_a_camera_of_the_image(tmp_path: Path) -> None:
-    path = written(tmp_path / "k.txt", np.array([[585, 0, 320], [0, 586, 240], [0, 0, 1.0]]))
+    path = write(tmp_path / "k.txt", np.array([[585, 0, 320], [0, 586, 240], [0, 0, 1.0]]))
     assert read_intrinsics(path, 3, (640, 480)) == Camera(640, 480, 585, 586, 320, 240)
     with pytest.raises(DataError, match=r"k\.txt: cx=320 px is far outside"):
         read_intrinsics(path, 3, (64, 48))
@@ -66,7 +66,7 @@ def test_intrinsics_are_a_camera_of_the_image(tmp_path: Path) -> None:
 def test_trajectory_skips_frames_without_a_pose(tmp_path: Path) -> None:
     unknown = np.full((4, 4), -np.inf)
     paths = [tmp_path / f"{k}.txt" for k in range(4)]
-    written(paths[0], unknown), written(paths[1], T), written(paths[3], np.eye(4))
+    write(paths[0], unknown), write(paths[1], T), write(paths[3], np.eye(4))
     found = read_trajectory(np.array([0, 1, 2, 3]) * 10**9, paths)
     assert found is not None
     assert found.stamps_s.tolist() == [1.0, 3.0]

@@ -13,7 +13,7 @@ def test_only_whole_names_that_match_are_numbered(tmp_path: Path) -> None:
     assert numbered(tmp_path / "nowhere", r"(\d+)\.png") == {}
 
 
-def test_frames_are_the_numbers_that_both_have(tmp_path: Path) -> None:
+def test_frames_are_the_numbers_that_color_and_depth_share(tmp_path: Path) -> None:
     color = {k: Path(f"c{k}") for k in (30, 2, 10)}
     depth = {k: Path(f"d{k}") for k in (10, 30, 4)}
     frames = pair_by_number(color, depth, tmp_path)

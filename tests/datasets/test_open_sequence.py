@@ -7,7 +7,7 @@ from ldo_service.datasets import SequenceOptions, open_sequence
 from ldo_service.errors import ConfigError, DataError
 
 
-def test_synthetic_is_the_room() -> None:
+def test_synthetic_without_a_name_is_the_room() -> None:
     assert open_sequence("synthetic").name == open_sequence("synthetic:room").name
 
 
@@ -16,7 +16,7 @@ def test_unknown_synthetic_name_lists_the_known_ones() -> None:
         open_sequence("synthetic:castle")
 
 
-def test_a_seed_behind_the_name_is_part_of_the_name() -> None:
+def test_seed_after_the_name_is_part_of_the_name() -> None:
     plain, other = (open_sequence(f"synthetic:room{seed}") for seed in ("@0", "@3"))
     assert (plain.name, other.name) == ("synthetic:room", "synthetic:room@3")
     assert plain[0].color.tobytes() != other[0].color.tobytes()
@@ -24,12 +24,12 @@ def test_a_seed_behind_the_name_is_part_of_the_name() -> None:
 
 
 @pytest.mark.parametrize("seed", ["@", "@x", "@-1", "@1.5"])
-def test_what_is_no_seed_is_refused(seed: str) -> None:
+def test_invalid_seed_is_refused(seed: str) -> None:
     with pytest.raises(DataError, match="such as synthetic:room@3"):
         open_sequence(f"synthetic:room{seed}")
 
 
-def test_folder_of_no_known_layout_says_what_was_looked_for(tmp_path: Path) -> None:
+def test_folder_of_unknown_layout_lists_the_expected_files(tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text("")
     with pytest.raises(
         DataError, match=r"rgb\.txt with depth\.txt.*results/.*TUM.*Replica.*ScanNet.*7-Scenes"
@@ -37,7 +37,7 @@ def test_folder_of_no_known_layout_says_what_was_looked_for(tmp_path: Path) -> N
         open_sequence(str(tmp_path))
 
 
-def test_missing_folder_and_file_are_told_apart(tmp_path: Path) -> None:
+def test_missing_folder_and_file_have_different_messages(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"does not exist.*TUM"):
         open_sequence(str(tmp_path / "nowhere"))
     (tmp_path / "a.mcap").touch()

@@ -70,7 +70,7 @@ def test_trajectory_line_that_is_no_pose_is_named(replica_folder: Writer, line: 
         open_sequence(str(folder)).truth()
 
 
-def test_missing_parameters_name_both_places(replica_folder: Writer) -> None:
+def test_missing_parameters_name_both_paths(replica_folder: Writer) -> None:
     folder = replica_folder([0], params=None)
     with pytest.raises(DataError, match=r"office0/cam_params\.json nor"):
         open_sequence(str(folder))

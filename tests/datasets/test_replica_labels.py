@@ -13,7 +13,7 @@ Writer = Callable[..., Path]
 
 
 def with_labels(folder: Path, numbers: list[int]) -> Path:
-    """Class k and object 300 + k all over frame k."""
+    """Write labels: class k and object 300 + k cover frame k."""
     for kind, dtype, start in (("semantic_class", np.uint8, 0), ("instance", np.uint16, 300)):
         (folder / kind).mkdir()
         for k in numbers:
@@ -34,7 +34,7 @@ def test_labels_belong_to_the_numbers_of_frames(replica_folder: Writer) -> None:
     assert (np.unique(last.class_ids), np.unique(last.instance_ids)) == (5, 305)
 
 
-def test_without_a_file_of_names_there_are_none(replica_folder: Writer) -> None:
+def test_sequence_without_labels_json_has_no_labels(replica_folder: Writer) -> None:
     assert open_sequence(str(replica_folder([0]))).true_labels() is None
 
 
@@ -45,7 +45,7 @@ def test_a_frame_without_labels_is_named(replica_folder: Writer) -> None:
         labels.frame(1)
 
 
-def test_an_image_of_another_kind_or_none_is_named(replica_folder: Writer) -> None:
+def test_image_of_another_type_or_a_truncated_one_is_named(replica_folder: Writer) -> None:
     folder = with_labels(replica_folder([0, 1]), [0, 1])
     labels = open_sequence(str(folder)).true_labels()
     assert labels is not None
@@ -62,7 +62,7 @@ def test_an_image_of_another_kind_or_none_is_named(replica_folder: Writer) -> No
     "text", ["{", "[]", "{}", '{"classes": ["a"]}', '{"classes": {"x": "a"}}', '{"classes": {}}',
              '{"classes": {"256": "a"}}', '{"classes": {"-1": "a"}}']
 )  # fmt: skip
-def test_names_that_make_no_sense_are_one_clear_error(replica_folder: Writer, text: str) -> None:
+def test_invalid_labels_json_is_a_data_error(replica_folder: Writer, text: str) -> None:
     folder = replica_folder([0])
     (folder / "labels.json").write_text(text)
     with pytest.raises(DataError, match=r"labels\.json"):

@@ -17,8 +17,8 @@ def test_cameras_a_millimeter_apart_are_two_views(xi: list[float], is_one_view: 
     assert Rig(A, B, se3.exp(np.array(xi))).is_one_view is is_one_view
 
 
-def test_color_camera_stands_where_the_transform_says() -> None:
-    """The origin of colour, seen in depth coordinates, is where T_color_depth maps to zero."""
+def test_color_camera_pose_follows_from_t_color_depth() -> None:
+    """Both cameras give a point the same world coordinates."""
     T_color_depth = se3.exp(np.array([0.1, 0.2, -0.3, 0.02, -0.01, 0.03]))
     T_world_depth = se3.exp(np.array([-0.5, 0.1, 1.0, 3.0, 2.0, 1.0]))
     T_world_color = Rig(A, B, T_color_depth).T_world_color(T_world_depth)

@@ -15,7 +15,7 @@ DEPTH_CAMERA = Camera(24, 16, 20.0, 21.0, 11.5, 7.5)
 COLOR_CAMERA = Camera(48, 32, 40.0, 42.0, 23.5, 15.5)
 
 
-def test_larger_color_is_brought_to_the_depth_image(scannet_folder: Writer) -> None:
+def test_larger_color_is_resampled_to_the_depth_image(scannet_folder: Writer) -> None:
     sequence = open_sequence(str(scannet_folder([0, 1])))
     assert sequence.camera == DEPTH_CAMERA
     raw = sequence.read(1)
@@ -37,7 +37,7 @@ def test_gap_in_the_numbers_is_a_gap_in_time_and_not_in_the_indices(scannet_fold
     assert sequence.stamps_ns.tolist() == [0, 666_666_666, 2_000_000_000]
 
 
-def test_image_without_partner_is_left_out(scannet_folder: Writer) -> None:
+def test_image_without_partner_is_skipped(scannet_folder: Writer) -> None:
     folder = scannet_folder([0, 1, 2, 3])
     (folder / "color/1.jpg").unlink()
     (folder / "depth/2.png").unlink()
@@ -91,11 +91,11 @@ def test_color_of_another_size_than_the_first_is_a_bad_frame(scannet_folder: Wri
         open_sequence(str(folder)).read(1)
 
 
-def test_depth_that_color_does_not_look_at_is_left_out(
+def test_depth_outside_the_color_view_is_removed(
     scannet_folder: Writer, write_matrix: Callable[..., None]
 ) -> None:
     folder = scannet_folder([0])
-    K = np.diag([80.0, 84.0, 1.0, 1.0])  # twice as long, so colour sees the middle half
+    K = np.diag([80.0, 84.0, 1.0, 1.0])  # Twice the focal length: color sees the middle half.
     K[0, 2], K[1, 2] = 23.5, 15.5
     write_matrix(folder / "intrinsic/intrinsic_color.txt", K)
     expected = np.zeros((16, 24), np.float32)
@@ -113,8 +113,8 @@ def test_intrinsics_are_required_and_extrinsics_are_not(scannet_folder: Writer) 
         open_sequence(str(folder))
 
 
-def test_cameras_apart_have_depth_registered_to_color(scannet_folder: Writer) -> None:
-    """Depth 0.1 m right of colour: at 2 m its wall moves by 40 * 0.1 / 2 = 2 colour pixels."""
+def test_depth_of_a_separate_camera_is_registered_to_color(scannet_folder: Writer) -> None:
+    """With 0.1 m between the cameras, a wall at 2 m moves by 40 * 0.1 / 2 = 2 color pixels."""
     T_sensor_depth = se3.exp(np.array([0, 0, 0, 0.1, 0, 0]))
     sequence = open_sequence(str(scannet_folder([0, 1], T_sensor_depth)))
     frame = sequence[1]
@@ -126,17 +126,17 @@ def test_cameras_apart_have_depth_registered_to_color(scannet_folder: Writer) ->
     np.testing.assert_allclose(truth.T_world_camera[:, 0, 3], [-0.1, 0.9], atol=1e-12)
 
 
-def test_registration_into_large_color_can_be_asked_for(scannet_folder: Writer) -> None:
+def test_depth_is_registered_to_larger_color_on_request(scannet_folder: Writer) -> None:
     folder = scannet_folder([0, 1])
     frame = open_sequence(str(folder), SequenceOptions(register_depth=True))[1]
     assert frame.camera == COLOR_CAMERA
     assert np.all(frame.depth_m == 2.0)
 
 
-def test_real_frames_at_the_sizes_of_scannet_come_back(
+def test_real_frames_in_scannet_sizes_are_read(
     data: Path, tmp_path: Path, write_matrix: Callable[..., None]
 ) -> None:
-    """Kitchen frames, colour enlarged to 1296x968 as ScanNet has it."""
+    """The color images of the kitchen are enlarged to 1296x968, the size in ScanNet."""
     kitchen = open_sequence(str(data / "tum/kitchen"))
     large = Camera(1296, 968, 525 * 2.025, 525 * 968 / 480, 320.5 * 2.025 - 0.5, 480.487)
     for k in range(3):

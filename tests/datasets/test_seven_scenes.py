@@ -21,7 +21,7 @@ def set_depth(folder: Path, k: int, depth: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
-def test_frames_are_read_as_the_files_are(seven_scenes_folder: Writer, suffix: str) -> None:
+def test_frames_equal_the_files(seven_scenes_folder: Writer, suffix: str) -> None:
     sequence = open_sequence(str(seven_scenes_folder([0, 1], suffix)))
     assert sequence.camera == Camera(640, 480, 585, 585, 320, 240)
     raw = sequence.read(1)
@@ -30,7 +30,7 @@ def test_frames_are_read_as_the_files_are(seven_scenes_folder: Writer, suffix: s
     np.testing.assert_allclose(sequence[1].depth_m, 2.0, rtol=1e-7)
 
 
-def test_both_marks_of_missing_depth_are_missing(seven_scenes_folder: Writer) -> None:
+def test_both_codes_of_missing_depth_are_read_as_zero(seven_scenes_folder: Writer) -> None:
     folder = seven_scenes_folder([0])
     depth = np.full((480, 640), 3000)
     depth[:100], depth[100:200] = 65535, 0
@@ -58,7 +58,7 @@ def test_own_intrinsics_are_those_of_the_depth_camera(
 
 
 def test_registered_depth_moves_to_the_color_camera(seven_scenes_folder: Writer) -> None:
-    """A point straight ahead of the depth camera at 1 m is 0.0254 * 525 = 13.3 px left of it."""
+    """A point 1 m ahead of the depth camera is 0.0254 * 525 = 13.3 px left in color."""
     folder = seven_scenes_folder([0])
     depth = np.zeros((480, 640))
     depth[240, 320] = 1000
@@ -134,8 +134,8 @@ def test_color_without_any_depth_is_an_error(seven_scenes_folder: Writer) -> Non
         open_sequence(str(folder))
 
 
-def unregistered(kitchen: Sequence, indices: list[int], folder: Path) -> Path:
-    """RedKitchen as its Kinect delivered it, from frames whose depth was moved to colour."""
+def write_unregistered(kitchen: Sequence, indices: list[int], folder: Path) -> Path:
+    """Write RedKitchen as its Kinect delivered it, from frames with registered depth."""
     truth = kitchen.truth()
     assert truth is not None
     for k in indices:
@@ -151,19 +151,20 @@ def unregistered(kitchen: Sequence, indices: list[int], folder: Path) -> Path:
     return folder
 
 
-def test_real_kitchen_is_registered_again(data: Path, tmp_path: Path) -> None:
+def test_unregistered_real_kitchen_is_registered(data: Path, tmp_path: Path) -> None:
     kitchen = open_sequence(str(data / "tum/kitchen"))
-    folder = unregistered(kitchen, [0, 300], tmp_path)
+    folder = write_unregistered(kitchen, [0, 300], tmp_path)
     sequence, expected = open_sequence(str(folder), REGISTERED), kitchen[300]
     frame = sequence[1]
     both = (frame.depth_m > 0) & (expected.depth_m > 0)
     error_m = np.abs(frame.depth_m - expected.depth_m)[both]
     assert both.sum() > 0.95 * (expected.depth_m > 0).sum()
     assert np.median(error_m) < 0.002
-    assert np.mean(error_m > 0.05) < 0.02  # the rims of what stands in front
-    as_it_is = open_sequence(str(folder))[1].depth_m
-    apart = np.abs(as_it_is - expected.depth_m)[(as_it_is > 0) & (expected.depth_m > 0)]
-    assert np.median(apart) > 5 * np.median(error_m)
+    assert np.mean(error_m > 0.05) < 0.02  # The rims of foreground objects.
+    without_registration = open_sequence(str(folder))[1].depth_m
+    both = (without_registration > 0) & (expected.depth_m > 0)
+    unregistered_error_m = np.abs(without_registration - expected.depth_m)[both]
+    assert np.median(unregistered_error_m) > 5 * np.median(error_m)
     assert np.array_equal(frame.color, expected.color)
     truth, known = sequence.truth(), kitchen.truth()
     assert truth is not None

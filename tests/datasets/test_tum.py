@@ -91,7 +91,7 @@ def test_camera_json_that_is_not_json_is_named(tum_folder: Writer) -> None:
         open_sequence(str(folder))
 
 
-def test_color_without_depth_partner_is_left_out(
+def test_color_without_depth_partner_is_skipped(
     tum_folder: Writer, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -102,7 +102,7 @@ def test_color_without_depth_partner_is_left_out(
     assert "1 of 3 color images" in caplog.text
 
 
-def test_one_depth_image_serves_one_color_image(tum_folder: Writer) -> None:
+def test_depth_image_is_paired_with_one_color_image_only(tum_folder: Writer) -> None:
     sequence = open_sequence(str(tum_folder(["1.000", "1.012"], ["1.010"])))
     assert sequence.stamps_ns.tolist() == [1_012_000_000]
 
@@ -125,7 +125,7 @@ def test_empty_lists_are_a_data_error(tum_folder: Writer) -> None:
 
 
 @pytest.mark.parametrize("line", ["1.5", "now rgb/1.png", "inf rgb/1.png"])
-def test_list_line_that_does_not_read_is_named(tum_folder: Writer, line: str) -> None:
+def test_unreadable_list_line_is_named(tum_folder: Writer, line: str) -> None:
     folder = tum_folder(["1"], ["1"])
     (folder / "rgb.txt").write_text(f"# x\n{line}\n")
     with pytest.raises(DataError, match=r"rgb\.txt, line 2"):
@@ -144,7 +144,7 @@ def test_truncated_image_fails_alone(tum_folder: Writer, kind: str, kept: int) -
     assert sequence[1].index == 1
 
 
-def test_garbage_with_a_good_end_is_an_error(tum_folder: Writer) -> None:
+def test_corrupt_image_with_a_valid_end_is_an_error(tum_folder: Writer) -> None:
     folder = tum_folder(["1"], ["1"])
     path = folder / "rgb/1.png"
     data = bytearray(path.read_bytes())
