@@ -1,4 +1,4 @@
-"""ROS 2 messages as CDR, made by rosbags."""
+"""ROS 2 messages as CDR, serialized by rosbags."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ def header(stamp_ns: int = 1_500_000_002, frame_id: str = FRAME_ID) -> Any:
 def image(
     encoding: str, pixels: np.ndarray, about: Any = None, *, padding: int = 0, **changes: Any
 ) -> Any:
-    """`padding` bytes follow each row."""
+    """Return an Image message; `padding` bytes follow each row."""
     height, width = pixels.shape[:2]
     rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(height, -1)
     rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=0xAA)

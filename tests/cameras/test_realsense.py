@@ -1,4 +1,4 @@
-"""librealsense's own software device stands for a camera on USB; a real one was not here."""
+"""The RealSense camera, replaced by librealsense's software device."""
 
 import sys
 from itertools import islice
@@ -41,7 +41,7 @@ def stream(kind, form, bytes_per_pixel: int, camera):
 
 
 class SoftwareCamera:
-    """A depth and a colour camera side by side, before a wall; as a pipeline, for nine frames."""
+    """A depth and a color camera side by side before a wall, as a pipeline of nine frames."""
 
     def __init__(self) -> None:
         self.device = rs.software_device()
@@ -81,7 +81,7 @@ class SoftwareCamera:
         return self.syncer.wait_for_frames(timeout_ms)
 
 
-def test_depth_is_aligned_to_color_and_in_the_device_s_units() -> None:
+def test_depth_is_aligned_to_color_in_device_units() -> None:
     camera = SoftwareCamera()
     sent = messages(rs, camera, camera_model(rs, intrinsics(50.0)))
     *_, frame = islice(sent, 5)
@@ -91,7 +91,7 @@ def test_depth_is_aligned_to_color_and_in_the_device_s_units() -> None:
     depth_m = np.frombuffer(frame.depth.data, "<u2").reshape(HEIGHT, WIDTH) / frame.depth_scale
     moved_px = round(50 * BASELINE_M / DEPTH_M)
     assert moved_px == 2
-    assert not depth_m[:, : moved_px - 1].any(), "colour sees there what depth did not"
+    assert not depth_m[:, : moved_px - 1].any(), "depth does not see what color sees there"
     seen = depth_m[:, moved_px + 1 : -1]
     assert set(np.unique(seen)) <= {0.0, DEPTH_M}
     assert (seen > 0).mean() > 0.9, "librealsense leaves single pixels out"
@@ -99,7 +99,7 @@ def test_depth_is_aligned_to_color_and_in_the_device_s_units() -> None:
         list(sent)
 
 
-def test_a_camera_without_distortion_has_none() -> None:
+def test_camera_without_distortion_has_no_coefficients() -> None:
     camera = camera_from_message(camera_model(rs, intrinsics(50.0)))
     assert camera == Camera(WIDTH, HEIGHT, 50.0, 50.0, 31.0, 23.0)
 
@@ -107,8 +107,8 @@ def test_a_camera_without_distortion_has_none() -> None:
 @pytest.mark.parametrize(
     "name", ["brown_conrady", "inverse_brown_conrady", "modified_brown_conrady"]
 )
-def test_opencv_s_lens_sees_what_the_device_s_own_does(name: str) -> None:
-    """librealsense is the judge: it says where a point is seen, or where from."""
+def test_opencv_lens_model_agrees_with_librealsense(name: str) -> None:
+    """librealsense gives the reference: it projects a point, or deprojects a pixel."""
     theirs = intrinsics(50.0, getattr(rs.distortion, name), LENS)
     ours = camera_from_message(camera_model(rs, theirs))
     if name == "brown_conrady":
@@ -123,20 +123,20 @@ def test_opencv_s_lens_sees_what_the_device_s_own_does(name: str) -> None:
         assert (float(u[0, 0]), float(v[0, 0])) == pytest.approx(tuple(seen), abs=0.05)
 
 
-def test_a_lens_that_opencv_has_no_model_for_is_refused() -> None:
+def test_lens_without_an_opencv_model_is_refused() -> None:
     fisheye = intrinsics(20.0, rs.distortion.kannala_brandt4, [0.9, -0.8, 0.5, -0.2, 0.0])
     with pytest.raises(ConfigError, match="too wide"):
         camera_model(rs, fisheye)
 
 
-def test_without_a_camera_one_line_says_so() -> None:
+def test_missing_camera_is_a_config_error() -> None:
     if len(rs.context().query_devices()):
         pytest.skip("a RealSense is plugged in")
     with pytest.raises(ConfigError, match="no RealSense was found"):
         next(frames(RealSenseStream()))
 
 
-def test_without_the_library_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_an_error_with_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(ConfigError, match=r"ldo-slam\[realsense\]"):
         library()

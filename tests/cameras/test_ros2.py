@@ -1,4 +1,4 @@
-"""Topics of ROS 2 on a Zenoh router, as the bridge puts them there, become frames."""
+"""Topics of ROS 2 on a Zenoh router, published as the bridge does, as frames."""
 
 import subprocess
 import time
@@ -34,12 +34,12 @@ def depth(stamp_ns: int) -> bytes:
     return cdr(image("16UC1", DEPTH_MM, header(stamp_ns)))
 
 
-class Fed:
-    """A camera that was fed, frame by frame."""
+class CameraFeed:
+    """A ROS camera with the frames that it gives and the lines that it logs."""
 
     def __init__(self, topics: RosTopics = TOPICS, has_info: bool = True) -> None:
-        self.said: list[str] = []
-        self.camera, self.topics = RosCamera(topics, self.said.append), topics
+        self.log: list[str] = []
+        self.camera, self.topics = RosCamera(topics, self.log.append), topics
         self.frames: list[CameraRgbd] = []
         if has_info:
             self.take(topics.camera_info, cdr(camera_info()))
@@ -52,59 +52,59 @@ class Fed:
         self.take(self.topics.depth, depth(depth_ns))
 
 
-def test_the_camera_info_is_beside_the_image() -> None:
+def test_camera_info_topic_is_next_to_the_image_topic() -> None:
     assert TOPICS.camera_info == "/camera/color/camera_info"
     assert RosTopics("/a/image_raw/compressed", "/d").camera_info == "/a/camera_info"
     assert RosTopics("/a/image_raw", "/d", "/b/info").camera_info == "/b/info"
 
 
 @pytest.mark.parametrize("topic", ["", "/", "/a//b", "/a/*", "a b", "/a/**", "/a/$*", "/ä"])
-def test_what_is_no_topic_is_refused(topic: str) -> None:
+def test_invalid_topic_is_refused(topic: str) -> None:
     with pytest.raises(ConfigError, match="not a valid ROS topic"):
         key_of(topic)
 
 
 def test_halves_are_paired_by_stamp_within_the_skew() -> None:
-    fed = Fed()
-    fed.pair(100 * MS, 104 * MS)
-    fed.pair(133 * MS, 160 * MS)  # 27 ms: the next colour is nearer
-    fed.take(TOPICS.color, color(166 * MS))
-    assert [frame.stamp_ns for frame in fed.frames] == [100 * MS, 166 * MS]
-    assert [frame.frame for frame in fed.frames] == [0, 1]
-    assert fed.said == []
+    feed = CameraFeed()
+    feed.pair(100 * MS, 104 * MS)
+    feed.pair(133 * MS, 160 * MS)  # 27 ms apart; the next color image is nearer.
+    feed.take(TOPICS.color, color(166 * MS))
+    assert [frame.stamp_ns for frame in feed.frames] == [100 * MS, 166 * MS]
+    assert [frame.frame for frame in feed.frames] == [0, 1]
+    assert feed.log == []
 
 
-def test_without_camera_info_it_is_said_once_what_is_missing() -> None:
-    fed = Fed(has_info=False)
-    fed.pair(100 * MS, 100 * MS)
-    fed.pair(133 * MS, 133 * MS)
-    assert (len(fed.frames), fed.camera.rejected, len(fed.said)) == (0, 2, 1)
-    assert "no camera info was received on /camera/color/camera_info yet" in fed.said[0]
-    fed.take(TOPICS.camera_info, cdr(camera_info()))
-    fed.pair(166 * MS, 166 * MS)
-    assert len(fed.frames) == 1
+def test_missing_camera_info_is_reported_once() -> None:
+    feed = CameraFeed(has_info=False)
+    feed.pair(100 * MS, 100 * MS)
+    feed.pair(133 * MS, 133 * MS)
+    assert (len(feed.frames), feed.camera.rejected, len(feed.log)) == (0, 2, 1)
+    assert "no camera info was received on /camera/color/camera_info yet" in feed.log[0]
+    feed.take(TOPICS.camera_info, cdr(camera_info()))
+    feed.pair(166 * MS, 166 * MS)
+    assert len(feed.frames) == 1
 
 
-def test_garbage_is_counted_and_its_reasons_said_once() -> None:
-    fed = Fed()
+def test_malformed_messages_are_counted_and_each_reason_reported_once() -> None:
+    feed = CameraFeed()
     for number in range(40):
-        fed.take(TOPICS.color, color(1)[: 40 + number % 2])
-    fed.pair(100 * MS, 100 * MS)
-    assert (len(fed.frames), fed.camera.rejected) == (1, 40)
-    assert len(fed.said) <= 2
-    assert "40 images rejected" in fed.camera.statistics
+        feed.take(TOPICS.color, color(1)[: 40 + number % 2])
+    feed.pair(100 * MS, 100 * MS)
+    assert (len(feed.frames), feed.camera.rejected) == (1, 40)
+    assert len(feed.log) <= 2
+    assert "40 images rejected" in feed.camera.statistics
 
 
-def test_a_camera_that_starts_again_is_followed() -> None:
-    fed = Fed()
-    fed.pair(9_000 * MS, 9_000 * MS)
-    fed.pair(100 * MS, 100 * MS)
-    fed.pair(133 * MS, 133 * MS)
-    assert len(fed.frames) == 3
-    assert fed.said == ["The stamps went back: the camera has restarted. No action needed."]
+def test_restarted_camera_is_accepted() -> None:
+    feed = CameraFeed()
+    feed.pair(9_000 * MS, 9_000 * MS)
+    feed.pair(100 * MS, 100 * MS)
+    feed.pair(133 * MS, 133 * MS)
+    assert len(feed.frames) == 3
+    assert feed.log == ["The stamps went back: the camera has restarted. No action needed."]
 
 
-def test_of_samples_that_nobody_takes_the_newest_stay() -> None:
+def test_full_inbox_keeps_the_newest_samples() -> None:
     class Sample:
         def __init__(self, body: bytes) -> None:
             self.payload = self
@@ -135,23 +135,23 @@ def publisher(endpoint: str, *arguments: str) -> Iterator[subprocess.Popen[str]]
             process.kill()
 
 
-def test_a_publisher_passes_on_what_a_bridge_forwards() -> None:
+def test_publisher_forwards_the_topics_of_a_bridge() -> None:
     endpoint = free_endpoint()
     with open_session(Endpoint("robot", endpoint), router=True) as session:
         channel = zenoh.handlers.FifoChannel(64)
         frames = session.declare_subscriber("ldo/robot/camera/rgbd", channel)
         with publisher(endpoint, "--max-frames", "5") as process:
             stamps_ns = count(33 * MS, 33 * MS)
-            while process.poll() is None:  # a bridge goes on, whether anybody listens or not
+            while process.poll() is None:  # A bridge publishes without subscribers too.
                 put(session, next(stamps_ns))
                 time.sleep(0.05)
             assert process.stderr is not None
-            told = process.stderr.read()
+            stderr = process.stderr.read()
         got = [
             decode(sample.payload.to_bytes(), CameraRgbd) for sample in iter(frames.try_recv, None)
         ]
-    assert process.returncode == 0, told
-    assert "5 frames published" in told
+    assert process.returncode == 0, stderr
+    assert "5 frames published" in stderr
     assert len(got) == 5
     assert [frame.frame for frame in got] == sorted(frame.frame for frame in got)
     assert got[0].camera.fx == 7.0
@@ -167,7 +167,7 @@ def put(session: zenoh.Session, stamp_ns: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_robot_of_ros_is_tracked(room: Sequence, tmp_path: Path) -> None:
+def test_camera_of_a_ros_robot_is_tracked(room: Sequence, tmp_path: Path) -> None:
     camera = room.camera
     info = camera_info(
         width=camera.width,
@@ -182,7 +182,7 @@ def test_a_robot_of_ros_is_tracked(room: Sequence, tmp_path: Path) -> None:
             open_session(Endpoint("robot", service.endpoint)) as bridge,
         ):
             frames, poses = cycle(range(20)), list[TrackedPose]()
-            for number in count(1):  # a camera goes on, whether anybody listens or not
+            for number in count(1):  # A camera publishes without subscribers too.
                 frame, stamp_ns = room[next(frames)], 66 * MS * number
                 bridge.put("camera/color/camera_info", cdr(info))
                 bridge.put(

@@ -1,4 +1,4 @@
-"""What rosbags writes as CDR is read as it was meant, and nothing else is."""
+"""Images and camera infos in CDR, serialized by rosbags; invalid messages raise FrameError."""
 
 import sys
 
@@ -82,12 +82,12 @@ def test_depth_is_in_meters_whatever_its_encoding(encoding: str, order: str, pad
     np.testing.assert_allclose(depth_m_of(read), DEPTH_MM / 1000, rtol=1e-6)
 
 
-def test_not_measured_stays_nan_in_floats() -> None:
+def test_missing_depth_stays_nan_in_floats() -> None:
     depth = np.full((HEIGHT, WIDTH), np.nan, np.float32)
     assert np.isnan(depth_m_of(read_depth(cdr(image("32FC1", depth)), "/depth"))).all()
 
 
-def test_compressed_images_are_passed_on_as_they_are() -> None:
+def test_compressed_images_are_passed_on_unchanged() -> None:
     color = read_color(cdr(compressed("rgb8; jpeg compressed bgr8", JPEG)), "/image_raw/compressed")
     assert (color.image.encoding, bytes(color.image.data)) == ("jpeg", JPEG)
     message = compressed("16UC1; compressedDepth png", bytes(12) + PNG16)
@@ -95,7 +95,7 @@ def test_compressed_images_are_passed_on_as_they_are() -> None:
     np.testing.assert_array_equal(depth_m_of(depth), DEPTH_MM / 1000)
 
 
-def test_a_camera_is_k_and_d_and_of_rectified_images_p() -> None:
+def test_camera_model_is_k_and_d_or_p_for_rectified_images() -> None:
     body = cdr(camera_info())
     raw, rectified = read_camera(body, False), read_camera(body, True)
     assert (raw.fx, raw.fy, raw.cx, raw.cy) == (7.0, 7.5, 3.5, 2.5)
@@ -104,13 +104,13 @@ def test_a_camera_is_k_and_d_and_of_rectified_images_p() -> None:
     assert rectified.distortion == ()
 
 
-def test_a_lens_of_zeros_is_none_of_whatever_model() -> None:
+def test_zero_coefficients_mean_no_distortion_in_any_model() -> None:
     info = camera_info(distortion_model="equidistant", d=np.zeros(4))
     assert read_camera(cdr(info), False).distortion == ()
 
 
 @pytest.mark.parametrize(
-    ("info", "says"),
+    ("info", "expected"),
     [
         (camera_info(distortion_model="equidistant", d=np.ones(4)), "equidistant.*--rectified"),
         (camera_info(k=np.zeros(9)), "focal lengths 0"),
@@ -119,13 +119,13 @@ def test_a_lens_of_zeros_is_none_of_whatever_model() -> None:
         (camera_info(width=0), "image size 0x6"),
     ],
 )
-def test_a_camera_that_is_none_is_refused(info, says: str) -> None:
-    with pytest.raises(FrameError, match=says):
+def test_invalid_camera_info_is_refused(info, expected: str) -> None:
+    with pytest.raises(FrameError, match=expected):
         read_camera(cdr(info), False)
 
 
 @pytest.mark.parametrize(
-    ("message", "says"),
+    ("message", "expected"),
     [
         (
             image("bayer_rggb8", COLOR[..., 0]),
@@ -142,8 +142,8 @@ def test_a_camera_that_is_none_is_refused(info, says: str) -> None:
         (camera_info(), "not a valid sensor_msgs/msg/Image|is not supported|rows of|pixels"),
     ],
 )
-def test_color_that_does_not_fit_itself_is_refused(message, says: str) -> None:
-    with pytest.raises(FrameError, match=says):
+def test_inconsistent_color_image_is_refused(message, expected: str) -> None:
+    with pytest.raises(FrameError, match=expected):
         read_color(cdr(message), "/image_raw")
 
 
@@ -168,7 +168,7 @@ def test_compressed_depth_of_another_kind_is_refused(kind: str) -> None:
         read_depth(cdr(compressed(kind, bytes(12) + PNG16)), "/depth/compressedDepth")
 
 
-def test_compressed_data_that_are_no_image_are_refused() -> None:
+def test_compressed_data_without_an_image_are_refused() -> None:
     with pytest.raises(FrameError, match="neither PNG nor JPEG"):
         read_color(cdr(compressed("jpeg", b"\xff\xd8")), "/image_raw/compressed")
 
@@ -192,13 +192,13 @@ def test_a_frame_has_both_images_and_the_stamp_of_color() -> None:
     assert frame.camera == CAMERA
 
 
-def test_depth_of_another_frame_is_refused_unless_the_user_knows_better() -> None:
+def test_depth_of_another_frame_is_refused_unless_declared_registered() -> None:
     with pytest.raises(FrameError, match=r"align_depth.*--registered"):
         frame_of(depth_of("camera_depth_optical_frame"))
     assert frame_of(depth_of("camera_depth_optical_frame"), is_registered=True).frame == 3
 
 
-def test_sizes_that_do_not_fit_are_refused() -> None:
+def test_sizes_that_differ_are_refused() -> None:
     with pytest.raises(FrameError, match="differ in size"):
         frame_of(depth_of(pixels=DEPTH_MM[:4]))
     with pytest.raises(FrameError, match="8x6 pixels and its camera info 8x5"):
@@ -211,7 +211,7 @@ def test_a_stamp_before_the_epoch_is_refused() -> None:
         joined(color, depth_of(), CAMERA, 0, False)
 
 
-def test_without_the_library_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_an_error_with_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     with pytest.raises(ConfigError, match=r"ldo-slam\[ros2\]"):
         typestore.__wrapped__()
