@@ -1,4 +1,4 @@
-"""The flat: exact where it claims to be, hard where it should be, cached without harm."""
+"""The synthetic flat: exact geometry, realistic sensor noise, and its cache of frames."""
 
 import hashlib
 import itertools
@@ -26,7 +26,7 @@ SMALL = {"width_px": 160, "height_px": 120}
 
 @pytest.fixture(scope="module", autouse=True)
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A cache of this module's own."""
+    """Return the cache folder of this module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LDO_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield cache.cache_root()
@@ -39,7 +39,7 @@ def exact() -> FlatSequence:
 
 @pytest.fixture(scope="module")
 def noisy(exact: FlatSequence) -> FlatSequence:
-    """The same flat; the shadows on its walls are not computed a second time."""
+    """Return the same flat with noise; it shares the renderer, as shadows are slow to compute."""
     sequence = FlatSequence.named("flat", **SMALL)
     sequence.__dict__["_renderer"] = exact._renderer
     return sequence
@@ -52,7 +52,7 @@ def bytes_of(sequence: FlatSequence, index: int) -> bytes:
 
 
 def warped(source: RgbdFrame, target: RgbdFrame, T_target_source: np.ndarray) -> tuple:
-    """Differences in colour and relative depth of the source's pixels seen in the target."""
+    """Return differences in color and relative depth of source pixels seen in the target."""
     points = se3.transform(T_target_source, source.camera.backproject(source.depth_m))
     u, v = np.moveaxis(source.camera.project(points).astype(np.float32), -1, 0)
     color = cv2.remap(target.color, u, v, cv2.INTER_LINEAR)
@@ -60,7 +60,7 @@ def warped(source: RgbdFrame, target: RgbdFrame, T_target_source: np.ndarray) ->
     inside = (u > 1) & (v > 1) & (u < source.camera.width - 2) & (v < source.camera.height - 2)
     inside &= points[..., 2] > 0.1
     difference = (depth_m - points[..., 2]) / points[..., 2]
-    seen = inside & (np.abs(difference) < 0.02)  # the rest is hidden behind something
+    seen = inside & (np.abs(difference) < 0.02)  # The other pixels are occluded.
     return color[seen].astype(float) - source.color[seen], difference[seen], seen.mean()
 
 
@@ -85,12 +85,12 @@ def test_unknown_name_lists_the_flats() -> None:
 
 
 @pytest.mark.parametrize("changes", [{"width_px": 8}, {"height_px": 0}, {"seed": -1}])
-def test_senseless_config_is_refused(changes: dict) -> None:
+def test_invalid_config_is_refused(changes: dict) -> None:
     with pytest.raises(ConfigError):
         FlatConfig(**changes)
 
 
-def test_bytes_are_those_of_every_machine(exact: FlatSequence, noisy: FlatSequence) -> None:
+def test_bytes_are_equal_on_every_machine(exact: FlatSequence, noisy: FlatSequence) -> None:
     frames = [bytes_of(sequence, index) for sequence in (exact, noisy) for index in (0, 330)]
     assert hashlib.sha256(b"".join(frames)).hexdigest()[:16] == "09daa59095c99a14"
 
@@ -105,7 +105,7 @@ def test_the_same_config_gives_the_same_bytes_without_the_cache(
     assert bytes_of(again, 60) == stored
 
 
-def test_another_seed_paints_and_shakes_otherwise(exact: FlatSequence) -> None:
+def test_another_seed_changes_textures_and_camera_shake(exact: FlatSequence) -> None:
     other = FlatSequence.named("flat-exact", seed=1, **SMALL)
     assert not np.array_equal(other.truth().T_world_camera, exact.truth().T_world_camera)
     ours, theirs = (
@@ -121,7 +121,7 @@ def test_views_of_the_same_point_agree(exact: FlatSequence, i: int, j: int) -> N
     assert overlap > 0.5
     assert np.median(np.abs(color)) <= 2
     assert abs(color.mean()) < 1.5
-    assert np.median(np.abs(depth)) < 5e-5  # depth is not linear between pixels
+    assert np.median(np.abs(depth)) < 5e-5  # Depth is not linear between pixels.
 
 
 @pytest.mark.parametrize("index", [20, 180])
@@ -136,9 +136,7 @@ def test_floor_and_ceiling_are_where_they_were_built(exact: FlatSequence, index:
 
 
 @pytest.mark.parametrize("index", [20, 180, 420])
-def test_what_is_labelled_a_thing_lies_in_the_box_of_that_thing(
-    exact: FlatSequence, index: int
-) -> None:
+def test_labelled_points_lie_in_the_box_of_their_object(exact: FlatSequence, index: int) -> None:
     points, labels = world_points(exact, index), exact.labels(index)
     instances = np.unique(labels.instance_ids)
     assert len(instances) > 4
@@ -149,14 +147,14 @@ def test_what_is_labelled_a_thing_lies_in_the_box_of_that_thing(
         assert (labels.class_ids[mask] == CLASS_NAMES.index(thing.label)).all()
 
 
-def test_building_and_things_share_the_pixels(exact: FlatSequence) -> None:
+def test_pixels_belong_either_to_the_building_or_to_an_object(exact: FlatSequence) -> None:
     labels = exact.labels(20)
     building = labels.class_ids >= CLASS_NAMES.index("wall")
     assert np.array_equal(building, labels.instance_ids == 0)
     assert (labels.class_ids.dtype, labels.instance_ids.dtype) == (np.uint8, np.uint16)
 
 
-def test_steps_in_depth_are_steps_between_labels(exact: FlatSequence) -> None:
+def test_depth_steps_coincide_with_label_steps(exact: FlatSequence) -> None:
     depth, ids = exact.read(20).depth, exact.labels(20).instance_ids
     step = np.abs(np.diff(depth, axis=1)) > 0.5
     assert step.sum() > 50
@@ -171,8 +169,8 @@ def test_labels_are_the_same_with_and_without_noise(
         np.testing.assert_array_equal(a, b)
 
 
-def test_depth_noise_is_a_kinects(exact: FlatSequence, noisy: FlatSequence) -> None:
-    """Quantised disparities about the truth; its edges are ragged, so robust figures count."""
+def test_depth_noise_has_kinect_statistics(exact: FlatSequence, noisy: FlatSequence) -> None:
+    """Disparities are quantized; the statistics are robust because edges are ragged."""
     z, measured = exact.read(180).depth.astype(float), noisy.read(180).depth.astype(float)
     seen = measured > 0
     assert 0.3 < seen.mean() < 0.995
@@ -188,7 +186,7 @@ def test_depth_noise_is_a_kinects(exact: FlatSequence, noisy: FlatSequence) -> N
 
 def test_neighbors_share_their_depth_noise(exact: FlatSequence, noisy: FlatSequence) -> None:
     z, measured = exact.read(20).depth.astype(float), noisy.read(20).depth.astype(float)
-    flat = (measured > 0) & (np.abs(measured - z) < 0.01 * z**2)  # no ragged edge
+    flat = (measured > 0) & (np.abs(measured - z) < 0.01 * z**2)  # Ragged edges are excluded.
     error = np.where(flat, (measured - z) / z**2, 0)
     variance = (error**2)[flat].mean()
 
@@ -218,8 +216,8 @@ def test_dark_surfaces_and_far_ones_lose_their_depth(
 
 
 @pytest.mark.parametrize(("left", "right", "near_m"), [(40, 50, 1.0), (30, 70, 2.0)])
-def test_the_projector_lights_what_it_sees(left: int, right: int, near_m: float) -> None:
-    """The shadow of a bar is as wide as the bar, and moved right by the parallax."""
+def test_projector_shadow_is_moved_by_the_parallax(left: int, right: int, near_m: float) -> None:
+    """The shadow of a bar has the width of the bar and is moved right by the parallax."""
     depth_m, parallax_px_m = np.full((1, 200), 3.0), 0.075 * 520
     depth_m[:, left:right] = near_m
     shift = parallax_px_m * (1 / near_m - 1 / 3.0)
@@ -229,7 +227,7 @@ def test_the_projector_lights_what_it_sees(left: int, right: int, near_m: float)
     assert np.sum(is_shadowed(depth_m, parallax_px_m)[0] != behind) <= 1
 
 
-def test_blur_follows_the_motion_and_keeps_what_rests() -> None:
+def test_blur_follows_the_motion_and_keeps_static_pixels() -> None:
     light = np.zeros((9, 40, 3))
     light[:, 20] = 1.0
     still = np.zeros((9, 40))
@@ -241,11 +239,12 @@ def test_blur_follows_the_motion_and_keeps_what_rests() -> None:
 
 
 @pytest.mark.parametrize("index", [308, 617])
-def test_blur_is_as_long_as_the_camera_turns_while_the_shutter_is_open(
+def test_blur_length_is_the_rotation_while_the_shutter_is_open(
     exact: FlatSequence, index: int
 ) -> None:
     sensor = Sensor(exact.camera, hand_held(exact.config.seed), 0)
-    du_px, dv_px = sensor.motion_px(index, np.full((120, 160), 1e6))  # so far that turns are all
+    far_m = np.full((120, 160), 1e6)  # Translation moves no pixels at this depth.
+    du_px, dv_px = sensor.motion_px(index, far_m)
     turn_rad_s = np.deg2rad(motion(exact.truth().T_world_camera).turns_deg_s[index])
     middle_px = np.hypot(du_px[60, 80], dv_px[60, 80])
     assert middle_px == pytest.approx(turn_rad_s * SHUTTER_S * exact.camera.fx, rel=0.2)
@@ -267,7 +266,7 @@ def test_the_walk_is_hand_held(exact: FlatSequence) -> None:
     assert 0.3 <= low < 0.65 < high <= 0.8
     assert 50 < moved.turns_deg_s.max() <= 60
     shake = np.linalg.norm(np.diff(T[:, :3, 3], 3, axis=0), axis=1)
-    assert np.median(shake) > 1e-4  # a spline without a hand has less than a tenth of it
+    assert np.median(shake) > 1e-4  # A smooth spline has less than a tenth of it.
     np.testing.assert_allclose(
         T[:, :3, :3] @ np.swapaxes(T[:, :3, :3], 1, 2),
         np.tile(np.eye(3), (len(T), 1, 1)),
@@ -288,8 +287,8 @@ def test_the_walk_passes_each_room_twice_and_returns(exact: FlatSequence) -> Non
     assert np.rad2deg(se3.rotation_angle(back)) < 20
 
 
-def test_the_camera_keeps_clear_of_everything(exact: FlatSequence) -> None:
-    """0.2 m about each solid's box, in its own frame."""
+def test_camera_keeps_its_distance_from_all_solids(exact: FlatSequence) -> None:
+    """The distance to the box of each solid, in its own frame, is at least 0.2 m."""
     eyes = vector(exact.truth().T_world_camera[:, :3, 3].T)
     solids = [panel.solid for panel in panels()]
     for solid in solids + [solid for thing in exact.things for solid in thing.solids]:
@@ -308,18 +307,18 @@ def test_the_ends_of_the_corridor_look_alike(exact: FlatSequence) -> None:
     assert things == {0}
 
 
-def test_classes_come_in_several_shapes_and_paints(exact: FlatSequence) -> None:
+def test_classes_have_several_shapes_and_textures(exact: FlatSequence) -> None:
     def shape(thing) -> tuple:
         return tuple((solid.shape, solid.size_m) for solid in thing.solids)
 
-    shapes, paints = {}, {}
+    shapes, textures = {}, {}
     for thing in exact.things:
         shapes.setdefault(thing.label, set()).add(shape(thing))
-        paints.setdefault(thing.label, set()).add(tuple(s.texture for s in thing.solids))
+        textures.setdefault(thing.label, set()).add(tuple(s.texture for s in thing.solids))
     assert sum(len(kinds) > 1 for kinds in shapes.values()) >= 12
     assert len(shapes["chair"]) >= 3
     repeated = Counter(thing.label for thing in exact.things)
-    assert all(len(paints[name]) > 1 for name, count in repeated.items() if count > 2)
+    assert all(len(textures[name]) > 1 for name, count in repeated.items() if count > 2)
 
 
 def test_the_flat_holds_objects_inside_and_outside_coco(exact: FlatSequence) -> None:
@@ -332,7 +331,7 @@ def test_the_flat_holds_objects_inside_and_outside_coco(exact: FlatSequence) -> 
 
 
 @pytest.mark.slow
-def test_the_walk_sees_them_before_bare_walls(exact: FlatSequence) -> None:
+def test_walk_shows_enough_objects_and_bare_walls(exact: FlatSequence) -> None:
     shown = contents(exact, stride=6)
     objects = shown.objects_per_class
     coco = sum(n for label, n in objects.items() if label in CLASS_NAMES[:COCO_COUNT])
@@ -345,7 +344,7 @@ def test_the_walk_sees_them_before_bare_walls(exact: FlatSequence) -> None:
 
 @pytest.mark.parametrize("index", [20, 180])
 def test_walls_are_weakly_textured_but_not_flat(exact: FlatSequence, index: int) -> None:
-    """Grey levels about the local mean, away from outlines and shadows."""
+    """The measure is gray levels about the local mean, away from outlines and shadows."""
     gray = exact.read(index).color.mean(axis=2)
     wall = exact.labels(index).class_ids == CLASS_NAMES.index("wall")
     inner = cv2.erode(wall.astype(np.uint8), np.ones((9, 9))) > 0
@@ -353,12 +352,12 @@ def test_walls_are_weakly_textured_but_not_flat(exact: FlatSequence, index: int)
     assert 0.1 < spread.mean() < 3
 
 
-@pytest.mark.parametrize("harm", [b"", b"nothing of use", None])
-def test_a_damaged_frame_is_rendered_again(noisy: FlatSequence, harm: bytes | None) -> None:
+@pytest.mark.parametrize("damage", [b"", b"nothing of use", None])
+def test_damaged_cached_frame_is_rendered_again(noisy: FlatSequence, damage: bytes | None) -> None:
     before = bytes_of(noisy, 5)
     (file,) = noisy.cache_folder.glob("0005.frame")
     stored = file.read_bytes()
-    file.write_bytes(stored[:-100] + bytes(100) if harm is None else harm)
+    file.write_bytes(stored[:-100] + bytes(100) if damage is None else damage)
     assert bytes_of(noisy, 5) == before
     assert file.read_bytes() == stored
 
@@ -366,22 +365,24 @@ def test_a_damaged_frame_is_rendered_again(noisy: FlatSequence, harm: bytes | No
 def test_a_cached_frame_is_not_rendered(noisy: FlatSequence) -> None:
     before = bytes_of(noisy, 6)
     again = FlatSequence.named("flat", **SMALL)
-    again.__dict__["_renderer"] = None  # nothing that could render
+    again.__dict__["_renderer"] = None  # The sequence cannot render.
     assert bytes_of(again, 6) == before
     assert sorted(path.suffix for path in noisy.cache_folder.iterdir())[-1] == ".frame"
 
 
-def test_a_cache_that_cannot_be_written_only_costs_time(
+def test_sequence_without_a_writable_cache_gives_the_same_bytes(
     noisy: FlatSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("LDO_CACHE", str(tmp_path / "file"))
-    homeless = FlatSequence.named("flat", **SMALL)
-    homeless.__dict__["_renderer"] = noisy._renderer
-    assert bytes_of(homeless, 5) == bytes_of(noisy, 5)
+    without_cache = FlatSequence.named("flat", **SMALL)
+    without_cache.__dict__["_renderer"] = noisy._renderer
+    assert bytes_of(without_cache, 5) == bytes_of(noisy, 5)
 
 
-def test_the_oldest_sequence_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_cache_drops_the_oldest_sequence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("LDO_CACHE", str(tmp_path))
     monkeypatch.setattr(cache, "LIMIT_BYTES", 1500)
     frame = cache.CachedFrame(
@@ -400,8 +401,8 @@ def test_the_oldest_sequence_makes_room(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("shape", ["wheel", *TAPERS])
-def test_rays_meet_round_shapes_where_their_inside_begins(shape: str) -> None:
-    """The judge is marching along the ray through the implicit body."""
+def test_ray_intervals_of_round_shapes_begin_at_the_surface(shape: str) -> None:
+    """The reference is marching along the ray through the implicit body."""
 
     def inside(q: np.ndarray) -> np.ndarray:
         if shape == "wheel":
@@ -423,7 +424,7 @@ def test_rays_meet_round_shapes_where_their_inside_begins(shape: str) -> None:
 
 
 @pytest.mark.parametrize("shape", ["wheel", *TAPERS])
-def test_normals_look_back_along_the_ray_and_across_the_surface(shape: str) -> None:
+def test_normals_face_the_ray_and_are_perpendicular_to_the_surface(shape: str) -> None:
     solid = Solid(shape, (1.0, 2.0, 0.5), (0.6, 0.8, 1.1), "", (0.6, 0.8))
     rng = np.random.default_rng(0)
     o = np.array([3.0, -1.0, 2.0])

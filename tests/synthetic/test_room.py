@@ -1,4 +1,4 @@
-"""The judge's judge: depth against closed forms, views against each other."""
+"""The synthetic room: depth against closed forms, and views against each other."""
 
 import hashlib
 
@@ -25,14 +25,14 @@ def bytes_of(sequence: SyntheticSequence, index: int) -> bytes:
 
 
 def warped(source: RgbdFrame, target: RgbdFrame, T_target_source: np.ndarray) -> tuple:
-    """Differences in colour and relative depth of the source's pixels seen in the target."""
+    """Return differences in color and relative depth of source pixels seen in the target."""
     points = se3.transform(T_target_source, source.camera.backproject(source.depth_m))
     u, v = np.moveaxis(source.camera.project(points).astype(np.float32), -1, 0)
     color = cv2.remap(target.color, u, v, cv2.INTER_LINEAR)
     depth_m = cv2.remap(target.depth_m, u, v, cv2.INTER_LINEAR)
     inside = (u > 1) & (v > 1) & (u < source.camera.width - 2) & (v < source.camera.height - 2)
     difference = (depth_m - points[..., 2]) / points[..., 2]
-    seen = inside & (np.abs(difference) < 0.02)  # the rest is hidden behind something
+    seen = inside & (np.abs(difference) < 0.02)  # The other pixels are occluded.
     return color[seen].astype(float) - source.color[seen], difference[seen], seen.mean()
 
 
@@ -42,12 +42,12 @@ def test_the_same_config_gives_the_same_bytes(room: SyntheticSequence) -> None:
     np.testing.assert_array_equal(room.truth().T_world_camera, again.truth().T_world_camera)
 
 
-def test_bytes_are_those_of_every_machine(room: SyntheticSequence) -> None:
+def test_bytes_are_equal_on_every_machine(room: SyntheticSequence) -> None:
     digest = hashlib.sha256(bytes_of(room, 0) + bytes_of(room, 60)).hexdigest()
     assert digest[:16] == "a1bd5d064a556ebf"
 
 
-def test_another_seed_paints_another_room(room: SyntheticSequence) -> None:
+def test_another_seed_changes_the_textures(room: SyntheticSequence) -> None:
     assert bytes_of(room, 0) != bytes_of(SyntheticSequence.named("room", seed=1), 0)
 
 
@@ -62,7 +62,7 @@ def test_views_of_the_same_point_agree(room: SyntheticSequence, i: int, j: int) 
     assert np.median(np.abs(depth)) < 1e-5
 
 
-def test_a_pose_off_by_two_centimeters_shows(room: SyntheticSequence) -> None:
+def test_pose_error_of_two_centimeters_raises_the_color_difference(room: SyntheticSequence) -> None:
     T = room.truth().T_world_camera
     off = se3.exp(np.array([0, 0, 0, 0.02, 0, 0]))
     good, *_ = warped(room[0], room[6], se3.inverse(T[6]) @ T[0])
@@ -95,7 +95,7 @@ def test_the_camera_moves_smoothly_and_comes_back(room: SyntheticSequence) -> No
     assert np.linalg.det(T[:, :3, :3]).min() > 0.999
 
 
-def test_the_tour_sees_all_directions() -> None:
+def test_tour_sees_all_directions() -> None:
     tour = SyntheticSequence.named("tour", width_px=16, height_px=12)
     forward = tour.truth().T_world_camera[:, :2, 2]
     headings = np.sort(np.arctan2(forward[:, 1], forward[:, 0]))
@@ -120,14 +120,14 @@ def test_every_size_renders() -> None:
 
 
 @pytest.mark.parametrize("changes", [{"frames": 0}, {"width_px": 2}, {"path": "spiral"}])
-def test_senseless_config_is_refused(changes: dict) -> None:
+def test_invalid_config_is_refused(changes: dict) -> None:
     with pytest.raises(ConfigError):
         SyntheticConfig(**changes)
 
 
 @pytest.mark.parametrize("shape", ["box", "ball", "cylinder"])
-def test_rays_meet_the_surface_where_the_inside_begins(shape: str) -> None:
-    """The judge is marching along the ray through the implicit body."""
+def test_ray_intervals_begin_at_the_surface(shape: str) -> None:
+    """The reference is marching along the ray through the implicit body."""
     rng = np.random.default_rng(0)
     inside = {
         "box": lambda q: np.abs(q).max(axis=0) < 1,
@@ -167,7 +167,7 @@ def test_far_textures_fade_to_their_mean_and_near_ones_interpolate() -> None:
     np.testing.assert_allclose(texture.sample(at[:1] + 3, at[1:] - 2, np.array([1e-6])), near)
 
 
-def test_the_person_is_all_that_tells_the_walk_from_the_empty_room() -> None:
+def test_walk_differs_from_the_empty_room_only_at_the_person() -> None:
     changes = {"width_px": 80, "height_px": 60}
     walk = SyntheticSequence.named("person", **changes)
     empty = SyntheticSequence.named("person", **changes, person=False)
@@ -184,7 +184,7 @@ def test_the_person_is_all_that_tells_the_walk_from_the_empty_room() -> None:
     assert min(sizes[1:]) > 0.05
 
 
-def test_a_person_stands_on_the_floor_and_steps_with_each_foot() -> None:
+def test_person_stands_on_the_floor_and_alternates_feet() -> None:
     lowest, leads = [], []
     for time_s in np.arange(0, 4, 0.1):
         solids = person_at(time_s)
@@ -192,4 +192,4 @@ def test_a_person_stands_on_the_floor_and_steps_with_each_foot() -> None:
         left, right = (s.center_m[0] for s in solids if s.texture == "shoes")
         leads.append(left > right)
     np.testing.assert_allclose(lowest, 0, atol=1e-9)
-    assert 4 <= np.count_nonzero(np.diff(leads)) <= 7  # steps of 0.7 m at 1 m/s
+    assert 4 <= np.count_nonzero(np.diff(leads)) <= 7  # Steps of 0.7 m at 1 m/s.
