@@ -1,4 +1,4 @@
-"""Writes small networks in ONNX, by the numbers of the fields in onnx.proto3."""
+"""Small networks in ONNX, written by the field numbers of onnx.proto3."""
 
 from pathlib import Path
 
@@ -10,8 +10,12 @@ FLOAT = 1  # TensorProto.DataType
 def write_network(
     path: Path, nodes: list[tuple[str, str, str]], inputs: dict[str, tuple[int | str, ...]]
 ) -> Path:
-    """Nodes are (operator, names of inputs, name of the output); the last output is the network's.
-    `channel_weights` [1, 3, 1, 1] = 1, 2, 4 can be an input of any."""
+    """Write a network to `path`, and return the path.
+
+    Nodes are (operator, names of inputs, name of the output). The last output is the output of
+    the network.
+    `channel_weights` [1, 3, 1, 1] = 1, 2, 4 can be an input of any node.
+    """
     weights = np.array([1, 2, 4], np.float32).tobytes()
     shape = b"".join(_number(1, n) for n in (1, 3, 1, 1))
     constant = shape + _number(2, FLOAT) + _text(8, "channel_weights") + _bytes(9, weights)

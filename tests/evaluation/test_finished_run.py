@@ -11,7 +11,7 @@ from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import read_run
 
 
-def test_a_frame_that_should_have_a_pose_and_has_none_is_an_error(finished_run: Path) -> None:
+def test_ok_frame_without_a_pose_is_an_error(finished_run: Path) -> None:
     run = read_run(finished_run)
     posed = run.maps[0]
     kept = np.arange(len(posed.trajectory)) != 7

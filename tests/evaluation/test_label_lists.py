@@ -16,14 +16,14 @@ MAP = ("background", "other", "couch", "dining table", "fire extinguisher", "per
 
 def named(labels, table, names) -> dict[str, str]:
     special = {VOID: "void", UNKNOWN: "unknown"}
-    places = (int(table[k]) for k in range(len(names)))
+    ids = (int(table[k]) for k in range(len(names)))
     return {
-        name: special.get(place) or labels.names[place]
-        for name, place in zip(names, places, strict=True)
+        name: special.get(label) or labels.names[label]
+        for name, label in zip(names, ids, strict=True)
     }
 
 
-def test_coco_has_its_classes_by_synonym_and_the_rest_as_background() -> None:
+def test_coco_list_maps_synonyms_and_puts_the_rest_into_background() -> None:
     labels = coco_list(SOURCE)
     assert labels.names == ("background", "couch", "dining table")
     assert named(labels, labels.of_truth(SOURCE), SOURCE) == {
@@ -46,7 +46,7 @@ def test_coco_has_its_classes_by_synonym_and_the_rest_as_background() -> None:
     }
 
 
-def test_the_full_list_has_every_object_and_no_building() -> None:
+def test_full_list_has_every_object_and_no_parts_of_the_building() -> None:
     labels = full_list(SOURCE)
     assert labels.names == ("background", "couch", "dining table", "cushion", "fire extinguisher")
     of_map = named(labels, labels.of_map(MAP), MAP)
@@ -55,7 +55,7 @@ def test_the_full_list_has_every_object_and_no_building() -> None:
     assert of_map["wall"] == "background"
 
 
-def test_numbers_beyond_the_names_are_void_in_truth_and_unknown_in_a_map() -> None:
+def test_ids_beyond_the_names_are_void_in_truth_and_unknown_in_a_map() -> None:
     labels = full_list(SOURCE)
     assert set(labels.of_truth(SOURCE)[len(SOURCE) :]) == {VOID}
     assert set(labels.of_map(MAP)[len(MAP) :]) == {UNKNOWN}

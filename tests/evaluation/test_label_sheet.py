@@ -25,13 +25,13 @@ LABELS = full_list(SOURCE)
 CHAIR, LADDER = 1, 2
 
 
-def test_every_kind_of_error_has_its_color() -> None:
+def test_each_kind_of_error_has_a_color() -> None:
     truth = np.uint8([[0, CHAIR, CHAIR, LADDER, 0, CHAIR, 0, VOID]])
     shown = np.uint8([[0, CHAIR, 0, 0, CHAIR, LADDER, UNKNOWN, CHAIR]])
     picture = error_colors(np.full((1, 8, 3), 100, np.uint8), truth, shown, LABELS)
     expected = (RIGHT, MISSED, BEYOND, INVENTED, CONFUSED, INVENTED, VOID_COLOR)
     assert [tuple(color) for color in picture[0, 1:].tolist()] == list(expected)
-    assert picture[0, 0].tolist() == [146, 146, 146], "background is the image in grey"
+    assert picture[0, 0].tolist() == [146, 146, 146], "background is the image in gray"
 
 
 def test_labels_that_occur_have_colors_of_their_own() -> None:
@@ -54,16 +54,16 @@ def test_a_row_shows_camera_truth_map_and_error_above_a_legend() -> None:
     cells = [sheet[100, 6 + 126 * k : 126 + 126 * k] for k in range(4)]
     assert cells[0][10].tolist() == [200, 30, 30]
     np.testing.assert_array_equal(cells[1][10], cells[1][110], "a chair from side to side")
-    np.testing.assert_array_equal(cells[2][10], cells[1][10], "found on the left")
-    assert len(set(cells[2][110].tolist())) == 1, "grey: background on the right"
+    np.testing.assert_array_equal(cells[2][10], cells[1][10], "the left half is correct")
+    assert len(set(cells[2][110].tolist())) == 1, "gray: background on the right"
     assert (tuple(cells[3][10]), tuple(cells[3][110])) == (RIGHT, MISSED)
     assert any(np.all(row == RIGHT) for row in sheet[150:].reshape(-1, 3)), "in the legend"
 
 
 def test_a_legend_breaks_into_lines_that_fit() -> None:
-    entries = [(f"thing {k}", (k, 0, 0)) for k in range(40)]
+    entries = [(f"object {k}", (k, 0, 0)) for k in range(40)]
     strip = legend(entries, 400)
     assert strip.shape[1] == 400
     assert strip.shape[0] > legend(entries[:3], 400).shape[0]
     for k in range(40):
-        assert np.any(np.all(strip == (k, 0, 0), axis=2)), f"thing {k}"
+        assert np.any(np.all(strip == (k, 0, 0), axis=2)), f"object {k}"

@@ -1,4 +1,4 @@
-"""Precision, recall and errors of loops whose truth is plain: a camera before a wall."""
+"""Precision, recall and errors of loop closures of a camera before a wall, with known truth."""
 
 import numpy as np
 import pytest
@@ -15,22 +15,22 @@ from ldo_service.evaluation.loops import (
 from ldo_service.geometry import Camera
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
-WIDE_M = 2 * 160 / 150  # of the wall in view, from 2 m
+WIDTH_IN_VIEW_M = 2 * 160 / 150  # Width of the wall in view, from 2 m.
 
 
-def at(x_m: float, id: int = 0, frame: int = 0, turned: bool = False) -> SeenKeyframe:
-    """Two metres before the wall, or with the back to it."""
+def keyframe_at(x_m: float, id: int = 0, frame: int = 0, turned: bool = False) -> SeenKeyframe:
+    """Return a keyframe 2 m before the wall, facing it or turned away."""
     T = np.diag([-1.0, 1, -1, 1]) if turned else np.eye(4)
     T[0, 3] = x_m
     return SeenKeyframe(id, frame, T, CAMERA, np.full((120, 160), 2.0, np.float32))
 
 
 def walk(*places: tuple[float, int]) -> dict[int, SeenKeyframe]:
-    """Keyframes by id: x in m, and frame."""
-    return {k: at(x_m, k, frame) for k, (x_m, frame) in enumerate(places)}
+    """Return keyframes by id from their x in m and their frame."""
+    return {k: keyframe_at(x_m, k, frame) for k, (x_m, frame) in enumerate(places)}
 
 
-# Three keyframes at the start, three far away, and three at the start again
+# Three keyframes at the start, three far away, and three at the start again.
 THERE_AND_BACK = walk(
     *((0.0, 0), (0.1, 5), (0.2, 10)),
     *((9.0, 150), (9.1, 155), (9.2, 160)),
@@ -50,18 +50,18 @@ def compared(newer: tuple[int, ...], older: tuple[int, ...], is_closure: bool) -
     return ComparedPair(newer, older, is_closure, ms=20.0)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 1.0])
-def test_overlap_is_the_share_of_the_wall_that_both_see(share: float) -> None:
-    there, here = at(0), at((1 - share) * WIDE_M)
-    assert overlap(here, there) == pytest.approx(share, abs=0.03)
-    assert overlap(there, here) == pytest.approx(share, abs=0.03)
+@pytest.mark.parametrize("fraction", [0.0, 0.25, 0.5, 1.0])
+def test_overlap_is_the_fraction_of_the_wall_that_both_see(fraction: float) -> None:
+    first, second = keyframe_at(0), keyframe_at((1 - fraction) * WIDTH_IN_VIEW_M)
+    assert overlap(second, first) == pytest.approx(fraction, abs=0.03)
+    assert overlap(first, second) == pytest.approx(fraction, abs=0.03)
 
 
-def test_one_that_looks_away_sees_nothing_of_it() -> None:
-    assert overlap(at(0), at(0, turned=True)) == 0
+def test_keyframe_turned_away_has_no_overlap() -> None:
+    assert overlap(keyframe_at(0), keyframe_at(0, turned=True)) == 0
 
 
-def test_a_right_closure_is_precise_and_complete() -> None:
+def test_correct_closure_has_full_precision_and_recall() -> None:
     found = FoundLoops(
         (compared(AGAIN, FIRST, True), compared(AGAIN, AWAY, False)),
         (LoopClosed(7, 2, true_pose(2, 7)),),
@@ -73,7 +73,7 @@ def test_a_right_closure_is_precise_and_complete() -> None:
     assert errors.ms == (20, 20)
 
 
-def test_a_false_closure_costs_precision_and_brings_no_recall() -> None:
+def test_false_closure_lowers_precision_and_adds_no_recall() -> None:
     T = true_pose(4, 7)
     T[1, 3] = 0.3
     found = FoundLoops((compared(AGAIN, AWAY, True),), (LoopClosed(7, 4, T),))
@@ -82,23 +82,23 @@ def test_a_false_closure_costs_precision_and_brings_no_recall() -> None:
     assert errors.position_errors_m == pytest.approx((0.3,))
 
 
-def test_a_true_pair_that_was_compared_and_refused_was_retrieved() -> None:
+def test_true_pair_that_was_compared_and_rejected_is_retrieved() -> None:
     errors = evaluate_loops(FoundLoops((compared(AGAIN, FIRST, False),), ()), THERE_AND_BACK)
     assert (errors.recall, errors.retrieved_queries) == (0, 1)
 
 
-def test_what_was_never_compared_still_counts_as_missed() -> None:
+def test_true_pair_that_was_never_compared_is_missed() -> None:
     errors = evaluate_loops(FoundLoops((), ()), THERE_AND_BACK)
     assert (errors.precision, errors.recall, errors.queries) == (None, 0, 1)
 
 
-def test_places_that_are_near_in_time_are_no_loop() -> None:
+def test_keyframes_that_are_close_in_time_are_no_loop() -> None:
     near = walk(*((0.0, 10 * k) for k in range(8)))
     errors = evaluate_loops(FoundLoops((), ()), near)
     assert (errors.queries, errors.recall) == (0, None)
 
 
-def test_keyframes_are_taken_from_a_source_with_every_nth_pixel(room) -> None:
+def test_keyframes_of_a_source_are_subsampled(room) -> None:
     truth = room.truth()
     seen = seen_keyframes({0: 0, 1: 6}, room, truth)
     assert seen[1].depth_m.shape == (120, 160)

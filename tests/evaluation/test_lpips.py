@@ -1,4 +1,4 @@
-"""The networks are made up: what is tested is how images reach them, and what is refused."""
+"""LPIPS with small networks made for the tests: input layout and rejected networks."""
 
 from pathlib import Path
 
@@ -15,7 +15,10 @@ A, B = np.random.default_rng(0).random((2, 20, 30, 3))
 
 
 def distance_nodes(compare: str = "Sub") -> list[tuple[str, str, str]]:
-    """mean of w (a^2 - b^2)^2, which knows channels apart, and 0..1 from -1..1."""
+    """Return nodes for the mean of w (a^2 - b^2)^2.
+
+    This distance depends on the order of channels, and on the range being -1..1, not 0..1.
+    """
     return [
         ("Mul", "in0 in0", "aa"),
         ("Mul", "in1 in1", "bb"),
@@ -26,7 +29,7 @@ def distance_nodes(compare: str = "Sub") -> list[tuple[str, str, str]]:
     ]
 
 
-def test_the_network_gets_rgb_planes_within_minus_one_and_one(tmp_path: Path) -> None:
+def test_network_receives_rgb_planes_in_minus_one_to_one(tmp_path: Path) -> None:
     lpips = Lpips(write_network(tmp_path / "net.onnx", distance_nodes(), IMAGES))
     expected = np.mean([1, 2, 4] * ((2 * A - 1) ** 2 - (2 * B - 1) ** 2) ** 2)
     assert lpips(A, B) == pytest.approx(expected, rel=1e-5)
@@ -34,17 +37,17 @@ def test_the_network_gets_rgb_planes_within_minus_one_and_one(tmp_path: Path) ->
     assert lpips(A[:12], B[:12]) > 0, "another size"
 
 
-def refusal(path: Path) -> str:
+def error_message(path: Path) -> str:
     with pytest.raises(ConfigError) as caught:
         Lpips(path)(A, B)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
-def test_a_file_that_is_absent_or_no_network_is_refused(tmp_path: Path) -> None:
-    assert "no such file" in refusal(tmp_path / "absent.onnx")
+def test_missing_file_or_one_without_a_network_is_refused(tmp_path: Path) -> None:
+    assert "no such file" in error_message(tmp_path / "absent.onnx")
     (tmp_path / "text.onnx").write_text("no network")
-    assert "cannot be opened" in refusal(tmp_path / "text.onnx")
+    assert "cannot be opened" in error_message(tmp_path / "text.onnx")
 
 
 @pytest.mark.parametrize(
@@ -58,17 +61,17 @@ def test_a_file_that_is_absent_or_no_network_is_refused(tmp_path: Path) -> None:
     ids=["one image", "no planes", "64 channels", "an image as output"],
 )
 def test_another_layout_is_refused_with_the_one_expected(tmp_path: Path, inputs, nodes) -> None:
-    message = refusal(write_network(tmp_path / "net.onnx", nodes, inputs))
+    message = error_message(write_network(tmp_path / "net.onnx", nodes, inputs))
     assert "Expected: two inputs float32 [1, 3, H, W]" in message
 
 
-def test_a_network_that_tells_equal_images_apart_is_no_distance(tmp_path: Path) -> None:
-    message = refusal(write_network(tmp_path / "net.onnx", distance_nodes("Add"), IMAGES))
+def test_network_with_a_distance_of_equal_images_is_refused(tmp_path: Path) -> None:
+    message = error_message(write_network(tmp_path / "net.onnx", distance_nodes("Add"), IMAGES))
     assert "an image to itself" in message
 
 
-def test_a_network_of_one_image_size_says_which_it_cannot_take(tmp_path: Path) -> None:
+def test_network_of_fixed_image_size_names_the_size_it_cannot_take(tmp_path: Path) -> None:
     fixed = dict.fromkeys(IMAGES, (1, 3, 64, 64))
-    message = refusal(write_network(tmp_path / "net.onnx", distance_nodes(), fixed))
+    message = error_message(write_network(tmp_path / "net.onnx", distance_nodes(), fixed))
     assert "30x20 pixels" in message
     assert "dynamic height and width" in message

@@ -11,8 +11,8 @@ LABELS = full_list(SOURCE)
 OF_TRUTH = LABELS.of_truth(SOURCE)
 
 
-def seen(*strips: tuple[int, str, str]) -> OpenNames:
-    """A view of vertical strips, 20 pixels each: instance, what it is, what the map says."""
+def names_of(*strips: tuple[int, str, str]) -> OpenNames:
+    """Return names of one view of vertical strips, 20 pixels each: instance, truth, map."""
     names = OpenNames(LABELS, MAP)
     add(names, *strips)
     return names
@@ -46,12 +46,12 @@ def add(names: OpenNames, *strips: tuple[int, str, str]) -> None:
         ("background", False),
     ],
 )
-def test_what_coco_has_no_class_for(name: str, expected: bool) -> None:
+def test_names_without_a_coco_class_are_beyond_coco(name: str, expected: bool) -> None:
     assert is_beyond_coco(name) == expected
 
 
-def test_an_object_is_called_what_most_of_its_pixels_are() -> None:
-    names = seen(
+def test_object_is_named_by_most_of_its_pixels() -> None:
+    names = names_of(
         *(3 * [(1, "ladder", "ladder")]),
         *(2 * [(1, "ladder", "background")]),
         *(2 * [(2, "globe", "globe")]),
@@ -62,15 +62,15 @@ def test_an_object_is_called_what_most_of_its_pixels_are() -> None:
     assert names.pixels == DetectionCounts(right=100, wanted=200, named=100)
 
 
-def test_views_are_pooled() -> None:
-    names = seen((1, "ladder", "background"))
+def test_counts_of_views_are_pooled() -> None:
+    names = names_of((1, "ladder", "background"))
     add(names, *(2 * [(1, "ladder", "ladder")]))
     assert names.objects == DetectionCounts(1, 1, 1)
     assert names.pixels == DetectionCounts(40, 60, 40)
 
 
-def test_a_wrong_name_costs_precision_on_objects_of_coco_on_walls_and_by_names_nobody_has() -> None:
-    names = seen(
+def test_wrong_names_of_any_kind_lower_precision() -> None:
+    names = names_of(
         (1, "ladder", "ladder"),
         (2, "chair", "globe"),
         (9, "wall", "ladder"),
@@ -82,13 +82,13 @@ def test_a_wrong_name_costs_precision_on_objects_of_coco_on_walls_and_by_names_n
     assert names.objects.recall == pytest.approx(1 / 3)
 
 
-def test_void_says_nothing() -> None:
-    names = seen((1, "ladder", "ladder"), (7, "undefined", "globe"))
+def test_void_pixels_are_not_counted() -> None:
+    names = names_of((1, "ladder", "ladder"), (7, "undefined", "globe"))
     assert names.objects == DetectionCounts(1, 1, 1)
     assert names.pixels == DetectionCounts(20, 20, 20)
 
 
-def test_what_is_too_small_to_be_found_is_not_asked_for() -> None:
+def test_objects_below_the_minimum_size_are_not_counted() -> None:
     frame = FrameLabels(np.full((40, 40), 1, np.uint8), np.zeros((40, 40), np.uint16))
     frame.class_ids[0, :7] = SOURCE.index("ladder")
     frame.instance_ids[0, :7] = 1
@@ -101,6 +101,6 @@ def test_what_is_too_small_to_be_found_is_not_asked_for() -> None:
     assert names.objects.wanted == 1
 
 
-def test_nothing_named_has_no_precision() -> None:
+def test_precision_without_names_and_recall_without_objects_are_nan() -> None:
     assert np.isnan(DetectionCounts(0, 3, 0).precision)
     assert np.isnan(DetectionCounts(0, 0, 3).recall)

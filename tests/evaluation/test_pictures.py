@@ -13,34 +13,34 @@ def circle(radius_m: float = 2.0) -> Trajectory:
     return Trajectory(angle, poses)
 
 
-def painted(picture: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
-    """Rows and columns of the pixels of one colour, below the legend."""
+def pixels_of(picture: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
+    """Return rows and columns of the pixels of one color, below the legend."""
     return np.argwhere((picture == color).all(axis=-1)[40:])
 
 
 def test_the_view_from_above_shows_a_circle_and_the_side_a_line() -> None:
     picture = trajectory_picture(circle(), None)
     above, side = np.split(picture, 2, axis=1)
-    assert np.ptp(painted(above, ESTIMATE), axis=0).min() > 300
-    assert np.ptp(painted(side, ESTIMATE)[:, 0]) < 8
+    assert np.ptp(pixels_of(above, ESTIMATE), axis=0).min() > 300
+    assert np.ptp(pixels_of(side, ESTIMATE)[:, 0]) < 8
 
 
-def test_the_estimate_is_drawn_over_the_truth_after_alignment() -> None:
+def test_estimate_covers_the_truth_after_alignment() -> None:
     moved = Trajectory(circle().stamps_s, se3.exp(np.ones(6)) @ circle().T_world_camera)
     picture = trajectory_picture(moved, circle())
-    assert len(painted(picture, ESTIMATE)) > 500
-    assert len(painted(picture, TRUTH)) < 0.05 * len(painted(picture, ESTIMATE))
+    assert len(pixels_of(picture, ESTIMATE)) > 500
+    assert len(pixels_of(picture, TRUTH)) < 0.05 * len(pixels_of(picture, ESTIMATE))
 
 
-def test_other_clocks_and_empty_estimates_still_make_a_picture() -> None:
+def test_pictures_of_other_clocks_and_empty_estimates_are_drawn() -> None:
     late = Trajectory(circle().stamps_s + 1e4, circle().T_world_camera)
-    nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
     assert trajectory_picture(late, circle()).dtype == np.uint8
-    assert len(painted(trajectory_picture(nothing, circle()), TRUTH)) > 500
-    assert trajectory_picture(nothing, None).ndim == 3
+    assert len(pixels_of(trajectory_picture(empty, circle()), TRUTH)) > 500
+    assert trajectory_picture(empty, None).ndim == 3
 
 
-def test_a_camera_that_stands_still_is_a_point() -> None:
+def test_trajectory_of_a_static_camera_is_drawn() -> None:
     still = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
     assert trajectory_picture(still, still).shape == trajectory_picture(circle(), None).shape
 
@@ -65,13 +65,13 @@ def test_contact_sheet_places_images_under_their_captions() -> None:
     assert (sheet[-10, half - 10] == (0, 0, 255)).all()
 
 
-def test_images_of_another_size_are_fitted() -> None:
+def test_images_of_another_size_are_scaled_to_fit() -> None:
     small, tall = np.zeros((20, 30, 3), np.uint8), np.zeros((200, 100, 3), np.uint8)
     assert (
         contact_sheet([[small], [tall]], ["a"]).shape == contact_sheet([[small]] * 2, ["a"]).shape
     )
 
 
-def test_ragged_sheets_are_refused() -> None:
+def test_row_with_another_number_of_images_than_captions_is_refused() -> None:
     with pytest.raises(ValueError, match="one image per caption"):
         contact_sheet([[np.zeros((2, 2, 3), np.uint8)]], ["a", "b"])

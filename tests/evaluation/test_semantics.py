@@ -1,4 +1,4 @@
-"""A run over some frames of a staged room, labelled by its truth, or by something wrong."""
+"""Labels of a run over a staged room, correct by ground truth or made wrong."""
 
 import json
 import shutil
@@ -45,7 +45,7 @@ COCO, ALL_NAMES = range(2)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The staged room in Replica's layout, 128x96; its chair is void."""
+    """Return the staged room in Replica's layout, 128x96; its chair is void."""
     folder = tmp_path_factory.mktemp("data") / "room"
     for kind in ("results", "semantic_class", "instance"):
         (folder / kind).mkdir(parents=True)
@@ -88,8 +88,10 @@ def unlabelled(sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture
 def labelled(unlabelled: Path, sequence: Sequence, tmp_path: Path) -> Path:
-    """A copy whose Gaussians are what the pixels truly show that they lie on, by COCO's names where
-    it has some."""
+    """Return a copy of the run with the true label of its pixel on each Gaussian.
+
+    Labels have the names of COCO where it has one.
+    """
     folder = shutil.copytree(unlabelled, tmp_path / "run")
     run, names = read_run(folder), Vocabulary()
     labels = new_labels(len(run.maps[0].rows))
@@ -98,7 +100,7 @@ def labelled(unlabelled: Path, sequence: Sequence, tmp_path: Path) -> Path:
         truth = sequence.true_labels()
         assert truth is not None
         known = [
-            names.index(coco_class(name) or name) if is_thing(name) else 0
+            names.index(coco_class(name) or name) if is_object(name) else 0
             for name in truth.class_names
         ]
         fields(labels)["ids"][gaussians, 0] = np.array(known)[class_ids]
@@ -110,7 +112,7 @@ def labelled(unlabelled: Path, sequence: Sequence, tmp_path: Path) -> Path:
 def on_surfaces(
     sequence: Sequence, run: FinishedRun, frame: RunFrame
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gaussians whose depth is that of the pixel they lie on, and the classes of these pixels."""
+    """Return Gaussians at the depth of their pixel, and the classes of these pixels."""
     shown, truth, posed = sequence[frame.index], sequence.true_labels(), run.maps[0]
     assert truth is not None
     p_camera = se3.transform(se3.inverse(posed.T_map_camera(frame)), posed.rows[:, :3])
@@ -121,12 +123,12 @@ def on_surfaces(
     return i, truth.frame(frame.index).class_ids[v[i], u[i]]
 
 
-def is_thing(name: str) -> bool:
+def is_object(name: str) -> bool:
     return name not in ("", "undefined", "wall", "floor", "ceiling")
 
 
 def renamed(folder: Path, other: dict[str, str]) -> Path:
-    """The same labels, some by another name."""
+    """Rename some labels of a run, and return its folder."""
     saved = read_run(folder).maps[0].semantics
     assert saved is not None
     names = tuple(other.get(name, name) for name in saved.names)
@@ -140,7 +142,7 @@ def errors_of(sequence: Sequence, folder: Path) -> LabelErrors:
     return errors
 
 
-def test_a_map_that_knows_the_truth_is_nearly_right(sequence: Sequence, labelled: Path) -> None:
+def test_map_with_true_labels_scores_high(sequence: Sequence, labelled: Path) -> None:
     errors = errors_of(sequence, labelled)
     coco, full = errors.lists
     assert (coco.labels.name, full.labels.name) == ("COCO", "all names")
@@ -159,13 +161,15 @@ def test_a_map_that_knows_the_truth_is_nearly_right(sequence: Sequence, labelled
     assert errors.pixels.precision > 0.9
 
 
-def test_names_that_nobody_has_are_wrong_everywhere(sequence: Sequence, labelled: Path) -> None:
+def test_wrong_names_lower_the_scores_but_not_consistency(
+    sequence: Sequence, labelled: Path
+) -> None:
     right = errors_of(sequence, labelled)
     wrong = errors_of(sequence, renamed(labelled, {"couch": "elephant", "globe": "samovar"}))
     couches, elephants = (row.lists[COCO].labels.names.index("couch") for row in (right, wrong))
     assert right.lists[COCO].pooled[couches, couches] > 1000
     assert wrong.lists[COCO].pooled[elephants, elephants] == 0
-    assert wrong.consistency == right.consistency, "which looks at no truth"
+    assert wrong.consistency == right.consistency, "consistency does not depend on the truth"
     assert wrong.objects.named == right.objects.named
     assert wrong.objects.right < right.objects.right
     assert wrong.lists[ALL_NAMES].figures(0).pixel_accuracy < (
@@ -173,7 +177,7 @@ def test_names_that_nobody_has_are_wrong_everywhere(sequence: Sequence, labelled
     )
 
 
-def test_a_detector_alone_names_nothing_beyond_coco(sequence: Sequence, labelled: Path) -> None:
+def test_detector_labels_have_no_recall_beyond_coco(sequence: Sequence, labelled: Path) -> None:
     saved = read_run(labelled).maps[0].semantics
     assert saved is not None
     labels = saved.labels.copy()
@@ -186,7 +190,7 @@ def test_a_detector_alone_names_nothing_beyond_coco(sequence: Sequence, labelled
     assert errors.lists[COCO].figures(0).object_iou > 0.7
 
 
-def test_the_command_prints_protocol_and_tables_and_draws(
+def test_eval_command_prints_protocol_and_tables_and_saves_labels_png(
     capsys, labelled: Path, folder: Path
 ) -> None:
     code, out, _ = ldo(capsys, "eval", labelled, folder)
@@ -202,10 +206,10 @@ def test_the_command_prints_protocol_and_tables_and_draws(
     assert [out.index(part) for part in parts] == sorted(out.index(part) for part in parts)
     sheet = cv2.imread(str(labelled / "labels.png"))
     assert sheet is not None
-    assert sheet.shape[0] > 3 * 96, "a row for each frame"
+    assert sheet.shape[0] > 3 * 96, "the sheet has a row for each frame"
 
 
-def test_json_has_every_figure_of_every_list(capsys, labelled: Path, folder: Path) -> None:
+def test_json_has_every_measure_of_every_list(capsys, labelled: Path, folder: Path) -> None:
     code, out, _ = ldo(capsys, "eval", labelled, folder, "--json")
     assert code == 0
     found = json.loads(out)
@@ -223,7 +227,7 @@ def test_json_has_every_figure_of_every_list(capsys, labelled: Path, folder: Pat
     ("summary", "expected"),
     [('{"labeller_requests": 3}', pytest.approx(1 / 3)), ("{}", None), ("[", None), (None, None)],
 )
-def test_calls_of_the_labeller_are_those_that_the_run_counted(
+def test_labeller_calls_are_read_from_the_summary_of_the_run(
     capsys, labelled: Path, folder: Path, summary: str | None, expected
 ) -> None:
     (labelled / "summary.json").unlink()
@@ -233,24 +237,24 @@ def test_calls_of_the_labeller_are_those_that_the_run_counted(
     assert json.loads(out)["vlm_calls_per_frame"] == expected
 
 
-def test_without_labels_on_either_side_it_says_which(
+def test_missing_labels_of_run_or_truth_are_reported(
     capsys, unlabelled: Path, labelled: Path, folder: Path, tmp_path: Path
 ) -> None:
     run = shutil.copytree(unlabelled, tmp_path / "plain")
     _, out, _ = ldo(capsys, "eval", run, folder)
     assert NO_LABELS in " ".join(out.split())
     assert not (run / "labels.png").exists()
-    untold = shutil.copytree(folder, tmp_path / "untold")
-    (untold / "labels.json").unlink()
-    _, out, _ = ldo(capsys, "eval", labelled, untold)
+    without_truth = shutil.copytree(folder, tmp_path / "without_truth")
+    (without_truth / "labels.json").unlink()
+    _, out, _ = ldo(capsys, "eval", labelled, without_truth)
     assert NO_TRUTH in " ".join(out.split())
     assert "mIoU" not in out
-    _, out, _ = ldo(capsys, "eval", run, untold)
+    _, out, _ = ldo(capsys, "eval", run, without_truth)
     assert NO_TRUTH not in " ".join(out.split())
     assert NO_LABELS not in " ".join(out.split())
 
 
-def test_labels_of_another_size_are_one_clear_error(
+def test_labels_of_another_size_are_a_data_error(
     monkeypatch, sequence: Sequence, labelled: Path
 ) -> None:
     truth = sequence.true_labels()
@@ -265,18 +269,18 @@ def test_labels_of_another_size_are_one_clear_error(
         errors_of(sequence, labelled)
 
 
-def test_the_frames_shown_go_from_the_worst_to_the_best() -> None:
+def test_shown_frames_include_the_worst_and_the_best() -> None:
     def half_right(share: float) -> np.ndarray:
         return np.array([[50, 0, 0], [round(100 * (1 - share)), round(100 * share), 0]])
 
     shares = (0.5, 0.1, 0.9, 0.2, 0.6, 0.7, 0.3, 0.4)
-    nothing = np.array([[99, 1, 0], [0, 0, 0]])
-    rows = (*map(half_right, shares), nothing)
+    almost_empty = np.array([[99, 1, 0], [0, 0, 0]])
+    rows = (*map(half_right, shares), almost_empty)
     chosen = frames_to_show(ListErrors(None, tuple(range(10, 19)), rows), count=4)  # type: ignore[arg-type]
     assert [frame for frame, _ in chosen] == sorted(frame for frame, _ in chosen)
     notes = dict(chosen)
     assert notes[11] == "frame 11: 10% right, the worst"
     assert notes[12] == "frame 12: 90% right, the best"
     assert len(chosen) == 4
-    assert 18 not in notes, "a frame with next to no object shows nothing"
-    assert frames_to_show(ListErrors(None, (3,), (nothing,))) == []  # type: ignore[arg-type]
+    assert 18 not in notes, "a frame with almost no object is not shown"
+    assert frames_to_show(ListErrors(None, (3,), (almost_empty,))) == []  # type: ignore[arg-type]

@@ -23,7 +23,7 @@ def flat_view(frame: int, seen: float = 0.5, shown: float = 0.5) -> RenderedView
     return RenderedView(RgbdFrame(color, depth_m, CAMERA, 0, frame), rendering)
 
 
-def test_best_and_worst_are_among_those_spread_over_the_run() -> None:
+def test_best_and_worst_frame_are_among_those_shown() -> None:
     psnrs_db = [20.0 + 0.01 * i for i in range(60)]
     psnrs_db[31], psnrs_db[33] = 12.0, 35.0
     frames = [view.frame for view in some_of(errors_of(psnrs_db).views)]
@@ -54,6 +54,6 @@ def test_a_row_shows_camera_map_error_and_both_depths() -> None:
     assert camera_depth[5, -10, 2] > camera_depth[5, -10, 0], "far is blue"
 
 
-def test_images_are_scaled_to_a_width_that_a_screen_holds() -> None:
+def test_images_are_scaled_to_the_width_of_the_sheet() -> None:
     sheet = rendering_sheet(errors_of([20.0, 21.0]), flat_view)
     assert sheet.shape[1] == 5 * (WIDTH_PX + 6) + 6

@@ -1,4 +1,4 @@
-"""The judge is evo."""
+"""Trajectory errors, compared with evo."""
 
 import copy
 from pathlib import Path
@@ -31,7 +31,7 @@ def random_trajectory(seed: int, count: int = 150) -> Trajectory:
 
 
 def disturbed(truth: Trajectory, seed: int, sigma: float = 0.01) -> Trajectory:
-    """Another world frame, drift, and stamps off by milliseconds."""
+    """Return the truth in another world frame, with drift, and with stamps off by milliseconds."""
     rng = np.random.default_rng(seed)
     T_other_world = se3.exp(rng.normal(0, 1, 6))
     errors = np.cumsum(rng.normal(0, sigma, (len(truth), 6)), axis=0)
@@ -47,9 +47,9 @@ def as_evo(trajectory: Trajectory) -> PoseTrajectory3D:
     )
 
 
-def with_gaps(trajectory: Trajectory, seed: int, share: float = 0.8) -> Trajectory:
-    """Single poses are missing, and 12 in a row."""
-    kept = np.random.default_rng(seed).random(len(trajectory)) < share
+def with_gaps(trajectory: Trajectory, seed: int, kept_ratio: float = 0.8) -> Trajectory:
+    """Remove single poses, and 12 in a row."""
+    kept = np.random.default_rng(seed).random(len(trajectory)) < kept_ratio
     kept[40 + seed : 52 + seed] = False
     return Trajectory(trajectory.stamps_s[kept], trajectory.T_world_camera[kept])
 
@@ -84,12 +84,12 @@ def assert_evo_agrees(estimate: Trajectory, truth: Trajectory) -> None:
 
 
 def assert_equal(ours: TrajectoryErrors, theirs: list[dict[str, float]]) -> None:
-    for mine, judge in zip(
+    for mine, expected in zip(
         (ours.ate_m, ours.rpe_translation_m, ours.rpe_rotation_deg), theirs, strict=True
     ):
         assert mine is not None
         for name in ("rmse", "mean", "median", "max"):
-            assert getattr(mine, name) == pytest.approx(judge[name], abs=1e-6), name
+            assert getattr(mine, name) == pytest.approx(expected[name], abs=1e-6), name
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -122,7 +122,7 @@ def test_errors_agree_with_evo_when_the_truth_is_denser() -> None:
     assert_evo_agrees(with_gaps(thin, 8), truth)
 
 
-def test_errors_of_unsorted_files_are_those_that_evo_finds_in_sorted_ones(tmp_path: Path) -> None:
+def test_errors_of_unsorted_files_agree_with_evo_on_sorted_ones(tmp_path: Path) -> None:
     truth = random_trajectory(9)
     sorted_files, shuffled_files = [], []
     for name, trajectory in (("estimate", disturbed(truth, 9)), ("truth", truth)):
@@ -133,20 +133,20 @@ def test_errors_of_unsorted_files_are_those_that_evo_finds_in_sorted_ones(tmp_pa
         shuffled_files.append(tmp_path / f"{name}-shuffled.txt")
         shuffled_files[-1].write_text("# stamp tx ty tz qx qy qz qw\n" + "\n".join(lines))
     ours = evaluate_trajectory(*(Trajectory.load(file) for file in shuffled_files))
-    judged = (file_interface.read_tum_trajectory_file(file) for file in sorted_files)
-    assert_equal(ours, evo_errors(*judged, ours.rpe_poses))
+    sorted_trajectories = (file_interface.read_tum_trajectory_file(file) for file in sorted_files)
+    assert_equal(ours, evo_errors(*sorted_trajectories, ours.rpe_poses))
 
 
 def test_each_pose_is_used_once_where_evo_may_use_one_twice() -> None:
-    """Two late poses have the same true one nearest, because the first one's own is missing."""
+    """Two late poses have the same nearest true pose, because that of the first is missing."""
     truth = random_trajectory(3, count=60)
     late = shifted(truth, 0.015)
-    own_is_missing = Trajectory(
+    with_missing_pose = Trajectory(
         np.delete(truth.stamps_s, 30), np.delete(truth.T_world_camera, 30, 0)
     )
     fewer = Trajectory(late.stamps_s[10:50], late.T_world_camera[10:50])
-    ours = evaluate_trajectory(fewer, own_is_missing)
-    _, theirs = sync.associate_trajectories(as_evo(own_is_missing), as_evo(fewer), max_diff=0.02)
+    ours = evaluate_trajectory(fewer, with_missing_pose)
+    _, theirs = sync.associate_trajectories(as_evo(with_missing_pose), as_evo(fewer), max_diff=0.02)
     assert (ours.poses, theirs.num_poses) == (39, 40)
 
 
@@ -156,7 +156,7 @@ def test_errors_agree_with_evo_on_a_real_trajectory(data: Path) -> None:
     assert_evo_agrees(disturbed(truth, 1, sigma=0.002), truth)
 
 
-def test_errors_agree_with_evo_on_the_trajectory_that_was_tracked(data: Path) -> None:
+def test_errors_agree_with_evo_on_a_tracked_trajectory(data: Path) -> None:
     kitchen, odometry = open_sequence(str(data / "tum/kitchen")), Odometry()
     poses, indices = [], range(0, 160, 4)
     for index in indices:
@@ -166,7 +166,7 @@ def test_errors_agree_with_evo_on_the_trajectory_that_was_tracked(data: Path) ->
     assert_evo_agrees(Trajectory(kitchen.stamps_ns[indices] * 1e-9, np.array(poses)), truth)
 
 
-def test_another_world_frame_costs_nothing() -> None:
+def test_another_world_frame_adds_no_error() -> None:
     truth = random_trajectory(1)
     T_other_world = se3.exp(np.array([1.0, -2, 0.5, 3, 2, 1]))
     errors = evaluate_trajectory(
@@ -199,7 +199,7 @@ def test_points_on_a_line_still_align() -> None:
     )
 
 
-def test_a_camera_that_stands_still_has_errors_too() -> None:
+def test_static_camera_has_an_error_of_zero() -> None:
     poses = np.tile(np.eye(4), (50, 1, 1))
     still = Trajectory(np.arange(50) / 30, poses)
     assert evaluate_trajectory(still, still).ate_m.max == 0
@@ -213,17 +213,17 @@ def test_short_trajectories_have_no_relative_error() -> None:
     assert errors.rpe_rotation_deg is None
 
 
-def test_too_few_pairs_are_a_data_error_that_shows_both_clocks() -> None:
+def test_too_few_pairs_are_a_data_error_with_both_time_ranges() -> None:
     truth = random_trajectory(5)
     late = Trajectory(truth.stamps_s + 1000, truth.T_world_camera)
     with pytest.raises(DataError, match=r"0 of 150.*1100\.000 s.*100\.000 s.*same clock"):
         evaluate_trajectory(late, truth)
-    nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
     with pytest.raises(DataError, match="spans nothing"):
-        evaluate_trajectory(nothing, truth)
+        evaluate_trajectory(empty, truth)
 
 
-def test_statistics_are_the_textbook_ones() -> None:
+def test_statistics_are_rmse_mean_median_and_max() -> None:
     assert ErrorStatistics.of(np.array([3.0, 4, 0, 1])) == ErrorStatistics(
         np.sqrt(26 / 4), 2.0, 2.0, 4.0
     )

@@ -37,8 +37,8 @@ def run(finished_run: Path) -> FinishedRun:
 def evaluate(
     sequence: Sequence, run: FinishedRun, *maps: PosedMap
 ) -> dict[tuple[str, str], RenderingErrors]:
-    judged = EvaluatedFrames.of(run.frames)
-    rows = evaluate_rendering(sequence, judged, maps or run.maps, lambda _done: None)
+    evaluated = EvaluatedFrames.of(run.frames)
+    rows = evaluate_rendering(sequence, evaluated, maps or run.maps, lambda _done: None)
     return {(row.map, row.protocol): row for row in rows}
 
 
@@ -48,7 +48,7 @@ def moved(posed: PosedMap, distance_m: float) -> PosedMap:
     return replace(posed, name="moved", trajectory=Trajectory(posed.trajectory.stamps_s, poses))
 
 
-def test_each_protocol_judges_its_frames(sequence: Sequence, run: FinishedRun) -> None:
+def test_each_protocol_evaluates_its_frames(sequence: Sequence, run: FinishedRun) -> None:
     rows = evaluate(sequence, run)
     assert list(rows) == [("online", protocol) for protocol in (A, FITTED, PLAIN, B)]
     frames = {protocol: [v.frame for v in row.views] for (_, protocol), row in rows.items()}
@@ -61,7 +61,7 @@ def test_each_protocol_judges_its_frames(sequence: Sequence, run: FinishedRun) -
         assert row.mean("lpips") is None
 
 
-def test_a_wrong_pose_costs_in_every_figure(sequence: Sequence, run: FinishedRun) -> None:
+def test_wrong_pose_worsens_every_measure(sequence: Sequence, run: FinishedRun) -> None:
     rows = evaluate(sequence, run, run.maps[0], moved(run.maps[0], 0.02))
     for protocol in (A, FITTED, B):
         right, wrong = rows["online", protocol], rows["moved", protocol]
@@ -70,7 +70,7 @@ def test_a_wrong_pose_costs_in_every_figure(sequence: Sequence, run: FinishedRun
         assert wrong.mean("depth_l1_m") > right.mean("depth_l1_m")
 
 
-def test_a_lost_frame_is_counted_and_not_judged(sequence: Sequence, run: FinishedRun) -> None:
+def test_lost_frame_is_counted_and_not_evaluated(sequence: Sequence, run: FinishedRun) -> None:
     status = {9: "LOST", 6: "LOST", 4: "WEAK"}
     frames = tuple(replace(f, status=status.get(f.index, f.status)) for f in run.frames)
     rows = evaluate(sequence, replace(run, frames=frames))
@@ -81,7 +81,7 @@ def test_a_lost_frame_is_counted_and_not_judged(sequence: Sequence, run: Finishe
     )
 
 
-def test_without_held_out_frames_the_counts_say_how_to_get_some(
+def test_counts_without_held_out_frames_name_the_option(
     sequence: Sequence, run: FinishedRun
 ) -> None:
     frames = tuple(replace(frame, is_held_out=False) for frame in run.frames)
@@ -91,7 +91,7 @@ def test_without_held_out_frames_the_counts_say_how_to_get_some(
     assert "--hold-out-every 5" in EvaluatedFrames.of(frames).counts()
 
 
-def test_a_darker_camera_costs_unless_its_exposure_is_fitted(
+def test_darker_image_lowers_psnr_unless_exposure_is_fitted(
     sequence: Sequence, run: FinishedRun
 ) -> None:
     posed, frame = run.maps[0], sequence[4]
@@ -105,10 +105,10 @@ def test_a_darker_camera_costs_unless_its_exposure_is_fitted(
     assert darkened[FITTED].depth_l1_m == as_seen[A].depth_l1_m
 
 
-def test_the_exposure_expected_is_that_of_the_keyframes_beside_the_frame(
+def test_exposure_is_interpolated_between_neighboring_keyframes(
     sequence: Sequence, run: FinishedRun
 ) -> None:
-    """Half a second after a keyframe twice as bright as the map, of one second."""
+    """The frame is midway between keyframes 1 s apart, one of them twice as bright as the map."""
     stamp_ns = run.frame(4).stamp_ns
     matrices = np.array([np.full((2, 3), 2.0), np.full((2, 3), 1.0)]) * [[1], [0]]
     exposures = Exposures(stamp_ns + np.array([-500_000_000, 500_000_000]), matrices)
@@ -119,7 +119,7 @@ def test_the_exposure_expected_is_that_of_the_keyframes_beside_the_frame(
     assert exposures.at(stamp_ns + 10**12).gain[0] == 1
 
 
-def test_exposure_is_fitted_to_what_is_shown_and_leaves_what_was_seen(
+def test_exposure_fit_changes_the_rendering_and_not_the_camera_image(
     sequence: Sequence, run: FinishedRun
 ) -> None:
     view = view_of(sequence[4], run.maps[0], run.frame(4))
@@ -141,23 +141,21 @@ def test_pixels_without_depth_are_black_in_both_images(
         np.testing.assert_array_equal(image[depth_m > 0], whole[depth_m > 0])
 
 
-def test_lpips_is_asked_for_the_images_of_each_protocol(
-    sequence: Sequence, run: FinishedRun
-) -> None:
-    asked = []
+def test_lpips_receives_the_images_of_each_protocol(sequence: Sequence, run: FinishedRun) -> None:
+    received = []
 
     def distance(a: np.ndarray, b: np.ndarray) -> float:
-        asked.append((a, b))
-        return float(len(asked))
+        received.append((a, b))
+        return float(len(received))
 
     view = view_of(sequence[4], run.maps[0], run.frame(4))
     errors = dict(evaluate_view(view, True, distance))
     assert [errors[A].lpips, errors[FITTED].lpips, errors[PLAIN].lpips] == [1, 2, 3]
-    np.testing.assert_array_equal(asked[0], (view.seen, view.shown))
-    np.testing.assert_array_equal(asked[1], exposure_fitted(view))
+    np.testing.assert_array_equal(received[0], (view.seen, view.shown))
+    np.testing.assert_array_equal(received[1], exposure_fitted(view))
 
 
-def test_frames_without_a_figure_do_not_enter_its_mean() -> None:
+def test_frames_without_a_measure_are_excluded_from_its_mean() -> None:
     views = tuple(
         ViewErrors(frame, psnr_db, 0.5, None, depth_l1_m, 0.0)
         for frame, psnr_db, depth_l1_m in ((1, 20.0, np.nan), (2, 30.0, 0.02), (3, 31.0, 0.04))
