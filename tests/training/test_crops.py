@@ -1,4 +1,4 @@
-"""What the encoder learns from, on drawings."""
+"""Training crops of the encoder, on drawings."""
 
 import sys
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ def encoder(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
 
 
 def drawn(encoder: ModuleType, shape: tuple[int, int], color: tuple, instance: int):
-    """A grey board with a thing in its middle half."""
+    """Return a gray board with an object in its middle half."""
     plane = np.zeros(shape, np.uint8)
     height, width = shape
     plane[height // 4 : -height // 4, width // 4 : -width // 4] = instance
@@ -33,14 +33,14 @@ def drawn(encoder: ModuleType, shape: tuple[int, int], color: tuple, instance: i
     return encoder.Shown(image, plane, instance)
 
 
-def test_another_thing_covers_with_its_own_pixels_alone(encoder: ModuleType) -> None:
+def test_occluder_covers_with_its_own_pixels_only(encoder: ModuleType) -> None:
     covered = set()
     for seed in range(20):
         shown, by = drawn(encoder, (48, 32), RED, 3), drawn(encoder, (20, 24), GREEN, 7)
         encoder._cover(shown.color, by, np.random.default_rng(seed))
         is_green = (shown.color == GREEN).all(axis=-1)
         assert is_green.sum() <= (by.plane > 0).sum()
-        # the rest is as it was
+        # Pixels outside it are unchanged.
         assert (shown.color[~is_green & (shown.plane > 0)] == RED).all()
         assert (shown.color[~is_green & (shown.plane == 0)] == GRAY).all()
         covered.add(int(is_green.sum()))
@@ -54,7 +54,7 @@ def test_walls_cover_nothing(encoder: ModuleType) -> None:
     assert (shown.color == before).all()
 
 
-def test_a_box_is_cut_resized_and_set_in_the_middle(encoder: ModuleType) -> None:
+def test_crop_of_a_box_is_resized_and_centered(encoder: ModuleType) -> None:
     image = np.full((60, 80, 3), GRAY, np.uint8)
     image[10:30, 20:60] = RED
     taken = encoder.crop(image, np.array([20.0, 10.0, 60.0, 30.0]), 32)

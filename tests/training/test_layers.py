@@ -1,4 +1,4 @@
-"""Both readings of a network: what JAX computes is what the ONNX file tells."""
+"""The two builds of a network: JAX computes what the ONNX file computes."""
 
 import sys
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("jax", reason="needs the trainer's libraries: pip install --group train")
 
 
-HALF = 2e-3  # kernels are kept in half precision
+HALF_PRECISION = 2e-3  # Kernels are stored in half precision.
 
 
 @pytest.fixture
@@ -24,32 +24,32 @@ def layers(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     del sys.modules["layers"]
 
 
-def test_both_readings_of_a_network_tell_the_same(layers: ModuleType, tmp_path: Path) -> None:
+def test_jax_and_onnx_compute_the_same(layers: ModuleType, tmp_path: Path) -> None:
     def network(net, image):
         x = net.conv(net.folded(image, 2), "stem", 8, size=1)
         small = layers.residual(net, layers.merged(net, x, "merge", 8), "block", 8)
         small = net.add(small, net.conv(x, "down", 8, stride=2))
         joined = net.join([x, net.enlarged(net.widest(small))])
-        return net.linear(net.mean(net.conv(joined, "out", 6)), "told", 3, 0.5)
+        return net.linear(net.mean(net.conv(joined, "out", 6)), "result", 3, 0.5)
 
     rng = np.random.default_rng(0)
     image = rng.random((1, 16, 24, 3), np.float32)
     drawn = layers.JaxNetwork({}, rng=rng)
     network(drawn, image)
     moments = {name: tuple(map(np.asarray, pair)) for name, pair in drawn.observed.items()}
-    mine = np.asarray(network(layers.JaxNetwork(drawn.weights, moments), image))[0, 0, 0]
+    by_jax = np.asarray(network(layers.JaxNetwork(drawn.weights, moments), image))[0, 0, 0]
 
     graph = layers.Graph(drawn.weights, moments)
-    told = graph.node("Flatten", network(graph, "image"), output="told")
-    graph.save(tmp_path / "net.onnx", ("image", (1, 3, 16, 24)), (told, (1, 3)), {})
+    result = graph.node("Flatten", network(graph, "image"), output="result")
+    graph.save(tmp_path / "net.onnx", ("image", (1, 3, 16, 24)), (result, (1, 3)), {})
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
-    theirs = np.asarray(session.run(None, {"image": image.transpose(0, 3, 1, 2).copy()})[0])[0]
-    np.testing.assert_allclose(theirs, mine, atol=HALF)
+    by_onnx = np.asarray(session.run(None, {"image": image.transpose(0, 3, 1, 2).copy()})[0])[0]
+    np.testing.assert_allclose(by_onnx, by_jax, atol=HALF_PRECISION)
 
 
 @pytest.mark.parametrize("stride", [1, 2])
 @pytest.mark.parametrize("side", [2, 3, 4, 7])
-def test_a_product_with_what_is_unfolded_is_a_convolution(
+def test_product_with_an_unfolded_image_is_a_convolution(
     layers: ModuleType, side: int, stride: int
 ) -> None:
     rng = np.random.default_rng(0)
@@ -62,13 +62,13 @@ def test_a_product_with_what_is_unfolded_is_a_convolution(
     np.testing.assert_allclose(product, expected, atol=1e-4)
 
 
-def test_a_mirror_image_and_halves_of_a_batch(layers: ModuleType, tmp_path: Path) -> None:
+def test_mirrored_image_and_halves_of_a_batch(layers: ModuleType, tmp_path: Path) -> None:
     graph = layers.Graph({}, {})
     both = graph.node("Concat", "image", graph.mirrored("image"), axis=0)
     first, second = graph.halves(both)
-    told = graph.node("Sub", first, second, output="told")
+    result = graph.node("Sub", first, second, output="result")
     shape = ("n", 3, 4, 5)
-    graph.save(tmp_path / "net.onnx", ("image", shape), (told, shape), {})
+    graph.save(tmp_path / "net.onnx", ("image", shape), (result, shape), {})
     image = np.random.default_rng(0).random((2, 3, 4, 5), np.float32)
-    theirs = onnxruntime.InferenceSession(tmp_path / "net.onnx").run(None, {"image": image})[0]
-    np.testing.assert_array_equal(np.asarray(theirs), image - image[..., ::-1])
+    by_onnx = onnxruntime.InferenceSession(tmp_path / "net.onnx").run(None, {"image": image})[0]
+    np.testing.assert_array_equal(np.asarray(by_onnx), image - image[..., ::-1])

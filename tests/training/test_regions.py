@@ -1,4 +1,4 @@
-"""What the labeller's encoder learns from: regions as the service sets them apart."""
+"""Region proposals for training the labeller's encoder, as the service makes them."""
 
 import sys
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ def trainer(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimpleNamespace]:
 
 
 def frame(*things: tuple[int, int, int, int, int, int]) -> FlatRendering:
-    """A wall at 3 m, and boards before it: class, instance, left, top, right, bottom."""
+    """Return a wall at 3 m with boards before it: class, instance, left, top, right, bottom."""
     light, depth_m = np.full((240, 320, 3), 0.5), np.full((240, 320), 3.0)
     class_ids, instance_ids = np.full((240, 320), WALL), np.zeros((240, 320), np.uint16)
     for class_id, instance, left, top, right, bottom in things:
@@ -49,15 +49,15 @@ def rows(trainer: SimpleNamespace, *things) -> list[tuple]:
     return list(found)
 
 
-def test_a_region_is_the_thing_that_it_shows(trainer: SimpleNamespace) -> None:
+def test_region_has_class_box_and_size_of_its_object(trainer: SimpleNamespace) -> None:
     (row,) = rows(trainer, (OVEN, 4, 100, 60, 180, 160))
     assert row[:2] == (OVEN, 4)
     np.testing.assert_allclose(row[2:6], (100, 60, 180, 160), atol=4)
     assert row[6] == pytest.approx(80 * 100, rel=0.1)
 
 
-def test_a_region_of_several_things_is_none(trainer: SimpleNamespace) -> None:
-    """Boards that touch hang together: 0.7 of both has to be one of them."""
+def test_region_of_several_objects_has_no_class(trainer: SimpleNamespace) -> None:
+    """Boards that touch are one region, and 0.7 of it has to be one of them."""
     small, large = (CHAIR, 2, 160, 60, 180, 160), (CHAIR, 2, 140, 60, 180, 160)
     (row,) = rows(trainer, (OVEN, 4, 100, 60, 160, 160), small)
     assert row[0] == OVEN
@@ -65,8 +65,8 @@ def test_a_region_of_several_things_is_none(trainer: SimpleNamespace) -> None:
     assert row[:2] == (trainer.regions.NO_THING, 0)
 
 
-def test_a_small_piece_of_a_thing_is_left_out(trainer: SimpleNamespace) -> None:
-    """An oven of which a pillar hides all but two pieces."""
+def test_small_piece_of_an_object_is_excluded(trainer: SimpleNamespace) -> None:
+    """A pillar hides the oven except for two pieces."""
     pieces = (OVEN, 4, 20, 60, 60, 100), (OVEN, 4, 120, 40, 300, 230)
     (row,) = rows(trainer, *pieces)
     assert row[6] > 0.5 * 180 * 190
@@ -74,7 +74,7 @@ def test_a_small_piece_of_a_thing_is_left_out(trainer: SimpleNamespace) -> None:
     assert larger[:2] == smaller[:2] == (OVEN, 4)
 
 
-def test_names_of_regions(trainer: SimpleNamespace) -> None:
+def test_regions_are_named_by_class_or_as_background(trainer: SimpleNamespace) -> None:
     encoder, pair = trainer.encoder, trainer.pair
     unknown = CLASS_NAMES.index("person")
     ids = np.array([OVEN, trainer.regions.NO_THING, unknown, CHAIR])
@@ -97,11 +97,11 @@ def test_names_of_regions(trainer: SimpleNamespace) -> None:
     ]
 
 
-def test_what_is_told_by_nothing_is_what_was_learned_to_be_none(trainer: SimpleNamespace) -> None:
+def test_classes_without_an_object_equal_those_of_the_service(trainer: SimpleNamespace) -> None:
     assert set(trainer.pair.NO_THINGS) == set(NOTHING)
 
 
-def test_no_things_are_as_often_as_is_set(trainer: SimpleNamespace) -> None:
+def test_regions_without_an_object_have_the_configured_frequency(trainer: SimpleNamespace) -> None:
     pair, none = trainer.pair, len(trainer.encoder.NAMES)
     names = np.array([none] * 50 + [1] * 9 + [3])
     odds = pair._odds(names)
@@ -110,8 +110,8 @@ def test_no_things_are_as_often_as_is_set(trainer: SimpleNamespace) -> None:
     assert odds[names == 1].sum() == pytest.approx(3 * odds[names == 3].sum())
 
 
-def test_half_of_a_batch_are_regions(trainer: SimpleNamespace) -> None:
-    """Ovens are in a red frame; regions, a chair and nothing, in a green one."""
+def test_half_of_a_batch_is_regions(trainer: SimpleNamespace) -> None:
+    """Ovens are in a red frame; the regions, a chair and no object, are in a green one."""
     encoder, views = trainer.encoder, trainer.views
     colors = np.zeros((2, 240, 320, 3), np.uint8)
     colors[0, ..., 0], colors[1, ..., 1] = 200, 200
@@ -123,21 +123,21 @@ def test_half_of_a_batch_are_regions(trainer: SimpleNamespace) -> None:
     source = trainer.pair.batches(
         views.Views(colors, instances, things, regions), np.random.default_rng(0)
     )
-    crops, told = next(source)
+    crops, labels = next(source)
     oven, chair, none = (
         encoder.NAMES.index("oven"),
         encoder.NAMES.index("chair"),
         len(encoder.NAMES),
     )
-    assert set(told.tolist()) == {oven, chair, none}
-    is_region = told != oven
-    assert (is_region.sum(), len(told)) == (encoder.BATCH // 2, encoder.BATCH)
-    # channels are swapped in some
+    assert set(labels.tolist()) == {oven, chair, none}
+    is_region = labels != oven
+    assert (is_region.sum(), len(labels)) == (encoder.BATCH // 2, encoder.BATCH)
+    # The channels of some crops are swapped.
     is_green = crops[:, 24:40, 24:40].astype(float).mean(axis=(1, 2)).argmax(axis=1) == 1
     assert np.mean(is_green[is_region]) > 0.6 > 0.4 > np.mean(is_green[~is_region])
 
 
-def test_the_scale_is_found_that_made_the_answers(trainer: SimpleNamespace) -> None:
+def test_fitted_scale_is_that_of_the_generated_names(trainer: SimpleNamespace) -> None:
     """Names drawn with the softmax of a known scale; where two names are right, either may be
     drawn."""
     rng = np.random.default_rng(0)

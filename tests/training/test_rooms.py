@@ -1,4 +1,4 @@
-"""Rooms that the networks learn from: what stands where, and where it is seen from."""
+"""Rooms for training: placement of objects, and camera poses."""
 
 import sys
 from collections.abc import Iterator
@@ -25,42 +25,48 @@ def rooms() -> Iterator[SimpleNamespace]:
         sys.modules.pop(name, None)
 
 
-def meet(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray], gap_m: float) -> bool:
+Extent = tuple[np.ndarray, np.ndarray]  # Low and high corner, m.
+
+
+def overlap(a: Extent, b: Extent, gap_m: float) -> bool:
     return bool((a[0] < b[1] - gap_m).all() and (a[1] > b[0] + gap_m).all())
 
 
-def test_no_thing_meets_another_but_what_carries_it_or_is_pushed_under(
+def test_objects_overlap_only_their_support_or_a_table_above(
     rooms: SimpleNamespace,
 ) -> None:
     under = 0
     for flat in rooms.flats:
         placed = [(thing.label, rooms.furnishing.extent(thing)) for thing in flat.things]
         for k, (label, extent) in enumerate(placed):
-            # the gap is asked of the later one, which may lie within its carrier
-            met = [other for other, its in placed[:k] if meet(extent, its, rooms.furnishing.GAP_M)]
+            # The gap is required of the later object, which may lie within its support.
+            met = [
+                other for other, its in placed[:k] if overlap(extent, its, rooms.furnishing.GAP_M)
+            ]
             assert len(met) <= 1, (label, met)
             under += (label, met) == ("chair", ["dining table"])
     assert under >= len(rooms.flats) / 2
 
 
-def test_a_room_is_the_same_again(rooms: SimpleNamespace) -> None:
+def test_room_of_a_seed_is_reproducible(rooms: SimpleNamespace) -> None:
     again = rooms.layout.room(SEEDS[0])
     assert again.things == rooms.flats[0].things
 
 
-def test_things_before_an_eye_are_counted(rooms: SimpleNamespace) -> None:
+def test_objects_in_view_and_near_are_counted(rooms: SimpleNamespace) -> None:
     views = rooms.views
-    edge = 0.5 / views.FOCAL_PER_WIDTH  # of x / z at the border of the image
+    edge = 0.5 / views.FOCAL_PER_WIDTH  # Limit of x / z at the border of the image.
     before = [(0, 0, 1), (0.98 * edge, 0, 1), (0, 0.7 * edge, 1), (0, 0, 0.99 * views.NEAR_M)]
     beside = [(1.02 * edge, 0, 1), (0, 0.8 * edge, 1), (0, 0, -1), (0, 0, 1.01 * views.NEAR_M)]
     T = np.eye(4)
-    T[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looking along x of the world
+    # The camera looks along x of the world.
+    T[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     T[:3, 3] = 3, -2, 1.5
     in_world = [T[:3, :3] @ p + T[:3, 3] for p in np.array([*before, *beside], float)]
     assert views._things_before(T, np.array(in_world)) == len(before)
 
 
-def test_of_several_glances_the_one_with_most_before_it_is_taken(
+def test_pose_with_most_objects_in_view_is_chosen(
     rooms: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     views, flat = rooms.views, rooms.flats[0]

@@ -1,4 +1,4 @@
-"""The rate of descent over a fit."""
+"""Learning rate, optimizer and crop sizes of a training run."""
 
 import sys
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ def training(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
         sys.modules.pop(name, None)
 
 
-def test_rate_rises_stays_and_falls_to_nothing(training: ModuleType) -> None:
+def test_rate_rises_stays_constant_and_falls_to_zero(training: ModuleType) -> None:
     steps = 2000
     paces = np.array([training.pace(number, steps) for number in range(1, steps + 1)])
     assert (np.diff(paces[: training.WARM_UP_STEPS]) > 0).all()
@@ -32,7 +32,7 @@ def test_rate_rises_stays_and_falls_to_nothing(training: ModuleType) -> None:
     assert 0 < paces[-1] < 0.01
 
 
-def test_descent_finds_the_least_and_leaves_what_it_began_with(training: ModuleType) -> None:
+def test_fit_finds_the_minimum_and_keeps_the_start_weights(training: ModuleType) -> None:
     start = {"x.kernel": np.array([3.0, -2.0], np.float32)}
 
     def loss(weights: dict, batch: np.ndarray):
@@ -46,7 +46,7 @@ def test_descent_finds_the_least_and_leaves_what_it_began_with(training: ModuleT
     assert start["x.kernel"].tolist() == [3.0, -2.0]
 
 
-def test_crops_grow_after_their_shares_of_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crops_grow_after_their_fractions_of_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "training")
     before = set(sys.modules)
     import pair
