@@ -123,7 +123,7 @@ def test_opencv_lens_model_agrees_with_librealsense(name: str) -> None:
         assert (float(u[0, 0]), float(v[0, 0])) == pytest.approx(tuple(seen), abs=0.05)
 
 
-def test_lens_without_an_opencv_model_is_refused() -> None:
+def test_lens_without_an_opencv_model_is_rejected() -> None:
     fisheye = intrinsics(20.0, rs.distortion.kannala_brandt4, [0.9, -0.8, 0.5, -0.2, 0.0])
     with pytest.raises(ConfigError, match="too wide"):
         camera_model(rs, fisheye)

@@ -59,7 +59,7 @@ def test_camera_info_topic_is_next_to_the_image_topic() -> None:
 
 
 @pytest.mark.parametrize("topic", ["", "/", "/a//b", "/a/*", "a b", "/a/**", "/a/$*", "/ä"])
-def test_invalid_topic_is_refused(topic: str) -> None:
+def test_invalid_topic_is_rejected(topic: str) -> None:
     with pytest.raises(ConfigError, match="not a valid ROS topic"):
         key_of(topic)
 

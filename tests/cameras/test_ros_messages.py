@@ -119,7 +119,7 @@ def test_zero_coefficients_mean_no_distortion_in_any_model() -> None:
         (camera_info(width=0), "image size 0x6"),
     ],
 )
-def test_invalid_camera_info_is_refused(info, expected: str) -> None:
+def test_invalid_camera_info_is_rejected(info, expected: str) -> None:
     with pytest.raises(FrameError, match=expected):
         read_camera(cdr(info), False)
 
@@ -127,14 +127,8 @@ def test_invalid_camera_info_is_refused(info, expected: str) -> None:
 @pytest.mark.parametrize(
     ("message", "expected"),
     [
-        (
-            image("bayer_rggb8", COLOR[..., 0]),
-            "'bayer_rggb8' is not supported, expected one of rgb8",
-        ),
-        (
-            image("rgb8", COLOR, step=23),
-            "rows of at least 24 bytes, but has 144 bytes in rows of 23",
-        ),
+        (image("bayer_rggb8", COLOR[..., 0]), "'bayer_rggb8' is not supported, expected one of rgb8"),
+        (image("rgb8", COLOR, step=23), "rows of at least 24 bytes, but has 144 bytes in rows of 23"),
         (image("rgb8", COLOR, height=7), "has 144 bytes"),
         (image("rgb8", COLOR, data=np.zeros(3, np.uint8)), "has 3 bytes"),
         (image("rgb8", COLOR, width=0), "0x6 pixels, expected 1 to"),
@@ -142,13 +136,13 @@ def test_invalid_camera_info_is_refused(info, expected: str) -> None:
         (camera_info(), "not a valid sensor_msgs/msg/Image|is not supported|rows of|pixels"),
     ],
 )
-def test_inconsistent_color_image_is_refused(message, expected: str) -> None:
+def test_inconsistent_color_image_is_rejected(message, expected: str) -> None:
     with pytest.raises(FrameError, match=expected):
         read_color(cdr(message), "/image_raw")
 
 
 @pytest.mark.parametrize("length", [0, 1, 3, 4, 20, 40, 100, -1])
-def test_truncated_cdr_is_refused(length: int) -> None:
+def test_truncated_cdr_is_rejected(length: int) -> None:
     body = cdr(image("rgb8", COLOR))
     for read in (read_color, read_depth):
         with pytest.raises(FrameError):
@@ -157,18 +151,18 @@ def test_truncated_cdr_is_refused(length: int) -> None:
         read_camera(cdr(camera_info())[:length], False)
 
 
-def test_cdr_of_another_version_is_refused() -> None:
+def test_cdr_of_another_version_is_rejected() -> None:
     with pytest.raises(FrameError, match="not CDR of ROS 2"):
         read_color(b"\0\7\0\0" + cdr(image("rgb8", COLOR))[4:], "/image_raw")
 
 
 @pytest.mark.parametrize("kind", ["32FC1; compressedDepth png", "jpeg"])
-def test_compressed_depth_of_another_kind_is_refused(kind: str) -> None:
+def test_compressed_depth_of_another_kind_is_rejected(kind: str) -> None:
     with pytest.raises(FrameError, match="16UC1"):
         read_depth(cdr(compressed(kind, bytes(12) + PNG16)), "/depth/compressedDepth")
 
 
-def test_compressed_data_without_an_image_are_refused() -> None:
+def test_compressed_data_without_an_image_are_rejected() -> None:
     with pytest.raises(FrameError, match="neither PNG nor JPEG"):
         read_color(cdr(compressed("jpeg", b"\xff\xd8")), "/image_raw/compressed")
 
@@ -192,20 +186,20 @@ def test_a_frame_has_both_images_and_the_stamp_of_color() -> None:
     assert frame.camera == CAMERA
 
 
-def test_depth_of_another_frame_is_refused_unless_declared_registered() -> None:
+def test_depth_of_another_frame_is_rejected_unless_declared_registered() -> None:
     with pytest.raises(FrameError, match=r"align_depth.*--registered"):
         frame_of(depth_of("camera_depth_optical_frame"))
     assert frame_of(depth_of("camera_depth_optical_frame"), is_registered=True).frame == 3
 
 
-def test_sizes_that_differ_are_refused() -> None:
+def test_sizes_that_differ_are_rejected() -> None:
     with pytest.raises(FrameError, match="differ in size"):
         frame_of(depth_of(pixels=DEPTH_MM[:4]))
     with pytest.raises(FrameError, match="8x6 pixels and its camera info 8x5"):
         frame_of(depth_of(), read_camera(cdr(camera_info(height=5)), False))
 
 
-def test_a_stamp_before_the_epoch_is_refused() -> None:
+def test_a_stamp_before_the_epoch_is_rejected() -> None:
     color = read_color(cdr(image("rgb8", COLOR, header(-(10**9)))), "/image_raw")
     with pytest.raises(FrameError, match="stamp_ns"):
         joined(color, depth_of(), CAMERA, 0, False)

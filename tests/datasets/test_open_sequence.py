@@ -24,7 +24,7 @@ def test_seed_after_the_name_is_part_of_the_name() -> None:
 
 
 @pytest.mark.parametrize("seed", ["@", "@x", "@-1", "@1.5"])
-def test_invalid_seed_is_refused(seed: str) -> None:
+def test_invalid_seed_is_rejected(seed: str) -> None:
     with pytest.raises(DataError, match="such as synthetic:room@3"):
         open_sequence(f"synthetic:room{seed}")
 
@@ -51,14 +51,14 @@ def test_every_message_is_one_paragraph(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_indices_outside_the_sequence_are_refused() -> None:
+def test_indices_outside_the_sequence_are_rejected() -> None:
     room = open_sequence("synthetic")
     for index in (-1, len(room)):
         with pytest.raises(IndexError, match="of 120"):
             room[index]
 
 
-def test_registration_is_refused_where_depth_is_registered_already(
+def test_registration_is_rejected_where_depth_is_registered_already(
     tum_folder: Callable[..., Path], replica_folder: Callable[..., Path]
 ) -> None:
     for source in (tum_folder(["1"], ["1"]), replica_folder([0]), "synthetic:room"):

@@ -38,7 +38,7 @@ def test_options_replace_what_they_name_and_nothing_else() -> None:
     assert not SequenceOptions(depth_camera=A).is_default
 
 
-def test_transform_that_is_not_rigid_is_refused() -> None:
+def test_transform_that_is_not_rigid_is_rejected() -> None:
     for T in (2 * np.eye(4), np.eye(3), np.full((4, 4), np.nan)):
         with pytest.raises(ConfigError, match="expected a rigid transform"):
             SequenceOptions(T_color_depth=T)

@@ -20,7 +20,7 @@ def test_ok_frame_without_a_pose_is_an_error(finished_run: Path) -> None:
         replace(posed, trajectory=poses).T_map_camera(run.frame(7))
 
 
-def test_another_source_is_refused(finished_run: Path, room: Sequence, room_folder: Path) -> None:
+def test_another_source_is_rejected(finished_run: Path, room: Sequence, room_folder: Path) -> None:
     run = read_run(finished_run)
     later = replace(run.frames[3], stamp_ns=run.frames[3].stamp_ns + 1)
     beyond = replace(run.frames[3], index=16)

@@ -44,7 +44,7 @@ def error_message(path: Path) -> str:
     return str(caught.value)
 
 
-def test_missing_file_or_one_without_a_network_is_refused(tmp_path: Path) -> None:
+def test_missing_file_or_one_without_a_network_is_rejected(tmp_path: Path) -> None:
     assert "no such file" in error_message(tmp_path / "absent.onnx")
     (tmp_path / "text.onnx").write_text("no network")
     assert "cannot be opened" in error_message(tmp_path / "text.onnx")
@@ -60,12 +60,12 @@ def test_missing_file_or_one_without_a_network_is_refused(tmp_path: Path) -> Non
     ],
     ids=["one image", "no planes", "64 channels", "an image as output"],
 )
-def test_another_layout_is_refused_with_the_one_expected(tmp_path: Path, inputs, nodes) -> None:
+def test_another_layout_is_rejected_with_the_one_expected(tmp_path: Path, inputs, nodes) -> None:
     message = error_message(write_network(tmp_path / "net.onnx", nodes, inputs))
     assert "Expected: two inputs float32 [1, 3, H, W]" in message
 
 
-def test_network_with_a_distance_of_equal_images_is_refused(tmp_path: Path) -> None:
+def test_network_with_a_distance_of_equal_images_is_rejected(tmp_path: Path) -> None:
     message = error_message(write_network(tmp_path / "net.onnx", distance_nodes("Add"), IMAGES))
     assert "an image to itself" in message
 

@@ -72,6 +72,6 @@ def test_images_of_another_size_are_scaled_to_fit() -> None:
     )
 
 
-def test_row_with_another_number_of_images_than_captions_is_refused() -> None:
+def test_row_with_another_number_of_images_than_captions_is_rejected() -> None:
     with pytest.raises(ValueError, match="one image per caption"):
         contact_sheet([[np.zeros((2, 2, 3), np.uint8)]], ["a", "b"])

@@ -28,7 +28,7 @@ def test_psnr_is_infinite_for_equal_images_and_nan_without_pixels() -> None:
     assert np.isnan(psnr(A, B, np.zeros((20, 30), bool)))
 
 
-def test_images_of_different_size_or_type_are_refused() -> None:
+def test_images_of_different_size_or_type_are_rejected() -> None:
     with pytest.raises(ValueError, match="differ"):
         psnr(A, B[:10])
     with pytest.raises(ValueError, match="differ"):
@@ -58,7 +58,7 @@ def test_ssim_of_an_image_with_itself_is_one_and_of_a_negative_is_negative() -> 
     assert ssim(a, 1 - a) < -0.5
 
 
-def test_images_without_an_ssim_window_or_of_unequal_size_are_refused() -> None:
+def test_images_without_an_ssim_window_or_of_unequal_size_are_rejected() -> None:
     with pytest.raises(ValueError, match="11x11"):
         ssim(A[:10] / 255, A[:10] / 255)
     with pytest.raises(ValueError, match="alike"):

@@ -50,19 +50,19 @@ def test_png_depth_keeps_every_value() -> None:
     )
 
 
-def test_an_eight_bit_depth_png_is_refused() -> None:
+def test_an_eight_bit_depth_png_is_rejected() -> None:
     _, data = cv2.imencode(".png", COLOR[..., 0])
     with pytest.raises(FrameError, match="16-bit"):
         codecs.decode_depth("png", 9, 6, memoryview(data.tobytes()))
 
 
-def test_image_of_another_size_than_announced_is_refused() -> None:
+def test_image_of_another_size_than_announced_is_rejected() -> None:
     _, data = cv2.imencode(".png", COLOR)
     with pytest.raises(FrameError, match="announced as 8x6"):
         codecs.decode_color("png", 8, 6, memoryview(data.tobytes()))
 
 
-def test_a_truncated_image_is_refused() -> None:
+def test_a_truncated_image_is_rejected() -> None:
     with pytest.raises(FrameError, match="not a readable jpeg"):
         codecs.decode_color("jpeg", 9, 6, memoryview(codecs.encode_jpeg(COLOR)[:20]))
 
@@ -73,12 +73,12 @@ def test_a_small_message_cannot_unpack_to_gigabytes() -> None:
         codecs.decode_depth("z16+zstd", 9, 6, memoryview(bomb))
 
 
-def test_broken_compression_is_refused() -> None:
+def test_broken_compression_is_rejected() -> None:
     with pytest.raises(FrameError, match="decompressed"):
         codecs.decode_depth("z16+zstd", 9, 6, memoryview(b"not zstd at all"))
 
 
-def test_header_that_announces_gigabytes_is_refused_before_decoding() -> None:
+def test_header_that_announces_gigabytes_is_rejected_before_decoding() -> None:
     _, data = cv2.imencode(".png", COLOR)
     huge = bytearray(data.tobytes())
     huge[16:24] = (60000).to_bytes(4, "big") * 2

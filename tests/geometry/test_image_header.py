@@ -59,19 +59,19 @@ def test_every_prefix_of_a_header_is_read_without_an_error() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"GIF89a" + bytes(50), b"BM" + bytes(80), b"\xff\xd8"])
-def test_other_formats_have_no_size_and_are_refused(data: bytes) -> None:
+def test_other_formats_have_no_size_and_are_rejected(data: bytes) -> None:
     assert read_image_size(memoryview(data)) is None
     with pytest.raises(FrameError, match="not a readable"):
         decode_color("jpeg", 53, 37, memoryview(data))
 
 
 @pytest.mark.parametrize("size", [(20_000, 20_000), (65_500, 65_500), (53, 38)])
-def test_an_image_that_announces_another_size_is_refused(size: tuple[int, int]) -> None:
+def test_an_image_that_announces_another_size_is_rejected(size: tuple[int, int]) -> None:
     with pytest.raises(FrameError, match=f"is {size[0]}x{size[1]}, announced as 53x37"):
         decode_color("jpeg", 53, 37, memoryview(bomb(*size)))
 
 
-def test_truncated_depth_image_is_refused() -> None:
+def test_truncated_depth_image_is_rejected() -> None:
     data = png(COLOR[..., 0].astype(np.uint16))
     with pytest.raises(FrameError):
         decode_depth("png", 53, 37, memoryview(data[:60]))

@@ -67,9 +67,7 @@ def test_keyframes_newer_than_a_correction_follow_their_references(steps) -> Non
 def test_order_of_correction_and_keyframe_does_not_matter(steps, reference: int) -> None:
     rng = np.random.default_rng(4)
     before, after = chained(steps[:5]), chained(steps[:5])
-    new = {
-        k: before[k] @ random_pose(rng, 0.05) for k in range(5)
-    }  # Each moves differently.
+    new = {k: before[k] @ random_pose(rng, 0.05) for k in range(5)}  # Each moves differently.
     T_odom_5 = before[reference] @ steps[5]
     before.add(5, reference, steps[5], T_odom_5)
     before.correct(1, new)

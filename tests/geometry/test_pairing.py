@@ -98,7 +98,7 @@ def test_pair_does_not_wait_forever_for_a_nearer_half() -> None:
     assert feed(pairs, ("a", 197)) == [(98, 88)]
 
 
-def test_decreasing_stamps_are_refused_without_effect() -> None:
+def test_decreasing_stamps_are_rejected_without_effect() -> None:
     pairs = pairing()
     feed(pairs, ("a", 100))
     for stamp_ms in (100, 67):
@@ -108,7 +108,7 @@ def test_decreasing_stamps_are_refused_without_effect() -> None:
 
 
 @pytest.mark.parametrize(("max_skew_ns", "buffer"), [(-1, 8), (1, 0)])
-def test_impossible_limits_are_refused(max_skew_ns: int, buffer: int) -> None:
+def test_impossible_limits_are_rejected(max_skew_ns: int, buffer: int) -> None:
     with pytest.raises(ConfigError):
         StreamPairer(max_skew_ns, buffer)
 

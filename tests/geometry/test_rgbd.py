@@ -31,7 +31,7 @@ def test_arrays_that_do_not_match_are_named(
         RgbdFrame(color, depth_m, CAMERA, index=7)
 
 
-def test_one_nan_among_good_depth_is_refused() -> None:
+def test_one_nan_among_good_depth_is_rejected() -> None:
     depth_m = DEPTH.copy()
     depth_m[1, 2] = np.nan
     with pytest.raises(FrameError, match="finite"):

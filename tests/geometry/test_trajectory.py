@@ -57,7 +57,7 @@ def test_missing_file_is_a_data_error(tmp_path: Path) -> None:
         Trajectory.load(tmp_path / "nowhere.txt")
 
 
-def test_descending_stamps_and_unequal_lengths_are_refused() -> None:
+def test_descending_stamps_and_unequal_lengths_are_rejected() -> None:
     with pytest.raises(DataError, match="ascend"):
         Trajectory(np.array([2.0, 1.0]), np.zeros((2, 4, 4)))
     with pytest.raises(DataError, match="expected"):

@@ -85,7 +85,7 @@ def test_unknown_name_lists_the_flats() -> None:
 
 
 @pytest.mark.parametrize("changes", [{"width_px": 8}, {"height_px": 0}, {"seed": -1}])
-def test_invalid_config_is_refused(changes: dict) -> None:
+def test_invalid_config_is_rejected(changes: dict) -> None:
     with pytest.raises(ConfigError):
         FlatConfig(**changes)
 

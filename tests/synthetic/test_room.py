@@ -120,7 +120,7 @@ def test_every_size_renders() -> None:
 
 
 @pytest.mark.parametrize("changes", [{"frames": 0}, {"width_px": 2}, {"path": "spiral"}])
-def test_invalid_config_is_refused(changes: dict) -> None:
+def test_invalid_config_is_rejected(changes: dict) -> None:
     with pytest.raises(ConfigError):
         SyntheticConfig(**changes)
 

@@ -153,6 +153,6 @@ def test_results_are_bitwise_reproducible(room) -> None:
     assert first.information.tobytes() == second.information.tobytes()
 
 
-def test_settings_without_iterations_are_refused() -> None:
+def test_settings_without_iterations_are_rejected() -> None:
     with pytest.raises(ConfigError, match="iterations"):
         AlignConfig(iterations=())

@@ -40,6 +40,6 @@ def test_occluded_points_are_not_visible(room) -> None:
     assert e.visible == pytest.approx(points.shape[1] / 2, rel=0.05)
 
 
-def test_gate_of_zero_is_refused() -> None:
+def test_gate_of_zero_is_rejected() -> None:
     with pytest.raises(ConfigError, match="gate"):
         ResidualConfig(gate=0.0)

@@ -77,6 +77,6 @@ def test_blank_image_has_no_features_and_no_pose(large_room) -> None:
     assert estimate_pose(blank, textured, large_room.camera, CONFIG) is None
 
 
-def test_ratio_above_one_is_refused() -> None:
+def test_ratio_above_one_is_rejected() -> None:
     with pytest.raises(ConfigError, match="ratio"):
         FeatureConfig(ratio=1.5)

@@ -98,7 +98,7 @@ def test_distant_record_or_one_of_another_submap_is_not_replaced(room) -> None:
     assert [record.id for record in database.all] == [1, 2, 3]
 
 
-def test_database_of_two_records_is_refused() -> None:
+def test_database_of_two_records_is_rejected() -> None:
     with pytest.raises(ConfigError, match="count"):
         KeyframeDatabaseConfig(count=2)
 

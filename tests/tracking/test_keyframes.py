@@ -40,7 +40,7 @@ def test_features_are_detected_once(room) -> None:
     assert keyframe.reference is keyframe.reference
 
 
-def test_limits_in_the_wrong_order_are_refused() -> None:
+def test_limits_in_the_wrong_order_are_rejected() -> None:
     with pytest.raises(ConfigError, match="min_frames"):
         KeyframeConfig(min_frames=31)
     with pytest.raises(ConfigError, match="max_translation=0"):

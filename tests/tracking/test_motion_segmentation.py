@@ -167,7 +167,7 @@ def test_box_without_depth_is_masked_whole_and_one_outside_is_ignored() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"least_m": -1.0}, {"gone_frames": 0}, {"rim_px": -1}])
-def test_impossible_settings_are_refused(wrong: dict) -> None:
+def test_impossible_settings_are_rejected(wrong: dict) -> None:
     with pytest.raises(ConfigError):
         MotionSegmentationConfig(**wrong)
 

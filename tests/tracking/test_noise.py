@@ -10,6 +10,6 @@ def test_noise_grows_with_the_square_of_depth() -> None:
     np.testing.assert_allclose(sigma_m, [0.001, 0.003, 0.009])
 
 
-def test_noise_without_a_floor_is_refused() -> None:
+def test_noise_without_a_floor_is_rejected() -> None:
     with pytest.raises(ConfigError, match="floor_m"):
         DepthNoise(floor_m=0.0)

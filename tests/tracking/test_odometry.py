@@ -224,7 +224,7 @@ def test_odd_sizes_are_tracked(make_room, make_walk, size: tuple[int, int]) -> N
     assert {r.status for r in results} == {TrackingStatus.OK}
 
 
-def test_motion_limit_of_zero_is_refused() -> None:
+def test_motion_limit_of_zero_is_rejected() -> None:
     with pytest.raises(ConfigError, match="large_motion"):
         OdometryConfig(large_motion=0.0)
 

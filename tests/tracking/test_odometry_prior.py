@@ -121,7 +121,7 @@ def test_inconsistent_pose_is_rejected_or_starts_a_session(stamp_ns, T, check) -
 @pytest.mark.parametrize(
     "fields", [{"max_gap_s": 0.0}, {"max_extrapolation_s": -1.0}, {"max_carried_s": float("nan")}]
 )
-def test_impossible_settings_are_refused(fields) -> None:
+def test_impossible_settings_are_rejected(fields) -> None:
     with pytest.raises(ConfigError):
         PriorConfig(**fields)
 

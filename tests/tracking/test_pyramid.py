@@ -62,7 +62,7 @@ def test_depth_beyond_any_sensor_is_missing(room) -> None:
     assert all(level.depth_m.max() < 10 for level in levels)
 
 
-def test_pyramid_without_levels_is_refused() -> None:
+def test_pyramid_without_levels_is_rejected() -> None:
     with pytest.raises(ConfigError, match="at least 1"):
         PyramidConfig(levels=0)
 

@@ -137,6 +137,6 @@ def test_darker_image_resembles_the_last_trusted_view_and_another_does_not(large
         {"agreement_rad": 0.0},
     ],
 )
-def test_impossible_limits_are_refused(fields) -> None:
+def test_impossible_limits_are_rejected(fields) -> None:
     with pytest.raises(ConfigError):
         RelocalizationConfig(**fields)

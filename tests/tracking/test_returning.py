@@ -241,7 +241,7 @@ def test_keyframe_made_after_reuse_is_measured_from_the_reused_ones(room, make_w
     "wrong",
     [{"after": -1}, {"tries": 0}, {"agreement_rad": 0.0}, {"min_geometric_inliers": 1.5}],
 )
-def test_impossible_settings_are_refused(wrong: dict) -> None:
+def test_impossible_settings_are_rejected(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         KeyframeReuseConfig(**wrong)
 

@@ -87,6 +87,6 @@ def test_odometry_tracks_large_steps_past_white_walls(large_room) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"level": -1}, {"spacing": 0.3}, {"min_partners": 0.0}])
-def test_impossible_settings_are_refused(wrong: dict) -> None:
+def test_impossible_settings_are_rejected(wrong: dict) -> None:
     with pytest.raises(ConfigError):
         GicpConfig(**wrong)

@@ -140,6 +140,6 @@ def test_submaps_survive_packing(submaps: Submaps) -> None:
         {"confirm_rad": 0.0},
     ],
 )
-def test_impossible_settings_are_refused(fields) -> None:
+def test_impossible_settings_are_rejected(fields) -> None:
     with pytest.raises(ConfigError):
         SubmapConfig(**fields)

@@ -151,7 +151,7 @@ def test_history_keeps_the_newest_residuals() -> None:
     assert history.intensity_sigmas == tuple(float(k) for k in range(70, 100))
 
 
-def test_limits_in_the_wrong_order_are_refused() -> None:
+def test_limits_in_the_wrong_order_are_rejected() -> None:
     with pytest.raises(ConfigError, match="residual"):
         TrackingQualityConfig(weak_residual=6.0)
     with pytest.raises(ConfigError, match="relocalised_residual"):
