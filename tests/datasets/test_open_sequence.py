@@ -25,7 +25,7 @@ def test_seed_after_the_name_is_part_of_the_name() -> None:
 
 @pytest.mark.parametrize("seed", ["@", "@x", "@-1", "@1.5"])
 def test_invalid_seed_is_rejected(seed: str) -> None:
-    with pytest.raises(DataError, match="such as synthetic:room@3"):
+    with pytest.raises(DataError, match="as in synthetic:room@3"):
         open_sequence(f"synthetic:room{seed}")
 
 
