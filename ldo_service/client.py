@@ -10,15 +10,13 @@ The module imports no numerical code of the service. A slow subscriber does not 
 client buffers the newest messages and drops older ones.
 """
 
-import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import msgspec
 import numpy as np
 import zenoh
 
@@ -39,15 +37,11 @@ from ldo_service.schemas import (
     Pose,
     RefineMap,
     TrackedPose,
-    decode,
 )
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import (
     BY_NAME,
     CONTROL,
-    FROM_ODOMETRY,
-    FROM_OPERATORS,
-    FROM_OUTSIDE,
     LABEL_ADD,
     LABEL_NAMES,
     MAP_OBJECTS,
@@ -56,23 +50,24 @@ from ldo_service.schemas.topics import (
     TOPICS,
     Topic,
 )
-from ldo_service.transport.flow_control import ALIVE, Header, SequenceTracker, encode_link
+from ldo_service.transport.flow_control import Header
 from ldo_service.transport.keys import TlsKeys
+from ldo_service.transport.message_reader import MessageReader
+from ldo_service.transport.message_sender import MessageSender
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT, Endpoint, open_session
 
 M = TypeVar("M", bound=Message)
-log = logging.getLogger(__name__)
 
 
 class Client:
     """Connection to the topics of one robot, created by `connect`."""
 
     def __init__(self, session: zenoh.Session, network: Endpoint) -> None:
-        self._session, self._network = session, network
+        self._network = network
+        self._sender = MessageSender(session, network)
+        self._reader = MessageReader(session, network)
         self._sent = self._asked = self._priors = 0
         self._numbers: Counter[type[Message]] = Counter()  # Messages sent, by type.
-        self._epoch = time.time_ns()
-        self._publishers: dict[type[Message], Any] = {}  # Publisher by message type.
 
     def publish(
         self,
@@ -100,7 +95,7 @@ class Client:
             frame=self._sent,
             camera=camera,
             color=Image.raw("rgb8", color),
-            depth=_raw_depth(depth),
+            depth=Image.raw_depth(depth),
             depth_scale=depth_scale,
         )
         self.send(message)
@@ -140,7 +135,7 @@ class Client:
             stamp_ns=_stamp(stamp_ns),
             frame=self._sent,
             camera=camera,
-            image=_raw_depth(depth),
+            image=Image.raw_depth(depth),
             depth_scale=depth_scale,
             T_color_depth=T_color_depth,
         )
@@ -155,9 +150,7 @@ class Client:
                 default.
         """
         message = OdometryPrior(stamp_ns=_stamp(stamp_ns), T_prior_base=T_prior_base)
-        header = Header("odometry", self._epoch, self._priors, message.stamp_ns)
-        body = msgspec.msgpack.encode(message)
-        self._publisher(OdometryPrior).put(body, attachment=encode_link(header))
+        self._sender.send(message, "odometry", self._priors)
         self._priors += 1
 
     def send(self, frame: CameraRgbd | CameraColor | CameraDepth) -> None:
@@ -166,25 +159,14 @@ class Client:
         The call may block for some milliseconds. A congested network drops the message.
         """
         kind = type(frame)
-        header = Header("camera", self._epoch, self._numbers[kind], frame.stamp_ns)
-        self._publisher(kind).put(msgspec.msgpack.encode(frame), attachment=encode_link(header))
+        self._sender.send(frame, "camera", self._numbers[kind])
         self._sent += 1
         self._numbers[kind] += 1
-
-    def _publisher(self, kind: type[Message]) -> Any:
-        if kind not in self._publishers:
-            known = (*FROM_OUTSIDE, *FROM_ODOMETRY, *FROM_OPERATORS)
-            (topic,) = (topic for topic in known if topic.message is kind)
-            self._publishers[kind] = self._session.declare_publisher(
-                self._network.expression(topic.name),
-                congestion_control=zenoh.CongestionControl.DROP,
-            )
-        return self._publishers[kind]
 
     @property
     def has_subscriber(self) -> bool:
         """True if a subscriber of camera/rgbd exists."""
-        return self._publisher(CameraRgbd).matching_status.matching
+        return self._sender.has_subscriber(CameraRgbd)
 
     def wait_for_subscriber(self, timeout_s: float = 3.0) -> bool:
         """Wait for a subscriber of camera/rgbd.
@@ -194,10 +176,7 @@ class Client:
         Returns:
             False if none was found within `timeout_s`.
         """
-        until_s = time.monotonic() + timeout_s
-        while not self.has_subscriber and time.monotonic() < until_s:
-            time.sleep(0.02)
-        return self.has_subscriber
+        return self._sender.wait_for_subscriber(CameraRgbd, timeout_s)
 
     def poses(self, keep: int = 1) -> Iterator[TrackedPose]:
         """Yield tracked poses as they arrive, without end.
@@ -221,12 +200,7 @@ class Client:
         Raises:
             ConfigError: No topic has this name.
         """
-        topic, numbers = _topic(topic), SequenceTracker()
-        with self._subscriber(topic.subscription_key, keep) as subscriber:
-            for sample in subscriber:
-                header = _header(sample)
-                if numbers.observe(header):
-                    yield header, _message(sample, topic.message)
+        yield from self._reader.messages(_topic(topic), keep)
 
     @contextmanager
     def poller(self, name: str, of: type[M], keep: int = 256) -> Iterator[Callable[[], list[M]]]:
@@ -237,11 +211,7 @@ class Client:
             of: Type of the messages; malformed ones are logged and skipped.
             keep: Number of buffered messages; older ones are dropped.
         """
-        with self._subscriber(name, keep) as subscriber:
-
-            def inbox() -> list[M]:
-                return list(_readable(iter(subscriber.try_recv, None), of))
-
+        with self._reader.poller(name, of, keep) as inbox:
             yield inbox
 
     def latest(self, topic: Topic | str, timeout_s: float = 3.0) -> list[Message]:
@@ -261,12 +231,7 @@ class Client:
         if not topic.is_state:
             keeping = ", ".join(other.name for other in TOPICS if other.is_state)
             raise ConfigError(f"{topic.name} keeps no last value. Topics that do: {keeping}.")
-        replies = self._session.get(
-            self._network.expression(topic.name),
-            timeout=timeout_s,
-            consolidation=zenoh.ConsolidationMode.NONE,  # Other modes return only one part.
-        )
-        return list(_readable((r.ok for r in replies if r.ok is not None), topic.message))
+        return self._reader.last_values(topic, timeout_s)
 
     def objects(self, timeout_s: float = 3.0) -> MapObjects:
         """Request the current objects of the map.
@@ -288,9 +253,7 @@ class Client:
 
     def live_actors(self, timeout_s: float = 1.0) -> set[str]:
         """Return the names of the actors with a running process."""
-        expression = self._network.expression(f"{ALIVE}/*")
-        replies = self._session.liveliness().get(expression, timeout=timeout_s)
-        return {str(r.ok.key_expr).rsplit("/", 1)[1] for r in replies if r.ok is not None}
+        return self._reader.live_actors(timeout_s)
 
     def control(self, verb: str, timeout_s: float = 120.0) -> ControlAnswer:
         """Request the service to pause, resume, save or reset, and wait for all actors.
@@ -306,15 +269,11 @@ class Client:
         Raises:
             ConfigError: The service does not reply.
         """
-        replies = self._session.get(
-            self._network.expression(CONTROL.name),
-            payload=msgspec.msgpack.encode(ControlRequest(stamp_ns=time.time_ns(), command=verb)),
-            timeout=timeout_s,
-        )
-        for reply in replies:
-            if reply.ok is not None:
-                return _message(reply.ok, ControlAnswer)
-        raise self._nobody("replies", CONTROL)
+        request = ControlRequest(stamp_ns=time.time_ns(), command=verb)
+        answer = self._reader.request(CONTROL, request, ControlAnswer, timeout_s)
+        if answer is None:
+            raise self._nobody("replies", CONTROL)
+        return answer
 
     def refine(
         self,
@@ -381,13 +340,9 @@ class Client:
         Raises:
             ConfigError: There is no subscriber within `timeout_s`.
         """
-        publisher, until_s = self._publisher(type(message)), time.monotonic() + timeout_s
-        while not publisher.matching_status.matching:
-            if time.monotonic() > until_s:
-                raise self._nobody("listens", topic)
-            time.sleep(0.02)
-        header = Header("operator", self._epoch, self._asked, message.stamp_ns)
-        publisher.put(msgspec.msgpack.encode(message), attachment=encode_link(header))
+        if not self._sender.wait_for_subscriber(type(message), timeout_s):
+            raise self._nobody("listens", topic)
+        self._sender.send(message, "operator", self._asked)
         self._asked += 1
 
     def _nobody(self, does: str, topic: Topic) -> ConfigError:
@@ -395,10 +350,6 @@ class Client:
             f"no service {does} on {self._network.expression(topic.name)}. Check the name of the "
             "robot and whether its service is running: `ldo doctor`."
         )
-
-    def _subscriber(self, name: str, keep: int) -> Any:
-        ring = zenoh.handlers.RingChannel(keep)
-        return self._session.declare_subscriber(self._network.expression(name), ring)
 
 
 def _topic(topic: Topic | str) -> Topic:
@@ -418,30 +369,6 @@ def _names_or_why(name: str, answer: LabelNames) -> tuple[str, ...]:
 
 def _stamp(stamp_ns: int | None) -> int:
     return time.time_ns() if stamp_ns is None else stamp_ns
-
-
-def _raw_depth(depth: np.ndarray) -> Image:
-    return Image.raw("z16" if depth.dtype == np.uint16 else "f32", depth)
-
-
-def _header(sample: Any) -> Header:
-    return decode(sample.attachment.to_bytes(), Header)
-
-
-def _message(sample: Any, of: type[M]) -> M:
-    return decode(sample.payload.to_bytes(), of)
-
-
-def _readable(samples: Iterable[Any], of: type[M]) -> Iterator[M]:
-    """Yield the messages of samples; malformed ones are logged and skipped."""
-    for sample in samples:
-        try:
-            yield _message(sample, of)
-        except msgspec.DecodeError as error:
-            log.warning(
-                "client: malformed %s skipped: %s. Does the service run the same version?",
-                of.__name__, error,
-            )  # fmt: skip
 
 
 @contextmanager

@@ -79,6 +79,11 @@ class Image(msgspec.Struct, frozen=True, kw_only=True):
         data = memoryview(np.ascontiguousarray(pixels).tobytes())
         return cls(encoding=encoding, width=width, height=height, data=data)
 
+    @classmethod
+    def raw_depth(cls, pixels: np.ndarray) -> "Image":
+        """Return a depth image with a copy of uncompressed pixels [H, W], uint16 or float32."""
+        return cls.raw("z16" if pixels.dtype == np.uint16 else "f32", pixels)
+
 
 class CameraRgbd(Message, frozen=True, kw_only=True):
     """Raw RGB-D frame of a camera program, published on camera/rgbd; depth is registered to color.

@@ -1,0 +1,99 @@
+"""Reader of the service's topics, for programs outside the service."""
+
+import logging
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import msgspec
+import zenoh
+
+from ldo_service.schemas import Message, decode
+from ldo_service.schemas.topics import Topic
+
+from .endpoint import Endpoint
+from .flow_control import ALIVE, Header, SequenceTracker
+
+M = TypeVar("M", bound=Message)
+log = logging.getLogger(__name__)
+
+
+class MessageReader:
+    """Subscribers and queries of one program outside the service.
+
+    A subscriber buffers the newest messages and drops older ones, so that it slows no producer.
+    """
+
+    def __init__(self, session: zenoh.Session, network: Endpoint) -> None:
+        self._session, self._network = session, network
+
+    def messages(self, topic: Topic, keep: int) -> Iterator[tuple[Header, Message]]:
+        """Yield header and message of each sample on a topic, without end.
+
+        Messages that a restarted producer repeats are skipped.
+        """
+        numbers = SequenceTracker()
+        with self._subscriber(topic.subscription_key, keep) as subscriber:
+            for sample in subscriber:
+                header = decode(sample.attachment.to_bytes(), Header)
+                if numbers.observe(header):
+                    yield header, _message_of(sample, topic.message)
+
+    @contextmanager
+    def poller(self, key: str, kind: type[M], keep: int) -> Iterator[Callable[[], list[M]]]:
+        """Yield a function that returns the messages since its last call, without waiting."""
+        with self._subscriber(key, keep) as subscriber:
+
+            def inbox() -> list[M]:
+                return list(_readable(iter(subscriber.try_recv, None), kind))
+
+            yield inbox
+
+    def last_values(self, topic: Topic, timeout_s: float) -> list[Message]:
+        """Return all parts of the last value of a state topic; empty if there is no value."""
+        replies = self._session.get(
+            self._network.expression(topic.name),
+            timeout=timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,  # Other modes return only one part.
+        )
+        return list(_readable((r.ok for r in replies if r.ok is not None), topic.message))
+
+    def request(
+        self, topic: Topic, message: Message, answer: type[M], timeout_s: float
+    ) -> M | None:
+        """Send a request and return the answer, or None if the service does not reply."""
+        replies = self._session.get(
+            self._network.expression(topic.name),
+            payload=msgspec.msgpack.encode(message),
+            timeout=timeout_s,
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                return _message_of(reply.ok, answer)
+        return None
+
+    def live_actors(self, timeout_s: float) -> set[str]:
+        """Return the names of the actors with a running process."""
+        expression = self._network.expression(f"{ALIVE}/*")
+        replies = self._session.liveliness().get(expression, timeout=timeout_s)
+        return {str(r.ok.key_expr).rsplit("/", 1)[1] for r in replies if r.ok is not None}
+
+    def _subscriber(self, key: str, keep: int) -> Any:
+        ring = zenoh.handlers.RingChannel(keep)
+        return self._session.declare_subscriber(self._network.expression(key), ring)
+
+
+def _message_of(sample: Any, kind: type[M]) -> M:
+    return decode(sample.payload.to_bytes(), kind)
+
+
+def _readable(samples: Iterable[Any], kind: type[M]) -> Iterator[M]:
+    """Yield the messages of samples; malformed ones are logged and skipped."""
+    for sample in samples:
+        try:
+            yield _message_of(sample, kind)
+        except msgspec.DecodeError as error:
+            log.warning(
+                "client: malformed %s skipped: %s. Does the service run the same version?",
+                kind.__name__, error,
+            )  # fmt: skip
