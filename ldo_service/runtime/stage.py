@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator, Mapping
 from ldo_service.errors import StageStalled
 from ldo_service.schemas import Health, Message, encode
 from ldo_service.schemas.topics import HEALTH
-from ldo_service.storage.state_store import MemoryStore, State, StateStore
+from ldo_service.storage.state_store import MemoryStore, StateStore
 from ldo_service.transport.flow_control import Header, encode_link, new_epoch
 from ldo_service.transport.interface import Transport
 from ldo_service.transport.worker import Worker
 
-from .actor import Actor, FlowStatus, Lossless
+from .actor import Actor, FlowStatus
 from .checkpointer import Checkpointer
 from .delivery_state import LoggedInput
 from .inlet import Delivery
@@ -25,14 +25,11 @@ from .mailbox import Mailbox
 from .outlet import Outlet, Outlets
 from .stage_commands import CommandReceiver, StageCommand
 from .stage_metrics import StageMetrics
+from .state_saver import SAVE_AGAIN_S, StateSaver, UnsavedStateError
 from .step import MessageDecoder, Produced, produce
 from .supervision_policy import RestartBudget, SupervisionConfig
 
 log = logging.getLogger(__name__)
-
-
-class UnsavedStateError(Exception):
-    """End of a stage with an unsaved state; the last step is repeated after a restart."""
 
 
 class Stage:
@@ -43,19 +40,11 @@ class Stage:
     that a step depends on.
 
     Saving: A step is complete when it is saved. Only then does the stage send its outputs to
-    required consumers and acknowledge its input. While the disk is full, the stage retries and
-    takes no more messages, with two exceptions:
-
-    - A stage with nonblocking outputs continues. Its credit is 0 until the staged outputs are saved
-      and sent.
-    - A stage without lossless inputs and without required consumers continues too.
-
-    A stage that is about to end does not wait for the disk.
+    required consumers and acknowledge its input. While the disk is full, most stages take no more
+    messages; see `StateSaver`.
     """
 
     JOURNAL_WITHIN_S = 5.0  # Maximum time to wait at the end for the journal to be written.
-    # Time between two attempts to save: short for a user who frees disk space, and cheap.
-    SAVE_AGAIN_S = 0.5
 
     def __init__(
         self,
@@ -112,9 +101,10 @@ class Stage:
         nice = 0 if self._actor.is_prompt else self._config.nice
         self._worker = Worker(self.name, nice=nice)
         self._open_outlets()
+        self._saver = self._open_saver()
         if self._checkpointer.past.is_none:
-            self._begin()
-        self._mailbox = self._open_mailbox()
+            self._saver.save_initial(self._actor)
+        self._mailbox = self._saver.mailbox = self._open_mailbox()
         self._transport.declare_liveliness(self.name)
         tasks = {
             asyncio.create_task(self._heartbeat_loop(self._mailbox), name=f"{self.name} heartbeat"),
@@ -155,6 +145,16 @@ class Stage:
         )
         self._health = self._transport.publisher(f"{HEALTH.name}/{self.name}")
 
+    def _open_saver(self) -> StateSaver:
+        return StateSaver(
+            self._checkpointer,
+            self._worker,
+            self._outlets,
+            self._metrics,
+            self._journal,
+            is_draining=lambda: self._drain_requested,
+        )
+
     def _open_mailbox(self) -> Mailbox:
         mailbox = Mailbox(
             self.name,
@@ -190,14 +190,14 @@ class Stage:
     # --- work -----------------------------------------------------------------------------------
     async def _work(self, mailbox: Mailbox) -> None:
         try:
-            if self._checkpointer.is_unsaved:
-                await self._save()
+            if self._saver.is_unsaved:
+                await self._saver.save(self._actor)
             await self._outlets.release()  # Outputs that the previous process staged.
             await self._publish_restored()
             while delivery := await self._next(mailbox):
                 await self._take(delivery, mailbox)
             await self._publish_final()
-            if self._checkpointer.is_unsaved:
+            if self._saver.is_unsaved:
                 raise UnsavedStateError
             await self._outlets.flush()
         except UnsavedStateError:
@@ -209,9 +209,9 @@ class Stage:
 
     async def _next(self, mailbox: Mailbox) -> Delivery | StageCommand | None:
         """Take the next delivery or command, and retry to save an unsaved state meanwhile."""
-        while self._checkpointer.is_unsaved:
+        while self._saver.is_unsaved:
             try:
-                return await asyncio.wait_for(mailbox.take(), self.SAVE_AGAIN_S)
+                return await asyncio.wait_for(mailbox.take(), SAVE_AGAIN_S)
             except TimeoutError:
                 await self._tell([])
         return await mailbox.take()
@@ -232,7 +232,7 @@ class Stage:
                 return
         self._metrics.dead_lettered += 1
         self._journal.record_step("dead_lettered", FlowStatus())
-        await self._save(delivery)
+        await self._saver.save(self._actor, delivery)
         log.error(
             "%s: message %s (stamp %d ns) failed twice and becomes a dead letter. Its traceback is "
             "above; please report it with the recording.",
@@ -250,7 +250,7 @@ class Stage:
             with self._metrics.step():
                 produced = await self._worker.run(self._handle, message)
             self._outlets.hold(produced)
-            is_saved = await self._save(delivery, self._taken(delivery))
+            is_saved = await self._saver.save(self._actor, delivery, self._taken(delivery))
         except UnsavedStateError:
             raise
         except Exception as error:
@@ -272,7 +272,8 @@ class Stage:
 
     async def _tell(self, produced: list[Produced], *, whole: bool = False) -> None:
         self._outlets.hold(produced)
-        await self._outlets.release(is_saved=await self._save(whole=whole))
+        is_saved = await self._saver.save(self._actor, whole=whole)
+        await self._outlets.release(is_saved=is_saved)
 
     def _update_flow_status(self) -> None:
         self._actor.situation = FlowStatus(
@@ -302,73 +303,6 @@ class Stage:
             self._journal.record_step(kind, self._actor.situation, produced)
         await self._tell(produced, whole=True)
 
-    # --- saving ---------------------------------------------------------------------------------
-    async def _save(
-        self,
-        delivery: Delivery | None = None,
-        taken: LoggedInput | None = None,
-        whole: bool = False,
-    ) -> bool:
-        """Save the current state, and retry while the disk is full.
-
-        Args:
-            delivery: The delivery of the current step, which counts as handled.
-            taken: Its log entry if the actor lags.
-            whole: Write a checkpoint instead of a snapshot.
-
-        Returns:
-            False if the state is not saved and the stage need not wait for the disk.
-
-        Raises:
-            UnsavedStateError: The stage is about to end and the state cannot be written.
-            Exception: Any exception of the actor's `snapshot` or `checkpoint`.
-        """
-        state = await self._worker.run(
-            self._checkpointer.build_checkpoint, self._actor, self._links(delivery), taken, whole
-        )
-        while not await self._is_written(state):
-            if not self._waits_for_disk:
-                return False
-            if self._drain_requested:
-                raise UnsavedStateError
-            await asyncio.sleep(self.SAVE_AGAIN_S)
-        return True
-
-    async def _is_written(self, state: State) -> bool:
-        try:
-            await self._worker.run(self._write, state)
-        except OSError as error:
-            self._note_unsaved(error)
-        if self._mailbox:
-            self._mailbox.waits_for_disk = self._checkpointer.is_unsaved
-        return not self._checkpointer.is_unsaved
-
-    @property
-    def _waits_for_disk(self) -> bool:
-        takes = any(isinstance(port.policy, Lossless) for port in self._actor.inputs)
-        return not self._outlets.is_nonblocking and (takes or self._outlets.has_required_consumers)
-
-    def _begin(self) -> None:
-        """Save the initial state before other actors connect.
-
-        The state is small, so the event loop saves it itself. If that fails, the stage retries
-        before the first step.
-        """
-        try:
-            self._write(
-                self._checkpointer.build_checkpoint(self._actor, self._links(), None, False)
-            )
-        except OSError as error:
-            self._note_unsaved(error)
-
-    def _links(self, delivery: Delivery | None = None) -> State:
-        inputs = self._mailbox.past(delivery) if self._mailbox else self._checkpointer.past.inputs
-        return self._checkpointer.links(inputs, self._outlets.past())
-
-    def _note_unsaved(self, error: OSError) -> None:
-        self._metrics.failures += self._checkpointer.record_failure(self.name, error)
-        self._metrics.facts = {**self._metrics.facts, **self._checkpointer.metrics()}
-
     # --- commands -------------------------------------------------------------------------------
     async def _execute(self, order: StageCommand, mailbox: Mailbox) -> None:
         try:
@@ -380,7 +314,7 @@ class Stage:
                 case "reset":
                     await self._renew(mailbox)
                 case "save":
-                    await self._worker.run(self._save_whole, self._links())
+                    await self._saver.save_checkpoint(self._actor)
         except Exception as error:
             log.exception(
                 "%s: command %s failed. Repeat `ldo control %s` or restart the service.",
@@ -398,7 +332,7 @@ class Stage:
         self._metrics.facts = {}
         mailbox.reset()
         self._outlets.renew(self._epoch)
-        await self._save()
+        await self._saver.save(self._actor)
 
     # --- in the actor's thread ------------------------------------------------------------------
     def _handle(self, message: Message) -> list[Produced]:
@@ -408,17 +342,6 @@ class Stage:
         actor = self._checkpointer.restore_actor(self._make)
         self._journal.record_start(self._checkpointer.past.of_actor or None)
         return actor
-
-    def _write(self, state: State) -> None:
-        self._checkpointer.write(self._actor, state)
-        self._metrics.facts = {
-            **self._actor.metrics(),
-            **self._journal.metrics(),
-            **self._checkpointer.metrics(),
-        }
-
-    def _save_whole(self, links: State) -> None:
-        self._write(self._checkpointer.build_checkpoint(self._actor, links, None, True))
 
     async def _restart(self) -> None:
         """Wait, longer with each failure, and restore the actor from its last state."""

@@ -1,0 +1,154 @@
+"""Saving of a stage's state after each step, also while the disk is full."""
+
+import asyncio
+from collections.abc import Callable
+
+from ldo_service.storage.state_store import State
+from ldo_service.transport.worker import Worker
+
+from .actor import Actor, Lossless
+from .checkpointer import Checkpointer
+from .delivery_state import LoggedInput
+from .inlet import Delivery
+from .journal import Journal
+from .mailbox import Mailbox
+from .outlet import Outlets
+from .stage_metrics import StageMetrics
+
+# Time between two attempts to save: short for a user who frees disk space, and cheap.
+SAVE_AGAIN_S = 0.5
+
+
+class UnsavedStateError(Exception):
+    """End of a stage with an unsaved state; the last step is repeated after a restart."""
+
+
+class StateSaver:
+    """Saver of the state of one stage.
+
+    While the disk is full, it retries and the stage waits, with two exceptions:
+
+    - A stage with nonblocking outputs continues. Its credit is 0 until the staged outputs are saved
+      and sent.
+    - A stage without lossless inputs and without required consumers continues too.
+
+    A stage that is about to end does not wait for the disk.
+    """
+
+    def __init__(
+        self,
+        checkpointer: Checkpointer,
+        worker: Worker,
+        outlets: Outlets,
+        metrics: StageMetrics,
+        journal: Journal,
+        is_draining: Callable[[], bool],
+    ) -> None:
+        """Initialize without a mailbox; the stage sets `mailbox` once it is open.
+
+        Args:
+            checkpointer: Writer of the state.
+            worker: The actor's thread.
+            outlets: Outputs of the stage, whose positions are saved.
+            metrics: Counters of the stage; every write updates the actor's metrics in it.
+            journal: Journal of the stage, for its metrics.
+            is_draining: Returns whether the stage is about to end.
+        """
+        self._checkpointer, self._worker, self._outlets = checkpointer, worker, outlets
+        self._metrics, self._journal = metrics, journal
+        self._is_draining = is_draining
+        self.mailbox: Mailbox | None = None
+
+    @property
+    def is_unsaved(self) -> bool:
+        """True if the last step is not saved."""
+        return self._checkpointer.is_unsaved
+
+    def save_initial(self, actor: Actor) -> None:
+        """Save the initial state before other actors connect.
+
+        The state is small, so the event loop saves it itself. If that fails, the stage retries
+        before the first step.
+        """
+        try:
+            self._write(
+                actor, self._checkpointer.build_checkpoint(actor, self._links(), None, False)
+            )
+        except OSError as error:
+            self._record_failure(actor, error)
+
+    async def save(
+        self,
+        actor: Actor,
+        delivery: Delivery | None = None,
+        taken: LoggedInput | None = None,
+        *,
+        whole: bool = False,
+    ) -> bool:
+        """Save the current state, and retry while the disk is full.
+
+        Args:
+            actor: The actor of the stage.
+            delivery: The delivery of the current step, which counts as handled.
+            taken: Its log entry if the actor lags.
+            whole: Write a checkpoint instead of a snapshot.
+
+        Returns:
+            False if the state is not saved and the stage need not wait for the disk.
+
+        Raises:
+            UnsavedStateError: The stage is about to end and the state cannot be written.
+            Exception: Any exception of the actor's `snapshot` or `checkpoint`.
+        """
+        state = await self._worker.run(
+            self._checkpointer.build_checkpoint, actor, self._links(delivery), taken, whole
+        )
+        while not await self._is_written(actor, state):
+            if not self._waits_for_disk(actor):
+                return False
+            if self._is_draining():
+                raise UnsavedStateError
+            await asyncio.sleep(SAVE_AGAIN_S)
+        return True
+
+    async def save_checkpoint(self, actor: Actor) -> None:
+        """Save a checkpoint once, on request.
+
+        Raises:
+            OSError: The state cannot be written.
+            Exception: Any exception of the actor's `checkpoint`.
+        """
+        await self._worker.run(self._write_checkpoint, actor, self._links())
+
+    def _links(self, delivery: Delivery | None = None) -> State:
+        inputs = self.mailbox.past(delivery) if self.mailbox else self._checkpointer.past.inputs
+        return self._checkpointer.links(inputs, self._outlets.past())
+
+    async def _is_written(self, actor: Actor, state: State) -> bool:
+        try:
+            await self._worker.run(self._write, actor, state)
+        except OSError as error:
+            self._record_failure(actor, error)
+        if self.mailbox:
+            self.mailbox.waits_for_disk = self._checkpointer.is_unsaved
+        return not self._checkpointer.is_unsaved
+
+    def _waits_for_disk(self, actor: Actor) -> bool:
+        takes = any(isinstance(port.policy, Lossless) for port in actor.inputs)
+        return not self._outlets.is_nonblocking and (takes or self._outlets.has_required_consumers)
+
+    def _record_failure(self, actor: Actor, error: OSError) -> None:
+        self._metrics.failures += self._checkpointer.record_failure(actor.name, error)
+        self._metrics.facts = {**self._metrics.facts, **self._checkpointer.metrics()}
+
+    # --- in the actor's thread ------------------------------------------------------------------
+    def _write(self, actor: Actor, state: State) -> None:
+        self._checkpointer.write(actor, state)
+        self._metrics.facts = {
+            **actor.metrics(),
+            **self._journal.metrics(),
+            **self._checkpointer.metrics(),
+        }
+
+    def _write_checkpoint(self, actor: Actor, links: State) -> None:
+        self._write(actor, self._checkpointer.build_checkpoint(actor, links, None, True))
