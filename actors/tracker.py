@@ -53,7 +53,8 @@ from ldo_service.schemas.topics import (
 )
 from ldo_service.tracking.keyframe_database import load_keyframe_database
 from ldo_service.tracking.localizer import Localizer
-from ldo_service.tracking.odometry import Odometry, OdometryConfig
+from ldo_service.tracking.odometry import Odometry
+from ldo_service.tracking.odometry_config import OdometryConfig
 from ldo_service.tracking.odometry_prior import OdometryPriorBuffer, PriorCheck
 from ldo_service.tracking.tracking_result import TrackingResult
 

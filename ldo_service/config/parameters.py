@@ -48,7 +48,7 @@ from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.keyframe_database import KeyframeDatabaseConfig
 from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.motion_segmentation import MotionSegmentationConfig
-from ldo_service.tracking.odometry import OdometryConfig
+from ldo_service.tracking.odometry_config import OdometryConfig
 from ldo_service.tracking.odometry_prior import PriorConfig
 from ldo_service.tracking.pyramid import DepthNoise, PyramidConfig
 from ldo_service.tracking.relocalization import KeyframeReuseConfig, RelocalizationConfig

@@ -1,7 +1,8 @@
 """RGB-D odometry: direct alignment to keyframes and relocalization by features."""
 
 from .alignment import AlignConfig, Alignment, align
-from .odometry import Odometry, OdometryConfig
+from .odometry import Odometry
+from .odometry_config import OdometryConfig
 from .odometry_prior import OdometryPriorBuffer, PriorConfig, PriorPose
 from .pyramid import Pyramid, PyramidConfig, ReferencePoints, build_reference, pyramid_of
 from .tracking_quality import TrackingStatus

@@ -8,64 +8,28 @@ Conventions: `ldo_service.geometry`.
 """
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ldo_service.detection.dynamic_classes import DynamicClassConfig
-from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 
-from .alignment import AlignConfig, Alignment
-from .features import FeatureConfig, GicpConfig
-from .keyframe_database import KeyframeDatabase, KeyframeDatabaseConfig, make_thumbnail
-from .keyframes import KeyframeConfig, ReferenceKeyframe, needs_keyframe, needs_mapping_keyframe
+from .alignment import Alignment
+from .keyframe_database import KeyframeDatabase, make_thumbnail
+from .keyframes import ReferenceKeyframe, needs_keyframe, needs_mapping_keyframe
 from .motion import ConstantVelocity
-from .motion_segmentation import MotionSegmentationConfig, grow_mask, segment_motion
-from .odometry_prior import DeadReckoningStart, PriorConfig, PriorPose
-from .pose_candidates import InitialGuessAligner, PoseHypothesis, PoseHypothesisConfig
-from .pyramid import Pyramid, PyramidConfig, pyramid_of
-from .relocalization import KeyframeReuseConfig, RelocalizationConfig, Relocalizer
+from .motion_segmentation import grow_mask, segment_motion
+from .odometry_config import OdometryConfig
+from .odometry_prior import DeadReckoningStart, PriorPose
+from .pose_candidates import InitialGuessAligner, PoseHypothesis
+from .pyramid import Pyramid, pyramid_of
+from .relocalization import Relocalizer
 from .state import KeyframeOrigin, OdometryState
-from .submaps import SubmapConfig, SubmapMatch, SubmapMeasurement
-from .tracking_quality import (
-    ResidualHistory,
-    TrackingQualityConfig,
-    TrackingStatus,
-    classify_tracking,
-)
+from .submaps import SubmapMatch, SubmapMeasurement
+from .tracking_quality import ResidualHistory, TrackingStatus, classify_tracking
 from .tracking_result import KeyframeKind, TrackedFrame
-from .window import WindowConfig
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryConfig:
-    """Settings of odometry and of its parts."""
-
-    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
-    align: AlignConfig = field(default_factory=AlignConfig)
-    features: FeatureConfig = field(default_factory=FeatureConfig)
-    shape: GicpConfig = field(default_factory=GicpConfig)
-    candidates: PoseHypothesisConfig = field(default_factory=PoseHypothesisConfig)
-    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
-    window: WindowConfig = field(default_factory=WindowConfig)
-    places: KeyframeDatabaseConfig = field(default_factory=KeyframeDatabaseConfig)
-    relocalisation: RelocalizationConfig = field(default_factory=RelocalizationConfig)
-    returning: KeyframeReuseConfig = field(default_factory=KeyframeReuseConfig)
-    submaps: SubmapConfig = field(default_factory=SubmapConfig)
-    judgement: TrackingQualityConfig = field(default_factory=TrackingQualityConfig)
-    moving: MotionSegmentationConfig = field(default_factory=MotionSegmentationConfig)
-    movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
-    prior: PriorConfig = field(default_factory=PriorConfig)
-    # Image motion from which all initial guesses are tried, image widths per frame: 2 pixels of the
-    # coarsest level.
-    large_motion: float = 0.05
-
-    def __post_init__(self) -> None:
-        if not self.large_motion > 0:
-            raise ConfigError(f"large_motion={self.large_motion:g} must be positive.")
 
 
 class FrameTracker:

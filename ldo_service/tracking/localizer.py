@@ -13,10 +13,10 @@ import numpy as np
 
 from ldo_service.geometry import RgbdFrame, se3
 
-from .frame_tracking import OdometryConfig
 from .keyframe_database import KeyframeDatabase
 from .map_frame import MapCorrection
 from .odometry import Odometry
+from .odometry_config import OdometryConfig
 from .odometry_prior import OdometryPriorBuffer
 from .submaps import SubmapConfig, SubmapMatch
 from .tracking_quality import TrackingStatus

@@ -30,10 +30,11 @@ from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .alignment import BrightnessModel
-from .frame_tracking import FrameTracker, OdometryConfig
+from .frame_tracking import FrameTracker
 from .keyframe_database import KeyframeRecord, make_keyframe_record
 from .keyframes import ReferenceKeyframe, keyframe_dynamic_class_mask
 from .map_frame import MapCorrection, MapFrame
+from .odometry_config import OdometryConfig
 from .odometry_prior import OdometryPriorBuffer, PriorPose
 from .relocalization import KeyframeReuse, ReusedKeyframe, find_nearby_keyframes
 from .state import KeyframeOrigin, pack, unpack

@@ -21,8 +21,8 @@ from ldo_service.schemas import (
     LoopCandidate,
     LoopClosure,
 )
+from ldo_service.tracking import Odometry, OdometryConfig
 from ldo_service.tracking.map_frame import MapCorrection, MapFrame
-from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.odometry_prior import OdometryPriorBuffer
 from ldo_service.tracking.tracking_result import TrackedFrame, TrackingResult
 

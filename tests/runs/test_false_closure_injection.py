@@ -4,7 +4,7 @@ import numpy as np
 
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.tracking.odometry import Odometry, OdometryConfig
+from ldo_service.tracking import Odometry, OdometryConfig
 from ldo_service.tracking.tracking_result import KeyframeKind
 
 from .false_closures import Drift, DriftingOdometry

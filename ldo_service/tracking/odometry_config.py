@@ -1,0 +1,47 @@
+"""Settings of odometry and of its parts."""
+
+from dataclasses import dataclass, field
+
+from ldo_service.detection.dynamic_classes import DynamicClassConfig
+from ldo_service.errors import ConfigError
+
+from .alignment import AlignConfig
+from .features import FeatureConfig, GicpConfig
+from .keyframe_database import KeyframeDatabaseConfig
+from .keyframes import KeyframeConfig
+from .motion_segmentation import MotionSegmentationConfig
+from .odometry_prior import PriorConfig
+from .pose_candidates import PoseHypothesisConfig
+from .pyramid import PyramidConfig
+from .relocalization import KeyframeReuseConfig, RelocalizationConfig
+from .submaps import SubmapConfig
+from .tracking_quality import TrackingQualityConfig
+from .window import WindowConfig
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig:
+    """Settings of odometry and of its parts."""
+
+    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    shape: GicpConfig = field(default_factory=GicpConfig)
+    candidates: PoseHypothesisConfig = field(default_factory=PoseHypothesisConfig)
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
+    places: KeyframeDatabaseConfig = field(default_factory=KeyframeDatabaseConfig)
+    relocalisation: RelocalizationConfig = field(default_factory=RelocalizationConfig)
+    returning: KeyframeReuseConfig = field(default_factory=KeyframeReuseConfig)
+    submaps: SubmapConfig = field(default_factory=SubmapConfig)
+    judgement: TrackingQualityConfig = field(default_factory=TrackingQualityConfig)
+    moving: MotionSegmentationConfig = field(default_factory=MotionSegmentationConfig)
+    movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    # Image motion from which all initial guesses are tried, image widths per frame: 2 pixels of the
+    # coarsest level.
+    large_motion: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not self.large_motion > 0:
+            raise ConfigError(f"large_motion={self.large_motion:g} must be positive.")
