@@ -35,7 +35,8 @@ from ldo_service.conversions.poses import (
 )
 from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.loop_refit import LoopRefit, LoopRefitConfig
-from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
+from ldo_service.gaussians.map_builder import MapBuilder
+from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.maps.publisher import MapPublisher, MessageContext, ObjectPublisher, PublishConfig

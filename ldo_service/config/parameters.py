@@ -15,7 +15,7 @@ from ldo_service.gaussians.adam import AdamConfig
 from ldo_service.gaussians.densification import DensificationConfig
 from ldo_service.gaussians.keyframe_store import KeyframeStoreConfig
 from ldo_service.gaussians.loss import LossWeights
-from ldo_service.gaussians.map_builder import MapBuilderConfig
+from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.gaussians.optimizer import GaussianOptimizerConfig
 from ldo_service.gaussians.pruning import PruningConfig
 from ldo_service.gaussians.visibility import OffloadConfig

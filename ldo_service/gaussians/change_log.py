@@ -1,8 +1,12 @@
-"""Log of the map changes that map replicas have not received yet."""
+"""Log of the map changes that map replicas have not received yet, and the published poses."""
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+
+from ldo_service.geometry import se3
+from ldo_service.geometry.point_records import PoseTable
 
 from .model import GaussianMap
 
@@ -85,3 +89,50 @@ class ChangeLog:
         self._next_untold = max(self._next_untold, newest + 1)
         self._is_changed = np.zeros(len(gaussians), bool)
         self._removed.clear()
+
+
+class PublishedPoses:
+    """Published poses T_map_keyframe of the keyframes with images.
+
+    Args:
+        min_m: Least translation that is published, meters.
+        min_rad: Least rotation that is published, radians.
+    """
+
+    def __init__(self, min_m: float, min_rad: float) -> None:
+        self._poses = PoseTable()
+        self._min_m, self._min_rad = min_m, min_rad
+
+    def add(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
+        """Record the pose [4, 4] of a new keyframe, which counts as published."""
+        self._poses[keyframe] = T_map_keyframe
+
+    def forget(self, keyframe: int) -> None:
+        """Drop a keyframe without images."""
+        del self._poses[keyframe]
+
+    def drain(self, poses: PoseTable) -> dict[int, np.ndarray]:
+        """Return the poses to publish now, by keyframe, and mark them as published.
+
+        Args:
+            poses: Current poses T_map_keyframe of all keyframes.
+        """
+        known = self._poses
+        is_news = se3.transforms_differ(
+            poses.of(known), known.of(known), self._min_m, self._min_rad
+        )
+        moved = {k: poses[k] for k, is_new in zip(known, is_news, strict=True) if is_new}
+        known.update(moved)
+        return moved
+
+    def move(self, T_map: Mapping[int, np.ndarray]) -> None:
+        """Replace poses after a correction, which replicas apply themselves."""
+        self._poses.update({k: T for k, T in T_map.items() if k in self._poses})
+
+    def snapshot(self) -> np.ndarray:
+        """Return the poses [K, 4, 4] in the order of their ids."""
+        return self._poses.of(self._poses)
+
+    def restore(self, keyframes: Collection[int], T_map: np.ndarray) -> None:
+        """Replace all poses by those of a snapshot."""
+        self._poses.become(keyframes, T_map)

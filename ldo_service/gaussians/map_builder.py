@@ -1,65 +1,32 @@
 """Construction of the map from keyframes: densification, optimization, pruning and offloading."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError, named
-from ldo_service.geometry import Camera, RgbdFrame, se3
-from ldo_service.geometry.point_records import PoseTable
+from ldo_service.geometry import Camera, RgbdFrame
 
-from .change_log import ChangeLog, Changes
-from .densification import DensificationConfig, densify
+from .change_log import ChangeLog, Changes, PublishedPoses
+from .confirmation import Confirmation
+from .densification import densify
 from .exposure import Exposure, estimate_exposure
-from .fitting import Fitting, ViewSamplingConfig, random_for
-from .keyframe_store import KeyframeStore, KeyframeStoreConfig, KeyframeViews
+from .fitting import Fitting
+from .keyframe_renderer import KeyframeRenderer
+from .keyframe_store import KeyframeStore, KeyframeViews
+from .map_builder_config import MapBuilderConfig
 from .model import GaussianBatch, GaussianMap
 from .offloading import OffloadedGaussians, iter_all_gaussians
-from .optimizer import GaussianOptimizerConfig
-from .pruning import DeduplicationConfig, PruningConfig, find_duplicates, prunable_mask
-from .renderer import Contributions, Rendering, RenderMemory, render
+from .pruning import find_duplicates, prunable_mask
+from .renderer import Contributions, Rendering
 from .training_views import TrainingView, visible_in_mask
-from .visibility import (
-    BoundingSpheres,
-    MaxDepthGrid,
-    OffloadConfig,
-    PlacedCamera,
-    chunk_numbers,
-    plan_offload,
-)
+from .visibility import BoundingSpheres, MaxDepthGrid, PlacedCamera, chunk_numbers, plan_offload
 
 # Iterations per unit of effort: an iteration that reaches almost no Gaussians counts half.
 MAX_ITERATIONS_PER_EFFORT = 2
-
-
-@dataclass(frozen=True, slots=True)
-class MapBuilderConfig:
-    """Settings of the map builder and of its parts."""
-
-    insertion: DensificationConfig = field(default_factory=DensificationConfig)
-    optimiser: GaussianOptimizerConfig = field(default_factory=GaussianOptimizerConfig)
-    window: ViewSamplingConfig = field(default_factory=ViewSamplingConfig)
-    pruning: PruningConfig = field(default_factory=PruningConfig)
-    merging: DeduplicationConfig = field(default_factory=DeduplicationConfig)
-    store: KeyframeStoreConfig = field(default_factory=KeyframeStoreConfig)
-    sleep: OffloadConfig = field(default_factory=OffloadConfig)
-    recent_cameras: int = 8  # Number of last keyframes whose visible Gaussians stay in memory.
-    prune_keyframes: int = 5  # Keyframes between two prunings.
-    # Least translation and rotation of a keyframe by the Gaussian optimizer that is published.
-    refined_m: float = 2e-4
-    refined_rad: float = 2e-4
-    seed: int = 0  # Seed of the random choice of keyframes.
-
-    def __post_init__(self) -> None:
-        if self.prune_keyframes < 1 or min(self.refined_m, self.refined_rad, self.seed) < 0:
-            raise ConfigError(
-                named(self, "prune_keyframes", "refined_m", "refined_rad", "seed")
-                + ": prune_keyframes must be at least 1, the others at least 0."
-            )
 
 
 class MapBuilder:
@@ -87,7 +54,11 @@ class MapBuilder:
         self.gaussians = GaussianMap()
         self.sleeping = OffloadedGaussians(folder and folder / "gaussians")
         self.views = KeyframeViews(KeyframeStore(folder and folder / "images", self.config.store))
-        self._threads, self._memory = threads, RenderMemory()
+        self._threads = threads
+        self._renderer = KeyframeRenderer(self.views, threads)
+        self._confirmation = Confirmation(
+            self.views.store, self._renderer, self.config.pruning, self.config.seed
+        )
         self._fitting = Fitting(
             self.config.optimiser,
             self.config.window,
@@ -97,10 +68,8 @@ class MapBuilder:
             threads=threads,
         )
         self._log = ChangeLog()
-        self._told = PoseTable()  # Published T_map_keyframe of the keyframes with images.
+        self._published = PublishedPoses(self.config.refined_m, self.config.refined_rad)
         self._newest: int | None = None
-        # Cached rendering of one keyframe; None after a change of the map.
-        self._shown: tuple[int, Rendering] | None = None
         self._pruned = self._excess = 0
 
     # --- keyframes --------------------------------------------------------------------------------
@@ -125,36 +94,31 @@ class MapBuilder:
             dynamic_mask: Pixels that are neither mapped nor fitted, [H, W] bool.
         """
         self._wake(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
-        self._shown = None
+        self._renderer.forget()
         before = self.render_from(frame.camera, T_map_camera)
-        exposure = self._exposure(frame, before, dynamic_mask)
-        self._insert(frame, T_map_camera, keyframe, before, exposure, dynamic_mask)
         counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
+        exposure = self._exposure(frame, before, counts)
+        self._insert(frame, T_map_camera, keyframe, before, exposure, dynamic_mask)
         view = replace(
             TrainingView.of(frame, T_map_camera, keyframe), exposure=exposure, mask=counts
         )
-        self._told[keyframe], self._newest = T_map_camera, keyframe
+        self._published.add(keyframe, T_map_camera)
+        self._newest = keyframe
         for forgotten in self.views.add(view):
-            del self._told[forgotten]
+            self._published.forget(forgotten)
             self._fitting.forget_view(forgotten)
         plan = self._fitting.plan(view, MAX_ITERATIONS_PER_EFFORT * iterations)
         touched = self._fit(plan, effort=iterations)
         if len(self.views) % self.config.prune_keyframes == 0:
             self._prune_misshapen(touched)
-        self._prune_unconfirmed(keyframe)
+        self._remove(self._confirmation.hidden_mask(self.gaussians, keyframe))
 
     def render_from(
         self, camera: Camera, T_map_camera: np.ndarray, *, contributions: bool = False
     ) -> Rendering:
         """Render the resident Gaussians from a camera pose."""
-        return render(
-            self.gaussians.rows,
-            camera,
-            se3.inverse(T_map_camera),
-            bounds=self.gaussians.bounds,
-            memory=self._memory,
-            contributions=contributions,
-            threads=self._threads,
+        return self._renderer.render_from(
+            self.gaussians, camera, T_map_camera, contributions=contributions
         )
 
     def render_keyframe(self, keyframe: int, *, contributions: bool = False) -> Rendering:
@@ -162,22 +126,14 @@ class MapBuilder:
 
         The cache is valid until the map changes.
         """
-        if self._shown is None or self._shown[0] != keyframe:
-            self._shown = None
-        if self._shown is None or (contributions and self._shown[1].contributions is None):
-            camera, pose = self.views.cameras[keyframe], self.views.poses[keyframe]
-            self._shown = keyframe, self.render_from(camera, pose, contributions=contributions)
-        return self._shown[1]
+        return self._renderer.render_keyframe(self.gaussians, keyframe, contributions=contributions)
 
-    def _exposure(
-        self, frame: RgbdFrame, before: Rendering, dynamic_mask: np.ndarray | None
-    ) -> Exposure:
+    def _exposure(self, frame: RgbdFrame, before: Rendering, counts: np.ndarray | None) -> Exposure:
         """Estimate the exposure of a frame relative to the map.
 
         If the map covers too little of the image, use the exposure of the previous keyframe.
         """
         rendered, seen = before.color.transpose(2, 0, 1), frame.color.transpose(2, 0, 1)
-        counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
         estimated = estimate_exposure(rendered, before.opacity, seen, counts)
         if estimated is not None or self._newest is None:
             return estimated or Exposure()
@@ -222,7 +178,7 @@ class MapBuilder:
             KeyError: The images of the keyframe are dropped or unreadable.
         """
         self._wake(self.views.placed(keyframe))
-        self._shown = None
+        self._renderer.forget()
         self.views.mask_pixels(keyframe, pixels)
         theirs = np.flatnonzero(self.gaussians.anchors == keyframe)
         camera, T_map_camera = self.views.cameras[keyframe], self.views.poses[keyframe]
@@ -255,7 +211,8 @@ class MapBuilder:
             Number of iterations that were run. It is smaller if `effort` was spent, or if most
             keyframes see offloaded Gaussians.
         """
-        self._shown, before = None, self._fitting.iterations
+        self._renderer.forget()
+        before = self._fitting.iterations
         self._fit(self._fitting.plan_refinement(iterations, first), rates, effort)
         return self._fitting.iterations - before
 
@@ -289,7 +246,7 @@ class MapBuilder:
         """
         if keyframe not in self.views.cameras:
             return 0
-        self._shown = None
+        self._renderer.forget()
         self._wake(self.views.placed(keyframe))
         mask = find_duplicates(
             self.gaussians.rows, self.gaussians.anchors, keyframe, self.config.merging
@@ -305,33 +262,6 @@ class MapBuilder:
         mask = np.zeros(len(self.gaussians), bool)
         mask[among] = prunable_mask(self.gaussians.rows[among], self.config.pruning)
         self._remove(mask)
-
-    def _prune_unconfirmed(self, newest: int) -> None:
-        """Prune the hidden Gaussians of two keyframes.
-
-        One of them has just received the last of its `confirm_keyframes` later keyframes. The other
-        is a random earlier one, because the map around it keeps changing.
-        """
-        age, pruning = self.config.pruning.confirm_keyframes, self.config.pruning
-        older = [k for k in self.views.store.keyframes() if k < newest][: 1 - age or None]
-        if not older or pruning.min_weight_px == 0:
-            return
-        chosen = {
-            older[-1],
-            older[int(random_for(self.config.seed, newest, 1).integers(len(older)))],
-        }
-        shown = np.zeros(len(self.gaussians), np.float32)
-        for keyframe in (newest, *sorted(chosen)):
-            made_by = self._contributions(keyframe)
-            shown[made_by.indices] = np.maximum(shown[made_by.indices], made_by.weights)
-        is_theirs = np.isin(self.gaussians.anchors, list(chosen))
-        self._remove(is_theirs & (shown < pruning.min_weight_px))
-
-    def _contributions(self, keyframe: int) -> Contributions:
-        camera, pose = self.views.cameras[keyframe], self.views.poses[keyframe]
-        shown = self.render_from(camera, pose, contributions=True).contributions
-        assert shown is not None
-        return shown
 
     def _remove(self, mask: np.ndarray) -> None:
         self._log.mark_removed(self.gaussians, mask)
@@ -363,7 +293,7 @@ class MapBuilder:
         seen = self.sleeping.visible_chunks(camera, self._reach_m)
         ids = self.sleeping.load_into(self.gaussians, seen)
         if len(ids):
-            self._shown = None
+            self._renderer.forget()
         self._log.mark_loaded(self.gaussians, ids)
 
     def offload_excess(self) -> None:
@@ -381,7 +311,7 @@ class MapBuilder:
         choice = plan_offload(awake, recent, self.config.sleep)
         self._excess = choice.excess
         self.sleeping.offload_from(self.gaussians, clumps, choice.clumps)
-        self._shown = None
+        self._renderer.forget()
         self._log.mark_all_published(self.gaussians)
 
     def size(self) -> int:
@@ -403,16 +333,7 @@ class MapBuilder:
 
         The poses count as published then.
         """
-        poses = self.views.poses
-        is_news = se3.transforms_differ(
-            poses.of(self._told),
-            self._told.of(self._told),
-            self.config.refined_m,
-            self.config.refined_rad,
-        )
-        moved = {k: poses[k] for k, is_new in zip(self._told, is_news, strict=True) if is_new}
-        self._told.update(moved)
-        return moved
+        return self._published.drain(self.views.poses)
 
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move keyframes, their views and the Gaussians anchored to them, after a pose correction.
@@ -421,11 +342,11 @@ class MapBuilder:
             T_new_old: Transforms [4, 4] by keyframe id, see `GaussianMap.move_anchors`.
         """
         T_map = {k: T @ self.views.poses[k] for k, T in T_new_old.items()}
-        self._shown = None
+        self._renderer.forget()
         self.gaussians.move_anchors(T_new_old)
         self.sleeping.move(T_new_old)
         self.views.poses.update(T_map)
-        self._told.update({k: T for k, T in T_map.items() if k in self._told})
+        self._published.move(T_map)
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
@@ -435,7 +356,7 @@ class MapBuilder:
             "sleeping": self.sleeping.snapshot(),
             "optimiser": self._fitting.snapshot(),
             "views": self.views.snapshot(),
-            "told": self._told.of(self._told),
+            "told": self._published.snapshot(),
             "newest": self._newest,
             "iterations": self._fitting.iterations,
         }
@@ -450,8 +371,9 @@ class MapBuilder:
         self._fitting.restore(state["optimiser"], state["iterations"])
         self.views.restore(state["views"])
         self.sleeping.restore(state["sleeping"])
-        self._told.become(self.views.cameras, state["told"])
-        self._newest, self._shown = state["newest"], None
+        self._published.restore(self.views.cameras, state["told"])
+        self._newest = state["newest"]
+        self._renderer.forget()
         self._log.mark_all_published(self.gaussians)
 
     def metrics(self) -> dict[str, float]:

@@ -25,7 +25,7 @@ from ldo_service.gaussians import (
     PruningConfig,
     render,
 )
-from ldo_service.gaussians.map_builder import MapBuilderConfig
+from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.gaussians.visibility import OffloadConfig
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.maps.replica import MapReplica

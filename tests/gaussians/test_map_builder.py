@@ -10,8 +10,10 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.views import psnr
 from ldo_service.gaussians import GaussianOptimizerConfig, PruningConfig, render
+from ldo_service.gaussians.fitting import ViewSamplingConfig
 from ldo_service.gaussians.keyframe_store import KeyframeStoreConfig
-from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig, ViewSamplingConfig
+from ldo_service.gaussians.map_builder import MapBuilder
+from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.gaussians.visibility import OffloadConfig
 from ldo_service.geometry import se3
 

@@ -9,7 +9,8 @@ import pytest
 
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
+from ldo_service.gaussians.map_builder import MapBuilder
+from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.gaussians.visibility import OffloadConfig
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.regions.foreground import RegionDetections

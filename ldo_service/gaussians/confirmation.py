@@ -1,0 +1,49 @@
+"""Confirmation of Gaussians: each must be visible in the images of some keyframes."""
+
+import numpy as np
+
+from .fitting import random_for
+from .keyframe_renderer import KeyframeRenderer
+from .keyframe_store import KeyframeStore
+from .model import GaussianMap
+from .pruning import PruningConfig
+
+
+class Confirmation:
+    """Search of hidden Gaussians, two keyframes at a time.
+
+    Args:
+        store: Keyframes with images.
+        renderer: Renderer of the map at these keyframes.
+        config: Criteria.
+        seed: Seed of the random choice of keyframes.
+    """
+
+    def __init__(
+        self, store: KeyframeStore, renderer: KeyframeRenderer, config: PruningConfig, seed: int
+    ) -> None:
+        self._store, self._renderer = store, renderer
+        self._config, self._seed = config, seed
+
+    def hidden_mask(self, gaussians: GaussianMap, newest: int) -> np.ndarray:
+        """Return the mask [N] bool of the hidden Gaussians of two keyframes.
+
+        One of them has just received the last of its `confirm_keyframes` later keyframes. The other
+        is a random earlier one, because the map around it keeps changing. A Gaussian is hidden if
+        neither these two nor the newest keyframe show it with `min_weight_px`.
+
+        Args:
+            gaussians: The map.
+            newest: Id of the newest keyframe.
+        """
+        age, least_px = self._config.confirm_keyframes, self._config.min_weight_px
+        older = [k for k in self._store.keyframes() if k < newest][: 1 - age or None]
+        if not older or least_px == 0:
+            return np.zeros(len(gaussians), bool)
+        rng = random_for(self._seed, newest, 1)
+        chosen = {older[-1], older[int(rng.integers(len(older)))]}
+        shown = np.zeros(len(gaussians), np.float32)
+        for keyframe in (newest, *sorted(chosen)):
+            made_by = self._renderer.contributions(gaussians, keyframe)
+            shown[made_by.indices] = np.maximum(shown[made_by.indices], made_by.weights)
+        return np.isin(gaussians.anchors, list(chosen)) & (shown < least_px)

@@ -1,0 +1,68 @@
+"""Rendering of the map at the poses of its keyframes."""
+
+import numpy as np
+
+from ldo_service.geometry import Camera, se3
+
+from .keyframe_store import KeyframeViews
+from .model import GaussianMap
+from .renderer import Contributions, Rendering, RenderMemory, render
+
+
+class KeyframeRenderer:
+    """Renderer of the resident Gaussians that caches the rendering of one keyframe."""
+
+    def __init__(self, views: KeyframeViews, threads: int) -> None:
+        """Initialize without a rendering.
+
+        Args:
+            views: Cameras and poses of the keyframes.
+            threads: Threads of the renderer.
+        """
+        self._views, self._threads, self._memory = views, threads, RenderMemory()
+        # Cached rendering of one keyframe; None after a change of the map.
+        self._cached: tuple[int, Rendering] | None = None
+
+    def forget(self) -> None:
+        """Drop the cached rendering, because the map changes."""
+        self._cached = None
+
+    def render_from(
+        self,
+        gaussians: GaussianMap,
+        camera: Camera,
+        T_map_camera: np.ndarray,
+        *,
+        contributions: bool = False,
+    ) -> Rendering:
+        """Render the Gaussians from a camera pose."""
+        return render(
+            gaussians.rows,
+            camera,
+            se3.inverse(T_map_camera),
+            bounds=gaussians.bounds,
+            memory=self._memory,
+            contributions=contributions,
+            threads=self._threads,
+        )
+
+    def render_keyframe(
+        self, gaussians: GaussianMap, keyframe: int, *, contributions: bool = False
+    ) -> Rendering:
+        """Render the Gaussians at the pose of a keyframe, or return the cached rendering."""
+        if self._cached is None or self._cached[0] != keyframe:
+            self._cached = None
+        if self._cached is None or (contributions and self._cached[1].contributions is None):
+            camera, pose = self._views.cameras[keyframe], self._views.poses[keyframe]
+            self._cached = (
+                keyframe,
+                self.render_from(gaussians, camera, pose, contributions=contributions),
+            )
+        return self._cached[1]
+
+    def contributions(self, gaussians: GaussianMap, keyframe: int) -> Contributions:
+        """Return the contributions of the Gaussians to the image of a keyframe, without caching."""
+        camera, pose = self._views.cameras[keyframe], self._views.poses[keyframe]
+        shown = self.render_from(gaussians, camera, pose, contributions=True).contributions
+        assert shown is not None
+        return shown
