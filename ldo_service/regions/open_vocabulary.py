@@ -18,7 +18,7 @@ from ldo_service.geometry.boxes import areas, intersections
 
 from .foreground import Foreground, RegionDetections
 from .geometric_segmentation import segment_geometry
-from .region import RegionLabelResult
+from .region import RegionLabel, RegionLabelResult, RegionRequest
 from .region_proposals import (
     RegionProposal,
     RegionProposalConfig,
@@ -26,7 +26,7 @@ from .region_proposals import (
     propose_regions,
     regions_of_image,
 )
-from .region_tracker import RegionLabel, RegionRequest, RegionTracker, RegionTrackerConfig
+from .region_tracker import RegionTracker, RegionTrackerConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Region track: an image region over keyframes, with its masks, views and label votes."""
+"""Region track: an image region over keyframes, with its masks, views, votes and labels."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -161,6 +161,31 @@ class Region:
     def view_quality_gain(self) -> float:
         """Return the gain in summed view quality since the last label request."""
         return sum(view.quality for view in self.views) - self.quality
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RegionRequest:
+    """Label request for a region, with its best observation."""
+
+    region: Region
+    candidate: RegionProposal
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RegionLabel:
+    """Label of a region in a keyframe, with its confidence `sure`, 0..1."""
+
+    of: RegionProposal
+    label: str
+    sure: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RegionUpdate:
+    """Result of a keyframe: new label requests, and labels of its regions."""
+
+    questions: list[RegionRequest]
+    opinions: list[RegionLabel]
 
 
 def observe_region(

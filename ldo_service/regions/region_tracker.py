@@ -24,8 +24,11 @@ from ldo_service.geometry import Camera
 
 from .region import (
     Region,
+    RegionLabel,
     RegionLabelResult,
     RegionObservation,
+    RegionRequest,
+    RegionUpdate,
     Votes,
     merge_observation,
     observe_region,
@@ -125,31 +128,6 @@ class RegionTrackerConfig:
     def most_boxes(self) -> float:
         """Maximum sum of the votes of all boxes for one label."""
         return self.answer_weight if self.boxes_vote else 0.0
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class RegionRequest:
-    """Label request for a region, with its best observation."""
-
-    region: Region
-    candidate: RegionProposal
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class RegionLabel:
-    """Label of a region in a keyframe, with its confidence `sure`, 0..1."""
-
-    of: RegionProposal
-    label: str
-    sure: float
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class RegionUpdate:
-    """Result of a keyframe: new label requests, and labels of its regions."""
-
-    questions: list[RegionRequest]
-    opinions: list[RegionLabel]
 
 
 class RegionTracker:

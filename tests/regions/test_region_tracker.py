@@ -10,14 +10,9 @@ from ldo_service.conversions.objects import label_request_to_message
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, codecs
 from ldo_service.regions.foreground import Foreground
-from ldo_service.regions.region import RegionLabelResult
+from ldo_service.regions.region import RegionLabel, RegionLabelResult
 from ldo_service.regions.region_proposals import RegionProposal
-from ldo_service.regions.region_tracker import (
-    MAX_VIEWS,
-    RegionLabel,
-    RegionTracker,
-    RegionTrackerConfig,
-)
+from ldo_service.regions.region_tracker import MAX_VIEWS, RegionTracker, RegionTrackerConfig
 from ldo_service.regions.region_views import (
     ViewConfig,
     border_factor,
