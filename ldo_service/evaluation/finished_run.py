@@ -66,7 +66,7 @@ class PosedMap:
 
     Attributes:
         name: "online" as the run left it, "refined" after further iterations.
-        rows: Gaussians, [N, 16] (see `gaussians.model`).
+        rows: Gaussians, [N, 16] (see `gaussians.rows`).
         trajectory: T_map_camera of the frames that are not LOST.
         exposures: Exposures of the keyframes.
         semantics: Labels of the Gaussians; None without a detector.

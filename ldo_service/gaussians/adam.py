@@ -10,8 +10,9 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.kernels import _adam
 
-from .model import GaussianMap, aligned_rows
+from .model import GaussianMap
 from .renderer import AdamStep, Rasterizer, RowGradients, VisibleGaussians
+from .rows import aligned_rows
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,8 @@ import zstandard
 
 from ldo_service.errors import DataError
 
-from .model import LABEL_BYTES, ROW, GaussianBatch, transform_rows
+from .model import LABEL_BYTES, GaussianBatch
+from .rows import ROW, transform_rows
 
 _HEADER = struct.Struct("<qq")  # Anchor, number of Gaussians.
 _LEVEL = 1  # Compression level of zstd.
@@ -22,7 +23,7 @@ class Chunk:
     Attributes:
         anchor: Id of the anchor keyframe.
         ids: [M] int64, ascending.
-        rows: [M, 16] float32, in the map frame (see `gaussians.model`).
+        rows: [M, 16] float32, in the map frame (see `gaussians.rows`).
         labels: [M, 32] uint8.
     """
 

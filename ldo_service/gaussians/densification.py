@@ -14,8 +14,9 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
 from .cells import QuadtreeCells, quadtree
-from .model import ROW, GaussianMap
+from .model import GaussianMap
 from .renderer import Rendering, render
+from .rows import ROW
 
 # Densification subtracts this much of the 0.3 px^2 that the renderer adds to every splat. A larger
 # value gives sharper images. Subtracting all of it leaves cracks between Gaussians of one pixel

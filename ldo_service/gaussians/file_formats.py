@@ -25,7 +25,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, DataError
 
-from .model import aligned_rows
+from .rows import aligned_rows
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ OPENGL_QUAT = np.array([1, 1, -1, -1], np.float32)  # The same conversion F of a
 
 
 def write_ply(path: Path, rows: np.ndarray) -> None:
-    """Write Gaussian rows [N, 16] (see `gaussians.model`) as PLY.
+    """Write Gaussian rows [N, 16] (see `gaussians.rows`) as PLY.
 
     Means are in meters, scales are logarithms, quaternions (wxyz) have length one, opacity is a
     logit, and color is the constant spherical harmonic.
@@ -91,7 +91,7 @@ def read_ply(path: Path) -> np.ndarray:
     and elements are ignored. View-dependent color (`f_rest_*`) is ignored with a warning.
 
     Returns:
-        Gaussian rows [N, 16] float32 (see `gaussians.model`).
+        Gaussian rows [N, 16] float32 (see `gaussians.rows`).
 
     Raises:
         DataError: The file is cut off or too long, lacks a property, or holds NaN, infinity or a
@@ -218,7 +218,7 @@ def _rows(path: Path, vertices: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def write_splat(path: Path, rows: np.ndarray) -> None:
-    """Write Gaussian rows [N, 16] (see `gaussians.model`) as .splat; colors are clipped to 0..1."""
+    """Write Gaussian rows [N, 16] (see `gaussians.rows`) as .splat; colors are clipped to 0..1."""
     scales, opacities = np.exp(rows[:, 3:6]), 1 / (1 + np.exp(-rows[:, 10:11]))
     quats = rows[:, 6:10] / np.linalg.norm(rows[:, 6:10], axis=1, keepdims=True)
     splats = np.zeros(len(rows), SPLAT)
@@ -235,7 +235,7 @@ def _bytes(values: np.ndarray) -> np.ndarray:
 
 
 def write_spz(path: Path, rows: np.ndarray) -> None:
-    """Write Gaussian rows [N, 16] (see `gaussians.model`) as .spz.
+    """Write Gaussian rows [N, 16] (see `gaussians.rows`) as .spz.
 
     Raises:
         ConfigError: The optional package gsply is not installed.

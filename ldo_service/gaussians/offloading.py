@@ -13,7 +13,8 @@ from ldo_service.geometry import se3
 from ldo_service.storage.checksummed_folder import ChecksummedFolder
 
 from .chunk import Chunk, pack, unpack
-from .model import ROW, GaussianBatch, GaussianMap, new_labels
+from .model import GaussianBatch, GaussianMap, new_labels
+from .rows import ROW
 from .visibility import BoundingSpheres, PlacedCamera
 
 log = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _rasterize
 
-from .model import ROW, aligned_rows
+from .rows import ROW, aligned_rows
 
 PLANES = 5  # Red, green, blue, weighted depth, opacity.
 WEIGHT = 14  # Field of the summed weight in a row of gradients.

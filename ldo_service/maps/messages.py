@@ -5,7 +5,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from ldo_service.gaussians.change_log import Changes
-from ldo_service.gaussians.model import ROW, GaussianBatch, new_labels
+from ldo_service.gaussians.model import GaussianBatch, new_labels
+from ldo_service.gaussians.rows import ROW
 from ldo_service.schemas import Array, Gaussians
 
 NO_IDS = np.zeros(0, np.int64)

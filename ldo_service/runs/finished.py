@@ -98,7 +98,7 @@ class MapFolder:
             )
 
     def gaussians(self) -> np.ndarray:
-        """Return the rows of all Gaussians, [N, 16], see `gaussians.model`."""
+        """Return the rows of all Gaussians, [N, 16], see `gaussians.rows`."""
         return read_ply(self.folder / "map.ply")
 
     def semantics(self) -> SavedSemantics | None:

@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 
 from ldo_service.errors import ConfigError, named
-from ldo_service.gaussians.model import aligned_rows
 from ldo_service.gaussians.renderer import Rendering, render
+from ldo_service.gaussians.rows import aligned_rows
 from ldo_service.geometry import Camera, se3
 from ldo_service.regions.foreground import (
     ForegroundConfig,

@@ -8,8 +8,8 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from ldo_service.gaussians.model import ROW
 from ldo_service.gaussians.pruning import _opacities
+from ldo_service.gaussians.rows import ROW
 from ldo_service.geometry import Camera, se3
 from ldo_service.schemas import MapObjects
 from ldo_service.schemas.objects import Box
@@ -35,7 +35,7 @@ class Scene:
     Other threads read `keyframes` and `objects`. So these are replaced and never modified.
     """
 
-    # Gaussians, [N, 16], see `gaussians.model`; valid until the next update.
+    # Gaussians, [N, 16], see `gaussians.rows`; valid until the next update.
     rows: np.ndarray = field(default_factory=lambda: np.zeros((0, ROW), np.float32))
     # Camera positions as published, [K, 3].
     online: np.ndarray = field(default_factory=NOTHING.copy)
@@ -112,7 +112,7 @@ def splats_of(rows: np.ndarray) -> Splats:
     The covariance is R S S R^T, with the rotation R of the quaternion and the scales S.
 
     Args:
-        rows: Gaussians, [N, 16], see `gaussians.model`.
+        rows: Gaussians, [N, 16], see `gaussians.rows`.
     """
     R, scales = se3.rotation(rows[:, 6:10]), np.exp(rows[:, 3:6])
     half = R * scales[:, None, :]  # Factor R S of the covariance.

@@ -16,8 +16,9 @@ from collections.abc import Callable
 import numpy as np
 
 from ldo_service.conversions.poses import correction_to_message, keyframe_poses_from_correction
-from ldo_service.gaussians.model import GaussianMap, aligned_rows
+from ldo_service.gaussians.model import GaussianMap
 from ldo_service.gaussians.pruning import find_duplicates
+from ldo_service.gaussians.rows import aligned_rows
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.pose_graph.pose_graph import PoseGraph

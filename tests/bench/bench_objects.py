@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from ldo_service.detection.vocabulary import COCO, Vocabulary
-from ldo_service.gaussians.model import aligned_rows
+from ldo_service.gaussians.rows import aligned_rows
 from ldo_service.geometry import Camera, se3
 from ldo_service.maps.publisher import ObjectPublisher
 from ldo_service.schemas import encode

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ldo_service.gaussians.model import aligned_rows
+from ldo_service.gaussians.rows import aligned_rows
 from ldo_service.geometry import Camera
 from ldo_service.regions.foreground import (
     Foreground,

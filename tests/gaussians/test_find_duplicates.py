@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ldo_service.gaussians.model import aligned_rows
 from ldo_service.gaussians.pruning import DeduplicationConfig, find_duplicates
 from ldo_service.gaussians.renderer import render
+from ldo_service.gaussians.rows import aligned_rows
 from ldo_service.geometry import Camera, se3
 
 SPACING_M = 0.02

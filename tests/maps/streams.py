@@ -3,7 +3,8 @@
 import numpy as np
 
 from ldo_service.conversions.poses import pose_to_message
-from ldo_service.gaussians.model import GaussianMap, aligned_rows
+from ldo_service.gaussians.model import GaussianMap
+from ldo_service.gaussians.rows import aligned_rows
 from ldo_service.geometry import se3
 from ldo_service.maps.messages import NO_GAUSSIANS, NO_IDS, gaussians_message, rechunk
 from ldo_service.schemas import AnchorMotion, Array, Gaussians, MapDelta, MapSnapshot

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ldo_service.gaussians import render
-from ldo_service.gaussians.model import aligned_rows
+from ldo_service.gaussians.rows import aligned_rows
 from ldo_service.geometry import Camera
 from ldo_service.regions.foreground import Foreground, RegionDetections
 from ldo_service.semantics.gaussian_labels import LabelConfig, fields, new_labels, top_labels

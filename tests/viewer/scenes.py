@@ -5,7 +5,7 @@ from typing import get_args
 import msgspec
 import numpy as np
 
-from ldo_service.gaussians.model import aligned_rows
+from ldo_service.gaussians.rows import aligned_rows
 from ldo_service.geometry import Camera
 from ldo_service.schemas import MapObject, MapObjects, ObjectView, Pose
 from ldo_service.viewer.scene import Layer, ObjectBox, Scene
