@@ -40,7 +40,7 @@ from ldo_service.runtime.supervision_policy import SupervisionConfig
 from ldo_service.semantics.data_association import AssociationConfig
 from ldo_service.semantics.gaussian_labels import ConsistencyConfig, LabelConfig
 from ldo_service.semantics.label_assignment import AssignmentConfig
-from ldo_service.semantics.objects import ObjectsConfig
+from ldo_service.semantics.objects_config import ObjectsConfig
 from ldo_service.semantics.semantic_fusion import FusionConfig, SemanticFusionConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.tracking.alignment import AlignConfig, ResidualConfig

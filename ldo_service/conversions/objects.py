@@ -23,7 +23,7 @@ from ldo_service.schemas import (
 from ldo_service.schemas.objects import Box, Distribution
 from ldo_service.semantics.distributions import entropy, sparse
 from ldo_service.semantics.object_landmarks import distributions, labels_of
-from ldo_service.semantics.objects import ObjectUpdate
+from ldo_service.semantics.observations import ObjectUpdate
 
 from .poses import pose_to_message
 

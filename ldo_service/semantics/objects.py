@@ -1,12 +1,10 @@
 """Objects of the map: creation, association, merge and removal (paper, III.C)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 
 from .data_association import (
@@ -35,7 +33,10 @@ from .object_landmarks import (
     new_landmarks,
     within,
 )
+from .objects_config import ObjectsConfig
 from .observations import (
+    ObjectSighting,
+    ObjectUpdate,
     add_views,
     boxes_overlap,
     inside,
@@ -47,77 +48,6 @@ from .observations import (
 
 CANDIDATE = -1  # Value in place of an id.
 _AT_A_TIME = 128  # Landmarks per batch of `derive`, to stay in cache.
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectsConfig:
-    """Settings of the objects."""
-
-    association: AssociationConfig = field(default_factory=AssociationConfig)
-    # Keyframes that must observe a candidate before it becomes an object (III.C).
-    min_keyframes: int = 3
-    # Maximum divergence (nats) of an observation from the candidate (III.C).
-    max_divergence: float = 0.2
-    miss_limit: int = 10  # Misses in a row, while it is visible, that remove an object (III.C).
-    uncertain_miss_limit: int = 5  # The same for objects with a high entropy.
-    # Minimum entropy (nats) of such objects, which are removed earlier (III.C).
-    uncertain_entropy: float = 0.5
-    # The same for candidates; a removed candidate can be created again.
-    candidate_miss_limit: int = 3
-    min_visible: float = 0.5  # Minimum fraction of the members in view and not occluded for a miss.
-    # Minimum side of the predicted box for a miss; smaller objects may be overlooked.
-    min_side_px: float = 20.0
-    merge_overlap: float = 0.5  # Minimum fraction of the members of one in the box of the other.
-    max_objects: int = 2000  # 6 MB, and some ms per keyframe if all are in view.
-    max_candidates: int = 256  # Maximum candidates; those observed last are kept.
-
-    def __post_init__(self) -> None:
-        counts = (
-            *("min_keyframes", "miss_limit", "uncertain_miss_limit"),
-            *("candidate_miss_limit", "max_objects", "max_candidates"),
-        )
-        if min(getattr(self, name) for name in counts) < 1:
-            raise ConfigError(named(self, *counts) + ": each must be at least 1.")
-        if min(self.max_divergence, self.uncertain_entropy) < 0:
-            raise ConfigError(
-                named(self, "max_divergence", "uncertain_entropy") + ": each must be at least 0."
-            )
-        if not (0 < self.min_visible <= 1 and 0 < self.merge_overlap <= 1):
-            raise ConfigError(
-                named(self, "min_visible", "merge_overlap")
-                + ": min_visible and merge_overlap must be in (0, 1]."
-            )
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class ObjectSighting:
-    """An object in a keyframe: an observation or a miss.
-
-    Attributes:
-        object: Id of the object.
-        box: Observed box or, for a miss, the predicted one, [4], x0 y0 x1 y1, pixels.
-        distribution: Label distribution of the Gaussians in the region or, for a miss, of the
-            object, [C].
-        entropy: Entropy of that distribution, nats.
-        is_miss: True if the object should have been visible and was not observed.
-    """
-
-    object: int
-    box: np.ndarray
-    distribution: np.ndarray
-    entropy: float
-    is_miss: bool
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectUpdate:
-    """Changes of the objects by a keyframe."""
-
-    observations: tuple[ObjectSighting, ...] = ()  # Observations and misses.
-    born: tuple[int, ...] = ()  # Ids of new objects.
-    # Pairs of a removed id and the id of the object that it was merged into.
-    merged: tuple[tuple[int, int], ...] = ()
-    retired: tuple[int, ...] = ()  # Ids of objects removed after misses.
 
 
 class Objects:

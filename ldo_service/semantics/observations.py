@@ -1,4 +1,6 @@
-"""Updates of object landmarks from a keyframe: views, votes, and merges of duplicates."""
+"""Observations of objects in a keyframe, and updates of their landmarks: views, votes, merges."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +15,37 @@ from .object_landmarks import (
     reliable_members,
     rows_of,
 )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ObjectSighting:
+    """An object in a keyframe: an observation or a miss.
+
+    Attributes:
+        object: Id of the object.
+        box: Observed box or, for a miss, the predicted one, [4], x0 y0 x1 y1, pixels.
+        distribution: Label distribution of the Gaussians in the region or, for a miss, of the
+            object, [C].
+        entropy: Entropy of that distribution, nats.
+        is_miss: True if the object should have been visible and was not observed.
+    """
+
+    object: int
+    box: np.ndarray
+    distribution: np.ndarray
+    entropy: float
+    is_miss: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectUpdate:
+    """Changes of the objects by a keyframe."""
+
+    observations: tuple[ObjectSighting, ...] = ()  # Observations and misses.
+    born: tuple[int, ...] = ()  # Ids of new objects.
+    # Pairs of a removed id and the id of the object that it was merged into.
+    merged: tuple[tuple[int, int], ...] = ()
+    retired: tuple[int, ...] = ()  # Ids of objects removed after misses.
 
 
 def one_each(members: np.ndarray) -> np.ndarray:

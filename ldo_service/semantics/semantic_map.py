@@ -18,7 +18,9 @@ from ldo_service.regions.region import Region, RegionLabelResult
 
 from .data_association import MapView
 from .gaussian_labels import BACKGROUND, MAX_LABELS, Disagreement, top_labels
-from .objects import Objects, ObjectsConfig, ObjectUpdate
+from .objects import Objects
+from .objects_config import ObjectsConfig
+from .observations import ObjectUpdate
 from .semantic_fusion import (
     FusionResult,
     SemanticFusionConfig,

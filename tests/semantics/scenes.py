@@ -15,7 +15,8 @@ from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.regions.foreground import RegionDetections
 from ldo_service.semantics.data_association import MapView
 from ldo_service.semantics.gaussian_labels import new_labels
-from ldo_service.semantics.objects import Objects, ObjectUpdate
+from ldo_service.semantics.objects import Objects
+from ldo_service.semantics.observations import ObjectUpdate
 from ldo_service.semantics.semantic_fusion import SemanticFusionConfig, fuse_detections
 from ldo_service.synthetic.path import look_at
 from ldo_service.synthetic.ray_casting import RayCaster

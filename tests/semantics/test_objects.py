@@ -10,7 +10,8 @@ from ldo_service.geometry import se3
 from ldo_service.semantics.data_association import AssociationConfig
 from ldo_service.semantics.gaussian_labels import fields
 from ldo_service.semantics.object_landmarks import entropies, reliable_members, rows_of
-from ldo_service.semantics.objects import Objects, ObjectsConfig
+from ldo_service.semantics.objects import Objects
+from ldo_service.semantics.objects_config import ObjectsConfig
 
 from .scenes import (
     CAMERA,
