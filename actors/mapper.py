@@ -45,7 +45,6 @@ from ldo_service.regions.region import RegionLabelResult
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.schemas import (
     AnchorMotion,
-    Array,
     DetectionBoxes,
     GraphCorrection,
     Keyframe,
@@ -221,7 +220,9 @@ class Mapper(Actor):
         self._repair.with_keyframe(is_behind=self._waiting() > 0)
         yield from self._refinement()
         yield from self._publisher.on_keyframe(self._message_context())
-        yield self._view(message)
+        yield self._publisher.rendering(
+            message, self._message_context(), contributions=self._semantics.is_used
+        )
         yield from self._publisher.snapshot_if_due(self._message_context())
         yield from self._publish_semantics(learnt, message.stamp_ns)
 
@@ -316,21 +317,6 @@ class Mapper(Actor):
     def _message_context(self) -> MessageContext:
         return MessageContext(self._newest[0], self._poses.version, self._semantics.names)
 
-    def _view(self, keyframe: Keyframe) -> MapRendering:
-        views, k = self._map.views, keyframe.keyframe
-        rendering = self._map.render_keyframe(k, contributions=self._semantics.is_used)
-        return MapRendering(
-            stamp_ns=keyframe.stamp_ns,
-            keyframe=keyframe.keyframe,
-            version=self._publisher.version,
-            graph_version=self._poses.version,
-            camera=keyframe.camera,
-            T_map_camera=pose_to_message(views.poses[k]),
-            color=Array.of(to_bytes(views.exposures[k].applied(rendering.color))),
-            depth_m=Array.of(rendering.median_depth_m),
-            opacity=Array.of(to_bytes(rendering.opacity)),
-        )
-
     def on_restored(self) -> Iterator[Output]:
         """Publish the whole map, as subscribers may have missed deltas and new ones need it."""
         if self._map.size():
@@ -392,8 +378,3 @@ class Mapper(Actor):
             **self._map.metrics(),
             **self._semantics.metrics(),
         }
-
-
-def to_bytes(image: np.ndarray) -> np.ndarray:
-    """Convert an image from 0..1 float to 0..255 uint8."""
-    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

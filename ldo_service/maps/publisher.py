@@ -9,15 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from ldo_service.conversions.objects import map_objects
+from ldo_service.conversions.poses import pose_to_message
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.runtime.process import trim_memory
 from ldo_service.schemas import (
     AnchorMotion,
     Array,
     Gaussians,
+    Keyframe,
     MapDelta,
     MapObject,
     MapObjects,
+    MapRendering,
     MapSnapshot,
 )
 from ldo_service.semantics.objects import Objects
@@ -95,6 +98,31 @@ class MapPublisher:
             self._since_changed = 0
             self._map.offload_excess()
             trim_memory()  # The steps above made copies as large as the map.
+
+    def rendering(
+        self, keyframe: Keyframe, now: MessageContext, *, contributions: bool
+    ) -> MapRendering:
+        """Return the map rendered at a keyframe.
+
+        Args:
+            keyframe: Message of a keyframe of the map.
+            now: Context of the message.
+            contributions: Compute the contributions too, because `MapBuilder.visible_contributions`
+                will need them.
+        """
+        views, k = self._map.views, keyframe.keyframe
+        rendering = self._map.render_keyframe(k, contributions=contributions)
+        return MapRendering(
+            stamp_ns=keyframe.stamp_ns,
+            keyframe=k,
+            version=self.version,
+            graph_version=now.graph_version,
+            camera=keyframe.camera,
+            T_map_camera=pose_to_message(views.poses[k]),
+            color=Array.of(_to_bytes(views.exposures[k].applied(rendering.color))),
+            depth_m=Array.of(rendering.median_depth_m),
+            opacity=Array.of(_to_bytes(rendering.opacity)),
+        )
 
     def delta(
         self,
@@ -223,3 +251,8 @@ class ObjectPublisher:
             graph_version=graph_version,
             objects=tuple(one for _, one in self._made.values()),
         )
+
+
+def _to_bytes(image: np.ndarray) -> np.ndarray:
+    """Convert an image from 0..1 float to 0..255 uint8."""
+    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
