@@ -35,7 +35,7 @@ from ldo_service.runs.offline import run_offline, with_all_cores
 from ldo_service.runs.source import Selection
 from ldo_service.runtime import Actor
 from ldo_service.schemas import GraphCorrection, Message, TrackedPose
-from tests.runs.false_closures import Drift, DriftingTracker, standing_in
+from tests.runs.false_closures import Drift, DriftingTracker, replaced_actors
 
 NO_LOOPS = "loop_closer.enabled=false"
 NONE = Drift(scale=0.0, aside=0.0, turn_rad_per_m=0.0)
@@ -77,7 +77,7 @@ def row(sequence: Sequence, config: Config, drift: Drift, folder: Path) -> str:
     actors["tracker"] = DriftingTracker(parameters.tracker, drift)
     tracker, *others = [Watched(actors[name]) for name in ("tracker", "loop_closer", "mapper")]
     prepare(folder, overwrite=False)
-    with standing_in(*actors.values()):
+    with replaced_actors(*actors.values()):
         record = run_offline(
             RunOptions(sequence, folder, config, Selection(), print), lambda *_: None
         )

@@ -1,4 +1,4 @@
-"""The whole service in one event loop, recorded over the synthetic room."""
+"""Recordings of the whole service in one event loop over the synthetic room."""
 
 import asyncio
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from ldo_service.transport.interface import MemoryTransport
 from tests.runtime.fake_actors import eventually, running, send
 
 FRAMES = 30
-ROUGH = "mapper.iterations=2"  # so few that it is quick, so many that keyframes move
+ROUGH = "mapper.iterations=2"  # Few for speed, but enough to move keyframes.
 REFINING = tuple(
     f"mapper.learning_rate.{rate}=0.001" for rate in ("pose_rotation_rad", "pose_translation_m")
 )
@@ -47,7 +47,7 @@ def stages(folder: Path, transport: MemoryTransport, config: Config) -> list[Sta
     return made
 
 
-async def live(
+async def record_service(
     folder: Path,
     sequence: Sequence,
     config: Config = CONFIG,
@@ -55,8 +55,16 @@ async def live(
     prior: Trajectory | None = None,
     until: Callable[[dict[str, Stage]], bool] = lambda _: True,
 ) -> None:
-    """Frame by frame, each behind its prior, then, once `until` holds of the stages by name, a soft
-    stop, producers first."""
+    """Record the service while it receives a sequence frame by frame, and stop it gracefully.
+
+    Args:
+        folder: Folder of the recording.
+        sequence: Source of the frames.
+        config: Configuration of the service.
+        count: Number of frames.
+        prior: Prior poses, each sent before the frame of the same index.
+        until: Condition on the stages by name that must hold before the stop.
+    """
     transport = MemoryTransport()
     actors = stages(folder, transport, config)
     camera = Outlet(Out(CAMERA_RGBD), "camera", 1, transport)
@@ -69,28 +77,28 @@ async def live(
                 pose = pose_to_message(prior.T_world_camera[index])
                 await send(odometry, OdometryPrior(stamp_ns=stamp_ns, T_prior_base=pose))
             await send(camera, raw_frame_to_message(sequence.read(index)))
-            await eventually(lambda frames=index + 1: frames_of(tracker) == frames)
+            await eventually(lambda frames=index + 1: frames_received(tracker) == frames)
         await eventually(lambda: until({stage.name: stage for stage in actors}))
         for stage, task in zip(actors, tasks, strict=True):
             stage.drain()
             await task
 
 
-def frames_of(tracker: Stage) -> int:
+def frames_received(tracker: Stage) -> int:
     return next(i.delivered for i in tracker.health().inputs if i.topic == "frame/rgbd")
 
 
 @pytest.fixture(scope="session")
 def recording(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of thirty frames; not to be changed."""
+    """A recording of thirty frames; tests must not change it."""
     folder = tmp_path_factory.mktemp("recording")
-    asyncio.run(live(folder, room))
+    asyncio.run(record_service(folder, room))
     return folder
 
 
 @pytest.fixture
-def spoilt(recording: Path, tmp_path: Path) -> Path:
-    """A copy, to be changed."""
+def recording_copy(recording: Path, tmp_path: Path) -> Path:
+    """A copy of the recording that tests may change."""
     for path in recording.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     return tmp_path

@@ -1,4 +1,4 @@
-"""Runs whose map need not be beautiful, and a camera that is carried off and comes back."""
+"""Offline runs with quick settings, and frames of a camera that is moved away and returns."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ from ldo_service.runs.job import RunOptions
 from ldo_service.runs.source import Selection, Warn
 from ldo_service.tracking.submaps import SubmapConfig
 
-ROUGH = "mapper.iterations=1"  # as fast as can be, with every part of the mapper in use
+ROUGH = "mapper.iterations=1"  # Fast, with every part of the mapper in use.
 
 
 def job(
@@ -26,21 +26,22 @@ def job(
     warn: Warn = print,
     prior: Trajectory | None = None,
 ) -> RunOptions:
-    """Of the first frames, or all, into a new folder."""
+    """Return the options of a run over the first frames, or all, into a new folder."""
     prepare(folder, overwrite=False)
     config = load_config(settings=(ROUGH, *settings))
     return RunOptions(sequence, folder, config, Selection(max_frames=frames), warn, prior=prior)
 
 
-SOON = ("tracker.submaps.start_after_lost_s=0.06",)
-AND_BACK = [*range(0, 24, 2), *range(60, 66), *range(1, 23, 2)]  # a short walk: here, away, here
-LONG_AGO = "loop_closer.retrieval.min_gap_frames=5"  # its first frames, at its end
+EARLY_SUBMAPS = ("tracker.submaps.start_after_lost_s=0.06",)
+# A short walk from one place to another and back.
+OUT_AND_BACK = [*range(0, 24, 2), *range(60, 66), *range(1, 23, 2)]
+SHORT_GAP = "loop_closer.retrieval.min_gap_frames=5"  # Allows loops from the end to the start.
 HERE, AWAY, BACK = range(12), range(60, 24, -2), range(24, 4, -2)
 
 
 @contextmanager
 def quick_submaps() -> Iterator[None]:
-    """Let every tracker that is made from a configuration join submaps after a few frames."""
+    """Let trackers made from a configuration merge submaps after a few frames."""
     quick = partial(SubmapConfig, look_every=3, confirm_after=2, confirm_apart_rad=0.05)
     with patch("ldo_service.config.parameters.SubmapConfig", quick):
         yield

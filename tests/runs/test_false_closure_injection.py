@@ -1,4 +1,4 @@
-"""The odometry that others are judged by errs by what it says, and by nothing else."""
+"""Drifting odometry of the test helpers, compared with its parameters."""
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from .false_closures import Drift, DriftingOdometry
 DRIFT = Drift(scale=0.1, turn_rad_per_m=0.3)
 
 
-def followed(odometry: Odometry, frames: list[RgbdFrame]) -> tuple[np.ndarray, list[int]]:
-    """T_odom_camera [N, 4, 4], and the frames that became keyframes."""
+def track_frames(odometry: Odometry, frames: list[RgbdFrame]) -> tuple[np.ndarray, list[int]]:
+    """Return T_odom_camera [N, 4, 4] and the indices of frames that became keyframes."""
     T_odom, keyframes, T_odom_keyframe = [], [], {}
     for index, frame in enumerate(frames):
         result = odometry.process(frame)
@@ -32,26 +32,26 @@ def followed(odometry: Odometry, frames: list[RgbdFrame]) -> tuple[np.ndarray, l
     return np.array(T_odom), keyframes
 
 
-def test_each_step_is_longer_and_turns_by_as_much_as_was_asked(room: Sequence) -> None:
+def test_each_step_is_scaled_and_turned_by_the_given_drift(room: Sequence) -> None:
     frames = [room[index] for index in range(0, 24, 2)]
-    right, keyframes = followed(Odometry(), frames)
-    drifted, same = followed(DriftingOdometry(OdometryConfig(), DRIFT), frames)
-    assert keyframes == same
+    exact, keyframes = track_frames(Odometry(), frames)
+    drifted, keyframes_drifted = track_frames(DriftingOdometry(OdometryConfig(), DRIFT), frames)
+    assert keyframes == keyframes_drifted
     assert len(keyframes) > 1
-    T_step, T_told = (se3.inverse(T[:-1]) @ T[1:] for T in (right, drifted))
-    way_m, told_m = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (T_step, T_told))
-    np.testing.assert_allclose(told_m, 1.1 * way_m, atol=1e-6)
-    turned = [se3.rotation_angle(T) for T in se3.inverse(T_step) @ T_told]
-    np.testing.assert_allclose(turned, 0.3 * way_m, atol=1e-6)
+    T_step, T_drifted = (se3.inverse(T[:-1]) @ T[1:] for T in (exact, drifted))
+    distance_m, drifted_m = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (T_step, T_drifted))
+    np.testing.assert_allclose(drifted_m, 1.1 * distance_m, atol=1e-6)
+    turned = [se3.rotation_angle(T) for T in se3.inverse(T_step) @ T_drifted]
+    np.testing.assert_allclose(turned, 0.3 * distance_m, atol=1e-6)
 
 
-def test_what_errs_aside_is_off_by_a_share_of_the_way_to_one_side(room: Sequence) -> None:
+def test_sideways_drift_is_a_fraction_of_the_distance_in_one_direction(room: Sequence) -> None:
     frames = [room[index] for index in range(0, 24, 2)]
-    right, _ = followed(Odometry(), frames)
+    exact, _ = track_frames(Odometry(), frames)
     drift = Drift(scale=0.0, aside=0.1, turn_rad_per_m=0.0)
-    drifted, _ = followed(DriftingOdometry(OdometryConfig(), drift), frames)
-    way_m = np.linalg.norm((se3.inverse(right[:-1]) @ right[1:])[:, :3, 3], axis=1).sum()
+    drifted, _ = track_frames(DriftingOdometry(OdometryConfig(), drift), frames)
+    distance_m = np.linalg.norm((se3.inverse(exact[:-1]) @ exact[1:])[:, :3, 3], axis=1).sum()
     np.testing.assert_allclose(
-        drifted[-1, :3, 3] - right[-1, :3, 3], [0.1 * way_m, 0, 0], atol=1e-6
+        drifted[-1, :3, 3] - exact[-1, :3, 3], [0.1 * distance_m, 0, 0], atol=1e-6
     )
-    np.testing.assert_allclose(drifted[-1, :3, :3], right[-1, :3, :3], atol=1e-9)
+    np.testing.assert_allclose(drifted[-1, :3, :3], exact[-1, :3, :3], atol=1e-9)

@@ -1,4 +1,4 @@
-"""A folder that `ldo run` wrote, and folders that something happened to."""
+"""Folders of finished runs: complete, refined and damaged ones."""
 
 import json
 import shutil
@@ -19,10 +19,10 @@ SOME_CAMERA = Camera(320, 240, 260.0, 261.0, 159.5, 119.5)
 T_MAP_CAMERA = se3.exp(np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0]))
 
 
-# --- all of it ------------------------------------------------------------------------------------
+# --- whole runs -----------------------------------------------------------------------------------
 @pytest.fixture
 def refined(finished_run: Path, tmp_path: Path) -> Path:
-    """A copy with a refined map, which is the same map."""
+    """A copy of the run with a refined map that equals its own."""
     run = shutil.copytree(finished_run, tmp_path / "run")
     (run / "refined").mkdir()
     for name in MAP_FILES:
@@ -30,7 +30,7 @@ def refined(finished_run: Path, tmp_path: Path) -> Path:
     return run
 
 
-def test_a_run_is_read_as_it_was(finished_run: Path, room_folder: Path) -> None:
+def test_finished_run_is_read_back(finished_run: Path, room_folder: Path) -> None:
     run = read_run(finished_run)
     run.require_source(open_sequence(str(room_folder)))
     assert [frame.index for frame in run.frames if frame.is_held_out] == [4, 9, 14]
@@ -43,7 +43,7 @@ def test_a_run_is_read_as_it_was(finished_run: Path, room_folder: Path) -> None:
     )
 
 
-def test_a_refined_map_is_another_with_poses_of_its_own(refined: Path) -> None:
+def test_refined_map_is_read_with_its_own_poses(refined: Path) -> None:
     poses = Trajectory.load(refined / "trajectory.txt")
     moved = poses.T_world_camera.copy()
     moved[:, 0, 3] += 0.5
@@ -55,7 +55,7 @@ def test_a_refined_map_is_another_with_poses_of_its_own(refined: Path) -> None:
     assert second[0, 3] - first[0, 3] == pytest.approx(0.5, abs=1e-6)
 
 
-def test_a_run_in_the_place_of_a_refined_one_is_not_refined(
+def test_run_that_replaces_a_refined_one_has_no_refined_map(
     refined: Path, finished_run: Path
 ) -> None:
     prepare(refined, overwrite=True)
@@ -63,7 +63,7 @@ def test_a_run_in_the_place_of_a_refined_one_is_not_refined(
     assert [posed.name for posed in read_run(refined).maps] == ["online"]
 
 
-def cut(path: Path) -> None:
+def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1000])
 
 
@@ -72,10 +72,10 @@ def overwrite(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "spoil"),
+    ("name", "damage"),
     [
         ("map.ply", Path.unlink),
-        ("map.ply", cut),
+        ("map.ply", truncate),
         ("map.ply", overwrite),
         ("frames.csv", Path.unlink),
         ("frames.csv", overwrite),
@@ -84,21 +84,21 @@ def overwrite(path: Path) -> None:
         ("keyframes.json", Path.unlink),
         ("keyframes.json", overwrite),
         ("trajectory_online.txt", Path.unlink),
-        ("refined/map.ply", cut),
+        ("refined/map.ply", truncate),
         ("refined/trajectory.txt", Path.unlink),
     ],
 )
-def test_a_file_that_is_missing_or_spoilt_is_named(
-    refined: Path, name: str, spoil: Callable[[Path], None]
+def test_missing_or_damaged_file_is_named_in_the_error(
+    refined: Path, name: str, damage: Callable[[Path], None]
 ) -> None:
-    spoil(refined / name)
+    damage(refined / name)
     with pytest.raises(DataError, match=Path(name).name) as caught:
         read_run(refined)
     assert str((refined / name).parent) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-# --- a map ----------------------------------------------------------------------------------------
+# --- maps -----------------------------------------------------------------------------------------
 def keyframe(**changes: object) -> dict[str, object]:
     camera = {name: getattr(SOME_CAMERA, name) for name in CAMERA}
     return {"keyframe": 0, "camera": camera, "T_map_camera": T_MAP_CAMERA.tolist(), **changes}
@@ -111,26 +111,26 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_keyframes_are_seen_from_where_they_were_taken(folder: Path) -> None:
+def test_viewpoints_have_camera_and_pose_of_the_keyframes(folder: Path) -> None:
     first, _ = MapFolder(folder).viewpoints()
     assert first.camera == SOME_CAMERA
     np.testing.assert_array_equal(first.T_map_camera, T_MAP_CAMERA)
 
 
-def test_keyframes_of_older_versions_have_the_exposure_of_the_map(folder: Path) -> None:
+def test_keyframes_without_exposure_have_unit_gain(folder: Path) -> None:
     np.testing.assert_array_equal(MapFolder(folder).exposures().at(0).gain, np.ones(3))
 
 
-def test_what_was_refined_goes_first(folder: Path) -> None:
+def test_refined_map_is_preferred_once_it_exists(folder: Path) -> None:
     assert newest_map(folder).folder == folder
     (folder / "refined").mkdir()
-    assert newest_map(folder).folder == folder  # as long as nothing is in it
+    assert newest_map(folder).folder == folder  # The folder is still empty.
     write_ply(folder / "refined" / "map.ply", np.zeros((0, 16), np.float32))
     assert newest_map(folder).folder == folder / "refined"
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "reason"),
     [
         ({"T_map_camera": np.eye(3).tolist()}, "not a finite 4x4"),
         ({"T_map_camera": np.full((4, 4), np.nan).tolist()}, "not a finite 4x4"),
@@ -138,7 +138,9 @@ def test_what_was_refined_goes_first(folder: Path) -> None:
         ({"camera": [1, 2]}, "not what `ldo run` writes"),
     ],
 )
-def test_a_keyframe_without_sense_is_said(folder: Path, changes: dict, said: str) -> None:
+def test_invalid_keyframe_is_refused_with_the_reason(
+    folder: Path, changes: dict, reason: str
+) -> None:
     (folder / "keyframes.json").write_text(json.dumps([keyframe(**changes)]))
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=reason):
         MapFolder(folder).viewpoints()

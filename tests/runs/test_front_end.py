@@ -1,4 +1,4 @@
-"""A front end that was kept: heard again, the others make the same; with other settings, others."""
+"""Kept front ends, reused with equal results or refused."""
 
 import csv
 import json
@@ -15,53 +15,55 @@ from ldo_service.runs.front_end import FRONT_END, FrontEnd, front_end_settings
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.source import Selection
 
-from .jobs import AND_BACK, LONG_AGO, ROUGH, Rearranged, job
+from .jobs import OUT_AND_BACK, ROUGH, SHORT_GAP, Rearranged, job
 
-SETTINGS = (LONG_AGO, "detector.model=demo")
-BAD = 7  # frame that cannot be read
-MADE = ("trajectory.txt", "trajectory_online.txt", "keyframes.json", "map.ply", "objects.json")
+SETTINGS = (SHORT_GAP, "detector.model=demo")
+BAD = 7  # Index of the unreadable frame.
+FILES = ("trajectory.txt", "trajectory_online.txt", "keyframes.json", "map.ply", "objects.json")
 
 
-class Spoilt(Rearranged):
+class WithBadFrame(Rearranged):
     def read(self, index: int) -> RawFrame:
         if index == BAD:
             raise FrameError(f"frame {index} is truncated. Copy it again.")
         return super().read(index)
 
 
-class Unread(Rearranged):
+class NeverRead(Rearranged):
     def read(self, index: int) -> RawFrame:
-        raise AssertionError(f"frame {index} is read, which a front end has seen")
+        raise AssertionError(f"frame {index} is read although the front end has it")
 
 
 @pytest.fixture(scope="module")
 def walk(room: Sequence) -> Sequence:
-    return Spoilt(room, AND_BACK)
+    return WithBadFrame(room, OUT_AND_BACK)
 
 
 @pytest.fixture(scope="module")
-def whole(walk: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("front_end") / "whole"
+def full_run(walk: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("front_end") / "full"
     run_offline(replace(job(walk, folder, *SETTINGS), keep_front_end=True), lambda *_: None)
     return folder
 
 
 @pytest.fixture(scope="module")
-def alike(room: Sequence, whole: Path) -> Path:
-    return again(room, whole, whole.parent / "alike")
+def reused_run(room: Sequence, full_run: Path) -> Path:
+    return run_with_front_end(room, full_run, full_run.parent / "reused")
 
 
-def again(room: Sequence, whole: Path, folder: Path, *settings: str) -> Path:
-    """A run of the others, by what was kept."""
-    asked = job(Unread(room, AND_BACK), folder, *SETTINGS, *settings)
-    front_end = FrontEnd.open(whole, asked.config, asked.sequence, asked.selection)
-    run_offline(replace(asked, front_end=front_end), lambda *_: None)
+def run_with_front_end(room: Sequence, full_run: Path, folder: Path, *settings: str) -> Path:
+    """Run all actors behind a kept front end, and return the folder of the run."""
+    options = job(NeverRead(room, OUT_AND_BACK), folder, *SETTINGS, *settings)
+    front_end = FrontEnd.open(full_run, options.config, options.sequence, options.selection)
+    run_offline(replace(options, front_end=front_end), lambda *_: None)
     return folder
 
 
-def opened(whole: Path, sequence: Sequence, *settings: str, frames: int | None = None) -> FrontEnd:
+def opened(
+    full_run: Path, sequence: Sequence, *settings: str, frames: int | None = None
+) -> FrontEnd:
     config = load_config(settings=(ROUGH, *SETTINGS, *settings))
-    return FrontEnd.open(whole, config, sequence, Selection(max_frames=frames))
+    return FrontEnd.open(full_run, config, sequence, Selection(max_frames=frames))
 
 
 def loops_of(folder: Path) -> list[tuple[list[int], list[int]]]:
@@ -69,113 +71,117 @@ def loops_of(folder: Path) -> list[tuple[list[int], list[int]]]:
     return [(one["keyframes"], one["reference_keyframes"]) for one in found["candidates"]]
 
 
-def test_what_is_made_of_it_is_what_the_whole_run_made(whole: Path, alike: Path) -> None:
-    for name in MADE:
-        assert (alike / name).read_bytes() == (whole / name).read_bytes(), name
-    assert loops_of(alike) == loops_of(whole) != []
-    ours, theirs = (json.loads((f / "summary.json").read_text()) for f in (alike, whole))
+def test_reused_front_end_gives_the_files_of_the_full_run(full_run: Path, reused_run: Path) -> None:
+    for name in FILES:
+        assert (reused_run / name).read_bytes() == (full_run / name).read_bytes(), name
+    assert loops_of(reused_run) == loops_of(full_run) != []
+    reused, full = (json.loads((f / "summary.json").read_text()) for f in (reused_run, full_run))
     for name in ("frames", "frames_rejected", "status", "keyframes", "boxes", "loops_accepted"):
-        assert ours[name] == theirs[name], name
-    assert ours["frames_rejected"] == 1
-    assert theirs["boxes"] > 0
-    assert ours["stage_ms"].keys() == theirs["stage_ms"].keys() - {
+        assert reused[name] == full[name], name
+    assert reused["frames_rejected"] == 1
+    assert full["boxes"] > 0
+    assert reused["stage_ms"].keys() == full["stage_ms"].keys() - {
         *("frame_source", "tracker", "detector")
     }
 
 
-def test_frames_are_told_as_they_were(whole: Path, alike: Path) -> None:
-    ours, theirs = (
+def test_reused_front_end_gives_equal_rows_of_frames(full_run: Path, reused_run: Path) -> None:
+    reused, full = (
         list(csv.DictReader((folder / "frames.csv").read_text().splitlines()))
-        for folder in (alike, whole)
+        for folder in (reused_run, full_run)
     )
-    assert [row | {"track_ms": ""} for row in ours] == [row | {"track_ms": ""} for row in theirs]
-    assert {row["track_ms"] for row in ours} == {"0.000"}  # nobody tracked
+    assert [row | {"track_ms": ""} for row in reused] == [row | {"track_ms": ""} for row in full]
+    assert {row["track_ms"] for row in reused} == {"0.000"}  # The reused run has no tracker.
 
 
-def test_another_map_is_made_of_the_same_poses(room: Sequence, whole: Path, tmp_path: Path) -> None:
-    other = again(room, whole, tmp_path / "other", "mapper.iterations=0")
+def test_other_mapper_setting_changes_the_map_and_no_online_pose(
+    room: Sequence, full_run: Path, tmp_path: Path
+) -> None:
+    other = run_with_front_end(room, full_run, tmp_path / "other", "mapper.iterations=0")
     online = "trajectory_online.txt"
-    assert (other / online).read_bytes() == (whole / online).read_bytes()
-    assert (other / "map.ply").read_bytes() != (whole / "map.ply").read_bytes()
+    assert (other / online).read_bytes() == (full_run / online).read_bytes()
+    assert (other / "map.ply").read_bytes() != (full_run / "map.ply").read_bytes()
 
 
-def test_a_setting_that_would_have_no_effect_is_refused(walk: Sequence, whole: Path) -> None:
+def test_changed_front_end_setting_is_refused(walk: Sequence, full_run: Path) -> None:
     with pytest.raises(ConfigError, match=r"tracker\.hold_out=5 was 0 when"):
-        opened(whole, walk, "tracker.hold_out=5")
+        opened(full_run, walk, "tracker.hold_out=5")
     with pytest.raises(ConfigError, match=r"offline\.latency_frames\.detector=4 was 3"):
-        opened(whole, walk, "offline.latency_frames.detector=4")
+        opened(full_run, walk, "offline.latency_frames.detector=4")
 
 
-def test_other_frames_are_refused(room: Sequence, walk: Sequence, whole: Path) -> None:
-    with pytest.raises(DataError, match=f"has {len(AND_BACK)} frames of .*this run has 12 of"):
-        opened(whole, walk, frames=12)
-    later = Rearranged(room, AND_BACK)
+def test_other_frames_are_refused(room: Sequence, walk: Sequence, full_run: Path) -> None:
+    with pytest.raises(DataError, match=f"has {len(OUT_AND_BACK)} frames of .*this run has 12 of"):
+        opened(full_run, walk, frames=12)
+    later = Rearranged(room, OUT_AND_BACK)
     later.stamps_ns = later.stamps_ns + 1
     with pytest.raises(DataError, match=r"stamps, .* must be the same"):
-        opened(whole, later)
+        opened(full_run, later)
 
 
-def test_a_run_that_kept_none_is_refused(walk: Sequence, tmp_path: Path) -> None:
+def test_run_without_a_front_end_is_refused(walk: Sequence, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"has no front_end\.mcap: `ldo run --keep-front-end`"):
         opened(tmp_path, walk)
 
 
-def test_what_is_no_recording_is_refused(walk: Sequence, tmp_path: Path) -> None:
+def test_invalid_front_end_file_is_refused(walk: Sequence, tmp_path: Path) -> None:
     (tmp_path / FRONT_END).write_bytes(b"not MCAP")
     with pytest.raises(DataError, match="cannot be read as a recording"):
         opened(tmp_path, walk)
 
 
-def test_a_file_that_was_cut_off_is_refused(walk: Sequence, whole: Path, tmp_path: Path) -> None:
-    body = (whole / FRONT_END).read_bytes()
+def test_truncated_front_end_file_is_refused(
+    walk: Sequence, full_run: Path, tmp_path: Path
+) -> None:
+    body = (full_run / FRONT_END).read_bytes()
     (tmp_path / FRONT_END).write_bytes(body[: len(body) // 2])
     with pytest.raises(DataError, match="is not complete"):
         opened(tmp_path, walk)
 
 
-def test_a_run_that_fails_leaves_none_for_others(
+def test_failed_run_leaves_no_front_end(
     room: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object) -> None:
         raise RuntimeError("out of luck")
 
     monkeypatch.setattr("ldo_service.actors.loop_closer.LoopCloser.handle", fails)
-    asked = job(Rearranged(room, AND_BACK), tmp_path / "out")
+    options = job(Rearranged(room, OUT_AND_BACK), tmp_path / "out")
     with pytest.raises(StageError, match="out of luck"):
-        run_offline(replace(asked, keep_front_end=True), lambda *_: None)
+        run_offline(replace(options, keep_front_end=True), lambda *_: None)
     monkeypatch.undo()
     assert not (tmp_path / "out" / FRONT_END).exists()
 
 
-def test_one_that_grows_too_large_is_not_whole(room: Sequence, tmp_path: Path) -> None:
+def test_front_end_beyond_the_size_limit_is_removed(room: Sequence, tmp_path: Path) -> None:
     tight = "recording.max_gb=0.0000001"
-    asked = job(Rearranged(room, AND_BACK), tmp_path / "out", tight)
+    options = job(Rearranged(room, OUT_AND_BACK), tmp_path / "out", tight)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ldo_service.recordings.mcap_file.CHECK_EVERY_BYTES", 1000)
-        record = run_offline(replace(asked, keep_front_end=True), lambda *_: None)
-    assert record.summary["frames"] == len(AND_BACK)  # the run goes on
+        record = run_offline(replace(options, keep_front_end=True), lambda *_: None)
+    assert record.summary["frames"] == len(OUT_AND_BACK)  # The run continues.
     assert not (tmp_path / "out" / FRONT_END).exists()
 
 
-def test_it_is_whole_when_the_stream_ends(
+def test_front_end_is_complete_once_the_stream_has_ended(
     room: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("ldo_service.runs.offline.OfflineRun.repair", fails)
-    asked = job(Rearranged(room, AND_BACK), tmp_path / "out")
+    options = job(Rearranged(room, OUT_AND_BACK), tmp_path / "out")
     with pytest.raises(KeyboardInterrupt):
-        run_offline(replace(asked, keep_front_end=True), lambda *_: None)
-    kept = FrontEnd.open(tmp_path / "out", asked.config, asked.sequence, asked.selection)
+        run_offline(replace(options, keep_front_end=True), lambda *_: None)
+    kept = FrontEnd.open(tmp_path / "out", options.config, options.sequence, options.selection)
     assert kept.rejected == 0
 
 
-def test_one_of_a_version_with_other_settings_is_refused(
-    walk: Sequence, whole: Path, monkeypatch: pytest.MonkeyPatch
+def test_front_end_of_a_version_with_other_settings_is_refused(
+    walk: Sequence, full_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = load_config(settings=(ROUGH, *SETTINGS))
-    more = front_end_settings(asked) | {"tracker.clairvoyance": True}
+    options = load_config(settings=(ROUGH, *SETTINGS))
+    more = front_end_settings(options) | {"tracker.clairvoyance": True}
     monkeypatch.setattr("ldo_service.runs.front_end.front_end_settings", lambda _: more)
     with pytest.raises(DataError, match=r"is of LDO-SLAM .*had other settings than this"):
-        FrontEnd.open(whole, asked, walk, Selection())
+        FrontEnd.open(full_run, options, walk, Selection())

@@ -1,4 +1,4 @@
-"""A run whose labeller is slow: the camera's poses and the map never wait for it."""
+"""Offline runs with a slow or failing labeller, which must not change poses and map."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ QUICK = ("timeout_s=0.2", "max_attempts=1", "max_requests_per_minute=1000000000.
 
 
 def run(sequence: Sequence, folder: Path, server: Server | None, latency: int) -> RunWriter:
-    """With a labeller that answers so many frames late."""
+    """Run with a labeller at the server with a latency in frames, or without one."""
     settings = [f"offline.latency_frames.vlm_labeller={latency}", "mapper.threads=1"]
     if server:
         settings += [f"vlm_labeller.http.{setting}" for setting in QUICK]
@@ -29,14 +29,14 @@ def run(sequence: Sequence, folder: Path, server: Server | None, latency: int) -
 
 
 @pytest.fixture(scope="module")
-def alone(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("alone") / "run"
+def without_labeller(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("without_labeller") / "run"
     run(room, folder, None, 0)
     return folder
 
 
-def labelled(folder: Path) -> set[str]:
-    """Names that Gaussians of the map have."""
+def assigned_labels(folder: Path) -> set[str]:
+    """Return the labels that Gaussians of the map have."""
     semantics = MapFolder(folder).semantics()
     assert semantics is not None
     rows = fields(semantics.labels)
@@ -44,19 +44,21 @@ def labelled(folder: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("latency", [0, 10])
-def test_answers_however_late_leave_poses_and_map_to_the_bit(
-    room: Sequence, tmp_path: Path, alone: Path, latency: int
+def test_late_label_results_leave_poses_and_map_bitwise_equal(
+    room: Sequence, tmp_path: Path, without_labeller: Path, latency: int
 ) -> None:
     with serving(replies_with("samovar", 0.9)) as server:
         record = run(room, tmp_path / "run", server, latency)
         assert record.summary["labeller_requests"] > 0
     for name in ("trajectory_online.txt", "trajectory.txt", "map.ply", "keyframes.json"):
-        assert (tmp_path / "run" / name).read_bytes() == (alone / name).read_bytes(), name
-    assert labelled(tmp_path / "run") == {"samovar"}
+        assert (tmp_path / "run" / name).read_bytes() == (without_labeller / name).read_bytes(), (
+            name
+        )
+    assert assigned_labels(tmp_path / "run") == {"samovar"}
     objects = read_objects(tmp_path / "run").objects
     assert {one.name for one in objects} <= {"samovar"}
     assert record.summary["objects"] == len(objects)
-    assert not (alone / "objects.json").exists()
+    assert not (without_labeller / "objects.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -64,13 +66,15 @@ def test_answers_however_late_leave_poses_and_map_to_the_bit(
     [responds(500), replies_with("I think it is a kind of thing", 0.9), hangs],
     ids=["500", "nonsense", "hangs"],
 )
-def test_a_server_that_fails_leaves_the_run_as_it_is_and_names_nothing(
-    room: Sequence, tmp_path: Path, alone: Path, behaves
+def test_failing_server_leaves_the_run_unchanged_and_labels_nothing(
+    room: Sequence, tmp_path: Path, without_labeller: Path, behaves
 ) -> None:
     with serving(behaves) as server:
         run(room, tmp_path / "run", server, 5)
         assert server.requests
     for name in ("trajectory.txt", "map.ply"):
-        assert (tmp_path / "run" / name).read_bytes() == (alone / name).read_bytes(), name
-    assert labelled(tmp_path / "run") == set()
+        assert (tmp_path / "run" / name).read_bytes() == (without_labeller / name).read_bytes(), (
+            name
+        )
+    assert assigned_labels(tmp_path / "run") == set()
     assert read_objects(tmp_path / "run").objects == ()

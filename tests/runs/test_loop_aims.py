@@ -1,6 +1,6 @@
-"""What closing loops reaches on data kept for that: no less than was aimed at.
+"""Target scores of loop closing on data sets.
 
-Minutes each, the last half an hour, so these run when asked for: `pytest -m slow tests/runs`.
+The tests take minutes, the last one half an hour; run them with `pytest -m slow tests/runs`.
 """
 
 import json
@@ -18,22 +18,22 @@ from ldo_service.runs.job import RunOptions
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.source import Selection
 
-from .false_closures import Drift, DriftingTracker, standing_in
+from .false_closures import Drift, DriftingTracker, replaced_actors
 
-LEAVES, RETURNS = range(2, 10), range(154, 160)  # frames of the apartment that show one place
-# 1 % of the way, to one side of the world: of its length a loop says nothing
+LEAVES, RETURNS = range(2, 10), range(154, 160)  # Frames of one place in the apartment.
+# 1 % of the distance, to one side of the world; loops cannot correct an error of the scale.
 DRIFT = Drift(scale=0.0, aside=0.01)
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(7200)]
 
 
-def judged(
+def evaluated_run(
     sequence: Sequence, folder: Path, drift: Drift | None = None, frames: int | None = None
 ) -> Results:
     config = load_config(settings=("tracker.hold_out=5",))
     prepare(folder, overwrite=False)
     job = RunOptions(sequence, folder, config, Selection(max_frames=frames), print)
-    with standing_in(
+    with replaced_actors(
         *([DriftingTracker(actor_parameters(config).tracker, drift)] if drift else [])
     ):
         run_offline(job, lambda *_: None)
@@ -46,17 +46,19 @@ def ate_m(results: Results, estimate: str) -> float:
     return results.trajectories[estimate].ate_m.rmse
 
 
-def test_the_kitchen_is_closed_and_nothing_beside_it(data: Path, tmp_path: Path) -> None:
-    results = judged(open_sequence(str(data / "tum/kitchen")), tmp_path / "run")
+def test_kitchen_gets_true_closures_only(data: Path, tmp_path: Path) -> None:
+    results = evaluated_run(open_sequence(str(data / "tum/kitchen")), tmp_path / "run")
     assert results.loops is not None
     assert results.loops.true_closures == results.loops.closures >= 1
     assert ate_m(results, "final") < ate_m(results, "online") + 0.005
     assert ate_m(results, "final") < 0.035
 
 
-def test_the_apartments_return_is_closed(data: Path, tmp_path: Path) -> None:
+def test_return_in_the_apartment_is_closed(data: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    results = judged(open_sequence(str(data / "replica/apartment_floor1")), folder, frames=165)
+    results = evaluated_run(
+        open_sequence(str(data / "replica/apartment_floor1")), folder, frames=165
+    )
     assert results.loops is not None
     assert results.loops.true_closures == results.loops.closures
     keyframes, loops = (
@@ -68,9 +70,12 @@ def test_the_apartments_return_is_closed(data: Path, tmp_path: Path) -> None:
     assert ate_m(results, "final") <= ate_m(results, "online")
 
 
-def test_drift_that_loops_can_see_costs_neither_trajectory_nor_map(tmp_path: Path) -> None:
+def test_loop_closures_correct_drift_of_trajectory_and_map(tmp_path: Path) -> None:
     flat = open_sequence("synthetic:flat")
-    without, drifting = judged(flat, tmp_path / "w"), judged(flat, tmp_path / "d", DRIFT)
+    without, drifting = (
+        evaluated_run(flat, tmp_path / "w"),
+        evaluated_run(flat, tmp_path / "d", DRIFT),
+    )
     assert ate_m(drifting, "online") > 0.05
     assert ate_m(drifting, "final") < ate_m(drifting, "online") / 5
     held_out = [results.renderings[0] for results in (without, drifting)]

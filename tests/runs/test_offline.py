@@ -1,4 +1,4 @@
-"""A run over a sequence: what it writes, that it repeats, what it does with bad frames."""
+"""Offline runs over a sequence: written files, repeatability and bad frames."""
 
 import csv
 import json
@@ -28,8 +28,8 @@ from .jobs import job
 FRAMES = 40
 
 
-class Spoilt(Cached):
-    """A sequence some frames of which cannot be read."""
+class WithBadFrames(Cached):
+    """A sequence with unreadable frames."""
 
     def __init__(self, sequence: Sequence, bad: set[int]) -> None:
         super().__init__(sequence)
@@ -52,7 +52,9 @@ def finished(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_frame_has_a_line_and_the_trajectory_is_right(room: Sequence, finished: Path) -> None:
+def test_every_frame_has_a_row_and_trajectories_match_ground_truth(
+    room: Sequence, finished: Path
+) -> None:
     truth = room.truth()
     assert truth is not None
     for name in ("trajectory_online.txt", "trajectory.txt"):
@@ -65,7 +67,7 @@ def test_every_frame_has_a_line_and_the_trajectory_is_right(room: Sequence, fini
     assert {row["status"] for row in rows} == {"OK"}
 
 
-def test_keyframes_are_placed(finished: Path) -> None:
+def test_keyframes_are_written_with_rigid_poses(finished: Path) -> None:
     keyframes = json.loads((finished / "keyframes.json").read_text())
     assert [k["keyframe"] for k in keyframes] == list(range(len(keyframes)))
     assert len(keyframes) > 3
@@ -75,7 +77,7 @@ def test_keyframes_are_placed(finished: Path) -> None:
         assert Camera(**keyframe["camera"]).width == 320
 
 
-def test_the_summary_has_what_tools_rely_on(finished: Path) -> None:
+def test_summary_has_the_keys_that_tools_read(finished: Path) -> None:
     summary = json.loads((finished / "summary.json").read_text())
     expected = {
         *("frames", "frames_rejected", "keyframes", "gaussians", "fps", "wall_s", "cpu_s"),
@@ -92,7 +94,7 @@ def test_the_summary_has_what_tools_rely_on(finished: Path) -> None:
     assert expected <= set(summary)
     assert summary["frames"] == FRAMES
     assert summary["gaussians"] > 1000
-    assert summary["optimizations"] >= summary["keyframes"], "one each, and for what was refined"
+    assert summary["optimizations"] >= summary["keyframes"], "one per keyframe and per refinement"
     assert set(summary["stage_ms"]["tracker"]) == {"p50", "p95"}
 
 
@@ -111,26 +113,26 @@ def test_two_runs_write_the_same_bytes(room: Sequence, finished: Path, tmp_path:
         assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes(), name
 
 
-def test_a_bad_frame_is_left_out_counted_and_said_once(room: Sequence, tmp_path: Path) -> None:
-    said: list[str] = []
-    record = run(Spoilt(room, {5, 6, 20}), tmp_path / "out", warn=said.append)
-    assert record.summary["frames_rejected"] == 3
-    assert len(record.online()) == FRAMES - 3
-    assert len(said) == 1
-    assert "frame 5" in said[0]
-
-
-def test_too_many_bad_frames_fail_and_keep_what_could_be_done(
+def test_bad_frames_are_skipped_counted_and_warned_about_once(
     room: Sequence, tmp_path: Path
 ) -> None:
+    warnings: list[str] = []
+    record = run(WithBadFrames(room, {5, 6, 20}), tmp_path / "out", warn=warnings.append)
+    assert record.summary["frames_rejected"] == 3
+    assert len(record.online()) == FRAMES - 3
+    assert len(warnings) == 1
+    assert "frame 5" in warnings[0]
+
+
+def test_too_many_bad_frames_fail_and_keep_partial_results(room: Sequence, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="10 of 40 frames"):
-        run(Spoilt(room, set(range(10, 20))), tmp_path / "out", warn=lambda _text: None)
+        run(WithBadFrames(room, set(range(10, 20))), tmp_path / "out", warn=lambda _text: None)
     assert (tmp_path / "out" / "summary.json").exists()
 
 
-def test_nothing_readable_fails_plainly(room: Sequence, tmp_path: Path) -> None:
+def test_sequence_without_readable_frames_fails(room: Sequence, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="could not be used"):
-        run(Spoilt(room, set(range(FRAMES))), tmp_path / "out", warn=lambda _text: None)
+        run(WithBadFrames(room, set(range(FRAMES))), tmp_path / "out", warn=lambda _text: None)
 
 
 def test_held_out_frames_are_marked_and_not_mapped(room: Sequence, tmp_path: Path) -> None:
@@ -142,16 +144,16 @@ def test_held_out_frames_are_marked_and_not_mapped(room: Sequence, tmp_path: Pat
     assert not any(row["keyframe"] for row in held_out)
 
 
-def test_a_refined_map_lies_beside_the_runs_own_and_looks_better(
+def test_refined_map_is_written_separately_and_renders_better(
     room: Sequence, tmp_path: Path
 ) -> None:
-    asked, done = replace(job(room, tmp_path / "out", frames=10), refine=30), []
-    record = run_offline(asked, lambda count, _total=None: done.append(count))
+    options, done = replace(job(room, tmp_path / "out", frames=10), refine=30), []
+    record = run_offline(options, lambda count, _total=None: done.append(count))
     assert record.summary["refine_iterations"] == 30
-    assert done[-1] == asked.work
+    assert done[-1] == options.work
     run = read_run(tmp_path / "out")
-    judged = EvaluatedFrames.of(run.frames)
-    online, refined = evaluate_rendering(room, judged, run.maps, lambda _done: None)
+    evaluated = EvaluatedFrames.of(run.frames)
+    online, refined = evaluate_rendering(room, evaluated, run.maps, lambda _done: None)
     assert (online.map, refined.map) == ("online", "refined")
     assert refined.mean("psnr_db") > online.mean("psnr_db") + 1
 
@@ -167,7 +169,7 @@ def test_forty_real_frames_stay_within_three_centimeters(data: Path, tmp_path: P
     assert evaluate_trajectory(record.online(), truth).ate_m.rmse < 0.03
 
 
-def test_a_run_with_a_detector_says_what_each_gaussian_of_the_map_is(
+def test_run_with_detector_writes_a_label_per_gaussian(
     room: Sequence, finished: Path, tmp_path: Path
 ) -> None:
     model = squares_network("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
@@ -183,7 +185,7 @@ def test_a_run_with_a_detector_says_what_each_gaussian_of_the_map_is(
     assert {"red", "green", "blue"} & set(saved.names)
 
 
-def test_a_run_without_a_detector_says_nothing_of_labels(finished: Path) -> None:
+def test_run_without_detector_writes_no_labels(finished: Path) -> None:
     assert MapFolder(finished).semantics() is None
     assert not (finished / "semantics.npz").exists()
 

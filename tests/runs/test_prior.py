@@ -1,4 +1,4 @@
-"""A run with what another odometry said, from a file."""
+"""Offline and realtime runs with an odometry prior from a file."""
 
 import csv
 from dataclasses import replace
@@ -20,20 +20,20 @@ from .jobs import job
 FRAMES, COVERED = 14, range(4, 9)
 
 
-class Hurried(Cached):
-    """Every third frame, some of them black and without depth, at the stamps of the first ones."""
+class FastCamera(Cached):
+    """Every third frame at the stamps of the first ones, some black and without depth."""
 
     def read(self, index: int) -> RawFrame:
         raw = super().read(3 * index)
         if index in COVERED:
-            nothing = np.zeros_like(raw.color), np.zeros_like(raw.depth)
-            raw = replace(raw, color=nothing[0], depth=nothing[1])
+            black = np.zeros_like(raw.color), np.zeros_like(raw.depth)
+            raw = replace(raw, color=black[0], depth=black[1])
         return replace(raw, index=index, stamp_ns=int(self.stamps_ns[index]))
 
 
 @pytest.fixture(scope="module")
-def hurried(room: Sequence) -> Sequence:
-    return Hurried(room)
+def fast_camera(room: Sequence) -> Sequence:
+    return FastCamera(room)
 
 
 @pytest.fixture(scope="module")
@@ -48,25 +48,25 @@ def statuses(folder: Path) -> list[str]:
         return [row["status"] for row in csv.DictReader(file)]
 
 
-def test_frames_come_behind_the_poses_that_reach_them(room: Sequence) -> None:
+def test_each_frame_follows_the_prior_poses_up_to_its_stamp(room: Sequence) -> None:
     stamps_s = np.arange(12) * 0.02 + float(room.stamps_ns[0]) * 1e-9
     poses = Trajectory(stamps_s, np.tile(np.eye(4), (12, 1, 1)))
-    told: list[int] = []
-    for *news, frame in interleave_prior(FrameReader(room, range(4), print), poses):
+    sent_ns: list[int] = []
+    for *priors, frame in interleave_prior(FrameReader(room, range(4), print), poses):
         assert isinstance(frame, CameraRgbd)
-        assert all(isinstance(pose, OdometryPrior) for pose in news)
-        told += [pose.stamp_ns for pose in news]
-        assert told[-1] >= frame.stamp_ns, "none would have to be extrapolated"
-        assert sum(stamp_ns >= frame.stamp_ns for stamp_ns in told) == 1, "and none comes early"
-    assert told == [round(1e9 * stamp_s) for stamp_s in stamps_s[: len(told)]]
+        assert all(isinstance(pose, OdometryPrior) for pose in priors)
+        sent_ns += [pose.stamp_ns for pose in priors]
+        assert sent_ns[-1] >= frame.stamp_ns, "no pose must be extrapolated"
+        assert sum(stamp_ns >= frame.stamp_ns for stamp_ns in sent_ns) == 1, "no pose comes early"
+    assert sent_ns == [round(1e9 * stamp_s) for stamp_s in stamps_s[: len(sent_ns)]]
 
 
-def test_a_covered_camera_is_found_at_once_and_the_run_repeats(
-    hurried: Sequence, prior: Trajectory, tmp_path: Path
+def test_covered_camera_recovers_at_once_and_the_run_is_repeatable(
+    fast_camera: Sequence, prior: Trajectory, tmp_path: Path
 ) -> None:
     for name in ("first", "second"):
-        of_run = job(hurried, tmp_path / name, frames=FRAMES, prior=prior)
-        run_offline(of_run, lambda *_: None)
+        options = job(fast_camera, tmp_path / name, frames=FRAMES, prior=prior)
+        run_offline(options, lambda *_: None)
     expected = ["LOST" if index in COVERED else "OK" for index in range(FRAMES)]
     assert statuses(tmp_path / "first") == expected
     first, second = (
@@ -75,17 +75,17 @@ def test_a_covered_camera_is_found_at_once_and_the_run_repeats(
     assert first == second
 
 
-def test_a_run_in_real_time_takes_a_prior_too(
-    hurried: Sequence, prior: Trajectory, tmp_path: Path
+def test_realtime_run_uses_a_prior(
+    fast_camera: Sequence, prior: Trajectory, tmp_path: Path
 ) -> None:
-    of_run = job(hurried, tmp_path / "out", frames=4, prior=prior)
-    record = run_realtime(of_run, lambda _done: None)
+    options = job(fast_camera, tmp_path / "out", frames=4, prior=prior)
+    record = run_realtime(options, lambda _done: None)
     assert record.summary["status"]["OK"] > 0
 
 
 def test_a_prior_of_another_clock_is_refused(
-    hurried: Sequence, prior: Trajectory, tmp_path: Path
+    fast_camera: Sequence, prior: Trajectory, tmp_path: Path
 ) -> None:
     later = Trajectory(prior.stamps_s + 1e6, prior.T_world_camera)
     with pytest.raises(DataError, match="must be of the same clock"):
-        job(hurried, tmp_path / "out", frames=FRAMES, prior=later)
+        job(fast_camera, tmp_path / "out", frames=FRAMES, prior=later)

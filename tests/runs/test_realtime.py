@@ -1,4 +1,4 @@
-"""A paced run uses the stages of the service."""
+"""Realtime runs with the stages of the service."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from ldo_service.runs.realtime import run_realtime
 from .jobs import job
 
 
-def test_a_paced_run_takes_as_long_as_the_sequence_and_accounts_for_every_frame(
+def test_realtime_run_takes_sequence_time_and_accounts_for_every_frame(
     room: Sequence, tmp_path: Path
 ) -> None:
     frames = 45
@@ -20,7 +20,9 @@ def test_a_paced_run_takes_as_long_as_the_sequence_and_accounts_for_every_frame(
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["wall_s"] >= (frames - 1) / 30
     tracked = sum(summary["status"].values())
-    assert tracked + sum(summary["drops"].values()) >= frames - 4, "the rest came before a keyframe"
+    assert tracked + sum(summary["drops"].values()) >= frames - 4, (
+        "the rest came before the first keyframe"
+    )
     assert summary["keyframes"] > 1
     truth = room.truth()
     assert truth is not None

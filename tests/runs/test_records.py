@@ -1,4 +1,4 @@
-"""loops.json: what a run compared and closed, and that nothing else changes by it."""
+"""Loop candidates and closures of a run in `loops.json`."""
 
 import json
 from pathlib import Path
@@ -20,52 +20,52 @@ from ldo_service.runs.simulation import ActorDigest, simulate_graph
 from ldo_service.runs.source import Selection
 from tests.schemas.examples import EXAMPLES
 
-from .jobs import AND_BACK, LONG_AGO, ROUGH, Rearranged, job
+from .jobs import OUT_AND_BACK, ROUGH, SHORT_GAP, Rearranged, job
 
 
 @pytest.fixture(scope="module")
-def returning(room: Sequence) -> Rearranged:
-    return Rearranged(room, AND_BACK)
+def walk_with_return(room: Sequence) -> Rearranged:
+    return Rearranged(room, OUT_AND_BACK)
 
 
 @pytest.fixture(scope="module")
-def finished(returning: Rearranged, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short walk, whose first frames count as long ago."""
+def finished(walk_with_return: Rearranged, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run over a short walk that may close loops from its end to its start."""
     folder = tmp_path_factory.mktemp("loops") / "out"
-    run_offline(job(returning, folder, LONG_AGO), print)
+    run_offline(job(walk_with_return, folder, SHORT_GAP), print)
     return folder
 
 
-def test_what_the_loop_closer_says_is_read_back(tmp_path: Path) -> None:
-    record, closure, refused = LoopRecord(), EXAMPLES["loop_closure"], EXAMPLES["loop_candidate"]
+def test_saved_loops_are_read_back(tmp_path: Path) -> None:
+    record, closure, rejected = LoopRecord(), EXAMPLES["loop_closure"], EXAMPLES["loop_candidate"]
     record.observe(closure, 60.0)
-    record.observe(refused, 60.0)
+    record.observe(rejected, 60.0)
     record.save(tmp_path)
     found = read_loops(tmp_path)
     assert found is not None
     (compared,), (closed,) = found.candidates, found.closures
-    assert (compared.newer, compared.older) == (refused.keyframes, refused.reference_keyframes)
-    assert compared.is_closure == (not refused.rejected_reason)
+    assert (compared.newer, compared.older) == (rejected.keyframes, rejected.reference_keyframes)
+    assert compared.is_closure == (not rejected.rejected_reason)
     assert compared.ms == 60.0
     assert (closed.keyframe, closed.reference) == (closure.pose.keyframe, closure.pose.reference)
     np.testing.assert_allclose(
         closed.T_reference_keyframe[:3, 3], closure.pose.T_reference_keyframe.translation
     )
-    assert (record.accepted, record.rejected) == (1, bool(refused.rejected_reason))
+    assert (record.accepted, record.rejected) == (1, bool(rejected.rejected_reason))
 
 
-def test_a_closure_that_the_graph_does_not_believe_is_no_accepted_one(tmp_path: Path) -> None:
+def test_closure_rejected_by_the_pose_graph_is_not_counted_as_accepted(tmp_path: Path) -> None:
     record, closure = LoopRecord(), EXAMPLES["loop_closure"]
     record.observe(closure, 60.0)
     pair = closure.pose.reference, closure.pose.keyframe
-    others = ((900, 901),)  # a correction has room for the newest alone
-    for not_believed, closures, accepted in (
+    others = ((900, 901),)  # A correction lists the newest closures only.
+    for rejected, closures, accepted in (
         *(((pair,), (), 0), (others, (), 0)),
         *(((), (pair,), 1), ((), (), 1)),
         ((pair,), (), 0),
     ):
         correction = msgspec.structs.replace(
-            EXAMPLES["graph_correction"], rejected_closures=not_believed, accepted_closures=closures
+            EXAMPLES["graph_correction"], rejected_closures=rejected, accepted_closures=closures
         )
         record.observe(correction, 1.0)
         assert (record.accepted, record.rejected) == (accepted, 1 - accepted)
@@ -83,14 +83,16 @@ def test_a_run_writes_its_loops_and_counts_them(finished: Path) -> None:
     assert all(candidate.ms for candidate in found.candidates)
 
 
-def test_its_loops_are_judged_by_the_truth(finished: Path, returning: Rearranged) -> None:
-    truth = returning.truth()
-    errors = judge_loops(read_run(finished), returning, truth)
+def test_loops_of_a_run_are_evaluated_against_ground_truth(
+    finished: Path, walk_with_return: Rearranged
+) -> None:
+    truth = walk_with_return.truth()
+    errors = judge_loops(read_run(finished), walk_with_return, truth)
     assert errors is not None
     assert max(errors.position_errors_m) < 0.01
 
 
-def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_invalid_loops_file_is_refused(tmp_path: Path) -> None:
     assert read_loops(tmp_path) is None
     for text in ("[]", '{"candidates": [{}], "closures": []}', "no JSON"):
         (tmp_path / "loops.json").write_text(text)
@@ -98,15 +100,15 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
             read_loops(tmp_path)
 
 
-def test_a_run_that_meets_nothing_again_is_what_it_is_without_a_loop_closer(
+def test_loop_closer_without_closures_changes_no_other_actor(
     room: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def simulated() -> dict[str, ActorDigest]:
         config, first = load_config(settings=(ROUGH,)), Selection(max_frames=20)
         return simulate_graph(room, config, first, print, lambda _done: None)
 
-    whole = simulated()
-    assert whole.pop("loop_closer").messages == 0
+    with_loop_closer = simulated()
+    assert with_loop_closer.pop("loop_closer").messages == 0
     others = [box for box in GRAPH if box.name != "loop_closer"]
     monkeypatch.setattr(topology, "GRAPH", tuple(others))
-    assert simulated() == whole
+    assert simulated() == with_loop_closer

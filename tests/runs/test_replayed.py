@@ -1,4 +1,4 @@
-"""The real actors, replayed: the same bytes, or exit code 5."""
+"""Replays of the real actors, which give equal bytes or exit code 5."""
 
 import asyncio
 import os
@@ -22,7 +22,7 @@ from ldo_service.runtime.journal import StepRecord, checksum
 from ldo_service.schemas import CameraRgbd, decode, encode
 from ldo_service.testing import replay_recording
 from tests.commands.test_cli import assert_one_paragraph, ldo
-from tests.runs.conftest import FRAMES, live
+from tests.runs.conftest import FRAMES, record_service
 
 EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "replay_test.py"
 
@@ -41,23 +41,25 @@ def test_every_actor_replays(recording: Path) -> None:
 
 
 def test_a_tracker_with_a_prior_replays(room: Sequence, tmp_path: Path) -> None:
-    asyncio.run(live(tmp_path, room, count=8, prior=room.truth()))
+    asyncio.run(record_service(tmp_path, room, count=8, prior=room.truth()))
     (tracker,) = replay_recording(tmp_path, "tracker").values()
     assert (tracker.taken["odometry/prior"], tracker.made["pose/tracked"]) == (8, 8)
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_the_number_of_threads_is_no_input(
+def test_replay_does_not_depend_on_the_number_of_threads(
     recording: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    """The configuration says "all cores but one", whatever machine it is."""
+    """The recorded setting is "all cores but one", which depends on the machine."""
     monkeypatch.setattr(os, "cpu_count", lambda: threads + 1)
     replay_recording(recording, "mapper")
 
 
-def test_one_bit_of_a_frame_is_found(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rewrite(spoilt / "frame_source.mcap", flip_a_pixel_of=7)
-    code, _, err = ldo(capsys, "replay", str(spoilt), "--verify")
+def test_flipped_bit_of_an_input_is_found_by_its_checksum(
+    recording_copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rewrite(recording_copy / "frame_source.mcap", flip_step=7)
+    code, _, err = ldo(capsys, "replay", str(recording_copy), "--verify")
     assert code == 5
     error = err[err.index("ldo: ") :]
     assert_one_paragraph(error)
@@ -65,15 +67,15 @@ def test_one_bit_of_a_frame_is_found(spoilt: Path, capsys: pytest.CaptureFixture
     assert len(set(re.findall(r"\b[0-9a-f]{8}\b", error))) == 2
 
 
-def test_one_bit_changes_what_the_actor_makes(spoilt: Path) -> None:
-    """The same, where whoever changed the frame also changed its checksum."""
-    rewrite(spoilt / "frame_source.mcap", flip_a_pixel_of=7, mend_checksum=True)
+def test_flipped_bit_with_fixed_checksum_changes_the_output(recording_copy: Path) -> None:
+    """The checksum in the recording matches the changed frame."""
+    rewrite(recording_copy / "frame_source.mcap", flip_step=7, fix_checksum=True)
     with pytest.raises(ReplayDiverged, match=r"step 7 .*output 1 of 1 differs: frame/rgbd"):
-        replay_recording(spoilt)
+        replay_recording(recording_copy)
 
 
-def rewrite(path: Path, flip_a_pixel_of: int, mend_checksum: bool = False) -> None:
-    """Copy with the MCAP library, one bit of one decoded frame flipped."""
+def rewrite(path: Path, flip_step: int, fix_checksum: bool = False) -> None:
+    """Rewrite a recording file with one bit of the camera frame of one step flipped."""
     copy = path.with_suffix(".new")
     flipped = b""
     with path.open("rb") as source, copy.open("wb") as target:
@@ -84,12 +86,12 @@ def rewrite(path: Path, flip_a_pixel_of: int, mend_checksum: bool = False) -> No
         channels: dict[str, int] = {}
         for _, channel, message in reader.iter_messages():
             body, topic = message.data, channel.topic
-            if topic == "camera/rgbd" and message.sequence == flip_a_pixel_of:
-                body = flipped = encode(with_a_flipped_bit(decode(body, CameraRgbd)))
-            if topic == "journal/step" and message.sequence == flip_a_pixel_of and mend_checksum:
+            if topic == "camera/rgbd" and message.sequence == flip_step:
+                body = flipped = encode(with_flipped_bit(decode(body, CameraRgbd)))
+            if topic == "journal/step" and message.sequence == flip_step and fix_checksum:
                 step = msgspec.msgpack.decode(body, type=StepRecord)
-                mended = msgspec.structs.replace(step, checksum=checksum(flipped))
-                body = msgspec.msgpack.encode(mended)
+                fixed = msgspec.structs.replace(step, checksum=checksum(flipped))
+                body = msgspec.msgpack.encode(fixed)
             if topic not in channels:
                 channels[topic] = writer.register_channel(topic, "msgpack", 0)
             writer.add_message(
@@ -99,7 +101,7 @@ def rewrite(path: Path, flip_a_pixel_of: int, mend_checksum: bool = False) -> No
     copy.rename(path)
 
 
-def with_a_flipped_bit(frame: CameraRgbd) -> CameraRgbd:
+def with_flipped_bit(frame: CameraRgbd) -> CameraRgbd:
     pixels = bytearray(frame.color.data)
     pixels[len(pixels) // 2] ^= 1
     color = msgspec.structs.replace(frame.color, data=memoryview(bytes(pixels)))
@@ -107,7 +109,7 @@ def with_a_flipped_bit(frame: CameraRgbd) -> CameraRgbd:
 
 
 # --- the command ----------------------------------------------------------------------------------
-def test_the_command_counts_what_was_replayed(recording: Path, capsys) -> None:
+def test_replay_command_prints_counts_of_steps_and_messages(recording: Path, capsys) -> None:
     code, out, err = ldo(capsys, "replay", str(recording), "--verify")
     assert code == 0
     assert re.search(r"frame_source .* 31 .* 30 camera/rgbd .* 30 frame/rgbd .* yes", out)
@@ -115,16 +117,18 @@ def test_the_command_counts_what_was_replayed(recording: Path, capsys) -> None:
     assert "note:" not in err
 
 
-def test_without_verify_a_difference_is_told_and_no_error(spoilt: Path, capsys) -> None:
-    rewrite(spoilt / "frame_source.mcap", flip_a_pixel_of=7)
-    code, out, err = ldo(capsys, "replay", str(spoilt), "--actor", "frame_source")
+def test_divergence_without_verify_is_reported_with_exit_code_0(
+    recording_copy: Path, capsys
+) -> None:
+    rewrite(recording_copy / "frame_source.mcap", flip_step=7)
+    code, out, err = ldo(capsys, "replay", str(recording_copy), "--actor", "frame_source")
     assert code == 0
     assert "frame_source diverged at step 7" in err
     assert "until" in out
     assert "tracker" not in out
 
 
-def test_another_instruction_set_is_noted(
+def test_replay_with_another_instruction_set_prints_a_note(
     recording: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorded_with = kernels.isa()
@@ -145,13 +149,13 @@ def test_a_folder_without_a_recording_is_bad_data(tmp_path: Path, capsys) -> Non
     assert_one_paragraph(err)
 
 
-def test_a_recording_is_never_written_over(recording: Path, capsys) -> None:
+def test_record_command_refuses_to_overwrite_a_recording(recording: Path, capsys) -> None:
     code, _, err = ldo(capsys, "record", str(recording))
     assert code == 2
     assert_one_paragraph(err)
 
 
-# --- as a test ------------------------------------------------------------------------------------
+# --- in pytest ------------------------------------------------------------------------------------
 def test_a_recording_of_another_version_is_refused(
     recording: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,7 +166,9 @@ def test_a_recording_of_another_version_is_refused(
     assert "has version=2, and this service replays 3" in err
 
 
-def test_only_some_actors_may_be_opened(recording: Path, tmp_path: Path) -> None:
+def test_selected_actors_are_opened_and_unknown_ones_refused(
+    recording: Path, tmp_path: Path
+) -> None:
     assert [actor.name for actor in open_recording(recording, ("tracker",))] == ["tracker"]
     with pytest.raises(ConfigError, match="no actor 'nobody'"):
         open_recording(recording, ("nobody",))
@@ -179,12 +185,12 @@ def pytest_on(example: Path, recording: Path) -> subprocess.CompletedProcess[str
     )
 
 
-def test_the_example_makes_a_case_of_each_actor(spoilt: Path) -> None:
-    rewrite(spoilt / "frame_source.mcap", flip_a_pixel_of=7)
-    done = pytest_on(EXAMPLE, spoilt)
+def test_example_has_one_test_case_per_actor(recording_copy: Path) -> None:
+    rewrite(recording_copy / "frame_source.mcap", flip_step=7)
+    done = pytest_on(EXAMPLE, recording_copy)
     assert f"1 failed, {len(GRAPH) - 1} passed" in done.stdout
     assert "ReplayDiverged: frame_source diverged at step 7" in done.stdout
 
 
-def test_the_example_skips_where_nothing_is_recorded(tmp_path: Path) -> None:
+def test_example_is_skipped_without_a_recording(tmp_path: Path) -> None:
     assert "1 skipped" in pytest_on(EXAMPLE, tmp_path).stdout

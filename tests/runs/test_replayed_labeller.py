@@ -1,4 +1,4 @@
-"""Names from a server outside, recorded and lived again bit for bit without it."""
+"""Recording of labels from a server, and replay without the server."""
 
 import asyncio
 from functools import partial
@@ -14,12 +14,12 @@ from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import LabelResult, decode
 from ldo_service.testing import replay_recording
 from tests.detection.labellers.server import replies_with, serving
-from tests.runs.conftest import live
+from tests.runs.conftest import record_service
 from tests.runs.jobs import ROUGH
 
 FRAMES = 12
-SOON = (ROUGH, "mapper.open_vocabulary.requests_per_keyframe=4")  # The stream is short.
-IMPATIENT = partial(RegionTrackerConfig, patience=0)
+MANY_REQUESTS = (ROUGH, "mapper.open_vocabulary.requests_per_keyframe=4")  # The stream is short.
+WITHOUT_DELAY = partial(RegionTrackerConfig, patience=0)
 
 
 def has_answers(stages: dict[str, Stage]) -> bool:
@@ -27,21 +27,25 @@ def has_answers(stages: dict[str, Stage]) -> bool:
     return any(port.delivered for port in inputs if port.topic == "label/result")
 
 
-def names_taken(folder: Path) -> list[str]:
-    """By the mapper."""
+def labels_received(folder: Path) -> list[str]:
+    """Return the labels that the mapper received in a recording."""
     (mapper,) = open_recording(folder, ("mapper",))
     steps = [(f, s) for f in mapper.files for s in f.entries() if isinstance(s, StepRecord)]
     answers = [f.taken(step) for f, step in steps if step.topic == "label/result"]
     return [decode(body, LabelResult).label for body in answers]
 
 
-def test_the_mapper_replays_with_the_answers_that_it_got(room: Sequence, tmp_path: Path) -> None:
+def test_mapper_replays_with_the_label_results_that_it_received(
+    room: Sequence, tmp_path: Path
+) -> None:
     with serving(replies_with("samovar", 0.9)) as server:
-        settings = (*SOON, f"vlm_labeller.url={server.url}")
+        settings = (*MANY_REQUESTS, f"vlm_labeller.url={server.url}")
         config = load_config(settings=settings)
-        with patch("ldo_service.config.parameters.RegionTrackerConfig", IMPATIENT):
-            asyncio.run(live(tmp_path / "recording", room, config, FRAMES, until=has_answers))
+        with patch("ldo_service.config.parameters.RegionTrackerConfig", WITHOUT_DELAY):
+            asyncio.run(
+                record_service(tmp_path / "recording", room, config, FRAMES, until=has_answers)
+            )
             replayed = replay_recording(tmp_path / "recording", "mapper", "vlm_labeller")
-    assert "samovar" in names_taken(tmp_path / "recording")
+    assert "samovar" in labels_received(tmp_path / "recording")
     assert replayed["mapper"].made["label/request"] >= 1
     assert replayed["mapper"].made["map/objects"] >= 1

@@ -1,4 +1,4 @@
-"""A lost camera that begins a submap and joins it, recorded and lived again."""
+"""Recording and replay of a lost camera that starts a submap and merges it."""
 
 import asyncio
 from pathlib import Path
@@ -8,17 +8,17 @@ import pytest
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.testing import replay_recording
-from tests.runs.conftest import live
-from tests.runs.jobs import AWAY, BACK, HERE, ROUGH, SOON, Rearranged, quick_submaps
+from tests.runs.conftest import record_service
+from tests.runs.jobs import AWAY, BACK, EARLY_SUBMAPS, HERE, ROUGH, Rearranged, quick_submaps
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_lost_and_joined_submap_replays(room: Sequence, tmp_path: Path) -> None:
+def test_started_and_merged_submap_replays(room: Sequence, tmp_path: Path) -> None:
     order = [*HERE, *AWAY, *BACK]
-    config = load_config(settings=(ROUGH, *SOON))
+    config = load_config(settings=(ROUGH, *EARLY_SUBMAPS))
     with quick_submaps():
-        asyncio.run(live(tmp_path, Rearranged(room, order), config, len(order)))
+        asyncio.run(record_service(tmp_path, Rearranged(room, order), config, len(order)))
         replayed = replay_recording(tmp_path)
     assert replayed["tracker"].made["pose/tracked"] == len(order)
     assert replayed["optimizer"].made["graph/correction"] > 5

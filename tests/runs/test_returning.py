@@ -1,4 +1,4 @@
-"""A robot on its round, by all actors: a map that has what it needs stays as it is."""
+"""Repeated rounds of a robot; later ones add no keyframes to the map."""
 
 import csv
 from pathlib import Path
@@ -12,14 +12,14 @@ from ldo_service.runs.offline import run_offline
 
 from .jobs import Rearranged, job
 
-THERE = range(0, 60, 3)
+OUTWARD = range(0, 60, 3)
 BACK = range(57, 0, -3)
-ROUND = len(THERE) + len(BACK)
+ROUND = len(OUTWARD) + len(BACK)
 
 
 @pytest.fixture(scope="module")
 def rounds(room: Sequence) -> Rearranged:
-    return Rearranged(room, [*THERE, *BACK] * 3)
+    return Rearranged(room, [*OUTWARD, *BACK] * 3)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_after_the_first_round_no_keyframe_is_made(rows) -> None:
     assert sum(row["pose_source"] == "reused" for row in rows[ROUND:]) > 4
 
 
-def test_poses_are_right_online_and_in_the_end(finished: Path, rounds: Rearranged) -> None:
+def test_online_and_final_poses_match_ground_truth(finished: Path, rounds: Rearranged) -> None:
     for name in ("trajectory.txt", "trajectory_online.txt"):
         track = Trajectory.load(finished / name)
         assert len(track) == len(rounds)

@@ -1,4 +1,4 @@
-"""The graph on the logical clock: digests that depend on the input alone."""
+"""Simulation of the actor graph on a logical clock, with digests of all messages."""
 
 import json
 import time
@@ -32,23 +32,23 @@ def simulated(sequence: Sequence, *settings: str) -> dict[str, ActorDigest]:
 
 
 @pytest.fixture(scope="module")
-def made(room: Sequence) -> dict[str, ActorDigest]:
+def digests_of_room(room: Sequence) -> dict[str, ActorDigest]:
     return simulated(room)
 
 
-def test_every_actor_has_a_digest(made: dict[str, ActorDigest]) -> None:
-    assert list(made) == [box.name for box in GRAPH]
-    assert made["frame_source"].messages == FRAMES
-    talking = [entry.digest for entry in made.values() if entry.messages]
-    assert len(talking) >= 5
-    assert len(set(talking)) == len(talking)
+def test_every_actor_has_a_digest(digests_of_room: dict[str, ActorDigest]) -> None:
+    assert list(digests_of_room) == [box.name for box in GRAPH]
+    assert digests_of_room["frame_source"].messages == FRAMES
+    publishing = [entry.digest for entry in digests_of_room.values() if entry.messages]
+    assert len(publishing) >= 5
+    assert len(set(publishing)) == len(publishing)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_digests_do_not_depend_on_threads(
-    room: Sequence, made: dict[str, ActorDigest], threads: int
+    room: Sequence, digests_of_room: dict[str, ActorDigest], threads: int
 ) -> None:
-    assert simulated(room, f"mapper.threads={threads}") == made
+    assert simulated(room, f"mapper.threads={threads}") == digests_of_room
 
 
 class OnePixel(Cached):
@@ -67,31 +67,35 @@ class OnePixel(Cached):
         return replace(raw, color=color)
 
 
-def test_one_pixel_changes_the_digests(room: Sequence, made: dict[str, ActorDigest]) -> None:
+def test_one_pixel_changes_the_digests(
+    room: Sequence, digests_of_room: dict[str, ActorDigest]
+) -> None:
     changed = simulated(OnePixel(room))
-    assert changed["frame_source"].digest != made["frame_source"].digest
-    assert changed["frame_source"].messages == made["frame_source"].messages
+    assert changed["frame_source"].digest != digests_of_room["frame_source"].digest
+    assert changed["frame_source"].messages == digests_of_room["frame_source"].messages
 
 
 def test_one_inverted_pixel_of_a_keyframe_reaches_tracker_and_map(
-    room: Sequence, made: dict[str, ActorDigest]
+    room: Sequence, digests_of_room: dict[str, ActorDigest]
 ) -> None:
     changed = simulated(OnePixel(room, frame=0, bits=255))
     for actor in ("frame_source", "tracker", "mapper"):
-        assert changed[actor].digest != made[actor].digest, actor
+        assert changed[actor].digest != digests_of_room[actor].digest, actor
 
 
-def test_the_latency_is_an_input(room: Sequence, made: dict[str, ActorDigest]) -> None:
+def test_latency_of_an_actor_changes_the_digests(
+    room: Sequence, digests_of_room: dict[str, ActorDigest]
+) -> None:
     later = simulated(room, "offline.latency_frames.optimizer=6")
-    assert later["frame_source"] == made["frame_source"]
-    assert later["tracker"] != made["tracker"]
+    assert later["frame_source"] == digests_of_room["frame_source"]
+    assert later["tracker"] != digests_of_room["tracker"]
 
 
 def test_the_renderer_uses_the_threads_it_is_given(
     keyframes: list[Keyframe],  # noqa: F811
 ) -> None:
-    def share_of_helpers(threads: int) -> float:
-        """CPU time that threads other than this one spend while it maps."""
+    def helper_ratio(threads: int) -> float:
+        """Return the fraction of CPU time that other threads spend during mapping."""
         mapper = Mapper(MapperConfig(threads=threads, iterations=1))
         whole_s, own_s = time.process_time(), time.thread_time()
         for keyframe in keyframes:
@@ -99,20 +103,20 @@ def test_the_renderer_uses_the_threads_it_is_given(
         whole_s, own_s = time.process_time() - whole_s, time.thread_time() - own_s
         return 1 - own_s / whole_s
 
-    assert share_of_helpers(1) == pytest.approx(0, abs=0.01)  # the clock's own error
-    assert share_of_helpers(8) > 0.02  # eight threads cannot hide; how fast they are is no matter
+    assert helper_ratio(1) == pytest.approx(0, abs=0.01)  # Error of the clock.
+    assert helper_ratio(8) > 0.02  # Independent of the speed of the threads.
 
 
-def test_nothing_readable_is_bad_data(room: Sequence) -> None:
-    class Spoilt(Cached):
+def test_source_without_readable_frames_is_bad_data(room: Sequence) -> None:
+    class Unreadable(Cached):
         def read(self, index: int) -> RawFrame:
             raise FrameError(f"frame {index} is truncated.")
 
     with pytest.raises(DataError, match="no frame"):
-        simulated(Spoilt(room))
+        simulated(Unreadable(room))
 
 
-def test_the_last_line_is_json_for_scripts(capsys: pytest.CaptureFixture[str]) -> None:
+def test_last_line_of_output_is_json(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ("simulate", "synthetic:room", "--max-frames", "4", "--threads", "2", "--json")
     code, out, _ = ldo(capsys, *arguments)
     assert code == 0
@@ -131,18 +135,18 @@ def test_real_frames_give_the_same_digests_for_one_thread_and_two(data: Path) ->
 
 @pytest.fixture(scope="module")
 def squares(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
-    """Settings of a detector that finds what is red, green or blue, however pale."""
+    """Settings of a detector of red, green and blue squares with a low minimum score."""
     path = tmp_path_factory.mktemp("model") / "squares.onnx"
     model = squares_network("yolov5", width=320, height=256).write(path)
     return f"detector.model={model}", "detector.min_score=0.02"
 
 
 def test_a_labelled_map_does_not_depend_on_threads(
-    room: Sequence, squares: tuple[str, ...], made: dict[str, ActorDigest]
+    room: Sequence, squares: tuple[str, ...], digests_of_room: dict[str, ActorDigest]
 ) -> None:
     one, two = (simulated(room, *squares, f"mapper.threads={threads}") for threads in (1, 2))
     assert one == two
-    assert one["detector"].digest != made["detector"].digest
-    assert one["mapper"].digest != made["mapper"].digest
+    assert one["detector"].digest != digests_of_room["detector"].digest
+    assert one["mapper"].digest != digests_of_room["mapper"].digest
     for same in ("tracker", "optimizer"):
-        assert one[same] == made[same], "labels reach nobody else"
+        assert one[same] == digests_of_room[same], "labels do not reach other actors"
