@@ -1,4 +1,4 @@
-"""Configuration: defaults, files, settings, and errors that say what to do."""
+"""Configuration from defaults, files and settings, and its errors."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ CHANGED = (
 
 
 @pytest.mark.parametrize("settings", [(), CHANGED])
-def test_every_print_reads_back_as_the_same(settings: tuple[str, ...]) -> None:
+def test_printed_configuration_reads_back_as_equal(settings: tuple[str, ...]) -> None:
     config = load_config(settings=settings)
     for text in (
         config_yaml(config),
@@ -30,18 +30,18 @@ def test_every_print_reads_back_as_the_same(settings: tuple[str, ...]) -> None:
         assert config_of(yaml.safe_load(text)) == config
 
 
-def test_the_short_print_has_public_settings_alone() -> None:
+def test_default_print_has_public_and_changed_settings_only() -> None:
     settings = settings_of(Config())
     lines = explained_yaml(Config()).splitlines()
     printed = [line for line in lines if "  # " in line]
     assert len(printed) == sum(setting.is_public for setting in settings) == 62
-    every = explained_yaml(Config(), with_advanced=True).splitlines()
-    assert len([line for line in every if "  # " in line]) == len(settings)
+    all_lines = explained_yaml(Config(), with_advanced=True).splitlines()
+    assert len([line for line in all_lines if "  # " in line]) == len(settings)
     assert "pyramid_levels" not in explained_yaml(Config())
     assert "pyramid_levels: 3" in explained_yaml(load_config(settings=CHANGED))
 
 
-def test_a_reason_stands_with_its_own_setting() -> None:
+def test_comment_is_printed_with_its_setting() -> None:
     lines = explained_yaml(Config(), with_advanced=True).splitlines()
     reasons = {key.strip(): reason for key, _, reason in (line.partition("  # ") for line in lines)}
     assert reasons["start_after_lost_s: 3.0"].endswith("0 never starts one.")
@@ -49,14 +49,14 @@ def test_a_reason_stands_with_its_own_setting() -> None:
     assert reasons["pyramid_levels: 4"].endswith("end at 40 pixels.")
 
 
-def test_settings_change_what_the_file_left(tmp_path: Path) -> None:
+def test_settings_override_the_file(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("tracker:\n  hold_out: 5\nmapper:\n  threads: 3\n")
     config = load_config(path, ["mapper.threads=2"])
     assert (config.tracker.hold_out, config.mapper.threads) == (5, 2)
 
 
-def test_one_latency_leaves_the_others(tmp_path: Path) -> None:
+def test_setting_one_latency_keeps_the_others(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("offline: {latency_frames: {detector: 9}}\n")
     latency = load_config(path).offline.latency_frames
@@ -64,12 +64,12 @@ def test_one_latency_leaves_the_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("written", ["2e-1", "2E-1", ".2e0", "+2.e-1", "0.2", "200e-3"])
-def test_exponents_are_those_of_yaml_1_2(written: str) -> None:
+def test_numbers_with_exponents_follow_yaml_1_2(written: str) -> None:
     config = load_config(settings=[f"supervision.heartbeat_s={written}"])
     assert config.supervision.heartbeat_s == 0.2
 
 
-def test_a_name_like_a_number_reads_back_as_the_name(tmp_path: Path) -> None:
+def test_name_that_looks_like_a_number_reads_back_as_text(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text('tracker:\n  localization_map: "1e5"\n')
     config = load_config(tmp_path / "mine.yaml")
     (tmp_path / "again.yaml").write_text(config_yaml(config))
@@ -83,7 +83,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "says"),
+    ("setting", "expected"),
     [
         (
             "tracker.holdout=5",
@@ -120,44 +120,44 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("dataset.T_color_depth=[1, 0]", "dataset.T_color_depth=[1.0, 0.0] must be 16 numbers"),
     ],
 )
-def test_a_wrong_setting_is_said_plainly(setting: str, says: str) -> None:
-    with pytest.raises(ConfigError) as refused:
+def test_invalid_setting_is_refused_with_the_reason(setting: str, expected: str) -> None:
+    with pytest.raises(ConfigError) as raised:
         load_config(settings=[setting])
-    assert says in str(refused.value)
+    assert expected in str(raised.value)
 
 
-def test_a_transform_that_is_not_rigid_is_said_plainly() -> None:
+def test_transform_that_is_not_rigid_is_refused() -> None:
     numbers = [2.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
     config = load_config(settings=[f"dataset.T_color_depth={numbers}"])
     with pytest.raises(ConfigError, match=r"^dataset\.T_color_depth=\[2\.0, .* must be rigid"):
         config.dataset.options()
 
 
-def test_a_wrong_file_is_said_plainly(tmp_path: Path) -> None:
+def test_invalid_file_is_refused_with_the_reason(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         load_config(tmp_path / "absent.yaml")
-    for text, says in (("tracker: [", "not valid YAML"), ("- a\n- b\n", "must hold sections")):
+    for text, expected in (("tracker: [", "not valid YAML"), ("- a\n- b\n", "must hold sections")):
         (tmp_path / "wrong.yaml").write_text(text)
-        with pytest.raises(ConfigError, match=says):
+        with pytest.raises(ConfigError, match=expected):
             load_config(tmp_path / "wrong.yaml")
 
 
 @pytest.mark.parametrize(
-    ("settings", "names"),
+    ("settings", "limit"),
     [
         (["deadline_s=55"], "supervision.step_timeout_s=60"),
         (["deadline_s=30", "timeout_s=30"], "supervision.step_timeout_s=60"),
         (["deadline_s=48"], "service.control_timeout_s=55"),
     ],
 )
-def test_no_labeller_behind_a_server_may_be_waited_for_until_it_is_given_up(
-    settings: list[str], names: str
+def test_labeller_deadline_must_be_below_timeouts_of_the_service(
+    settings: list[str], limit: str
 ) -> None:
-    """The service would end with it; a run has no such limits."""
+    """Otherwise a slow server would stop the service; runs have no such limits."""
     endpoint = [f"vlm_labeller.http.{setting}" for setting in settings]
     load_config(settings=endpoint).check_timeouts()
     server = "vlm_labeller.url=http://127.0.0.1:8000/v1"
     config = load_config(settings=[server, *endpoint])
-    with pytest.raises(ConfigError, match=f"together must be below {names}"):
+    with pytest.raises(ConfigError, match=f"together must be below {limit}"):
         config.check_timeouts()
     load_config(settings=[server]).check_timeouts()

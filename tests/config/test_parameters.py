@@ -16,7 +16,7 @@ from ldo_service.viewer.view_config import ViewerConfig, viewer_config
 
 
 def test_the_default_configuration_gives_the_defaults_of_the_classes() -> None:
-    """The measured reasons stand beside those, so the two must not part."""
+    """The classes document the measured reasons of their defaults, so both must agree."""
     config = Config()
     assert actor_parameters(config) == ActorParameters()
     assert stage_parameters(config) == SupervisionConfig()
@@ -32,7 +32,7 @@ def test_the_default_configuration_gives_the_defaults_of_the_classes() -> None:
     }
 
 
-def test_a_value_that_actors_share_is_set_once() -> None:
+def test_value_shared_by_several_actors_is_set_once() -> None:
     parameters = actor_parameters(
         load_config(
             settings=(

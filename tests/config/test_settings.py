@@ -1,4 +1,4 @@
-"""Properties of all settings: their number, their comments, and what a bad value says."""
+"""Properties of all settings: number, comments, errors and effect."""
 
 import re
 from math import inf, nan
@@ -54,7 +54,7 @@ def test_every_setting_is_a_plain_value() -> None:
         assert isinstance(setting.value, bool | int | float | str | tuple), setting.path
 
 
-def test_every_setting_has_a_reason_in_sentences() -> None:
+def test_every_setting_has_a_comment_of_short_sentences() -> None:
     for setting in SETTINGS:
         assert re.match(r"[A-Z0-9].*\.$", setting.comment), setting.path
         assert not setting.comment.startswith(RETIRED), setting.path
@@ -66,30 +66,30 @@ def test_every_setting_has_a_reason_in_sentences() -> None:
 @pytest.mark.parametrize("setting", NUMERIC, ids=ids)
 def test_a_bad_number_is_named_with_its_path_and_value(setting: Setting) -> None:
     for bad, shown in ((-1, "-1"), (nan, "nan"), ("many", "many"), ([1, 2], "[1, 2]")):
-        with pytest.raises(ConfigError) as refused:
+        with pytest.raises(ConfigError) as raised:
             config_of(tree_of(setting.path, bad))
-        assert str(refused.value).startswith(f"{setting.path}={shown} must be "), str(refused.value)
+        assert str(raised.value).startswith(f"{setting.path}={shown} must be "), str(raised.value)
 
 
 @pytest.mark.parametrize("setting", [s for s in SETTINGS if s not in NUMERIC], ids=ids)
-def test_another_bad_value_is_named_with_its_path_and_value(setting: Setting) -> None:
-    with pytest.raises(ConfigError) as refused:
+def test_a_bad_value_of_another_type_is_named_with_its_path_and_value(setting: Setting) -> None:
+    with pytest.raises(ConfigError) as raised:
         config_of(tree_of(setting.path, -1))
-    assert str(refused.value).startswith(f"{setting.path}=-1 must be "), str(refused.value)
+    assert str(raised.value).startswith(f"{setting.path}=-1 must be "), str(raised.value)
 
 
 @pytest.mark.parametrize("setting", NUMERIC, ids=ids)
-def test_a_number_that_is_taken_is_one_that_the_actors_take(setting: Setting) -> None:
+def test_number_accepted_by_the_configuration_is_accepted_by_the_actors(setting: Setting) -> None:
     for number in NUMBERS:
         shown = f"{number:g}" if isinstance(number, float) else str(number)
-        if (refused := refusal(setting.path, number)) is None:
-            everything_of(config_of(tree_of(setting.path, number)))
+        if (raised := refusal(setting.path, number)) is None:
+            parameters_of(config_of(tree_of(setting.path, number)))
         else:
-            assert f"{setting.path}={shown}" in refused
+            assert f"{setting.path}={shown}" in raised
 
 
 def refusal(path: str, value: object) -> str | None:
-    """Return the message with which a value is refused; None for one that is taken."""
+    """Return the error message for a value, or None if it is accepted."""
     try:
         config_of(tree_of(path, value))
     except ConfigError as error:
@@ -97,8 +97,8 @@ def refusal(path: str, value: object) -> str | None:
     return None
 
 
-def everything_of(config: Config) -> object:
-    """What the configuration says to actors, stages, recordings and the viewer."""
+def parameters_of(config: Config) -> object:
+    """Return the parameters of actors, stages, recordings, viewer and service."""
     return (
         actor_parameters(config),
         stage_parameters(config),
@@ -111,7 +111,7 @@ def everything_of(config: Config) -> object:
 
 
 def other_values(setting: Setting) -> list[Any]:
-    """Values of its kind, of which at least one is allowed and not the default."""
+    """Return values of the same type, at least one of them valid and not the default."""
     match setting.value:
         case bool():
             return [not setting.value]
@@ -127,13 +127,13 @@ def other_values(setting: Setting) -> list[Any]:
 
 
 @pytest.mark.parametrize("setting", SETTINGS, ids=ids)
-def test_every_setting_reaches_what_it_is_for(setting: Setting) -> None:
-    default = everything_of(Config())
+def test_every_setting_changes_the_parameters(setting: Setting) -> None:
+    default = parameters_of(Config())
     for value in other_values(setting):
         if refusal(setting.path, value) is None:
-            assert everything_of(config_of(tree_of(setting.path, value))) != default
+            assert parameters_of(config_of(tree_of(setting.path, value))) != default
             return
-    pytest.fail("no other value was taken")
+    pytest.fail("no other value was accepted")
 
 
 def test_no_error_prints_a_whole_parameter_object() -> None:
