@@ -1,4 +1,4 @@
-"""Suite files, what they run, and the tables that come of it."""
+"""Suite files, their runs, and the tables of scores."""
 
 import json
 from dataclasses import replace
@@ -33,19 +33,19 @@ TWO = Suite(
 )
 
 
-def written(folder: Path, text: str) -> str:
+def suite_file(folder: Path, text: str) -> str:
     path = folder / "suite.yaml"
     path.write_text(text)
     return str(path)
 
 
-def judged(ate_m: float, fps: float = 10.0) -> Judged:
+def scores(ate_m: float, fps: float = 10.0) -> Judged:
     trajectory = {"final": {"ate_m": {"rmse": ate_m}}}
     return Judged({"fps": fps}, {"trajectory": trajectory, "rendering": []})
 
 
 @pytest.mark.parametrize("name", known_suites())
-def test_every_suite_that_comes_with_it_can_be_run(name: str) -> None:
+def test_every_built_in_suite_is_valid(name: str) -> None:
     suite = load_suite(name)
     for settings in suite.variants.values():
         load_config(None, settings)
@@ -54,7 +54,7 @@ def test_every_suite_that_comes_with_it_can_be_run(name: str) -> None:
     assert set().union(*map(set, suite.published.values())) <= suite.sequences.keys()
 
 
-def test_folders_run_once_and_synthetic_sources_with_each_seed() -> None:
+def test_data_folders_run_once_and_synthetic_sources_once_per_seed() -> None:
     entries = list(TWO.entries(Path("/data")))
     assert [str(entry.folder) for entry in entries] == [
         *("flat/plain@0", "flat/plain@3", "flat/short@0", "flat/short@3"),
@@ -64,7 +64,7 @@ def test_folders_run_once_and_synthetic_sources_with_each_seed() -> None:
     assert entries[4].source == "/data/tum/desk"
 
 
-def test_all_take_the_front_end_of_the_first_with_their_seed_where_one_is_named() -> None:
+def test_other_variants_reuse_the_front_end_of_the_same_seed() -> None:
     shared = msgspec.structs.replace(TWO, front_end="plain", figures=("ate_cm",))
     first, again, other, other_again = list(shared.entries(Path()))[:4]
     assert (first.front_end_folder, again.front_end_folder) == (None, None)
@@ -72,27 +72,27 @@ def test_all_take_the_front_end_of_the_first_with_their_seed_where_one_is_named(
     assert {entry.front_end_folder for entry in TWO.entries(Path())} == {None}
 
 
-def test_a_first_run_whose_front_end_is_gone_is_not_finished(tmp_path: Path) -> None:
+def test_first_run_without_its_front_end_is_not_finished(tmp_path: Path) -> None:
     shared = msgspec.structs.replace(TWO, front_end="plain", figures=("ate_cm",))
-    work = SuiteRunner(shared, Path("/data"), tmp_path)
-    first, _, other, _ = work.entries()[:4]
+    runner = SuiteRunner(shared, Path("/data"), tmp_path)
+    first, _, other, _ = runner.entries()[:4]
     for entry in (first, other):
         (tmp_path / entry.folder).mkdir(parents=True)
-        (tmp_path / entry.folder / "entry.json").write_text(work._told(entry))
-    assert work._is_finished(other, tmp_path / other.folder)
-    assert not work._is_finished(first, tmp_path / first.folder)
+        (tmp_path / entry.folder / "entry.json").write_text(runner._told(entry))
+    assert runner._is_finished(other, tmp_path / other.folder)
+    assert not runner._is_finished(first, tmp_path / first.folder)
     (tmp_path / first.folder / "front_end.mcap").touch()
-    assert work._is_finished(first, tmp_path / first.folder)
+    assert runner._is_finished(first, tmp_path / first.folder)
 
 
-def test_each_figure_of_several_sequences_has_its_table() -> None:
+def test_several_sequences_give_one_table_per_score() -> None:
     flat, again, short, short_again, desk, short_desk = TWO.entries(Path("/data"))
     outcomes = [
-        Outcome(flat, judged(0.01)),
-        Outcome(again, judged(0.03)),
-        Outcome(short, judged(0.02)),
+        Outcome(flat, scores(0.01)),
+        Outcome(again, scores(0.03)),
+        Outcome(short, scores(0.02)),
         Outcome(short_again, None, "failed"),
-        Outcome(desk, judged(0.04)),
+        Outcome(desk, scores(0.04)),
         Outcome(short_desk, None, "no data"),
     ]
     tables = markdown(TWO, outcomes).split("\n\n")
@@ -110,7 +110,7 @@ def test_each_figure_of_several_sequences_has_its_table() -> None:
     ]
 
 
-def test_all_figures_of_one_sequence_are_one_table() -> None:
+def test_single_sequence_gives_one_table_of_all_scores() -> None:
     one = Suite(
         title="One",
         about="Why.",
@@ -119,7 +119,7 @@ def test_all_figures_of_one_sequence_are_one_table() -> None:
         published={"Other": {"desk": {"psnr_db": 20.0}}},
     )
     (entry,) = one.entries(Path())
-    assert markdown(one, [Outcome(entry, judged(0.04))]).split("\n\n")[1:] == [
+    assert markdown(one, [Outcome(entry, scores(0.04))]).split("\n\n")[1:] == [
         "Why.",
         "| desk | ATE RMSE cm | PSNR dB |\n| --- | --- | --- |\n"
         "| Other |  | 20.00 |\n| LDO-SLAM | 4.00 | - |\n",
@@ -127,7 +127,7 @@ def test_all_figures_of_one_sequence_are_one_table() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(FIGURES))
-def test_a_figure_that_was_not_judged_is_none_and_no_error(name: str) -> None:
+def test_score_that_was_not_evaluated_is_none(name: str) -> None:
     assert FIGURES[name].of(Judged({}, {"trajectory": None, "rendering": []})) is None
 
 
@@ -147,25 +147,25 @@ def test_a_figure_that_was_not_judged_is_none_and_no_error(name: str) -> None:
         ({"seeds": ["x"]}, "is not a suite: .*seeds"),
     ],
 )
-def test_a_file_that_is_wrong_is_refused_with_the_reason(
+def test_invalid_suite_file_is_refused_with_the_reason(
     tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
-    right = {"title": "T", "sequences": {"a": "synthetic:room"}, "figures": ["fps"]}
-    assert load_suite(written(tmp_path, json.dumps(right))).seeds == (0,)
+    valid = {"title": "T", "sequences": {"a": "synthetic:room"}, "figures": ["fps"]}
+    assert load_suite(suite_file(tmp_path, json.dumps(valid))).seeds == (0,)
     with pytest.raises(ConfigError, match=message):
-        load_suite(written(tmp_path, json.dumps(right | change)))
+        load_suite(suite_file(tmp_path, json.dumps(valid | change)))
 
 
-def test_a_name_that_is_no_suite_lists_those_that_are() -> None:
+def test_unknown_suite_name_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match=r"there is no suite table-99: .*table-1, table-2"):
         load_suite("table-99")
 
 
-def test_what_is_no_yaml_is_refused(tmp_path: Path) -> None:
+def test_invalid_yaml_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="is not a suite"):
-        load_suite(written(tmp_path, "title: ["))
+        load_suite(suite_file(tmp_path, "title: ["))
 
 
-def test_a_seed_of_another_run_is_another_folder() -> None:
+def test_runs_with_different_seeds_have_different_folders() -> None:
     entry = next(TWO.entries(Path()))
     assert replace(entry, seed=1).folder != entry.folder
