@@ -1,6 +1,6 @@
-"""What actors say, played without a runtime: `list(actor.handle(message))`."""
+"""Actors called without a runtime, and the messages that they publish over the room."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import pytest
 
@@ -8,26 +8,44 @@ from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.tracker import Tracker
 from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import Sequence
-from ldo_service.schemas import CameraRgbd, FrameRgbd, Keyframe, Message, TrackedPose
+from ldo_service.maps.replica import MapReplica
+from ldo_service.schemas import (
+    CameraRgbd,
+    FrameRgbd,
+    Keyframe,
+    MapDelta,
+    MapSnapshot,
+    Message,
+    TrackedPose,
+)
 
 
 def camera_messages(sequence: Sequence, indices: Iterable[int]) -> list[CameraRgbd]:
     return [raw_frame_to_message(sequence.read(i), compress_depth=False) for i in indices]
 
 
-def handled(actor, messages: Iterable[Message]) -> Iterator[Message]:
+def handle_all(actor, messages: Iterable[Message]) -> list:
+    """Return all messages that an actor publishes for the given inputs."""
+    return [out for message in messages for out in actor.handle(message)]
+
+
+def replicate(messages: Iterable[Message], replica: MapReplica | None = None) -> MapReplica:
+    """Apply all deltas and snapshots among the messages to a replica, by default a new one."""
+    replica = replica or MapReplica()
     for message in messages:
-        yield from actor.handle(message)
+        if isinstance(message, MapDelta | MapSnapshot):
+            replica.apply(message)
+    return replica
 
 
 @pytest.fixture(scope="session")
 def frames(room: Sequence) -> list[FrameRgbd]:
-    return list(handled(FrameSource(), camera_messages(room, range(40))))
+    return handle_all(FrameSource(), camera_messages(room, range(40)))
 
 
 @pytest.fixture(scope="session")
 def tracked(frames: list[FrameRgbd]) -> list[TrackedPose | Keyframe]:
-    return list(handled(Tracker(), frames))
+    return handle_all(Tracker(), frames)
 
 
 @pytest.fixture(scope="session")

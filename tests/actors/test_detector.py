@@ -1,4 +1,4 @@
-"""Boxes for each keyframe, and what becomes of a network that cannot be used."""
+"""Detections for each keyframe, also without a usable network."""
 
 import logging
 from pathlib import Path
@@ -11,7 +11,7 @@ from ldo_service.actors.detector import Detector, DetectorConfig, require_detect
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.errors import ConfigError, ModelError
 from ldo_service.schemas import Array, CameraModel, DetectionBoxes, Keyframe, encode
-from tests.detection.networks import SQUARES, squares_image, squares_network
+from tests.detection.networks import SQUARES, changed, squares_image
 
 SIZE = 128, 96
 
@@ -30,8 +30,8 @@ def keyframe_of(keyframe: Keyframe, image: np.ndarray, number: int = 4) -> Keyfr
 
 
 @pytest.fixture
-def red(keyframes: list[Keyframe]) -> Keyframe:
-    """A keyframe that shows a red square."""
+def red_keyframe(keyframes: list[Keyframe]) -> Keyframe:
+    """A keyframe with a red square."""
     return keyframe_of(keyframes[0], squares_image([("red", 16, 48, 16)]))
 
 
@@ -44,15 +44,15 @@ def model(tmp_path: Path) -> Path:
     return SQUARES["yolov8"].write(tmp_path / "squares.onnx")
 
 
-def only(messages) -> DetectionBoxes:
+def only_message(messages) -> DetectionBoxes:
     (message,) = messages
     return message
 
 
-def test_a_keyframe_has_its_boxes_by_name(model: Path, red: Keyframe) -> None:
+def test_detections_have_label_box_and_score(model: Path, red_keyframe: Keyframe) -> None:
     actor = detector(model)
-    boxes = only(actor.handle(red))
-    assert (boxes.keyframe, boxes.stamp_ns) == (red.keyframe, red.stamp_ns)
+    boxes = only_message(actor.handle(red_keyframe))
+    assert (boxes.keyframe, boxes.stamp_ns) == (red_keyframe.keyframe, red_keyframe.stamp_ns)
     assert (boxes.width, boxes.height) == SIZE
     (found,) = boxes.detections
     assert (found.label, found.box_px) == ("red", (15.5, 47.5, 31.5, 63.5))
@@ -66,67 +66,72 @@ def test_a_keyframe_has_its_boxes_by_name(model: Path, red: Keyframe) -> None:
     }
 
 
-def test_a_keyframe_without_objects_has_a_message_without_boxes(model: Path, red) -> None:
-    boxes = only(detector(model).handle(keyframe_of(red, squares_image([]))))
+def test_keyframe_without_objects_gives_empty_detections(model: Path, red_keyframe) -> None:
+    boxes = only_message(detector(model).handle(keyframe_of(red_keyframe, squares_image([]))))
     assert boxes.detections == ()
-    assert boxes.network, "somebody looked"
+    assert boxes.network, "a network was used"
 
 
-def test_real_sized_keyframes_give_the_same_bytes_from_any_successor(
+def test_detections_do_not_depend_on_earlier_keyframes(
     model: Path, keyframes: list[Keyframe]
 ) -> None:
     one, other = detector(model, score_min=0.0), detector(model, score_min=0.0)
     list(other.handle(keyframes[1]))
-    bodies = [encode(only(actor.handle(keyframes[0]))) for actor in (one, other, other)]
+    bodies = [encode(only_message(actor.handle(keyframes[0]))) for actor in (one, other, other)]
     assert len(set(bodies)) == 1
     assert b"label" in bodies[0]
 
 
-def test_without_a_model_every_keyframe_is_answered_and_nobody_looked(red: Keyframe) -> None:
+def test_without_model_keyframes_get_empty_detections_without_network(
+    red_keyframe: Keyframe,
+) -> None:
     actor = Detector()
-    boxes = only(actor.handle(red))
-    assert (boxes.keyframe, boxes.detections, boxes.network) == (red.keyframe, (), "")
+    boxes = only_message(actor.handle(red_keyframe))
+    assert (boxes.keyframe, boxes.detections, boxes.network) == (red_keyframe.keyframe, (), "")
     assert (actor.metrics()["networks"], actor.metrics()["networks_missing"]) == (0, 0)
 
 
 @pytest.mark.parametrize("body", [b"garbage", None])
-def test_a_model_that_cannot_be_used_is_said_once_and_the_service_goes_on(
-    tmp_path: Path, red: Keyframe, caplog, body: bytes | None
+def test_unusable_model_is_logged_once_and_gives_empty_detections(
+    tmp_path: Path, red_keyframe: Keyframe, caplog, body: bytes | None
 ) -> None:
     path = tmp_path / "net.onnx"
     if body is not None:
         path.write_bytes(body)
     actor = detector(path)
     for _ in range(3):
-        assert only(actor.handle(red)).network == ""
+        assert only_message(actor.handle(red_keyframe)).network == ""
     (record,) = caplog.records
     assert record.levelno == logging.ERROR
     assert str(path) in record.getMessage()
     assert actor.metrics()["networks_missing"] == 1
 
 
-def test_a_model_of_other_classes_is_not_taken_for_one_of_coco(
-    tmp_path: Path, red: Keyframe, caplog
+def test_model_without_class_names_is_not_assumed_to_be_coco(
+    tmp_path: Path, red_keyframe: Keyframe, caplog
 ) -> None:
     actor = detector(squares_network("yolox", metadata=None).write(tmp_path / "net.onnx"))
-    assert only(actor.handle(red)).detections == ()
+    assert only_message(actor.handle(red_keyframe)).detections == ()
     assert "3 classes without names" in caplog.text
 
 
-def test_a_network_that_fails_is_counted_and_warned_about_once(
-    tmp_path: Path, red: Keyframe, caplog
+def test_failed_inferences_are_counted_and_logged_once_per_episode(
+    tmp_path: Path, red_keyframe: Keyframe, caplog
 ) -> None:
     actor = detector(squares_network("yolov8", fails_on_white=True).write(tmp_path / "net.onnx"))
-    white = keyframe_of(red, np.full((96, 128, 3), 255, np.uint8))
-    answers = [only(actor.handle(frame)) for frame in (red, white, white, red, white)]
+    white = keyframe_of(red_keyframe, np.full((96, 128, 3), 255, np.uint8))
+    answers = [
+        only_message(actor.handle(frame))
+        for frame in (red_keyframe, white, white, red_keyframe, white)
+    ]
     assert [bool(answer.network) for answer in answers] == [True, False, False, True, False]
     assert [len(answer.detections) for answer in answers] == [1, 0, 0, 1, 0]
     assert actor.metrics()["inferences_failed"] == 3
-    assert len(caplog.records) == 2, "once an episode"
+    assert len(caplog.records) == 2, "one per episode"
     assert "NaN" in caplog.text
 
 
-def test_a_run_over_a_file_is_told_before_it_begins(tmp_path: Path, model: Path) -> None:
+def test_unusable_model_is_refused_before_an_offline_run(tmp_path: Path, model: Path) -> None:
     require_detector(DetectorConfig())
     require_detector(DetectorConfig(model=str(model)))
     with pytest.raises(ConfigError, match="nor an ONNX file, nor registered"):

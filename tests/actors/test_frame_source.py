@@ -1,4 +1,4 @@
-"""Camera frames are checked, paired, rectified, and rejected one by one."""
+"""Checks, pairing and rejection of camera frames."""
 
 import msgspec
 import numpy as np
@@ -56,7 +56,7 @@ def test_stamps_that_go_back_are_rejected(message: CameraRgbd) -> None:
     assert source.metrics()["frames_rejected"] == 1
 
 
-def test_a_broken_image_is_rejected_and_the_stream_goes_on(
+def test_a_broken_image_is_rejected_and_the_stream_continues(
     message: CameraRgbd, caplog: pytest.LogCaptureFixture
 ) -> None:
     source = FrameSource()
@@ -74,21 +74,21 @@ def test_an_image_of_another_size_than_announced_is_rejected(
     room: Sequence, message: CameraRgbd
 ) -> None:
     half = codecs.encode_jpeg(room[3].color[::2, ::2])
-    lying = Image(encoding="jpeg", width=320, height=240, data=memoryview(half))
+    mismatched = Image(encoding="jpeg", width=320, height=240, data=memoryview(half))
     source = FrameSource()
-    assert list(source.handle(msgspec.structs.replace(message, color=lying))) == []
+    assert list(source.handle(msgspec.structs.replace(message, color=mismatched))) == []
     assert source.metrics()["frames_rejected"] == 1
 
 
-def test_a_successor_still_knows_the_last_stamp(message: CameraRgbd) -> None:
+def test_restored_frame_source_rejects_old_stamps(message: CameraRgbd) -> None:
     first, second = FrameSource(), FrameSource()
     list(first.handle(message))
     second.restore(first.snapshot())
     assert list(second.handle(message)) == []
 
 
-# --- colour and depth on two topics ---------------------------------------------------------------
-def color_half(frame: RgbdFrame, stamp_ns: int | None = None) -> CameraColor:
+# --- color and depth on two topics ----------------------------------------------------------------
+def color_image(frame: RgbdFrame, stamp_ns: int | None = None) -> CameraColor:
     return CameraColor(
         stamp_ns=frame.stamp_ns if stamp_ns is None else stamp_ns,
         frame=frame.index,
@@ -97,7 +97,7 @@ def color_half(frame: RgbdFrame, stamp_ns: int | None = None) -> CameraColor:
     )
 
 
-def depth_half(
+def depth_image(
     frame: RgbdFrame, stamp_ns: int | None = None, T_color_depth: np.ndarray | None = None
 ) -> CameraDepth:
     return CameraDepth(
@@ -115,56 +115,58 @@ def frames_of(source: FrameSource, *messages: Message) -> list[FrameRgbd]:
 
 
 def coarser(frame: RgbdFrame) -> RgbdFrame:
-    """Every second pixel, exactly."""
+    """Return every second pixel of a frame, exactly."""
     k = frame.camera
     camera = Camera(k.width // 2, k.height // 2, k.fx / 2, k.fy / 2, k.cx / 2, k.cy / 2)
     color, depth_m = (np.ascontiguousarray(a[::2, ::2]) for a in (frame.color, frame.depth_m))
     return RgbdFrame(color, depth_m, camera, frame.stamp_ns, frame.index)
 
 
-def test_halves_of_one_camera_become_the_frame_that_a_whole_exposure_would(room: Sequence) -> None:
+def test_color_and_depth_images_give_the_same_frame_as_an_rgbd_message(room: Sequence) -> None:
     whole = frames_of(FrameSource(), raw_frame_to_message(room.read(3)))
-    color, depth = color_half(room[3]), depth_half(room[3])
+    color, depth = color_image(room[3]), depth_image(room[3])
     assert frames_of(FrameSource(), color, depth) == whole
     assert frames_of(FrameSource(), depth, color) == whole, "in either order"
 
 
-def test_a_pair_has_the_stamp_and_the_number_of_its_color(room: Sequence) -> None:
-    color = color_half(room[3], stamp_ns=50_000_000)
-    depth = depth_half(room[3], stamp_ns=57_000_000)
+def test_pair_has_stamp_and_number_of_its_color_image(room: Sequence) -> None:
+    color = color_image(room[3], stamp_ns=50_000_000)
+    depth = depth_image(room[3], stamp_ns=57_000_000)
     source = FrameSource()
     (frame,) = frames_of(source, color, depth)
     assert (frame.stamp_ns, frame.frame) == (50_000_000, 3)
-    facts = source.metrics()
-    assert (facts["pairs"], facts["skew_ms_p50"], facts["skew_ms_max"]) == (1, 7.0, 7.0)
+    metrics = source.metrics()
+    assert (metrics["pairs"], metrics["skew_ms_p50"], metrics["skew_ms_max"]) == (1, 7.0, 7.0)
 
 
-def test_halves_further_apart_than_the_allowed_skew_are_lost_and_counted(room: Sequence) -> None:
+def test_images_beyond_max_skew_are_dropped_and_counted(room: Sequence) -> None:
     source = FrameSource(FrameSourceConfig(max_skew_s=0.005))
-    halves = [
-        half
+    images = [
+        image
         for i in range(5)
-        for half in (
-            color_half(room[i], stamp_ns=i * 33_000_000),
-            depth_half(room[i], stamp_ns=i * 33_000_000 + 10_000_000),
+        for image in (
+            color_image(room[i], stamp_ns=i * 33_000_000),
+            depth_image(room[i], stamp_ns=i * 33_000_000 + 10_000_000),
         )
     ]
-    assert frames_of(source, *halves) == []
-    facts = source.metrics()
-    assert (facts["pairs"], facts["color_unpaired"], facts["depth_unpaired"]) == (0, 5, 4)
+    assert frames_of(source, *images) == []
+    metrics = source.metrics()
+    assert (metrics["pairs"], metrics["color_unpaired"], metrics["depth_unpaired"]) == (0, 5, 4)
 
 
-def test_two_clocks_are_said_once(room: Sequence, caplog: pytest.LogCaptureFixture) -> None:
+def test_stamps_of_two_clocks_are_logged_once(
+    room: Sequence, caplog: pytest.LogCaptureFixture
+) -> None:
     source = FrameSource()
     for i in range(100):
-        frames_of(source, color_half(room[0], i * 33_000_000))
-        frames_of(source, depth_half(room[0], 10**18 + i * 33_000_000))
+        frames_of(source, color_image(room[0], i * 33_000_000))
+        frames_of(source, depth_image(room[0], 10**18 + i * 33_000_000))
     assert [r for r in caplog.records if "one clock" in r.message] == caplog.records
     assert len(caplog.records) == 1
 
 
-def test_coarser_depth_is_brought_to_the_color_image(room: Sequence) -> None:
-    color, depth = color_half(room[3]), depth_half(coarser(room[3]))
+def test_coarser_depth_is_resampled_to_the_color_image(room: Sequence) -> None:
+    color, depth = color_image(room[3]), depth_image(coarser(room[3]))
     (frame,) = frames_of(FrameSource(), color, depth)
     assert frame.camera == color.camera
     error = np.abs(frame.depth_m.numpy() - room[3].depth_m)
@@ -172,20 +174,22 @@ def test_coarser_depth_is_brought_to_the_color_image(room: Sequence) -> None:
     assert (frame.depth_m.numpy() > 0).mean() > 0.98
 
 
-def test_depth_of_a_camera_beside_is_moved_by_its_extrinsics(room: Sequence) -> None:
-    """The judge: depth seen from the next pose, whose place relative to this one is exact."""
+def test_depth_of_a_separate_camera_is_transformed_by_its_extrinsics(room: Sequence) -> None:
+    """The depth image is from a later pose, relative to the color image known exactly."""
     truth = room.truth()
     assert truth is not None
-    here, there = 3, 9
-    T_color_depth = se3.inverse(truth.T_world_camera[here]) @ truth.T_world_camera[there]
+    color_index, depth_index = 3, 9
+    T_color_depth = (
+        se3.inverse(truth.T_world_camera[color_index]) @ truth.T_world_camera[depth_index]
+    )
     assert np.linalg.norm(T_color_depth[:3, 3]) > 0.02, "a baseline as large as a camera's"
-    color = color_half(room[here])
-    moved, not_moved = (
-        frames_of(FrameSource(), color, depth_half(room[there], color.stamp_ns, T))[0]
+    color = color_image(room[color_index])
+    transformed, untransformed = (
+        frames_of(FrameSource(), color, depth_image(room[depth_index], color.stamp_ns, T))[0]
         for T in (T_color_depth, np.eye(4))
     )
-    assert _median_error(moved, room[here]) < 0.003
-    assert _median_error(not_moved, room[here]) > 0.01
+    assert _median_error(transformed, room[color_index]) < 0.003
+    assert _median_error(untransformed, room[color_index]) > 0.01
 
 
 def _median_error(frame: FrameRgbd, truth: RgbdFrame) -> float:
@@ -195,23 +199,23 @@ def _median_error(frame: FrameRgbd, truth: RgbdFrame) -> float:
     return float(np.median(np.abs(depth_m - truth.depth_m)[seen]))
 
 
-def test_a_stream_of_halves_gives_the_same_bytes_again(room: Sequence) -> None:
-    halves = [
-        half for i in range(4) for half in (color_half(room[i]), depth_half(coarser(room[i])))
+def test_same_color_and_depth_images_give_bitwise_equal_frames(room: Sequence) -> None:
+    images = [
+        image for i in range(4) for image in (color_image(room[i]), depth_image(coarser(room[i])))
     ]
     first, second = (
-        [encode(frame) for frame in frames_of(FrameSource(), *halves)] for _ in range(2)
+        [encode(frame) for frame in frames_of(FrameSource(), *images)] for _ in range(2)
     )
     assert len(first) == 4
     assert first == second
 
 
-def test_halves_whose_stamps_go_back_are_rejected(room: Sequence) -> None:
+def test_color_and_depth_stamps_that_go_back_are_rejected(room: Sequence) -> None:
     source = FrameSource()
-    assert len(frames_of(source, color_half(room[3]), depth_half(room[3]))) == 1
-    assert frames_of(source, color_half(room[2]), depth_half(room[2])) == []
+    assert len(frames_of(source, color_image(room[3]), depth_image(room[3]))) == 1
+    assert frames_of(source, color_image(room[2]), depth_image(room[2])) == []
     assert source.metrics()["frames_rejected"] == 2
-    assert len(frames_of(source, color_half(room[4]), depth_half(room[4]))) == 1
+    assert len(frames_of(source, color_image(room[4]), depth_image(room[4]))) == 1
 
 
 def test_an_image_too_small_to_track_is_rejected() -> None:
@@ -237,8 +241,8 @@ def test_impossible_settings_are_refused(fields: dict[str, float]) -> None:
         FrameSourceConfig(**fields)  # type: ignore[arg-type]
 
 
-def test_a_camera_that_starts_again_is_followed(room: Sequence) -> None:
-    """With recorded stamps, as when a recording is published twice."""
+def test_restarted_camera_begins_a_new_session(room: Sequence) -> None:
+    """Stamps repeat, as when a recording is published twice."""
     source = FrameSource()
     messages = [raw_frame_to_message(room.read(i)) for i in range(0, 60, 20)]
     for _ in range(2):
@@ -247,7 +251,7 @@ def test_a_camera_that_starts_again_is_followed(room: Sequence) -> None:
     assert source.metrics()["frames_rejected"] == 0
 
 
-def test_one_stamp_in_the_far_future_does_not_lock_the_camera_out(room: Sequence) -> None:
+def test_one_stamp_in_the_far_future_does_not_block_later_frames(room: Sequence) -> None:
     source = FrameSource()
     message = raw_frame_to_message(room.read(0))
     future = msgspec.structs.replace(message, stamp_ns=10**18)

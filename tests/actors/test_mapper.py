@@ -1,4 +1,4 @@
-"""The mapper's messages reproduce its map, and corrections move it rigidly."""
+"""Map messages of the mapper, which reproduce its map, and effects of corrections."""
 
 import shutil
 from dataclasses import replace
@@ -47,6 +47,7 @@ from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantic_fusion import SemanticFusionConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
+from tests.actors.conftest import handle_all, replicate
 
 CONFIG = MapperConfig(
     iterations=2,
@@ -60,10 +61,6 @@ CONFIG = MapperConfig(
 SLOW_CHECKPOINTS = replace(CONFIG, checkpoint_keyframes=5)
 
 
-def handled(mapper: Mapper, messages) -> list:
-    return [out for message in messages for out in mapper.handle(message)]
-
-
 def changes(messages) -> list[MapDelta | MapSnapshot]:
     return [message for message in messages if isinstance(message, MapDelta | MapSnapshot)]
 
@@ -72,19 +69,12 @@ def deltas_of(messages) -> list[MapDelta]:
     return [message for message in messages if isinstance(message, MapDelta)]
 
 
-def followed(messages, follower: MapReplica | None = None) -> MapReplica:
-    follower = follower or MapReplica()
-    for message in changes(messages):
-        follower.apply(message)
-    return follower
-
-
 def last_snapshot_part(messages) -> MapSnapshot:
     return [message for message in messages if isinstance(message, MapSnapshot)][-1]
 
 
 def shifted(keyframes, xi):
-    """A correction that moves each keyframe a little more than the one before."""
+    """Return a correction that moves each keyframe a little more than the one before."""
     return correction_to_message(
         0,
         1,
@@ -101,8 +91,8 @@ def correction(keyframes):
     return shifted(keyframes, [0, 0.01, 0, 0.02, 0, 0])
 
 
-def test_the_view_shows_what_the_camera_saw(keyframes) -> None:
-    for message in handled(Mapper(CONFIG), keyframes):
+def test_rendering_matches_the_camera_image(keyframes) -> None:
+    for message in handle_all(Mapper(CONFIG), keyframes):
         if isinstance(message, MapRendering):
             frame = frame_from_message(keyframes[message.keyframe])
             assert psnr(message.color.numpy(), frame.color) > 25
@@ -112,63 +102,63 @@ def test_the_view_shows_what_the_camera_saw(keyframes) -> None:
             assert np.median(error / frame.depth_m[seen]) < 0.01
 
 
-def test_what_is_explained_is_not_inserted_again(keyframes) -> None:
+def test_mapped_surface_is_not_inserted_again(keyframes) -> None:
     mapper = Mapper(CONFIG)
-    handled(mapper, keyframes[:1])
+    handle_all(mapper, keyframes[:1])
     first = mapper.metrics()["gaussians"]
-    handled(mapper, keyframes[1:2])
+    handle_all(mapper, keyframes[1:2])
     assert mapper.metrics()["gaussians"] < 1.6 * first
 
 
-def test_following_every_delta_gives_equal_arrays(keyframes, correction) -> None:
+def test_replica_of_every_delta_equals_the_map(keyframes, correction) -> None:
     mapper = Mapper(CONFIG)
-    messages = handled(mapper, [*keyframes[:-1], correction, keyframes[-1]])
+    messages = handle_all(mapper, [*keyframes[:-1], correction, keyframes[-1]])
     deltas = deltas_of([*messages, *mapper.on_stop()])
     assert any(delta.motions for delta in deltas)
     assert any(len(delta.changed.ids.numpy()) for delta in deltas)
-    assert_equal_maps(followed(deltas), mapper)
+    assert_equal_maps(replicate(deltas), mapper)
 
 
-def test_followers_hold_to_the_bit_what_sleeps_and_wakes(keyframes) -> None:
-    """Through corrections: what is 3 m away sleeps, and wakes where a camera comes near."""
-    sleep = OffloadConfig(max_active=500, reach_m=3.0, clump_m=0.5)
-    builder = MapBuilderConfig(sleep=sleep, recent_cameras=1)
+def test_replica_equals_the_map_while_gaussians_are_offloaded_and_loaded(keyframes) -> None:
+    """Gaussians beyond 3 m are offloaded, and loaded when a camera comes near."""
+    offload = OffloadConfig(max_active=500, reach_m=3.0, clump_m=0.5)
+    builder = MapBuilderConfig(sleep=offload, recent_cameras=1)
     config = replace(CONFIG, builder=builder, changed_keyframes=1, iterations=1, least_iterations=1)
-    mapper, follower = Mapper(replace(config, mended_at_end=0)), MapReplica()
+    mapper, replica = Mapper(replace(config, mended_at_end=0)), MapReplica()
     for version, keyframe in enumerate(keyframes, 1):
         poses = {
             0: se3.exp(0.01 * version * np.ones(6))
             @ pose_from_message(keyframes[0].T_odom_keyframe)
         }
         correction = correction_to_message(0, version, poses)
-        followed(deltas_of(handled(mapper, [keyframe, correction])), follower)
+        replicate(deltas_of(handle_all(mapper, [keyframe, correction])), replica)
     assert mapper.metrics()["gaussians_offloaded"] > 1000
     assert mapper.metrics()["gaussians_loaded_total"] > 1000
-    assert_equal_maps(follower, mapper)
+    assert_equal_maps(replica, mapper)
 
 
-def test_what_gaussians_became_is_told_now_and_then(keyframes) -> None:
-    """Else every keyframe would send all that is in view."""
+def test_changed_gaussians_are_sent_every_few_keyframes(keyframes) -> None:
+    """Otherwise every keyframe would send all Gaussians in view."""
     config = replace(CONFIG, snapshot_keyframes=100)
-    mapper, told = Mapper(config), []
+    mapper, has_changes = Mapper(config), []
     for keyframe in keyframes[:7]:
         deltas = deltas_of(mapper.handle(keyframe))
-        told.append(any(len(delta.changed.ids.numpy()) for delta in deltas))
+        has_changes.append(any(len(delta.changed.ids.numpy()) for delta in deltas))
         assert all(len(d.added.ids.numpy()) <= config.part_gaussians for d in deltas)
-    assert told == [False, False, False, True, False, False, True]
+    assert has_changes == [False, False, False, True, False, False, True]
 
 
-def test_gaussians_that_were_pruned_leave_the_followers(keyframes) -> None:
+def test_pruned_gaussians_are_removed_from_the_replica(keyframes) -> None:
     builder = MapBuilderConfig(
         prune_keyframes=1, pruning=PruningConfig(min_opacity=0.9), insertion=DensificationConfig()
     )
     mapper = Mapper(replace(CONFIG, builder=builder, iterations=4))
-    deltas = deltas_of([*handled(mapper, keyframes[:5]), *mapper.on_stop()])
+    deltas = deltas_of([*handle_all(mapper, keyframes[:5]), *mapper.on_stop()])
     assert any(len(delta.removed.numpy()) for delta in deltas)
-    assert_equal_maps(followed(deltas), mapper)
+    assert_equal_maps(replicate(deltas), mapper)
 
 
-def test_fewer_iterations_when_keyframes_wait(keyframes) -> None:
+def test_backlog_reduces_iterations_per_keyframe(keyframes) -> None:
     mapper = Mapper(replace(CONFIG, iterations=12, least_iterations=3))
     spent = []
     for keyframe, waiting in zip(keyframes, (0, 1, 3), strict=False):
@@ -180,29 +170,29 @@ def test_fewer_iterations_when_keyframes_wait(keyframes) -> None:
     assert spent[0] > 2 * spent[2]
 
 
-def test_a_request_to_refine_makes_the_map_better_and_is_told(keyframes) -> None:
+def test_refinement_request_improves_the_map_and_sends_deltas(keyframes) -> None:
     mapper = Mapper(CONFIG)
-    messages = handled(mapper, keyframes[:4])
-    before = followed(deltas_of([*messages, *mapper.on_stop()]))
+    messages = handle_all(mapper, keyframes[:4])
+    before = replicate(deltas_of([*messages, *mapper.on_stop()]))
     rows = before.map.rows.copy()
-    asked = RefineMap(stamp_ns=0, iterations=40, initial_rate=1.0, final_rate=0.2)
-    deltas = deltas_of(mapper.handle(asked))
-    after = followed(deltas, before)
+    request = RefineMap(stamp_ns=0, iterations=40, initial_rate=1.0, final_rate=0.2)
+    deltas = deltas_of(mapper.handle(request))
+    after = replicate(deltas, before)
     assert_equal_maps(after, mapper)
     frame, T = frame_from_message(keyframes[1]), pose_from_message(keyframes[1].T_odom_keyframe)
-    assert seen_psnr(after.map.rows, frame, T) > seen_psnr(rows, frame, T) + 1
+    assert psnr_at(after.map.rows, frame, T) > psnr_at(rows, frame, T) + 1
 
 
-def test_what_was_refined_is_in_the_checkpoint_at_once(keyframes) -> None:
+def test_refined_map_is_in_the_next_snapshot(keyframes) -> None:
     mapper = Mapper(SLOW_CHECKPOINTS)
-    handled(mapper, keyframes[:2])
+    handle_all(mapper, keyframes[:2])
     before = mapper.snapshot()
     assert mapper.snapshot()["map"] is before["map"], "no keyframe was added"
     list(mapper.handle(RefineMap(stamp_ns=0, iterations=5)))
     assert mapper.snapshot()["map"] is not before["map"]
 
 
-def test_keyframes_that_the_renderer_moved_are_measured_anew(keyframes) -> None:
+def test_optimized_keyframe_poses_are_published_as_refinements(keyframes) -> None:
     optimizer = GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
     builder = MapBuilderConfig(optimiser=optimizer)
     mapper = Mapper(replace(CONFIG, builder=builder, iterations=6))
@@ -223,7 +213,7 @@ def test_keyframes_that_the_renderer_moved_are_measured_anew(keyframes) -> None:
     assert len(known) > 5, "nothing was refined"
 
 
-def test_a_correction_that_knows_nothing_of_a_refinement_does_not_undo_it(keyframes) -> None:
+def test_correction_older_than_a_refinement_does_not_undo_it(keyframes) -> None:
     optimizer = GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
     builder = MapBuilderConfig(optimiser=optimizer)
     mapper, optimizer = Mapper(replace(CONFIG, builder=builder, iterations=6)), Optimizer()
@@ -231,7 +221,7 @@ def test_a_correction_that_knows_nothing_of_a_refinement_does_not_undo_it(keyfra
         made = list(mapper.handle(keyframe))
         (before,) = optimizer.handle(keyframe)
         refinements = [m for m in made if isinstance(m, KeyframeRefinement)]
-        assert list(mapper.handle(before)) == [], "it was on its way when the renderer moved them"
+        assert list(mapper.handle(before)) == [], "it was sent before the renderer moved them"
         for refinement in refinements:
             (after,) = optimizer.handle(refinement)
             assert after.last_refinement == refinement.number
@@ -246,52 +236,52 @@ def test_a_correction_that_knows_nothing_of_a_refinement_does_not_undo_it(keyfra
     assert len(delta.motions) == 4
 
 
-def test_a_map_that_no_longer_grows_is_still_sent_whole_now_and_then(keyframes) -> None:
+def test_map_that_does_not_grow_still_gets_regular_snapshots(keyframes) -> None:
     config = replace(CONFIG, snapshot_growth=100.0, snapshot_keyframes_max=3)
     made = [list(mapper_made) for mapper_made in map(Mapper(config).handle, keyframes[:8])]
-    whole = [any(isinstance(m, MapSnapshot) for m in messages) for messages in made]
-    assert whole == [True, False, False, True, False, False, True, False]
+    has_snapshot = [any(isinstance(m, MapSnapshot) for m in messages) for messages in made]
+    assert has_snapshot == [True, False, False, True, False, False, True, False]
 
 
-def seen_psnr(rows: np.ndarray, frame: RgbdFrame, T_map_camera: np.ndarray) -> float:
+def psnr_at(rows: np.ndarray, frame: RgbdFrame, T_map_camera: np.ndarray) -> float:
     image = render(rows, frame.camera, se3.inverse(T_map_camera)).color.clip(0, 1)
     return psnr(image, frame.color / np.float32(255))
 
 
-def test_a_late_joiner_ends_with_equal_arrays(keyframes, correction) -> None:
+def test_late_replica_equals_the_map_after_the_final_snapshot(keyframes, correction) -> None:
     mapper = Mapper(CONFIG)
-    messages = changes(handled(mapper, [*keyframes, correction]))
+    messages = changes(handle_all(mapper, [*keyframes, correction]))
     late = messages[messages.index(last_snapshot_part(messages)) + 1 :]
-    follower = followed(late)
-    assert follower.version == 0, "it has not had a whole snapshot yet"
-    followed(mapper.on_stop(), follower)
-    assert_equal_maps(follower, mapper)
+    replica = replicate(late)
+    assert replica.version == 0, "no whole snapshot yet"
+    replicate(mapper.on_stop(), replica)
+    assert_equal_maps(replica, mapper)
 
 
-def test_a_missed_delta_is_noticed_and_mended_by_the_next_snapshot(keyframes) -> None:
+def test_missed_delta_is_noticed_and_repaired_by_the_next_snapshot(keyframes) -> None:
     mapper = Mapper(CONFIG)
-    messages = changes(handled(mapper, keyframes))
+    messages = changes(handle_all(mapper, keyframes))
     deltas = [m for m in messages if isinstance(m, MapDelta)]
-    follower = followed([*deltas[:1], *deltas[2:]])
-    assert follower.is_behind
-    followed(mapper.on_stop(), follower)
-    assert not follower.is_behind
-    assert_equal_maps(follower, mapper)
+    replica = replicate([*deltas[:1], *deltas[2:]])
+    assert replica.is_behind
+    replicate(mapper.on_stop(), replica)
+    assert not replica.is_behind
+    assert_equal_maps(replica, mapper)
 
 
 def test_a_correction_moves_gaussians_with_their_keyframes(keyframes, correction) -> None:
     mapper = Mapper(CONFIG)
-    before = followed(changes([*handled(mapper, keyframes), *mapper.on_stop()]))
+    before = replicate(changes([*handle_all(mapper, keyframes), *mapper.on_stop()]))
     means, anchors = before.map.means.copy(), before.map.anchors.copy()
-    after = followed(changes(handled(mapper, [correction])), before)
+    after = replicate(changes(handle_all(mapper, [correction])), before)
     for k in keyframes:
         mine = anchors == k.keyframe
         T = se3.exp(np.array([0, 0.01, 0, 0.02, 0, 0]) * (1 + k.keyframe))
         np.testing.assert_allclose(after.map.means[mine], se3.transform(T, means[mine]), atol=1e-5)
 
 
-def around_again(keyframes, T_drift: np.ndarray, first: int) -> list[Keyframe]:
-    """The same views, as a camera that has drifted makes them; ids from `first` on."""
+def second_round(keyframes, T_drift: np.ndarray, first: int) -> list[Keyframe]:
+    """Return the same keyframes after odometry drift, with ids from `first`."""
     poses = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes}
     again, before, T_before = [], keyframes[-1].keyframe, poses[keyframes[-1].keyframe]
     for k in keyframes:
@@ -310,110 +300,113 @@ def around_again(keyframes, T_drift: np.ndarray, first: int) -> list[Keyframe]:
     return again
 
 
-def test_surface_that_a_correction_lays_over_itself_is_held_once(keyframes) -> None:
-    """The second time around is 10 cm off, so it is mapped again; then the loop is closed."""
+def test_surface_mapped_twice_is_deduplicated_after_loop_closure(keyframes) -> None:
+    """The second round is 10 cm off and mapped again, until the loop is closed."""
     T_drift = se3.exp(np.array([0, 0, 0, 0, 0.1, 0]))
-    second = around_again(keyframes[:3], T_drift, first=100)
+    second = second_round(keyframes[:3], T_drift, first=100)
     poses = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes[:3]}
-    closed = correction_to_message(0, 1, poses | {100 + k: T for k, T in poses.items()})
+    loop_correction = correction_to_message(0, 1, poses | {100 + k: T for k, T in poses.items()})
     frame, T_map_camera = frame_from_message(keyframes[0]), poses[keyframes[0].keyframe]
     added, quality = {}, {}
-    for mended in (0, 10):
-        mapper = Mapper(replace(CONFIG, mended_at_end=mended))
-        messages = handled(mapper, keyframes[:3])
+    for at_end in (0, 10):
+        mapper = Mapper(replace(CONFIG, mended_at_end=at_end))
+        messages = handle_all(mapper, keyframes[:3])
         once = mapper.metrics()["gaussians"]
-        messages += handled(mapper, [*second, closed])
-        held_twice = mapper.metrics()["gaussians"]
+        messages += handle_all(mapper, [*second, loop_correction])
+        before_stop = mapper.metrics()["gaussians"]
         messages += mapper.on_stop()
-        assert mapper.metrics()["keyframes_to_deduplicate"] == 3 * (mended == 0)
+        assert mapper.metrics()["keyframes_to_deduplicate"] == 3 * (at_end == 0)
         held = mapper.metrics()["gaussians"]
-        assert held_twice - held >= mapper.metrics()["gaussians_deduplicated"]
-        added[mended] = held - once
-        follower = followed(messages)
-        assert follower.map.rows.tobytes() == mapper._map.gaussians.all().rows.tobytes()
-        quality[mended] = seen_psnr(follower.map.rows, frame, T_map_camera)
+        assert before_stop - held >= mapper.metrics()["gaussians_deduplicated"]
+        added[at_end] = held - once
+        replica = replicate(messages)
+        assert replica.map.rows.tobytes() == mapper._map.gaussians.all().rows.tobytes()
+        quality[at_end] = psnr_at(replica.map.rows, frame, T_map_camera)
     assert added[10] < 0.6 * added[0]
     assert quality[10] > quality[0] - 0.3
 
 
-def torn(keyframes, config: MapperConfig) -> Mapper:
-    """Three keyframes, the same again after drift, and the correction that lays them together."""
+def mapper_after_loop_closure(keyframes, config: MapperConfig) -> Mapper:
+    """Return a mapper of three keyframes, their second round and the loop correction."""
     T_drift = se3.exp(np.array([0, 0.02, 0, 0, 0.1, 0]))
-    second = around_again(keyframes[:3], T_drift, first=100)
+    second = second_round(keyframes[:3], T_drift, first=100)
     poses = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes[:3]}
-    closed = correction_to_message(0, 1, poses | {100 + k: T for k, T in poses.items()})
+    loop_correction = correction_to_message(0, 1, poses | {100 + k: T for k, T in poses.items()})
     mapper = Mapper(config)
-    handled(mapper, [*keyframes[:3], *second, closed])
+    handle_all(mapper, [*keyframes[:3], *second, loop_correction])
     return mapper
 
 
 def psnr_of(mapper: Mapper, keyframe: Keyframe) -> float:
     T_map_camera = pose_from_message(keyframe.T_odom_keyframe)
-    return seen_psnr(mapper._map.gaussians.rows, frame_from_message(keyframe), T_map_camera)
+    return psnr_at(mapper._map.gaussians.rows, frame_from_message(keyframe), T_map_camera)
 
 
-def test_what_a_correction_has_torn_fits_as_before_after_the_iterations_that_are_due(
+def test_pending_iterations_restore_quality_after_loop_closure(
     keyframes,
 ) -> None:
-    whole = Mapper(CONFIG)
-    handled(whole, keyframes[:3])
-    mapper = torn(keyframes, CONFIG)
+    undisturbed = Mapper(CONFIG)
+    handle_all(undisturbed, keyframes[:3])
+    mapper = mapper_after_loop_closure(keyframes, CONFIG)
     facts = mapper.metrics()
     assert facts["iterations_pending"] == 3 * CONFIG.due_iterations
-    assert psnr_of(mapper, keyframes[1]) < psnr_of(whole, keyframes[1]) - 1
-    handled(mapper, [RefineMap(stamp_ns=0, iterations=30)])
+    assert psnr_of(mapper, keyframes[1]) < psnr_of(undisturbed, keyframes[1]) - 1
+    handle_all(mapper, [RefineMap(stamp_ns=0, iterations=30)])
     assert mapper.metrics()["iterations_pending"] == 6
-    handled(mapper, [RefineMap(stamp_ns=0, iterations=6)])
+    handle_all(mapper, [RefineMap(stamp_ns=0, iterations=6)])
     assert mapper.metrics()["iterations_pending"] == 0
     assert mapper.metrics()["iterations"] == facts["iterations"] + 36
-    assert psnr_of(mapper, keyframes[1]) > psnr_of(whole, keyframes[1])
+    assert psnr_of(mapper, keyframes[1]) > psnr_of(undisturbed, keyframes[1])
 
 
-def test_a_keyframe_is_due_no_more_however_often_it_moves(keyframes) -> None:
+def test_repeated_corrections_do_not_add_pending_iterations(keyframes) -> None:
     poses = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes[:4]}
     mapper = Mapper(CONFIG)
-    handled(mapper, keyframes[:4])
+    handle_all(mapper, keyframes[:4])
     for version in range(1, 4):
         T_turned = se3.exp(np.array([0, 0.02 * version, 0, 0, 0, 0]))
         moved = {k: T if k < 2 else T_turned @ T for k, T in poses.items()}
-        handled(mapper, [correction_to_message(0, version, moved)])
+        handle_all(mapper, [correction_to_message(0, version, moved)])
         assert mapper.metrics()["iterations_pending"] == 2 * CONFIG.due_iterations
 
 
-def test_a_map_that_moves_as_a_whole_is_as_good_as_before(keyframes) -> None:
+def test_rigid_motion_of_the_whole_map_needs_no_refit(keyframes) -> None:
     T_moved = se3.exp(np.array([0, 0.3, 0, 1, 0, 0]))
     moved = {k.keyframe: T_moved @ pose_from_message(k.T_odom_keyframe) for k in keyframes}
     mapper = Mapper(CONFIG)
-    handled(mapper, [*keyframes, correction_to_message(0, 1, moved)])
+    handle_all(mapper, [*keyframes, correction_to_message(0, 1, moved)])
     assert mapper.metrics()["iterations_pending"] == 0
     assert mapper.metrics()["keyframes_to_deduplicate"] == len(keyframes)
 
 
-def test_iterations_that_are_due_are_done_while_no_keyframe_waits(keyframes, tmp_path) -> None:
+def test_pending_iterations_run_only_without_backlog(keyframes, tmp_path) -> None:
     config = replace(CONFIG, due_iterations=4, paid_iterations=6, folder=str(tmp_path))
-    mapper = torn(keyframes, config)
-    never = torn(keyframes, replace(config, paid_iterations=0, folder=""))
-    due, more = [], []
-    for i, k in enumerate(around_again(keyframes[3:7], np.eye(4), first=200)):
+    mapper = mapper_after_loop_closure(keyframes, config)
+    without_refit = mapper_after_loop_closure(
+        keyframes, replace(config, paid_iterations=0, folder="")
+    )
+    pending, extra = [], []
+    for i, k in enumerate(second_round(keyframes[3:7], np.eye(4), first=200)):
         if i == 2:
-            predecessor, mapper = mapper, Mapper(config)
-            mapper.restore(predecessor.checkpoint())
-        before = [m.metrics()["iterations"] for m in (mapper, never)]
-        for one in (mapper, never):
+            previous, mapper = mapper, Mapper(config)
+            mapper.restore(previous.checkpoint())
+        before = [m.metrics()["iterations"] for m in (mapper, without_refit)]
+        for one in (mapper, without_refit):
             one.situation = FlowStatus(backlog={KEYFRAME_NEW: int(i == 1)})
-            handled(one, [k])
+            handle_all(one, [k])
         done, usual = (
-            m.metrics()["iterations"] - n for m, n in zip((mapper, never), before, strict=True)
+            m.metrics()["iterations"] - n
+            for m, n in zip((mapper, without_refit), before, strict=True)
         )
-        due.append(mapper.metrics()["iterations_pending"])
-        more.append(done - usual)
-    assert due == [6, 6, 0, 0]
-    assert more == [6, 0, 6, 0]
-    assert never.metrics()["iterations_pending"] == 12
+        pending.append(mapper.metrics()["iterations_pending"])
+        extra.append(done - usual)
+    assert pending == [6, 6, 0, 0]
+    assert extra == [6, 0, 6, 0]
+    assert without_refit.metrics()["iterations_pending"] == 12
 
 
-def test_a_state_that_knows_of_no_iterations_is_gone_on_from(keyframes) -> None:
-    state = torn(keyframes, CONFIG).checkpoint()
+def test_state_without_pending_iterations_is_restored(keyframes) -> None:
+    state = mapper_after_loop_closure(keyframes, CONFIG).checkpoint()
     del state["map"]["due"]
     mapper = Mapper(CONFIG)
     mapper.restore(state)
@@ -421,32 +414,32 @@ def test_a_state_that_knows_of_no_iterations_is_gone_on_from(keyframes) -> None:
     assert mapper.metrics()["keyframes_to_deduplicate"] == 3
 
 
-def test_a_correction_that_moves_nothing_says_nothing(keyframes) -> None:
+def test_correction_without_motion_gives_no_output(keyframes) -> None:
     mapper = Mapper(CONFIG)
-    handled(mapper, keyframes)
+    handle_all(mapper, keyframes)
     same = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes}
-    assert handled(mapper, [correction_to_message(0, 1, same)]) == []
+    assert handle_all(mapper, [correction_to_message(0, 1, same)]) == []
 
 
 def test_a_keyframe_sent_twice_counts_once(keyframes) -> None:
     mapper = Mapper(CONFIG)
-    handled(mapper, keyframes[:2])
-    assert handled(mapper, keyframes[1:2]) == []
+    handle_all(mapper, keyframes[:2])
+    assert handle_all(mapper, keyframes[1:2]) == []
     assert mapper.metrics()["keyframes_repeated"] == 1
 
 
-def test_a_follower_of_a_killed_mapper_ends_with_the_successors_map(keyframes) -> None:
-    """The successor lacks what came after the checkpoint, and inserts other Gaussians."""
+def test_replica_of_a_killed_mapper_ends_equal_to_the_restored_mapper(keyframes) -> None:
+    """The restored mapper lacks keyframes after the checkpoint and inserts other Gaussians."""
     first, second = Mapper(SLOW_CHECKPOINTS), Mapper(SLOW_CHECKPOINTS)
-    follower = MapReplica()
-    for keyframe in keyframes[:4]:  # the checkpoint holds the first keyframe only
-        followed(changes(list(first.handle(keyframe))), follower)
+    replica = MapReplica()
+    for keyframe in keyframes[:4]:  # The checkpoint holds the first keyframe only.
+        replicate(changes(list(first.handle(keyframe))), replica)
         state = first.snapshot()
     second.restore(state)
     assert second.metrics()["gaussians"] < first.metrics()["gaussians"]
-    followed(changes(handled(second, keyframes[4:])), follower)
-    followed(second.on_stop(), follower)
-    assert_equal_maps(follower, second)
+    replicate(changes(handle_all(second, keyframes[4:])), replica)
+    replicate(second.on_stop(), replica)
+    assert_equal_maps(replica, second)
 
 
 def test_a_checkpoint_on_request_has_the_whole_map(keyframes) -> None:
@@ -457,70 +450,70 @@ def test_a_checkpoint_on_request_has_the_whole_map(keyframes) -> None:
     assert second.metrics()["gaussians"] == first.metrics()["gaussians"]
 
 
-def test_a_successor_with_the_same_folder_goes_on_as_its_predecessor(keyframes, tmp_path) -> None:
-    """Bit for bit: the keyframes it optimises against are on disk."""
+def test_restored_mapper_with_its_folder_continues_bitwise_equal(keyframes, tmp_path) -> None:
+    """The keyframes that it optimizes against are on disk."""
     config = replace(CONFIG, folder=str(tmp_path / "keyframes"), iterations=4)
     first = Mapper(config)
-    handled(first, keyframes[:5])
+    handle_all(first, keyframes[:5])
     state = decode_state(encode_state(first.checkpoint()))
-    handled(first, keyframes[5:8])
+    handle_all(first, keyframes[5:8])
     shutil.copytree(tmp_path / "keyframes", tmp_path / "copy")
     second = Mapper(replace(config, folder=str(tmp_path / "copy")))
     second.restore(state)
-    handled(second, keyframes[5:8])
+    handle_all(second, keyframes[5:8])
     assert (
-        followed(second.on_stop()).map.rows.tobytes()
-        == followed(first.on_stop()).map.rows.tobytes()
+        replicate(second.on_stop()).map.rows.tobytes()
+        == replicate(first.on_stop()).map.rows.tobytes()
     )
 
 
-def test_what_was_taken_since_the_checkpoint_gives_the_same_bits_again(
+def test_logged_inputs_since_the_checkpoint_give_bitwise_equal_state(
     keyframes, correction, tmp_path
 ) -> None:
-    """Gaussians, keyframes, objects and the numbers of what is to come."""
+    """Gaussians, keyframes, objects and the next ids are equal."""
     config = replace(LABELLING, folder=str(tmp_path / "keyframes"), checkpoint_keyframes=100)
     first = Mapper(config)
-    taken = [m for k in keyframes[:6] for m in (k, boxes_of(k))]
-    taken.insert(9, correction)
-    handled(first, taken[:1])
+    inputs = [m for k in keyframes[:6] for m in (k, boxes_of(k))]
+    inputs.insert(9, correction)
+    handle_all(first, inputs[:1])
     state = decode_state(encode_state(first.snapshot()))
-    told = handled(first, taken[1:])
+    published = handle_all(first, inputs[1:])
     shutil.copytree(tmp_path / "keyframes", tmp_path / "copy")
     config = replace(config, folder=str(tmp_path / "copy"))
-    past = RestoredState(state, taken=tuple(map(as_taken, taken[1:])))
-    second = restore_actor(Mapper(config), past, lambda: Mapper(config))
+    restored_state = RestoredState(state, taken=tuple(map(logged, inputs[1:])))
+    second = restore_actor(Mapper(config), restored_state, lambda: Mapper(config))
     one, other = first.checkpoint()["map"], second.checkpoint()["map"]
     for part in ("map", "semantics", "poses", "links", "to_mend", "due"):
         assert encode_state(one[part]) == encode_state(other[part]), part
-    version = max(delta.version for delta in deltas_of(told))
+    version = max(delta.version for delta in deltas_of(published))
     assert all(delta.version > version for delta in deltas_of(second.on_restored()))
 
 
-def as_taken(message) -> LoggedInput:
+def logged(message) -> LoggedInput:
     (port,) = (port for port in Mapper.inputs if port.topic.message is type(message))
     return LoggedInput.of(port.topic.name, encode(message), FlowStatus())
 
 
-def test_a_successor_first_shows_its_whole_map(keyframes) -> None:
+def test_restored_mapper_first_publishes_its_whole_map(keyframes) -> None:
     first, second = Mapper(CONFIG), Mapper(CONFIG)
-    follower = followed(changes(handled(first, keyframes[:3])))
+    replica = replicate(changes(handle_all(first, keyframes[:3])))
     second.restore(first.checkpoint())
-    words = list(second.on_restored())
-    followed(changes(words), follower)
-    assert_equal_maps(follower, second)
-    assert_equal_maps(followed(changes(words)), second)
+    restored_messages = list(second.on_restored())
+    replicate(changes(restored_messages), replica)
+    assert_equal_maps(replica, second)
+    assert_equal_maps(replicate(changes(restored_messages)), second)
     assert list(Mapper(CONFIG).on_restored()) == []
 
 
-def test_corrections_too_small_to_send_add_up(keyframes) -> None:
+def test_small_corrections_add_up_until_they_are_sent(keyframes) -> None:
     mapper = Mapper(CONFIG)
-    follower = followed(changes(handled(mapper, keyframes[:1])))
-    before = follower.map.means.copy()
+    replica = replicate(changes(handle_all(mapper, keyframes[:1])))
+    before = replica.map.means.copy()
     for step in range(1, 101):
         T = pose_from_message(keyframes[0].T_odom_keyframe)
         T[0, 3] += step * 0.4e-4
-        followed(mapper.handle(correction_to_message(0, step, {0: T})), follower)
-    moved = follower.map.means[:, 0] - before[:, 0]
+        replicate(mapper.handle(correction_to_message(0, step, {0: T})), replica)
+    moved = replica.map.means[:, 0] - before[:, 0]
     assert abs(float(np.median(moved)) - 40e-4) < 1.01e-4
 
 
@@ -536,52 +529,52 @@ def test_between_checkpoints_the_state_is_the_same_object(keyframes) -> None:
     assert mapper.snapshot()["map"] is first
 
 
-def test_a_follower_notices_that_the_mapper_began_anew(keyframes) -> None:
-    """Before its first snapshot: the first change is one of an empty map."""
+def test_replica_follows_a_mapper_that_restarted_empty(keyframes) -> None:
+    """Its first delta, before any snapshot, is that of an empty map."""
     config = replace(CONFIG, snapshot_keyframes=100)
-    follower = followed(changes(handled(Mapper(config), keyframes[:4])))
-    assert follower.version > 1
-    anew = Mapper(config)
-    followed(deltas_of([*handled(anew, keyframes[1:3]), *anew.on_stop()]), follower)
-    assert_equal_maps(follower, anew)
+    replica = replicate(changes(handle_all(Mapper(config), keyframes[:4])))
+    assert replica.version > 1
+    restarted = Mapper(config)
+    replicate(deltas_of([*handle_all(restarted, keyframes[1:3]), *restarted.on_stop()]), replica)
+    assert_equal_maps(replica, restarted)
 
 
-def assert_equal_maps(follower: MapReplica, mapper: Mapper) -> None:
-    """Of one that heard everything so far: nothing is left to tell it."""
-    last_words = list(mapper.on_stop())
-    assert deltas_of(last_words) == []
-    snapshot = followed(last_words)
-    assert follower.version == snapshot.version
-    np.testing.assert_array_equal(follower.map.ids, snapshot.map.ids)
-    np.testing.assert_array_equal(follower.map.anchors, snapshot.map.anchors)
-    np.testing.assert_array_equal(follower.map.rows, snapshot.map.rows)
-    np.testing.assert_array_equal(follower.map.labels, snapshot.map.labels)
-    assert follower.label_names == snapshot.label_names
+def assert_equal_maps(replica: MapReplica, mapper: Mapper) -> None:
+    """Assert that a replica of all messages equals the map and lacks no delta."""
+    final_messages = list(mapper.on_stop())
+    assert deltas_of(final_messages) == []
+    snapshot = replicate(final_messages)
+    assert replica.version == snapshot.version
+    np.testing.assert_array_equal(replica.map.ids, snapshot.map.ids)
+    np.testing.assert_array_equal(replica.map.anchors, snapshot.map.anchors)
+    np.testing.assert_array_equal(replica.map.rows, snapshot.map.rows)
+    np.testing.assert_array_equal(replica.map.labels, snapshot.map.labels)
+    assert replica.label_names == snapshot.label_names
 
 
-def test_what_a_keyframe_says_is_moving_does_not_count_in_the_map(keyframes) -> None:
+def test_dynamic_mask_of_a_keyframe_is_excluded_from_its_view(keyframes) -> None:
     first = keyframes[0]
     dynamic_mask = np.zeros((first.camera.height, first.camera.width), bool)
     dynamic_mask[40:80, 30:70] = True
     camera = frame_from_message(first).camera
-    said = msgspec.structs.replace(
+    masked = msgspec.structs.replace(
         first, dynamic_mask=mask_to_array(dynamic_mask[::2, ::2], camera)
     )
     mapper = Mapper(CONFIG)
-    handled(mapper, [said])
+    handle_all(mapper, [masked])
     (view,) = (mapper._map.views[k] for k in mapper._map.views.poses)
     np.testing.assert_array_equal(view.mask == 0, dynamic_mask)
 
 
-def test_nothing_that_moves_travels_as_an_empty_mask(keyframes) -> None:
+def test_empty_and_missing_dynamic_masks_are_decoded_as_none(keyframes) -> None:
     camera = frame_from_message(keyframes[0]).camera
-    for nothing in (None, np.zeros((8, 8), bool)):
-        assert mask_from_array(mask_to_array(nothing, camera)) is None
+    for no_motion in (None, np.zeros((8, 8), bool)):
+        assert mask_from_array(mask_to_array(no_motion, camera)) is None
 
 
 # --- labels -----------------------------------------------------------------------------------
 def boxes_of(keyframe, label: str = "chair", network: str = "test") -> DetectionBoxes:
-    """One, in the middle of the image."""
+    """Return one detection in the middle of the image, or none without a network."""
     camera = keyframe.camera
     x, y = camera.width / 4, camera.height / 4
     box = Detection(label=label, score=0.8, box_px=(x, y, 3 * x, 3 * y))
@@ -598,59 +591,59 @@ def boxes_of(keyframe, label: str = "chair", network: str = "test") -> Detection
 LABELLING = replace(CONFIG, semantics=SemanticMapConfig(SemanticFusionConfig(region="box")))
 
 
-def test_followers_hold_labels_to_the_bit_and_know_their_names(keyframes) -> None:
-    mapper, follower = Mapper(LABELLING), MapReplica()
+def test_replica_has_equal_labels_and_label_names(keyframes) -> None:
+    mapper, replica = Mapper(LABELLING), MapReplica()
     for keyframe in keyframes[:6]:
         boxes = boxes_of(keyframe, "lava lamp" if keyframe.keyframe > 2 else "chair")
-        followed(deltas_of(handled(mapper, [keyframe, boxes])), follower)
-    followed(deltas_of(mapper.on_stop()), follower)
-    assert_equal_maps(follower, mapper)
-    assert follower.label_names[-1] == "lava lamp"
-    known = {follower.label_names[k] for k in np.unique(top_labels(follower.map.labels))}
+        replicate(deltas_of(handle_all(mapper, [keyframe, boxes])), replica)
+    replicate(deltas_of(mapper.on_stop()), replica)
+    assert_equal_maps(replica, mapper)
+    assert replica.label_names[-1] == "lava lamp"
+    known = {replica.label_names[k] for k in np.unique(top_labels(replica.map.labels))}
     assert known == {"background", "chair", "lava lamp"}
 
 
-def test_names_travel_when_there_are_new_ones(keyframes) -> None:
-    mapper, told = Mapper(replace(LABELLING, snapshot_keyframes=100)), []
+def test_label_names_are_sent_only_when_new(keyframes) -> None:
+    mapper, counts = Mapper(replace(LABELLING, snapshot_keyframes=100)), []
     for keyframe in keyframes[:4]:
-        made = handled(mapper, [keyframe, boxes_of(keyframe)])
-        told.append(sum(bool(delta.label_names) for delta in deltas_of(made)))
-    assert told == [0, 1, 0, 0]
+        made = handle_all(mapper, [keyframe, boxes_of(keyframe)])
+        counts.append(sum(bool(delta.label_names) for delta in deltas_of(made)))
+    assert counts == [0, 1, 0, 0]
 
 
-def test_where_nobody_looked_nothing_is_labelled_or_missed(keyframes) -> None:
+def test_detections_without_network_label_nothing(keyframes) -> None:
     mapper = Mapper(LABELLING)
-    messages = handled(mapper, [keyframes[0], boxes_of(keyframes[0], network="")])
-    follower = followed([*changes(messages), *mapper.on_stop()])
-    assert not follower.map.labels.any()
-    assert follower.label_names == ()
+    messages = handle_all(mapper, [keyframes[0], boxes_of(keyframes[0], network="")])
+    replica = replicate([*changes(messages), *mapper.on_stop()])
+    assert not replica.map.labels.any()
+    assert replica.label_names == ()
 
 
-def test_labels_change_nothing_else_of_the_map(keyframes) -> None:
+def test_labels_do_not_change_gaussians(keyframes) -> None:
     mapper, plain = Mapper(LABELLING), Mapper(LABELLING)
     for keyframe in keyframes[:5]:
-        handled(mapper, [keyframe, boxes_of(keyframe)])
-        handled(plain, [keyframe])
-    labelled, without = followed(mapper.on_stop()).map, followed(plain.on_stop()).map
+        handle_all(mapper, [keyframe, boxes_of(keyframe)])
+        handle_all(plain, [keyframe])
+    labelled, without = replicate(mapper.on_stop()).map, replicate(plain.on_stop()).map
     assert top_labels(labelled.labels).any()
     assert labelled.rows.tobytes() == without.rows.tobytes()
 
 
-def test_a_successor_has_the_labels_and_answers_nothing_twice(keyframes, tmp_path) -> None:
+def test_restored_mapper_keeps_labels_and_ignores_repeated_detections(keyframes, tmp_path) -> None:
     config = replace(LABELLING, folder=str(tmp_path / "keyframes"))
     first = Mapper(config)
     for keyframe in keyframes[:4]:
-        handled(first, [keyframe, boxes_of(keyframe)])
+        handle_all(first, [keyframe, boxes_of(keyframe)])
     state = decode_state(encode_state(first.checkpoint()))
     shutil.copytree(tmp_path / "keyframes", tmp_path / "copy")
     second = Mapper(replace(config, folder=str(tmp_path / "copy")))
     second.restore(state)
-    handled(second, [boxes_of(keyframes[3])])
+    handle_all(second, [boxes_of(keyframes[3])])
     assert second.metrics()["boxes_repeated"] == 1
     ends = []
     for mapper in (first, second):
-        handled(mapper, [boxes_of(keyframes[4]), keyframes[4]])
-        ends.append(followed(mapper.on_stop()))
+        handle_all(mapper, [boxes_of(keyframes[4]), keyframes[4]])
+        ends.append(replicate(mapper.on_stop()))
     assert ends[0].map.labels.tobytes() == ends[1].map.labels.tobytes()
     assert ends[0].label_names == ends[1].label_names
     assert top_labels(ends[0].map.labels).any()

@@ -1,4 +1,4 @@
-"""What the mapper makes of boxes and of names: objects, questions, and labels that come late."""
+"""Objects, label requests and late label results of the mapper."""
 
 import shutil
 from collections.abc import Iterable
@@ -14,7 +14,6 @@ from ldo_service.actors.mapper import Mapper, MapperConfig
 from ldo_service.conversions.frames import camera_to_message
 from ldo_service.conversions.poses import correction_to_message, matrix6_to_message, pose_to_message
 from ldo_service.geometry import se3
-from ldo_service.maps.replica import MapReplica
 from ldo_service.regions.open_vocabulary import OpenVocabularyConfig, OpenVocabularyLabeling
 from ldo_service.regions.region_proposals import RegionProposalConfig
 from ldo_service.regions.region_tracker import RegionTrackerConfig
@@ -28,7 +27,6 @@ from ldo_service.schemas import (
     MapDelta,
     MapObjects,
     MapRendering,
-    MapSnapshot,
     Message,
     ObjectObservation,
     RefineMap,
@@ -38,19 +36,12 @@ from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantic_fusion import FusionConfig, SemanticFusionConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
-from tests.semantics.scenes import (
-    CAMERA,
-    SCENE_OBJECTS,
-    SceneObject,
-    Shot,
-    poses,
-    shoot,
-    true_objects,
-)
+from tests.actors.conftest import replicate
+from tests.semantics.scenes import CAMERA, SCENE_OBJECTS, Shot, SceneObject, poses, shoot, true_objects
 
-# of an image of 128x96, where walls hold a fifth each and the ball is 20 px wide
+# Images have 128x96 pixels; a wall covers a fifth of them, and the ball is 20 pixels wide.
 TRIGGER = RegionProposalConfig(min_side_px=10)
-REGIONS = RegionTrackerConfig(per_keyframe=4, at_once=8)  # the walk is short
+REGIONS = RegionTrackerConfig(per_keyframe=4, at_once=8)  # The walk is short.
 SEMANTICS = SemanticMapConfig(naming=OpenVocabularyConfig(trigger=TRIGGER, regions=REGIONS))
 CONFIG = MapperConfig(iterations=3, threads=1, semantics=SEMANTICS)
 COUCH, TABLE, VASE, _, CHAIR, BALL = SCENE_OBJECTS
@@ -60,7 +51,7 @@ STAMP_NS = 10**8
 
 
 def keyframe_of(shot: Shot, number: int) -> Keyframe:
-    """Placed exactly; each measured from the one before."""
+    """Return a keyframe at its exact pose, without a reference."""
     T = pose_to_message(shot.T_map_camera)
     return Keyframe(
         stamp_ns=number * STAMP_NS,
@@ -77,19 +68,13 @@ def keyframe_of(shot: Shot, number: int) -> Keyframe:
 
 
 def boxes_of(
-    shot: Shot,
-    number: int,
-    things: Iterable[SceneObject],
-    score: float = 0.9,
-    network: str = "exact",
+    shot: Shot, number: int, things: Iterable[SceneObject], score: float = 0.9, network: str = "exact"
 ) -> DetectionBoxes:
-    """Of those of the room's things; the detector knows no others."""
+    """Return exact boxes of the given objects, the only ones that the detector knows."""
     known = [thing.name for thing in things]
-    detections = shot.detections(SCENE_OBJECTS)
-    names = [
-        thing.name for k, thing in enumerate(SCENE_OBJECTS, 1) if np.sum(shot.instances == k) >= 40
-    ]
-    found = zip(names, detections.boxes.tolist(), strict=True)
+    claims = shot.claims(SCENE_OBJECTS)
+    names = [thing.name for k, thing in enumerate(SCENE_OBJECTS, 1) if np.sum(shot.instances == k) >= 40]
+    found = zip(names, claims.boxes.tolist(), strict=True)
     return DetectionBoxes(
         stamp_ns=number * STAMP_NS,
         keyframe=number,
@@ -111,38 +96,30 @@ def walk(
     known: Iterable[SceneObject] = SCENE_OBJECTS,
     **fields,
 ) -> list[Message]:
-    """All that the mapper makes of a walk past all things."""
-    made: list[Message] = []
+    """Return the messages of a mapper on a walk past all objects of the scene."""
+    messages: list[Message] = []
     for number, T in enumerate(way, first):
         shot = shoot(SCENE_OBJECTS, T, number)
-        made += mapper.handle(keyframe_of(shot, number))
-        made += mapper.handle(boxes_of(shot, number, known, **fields))
-    return made
+        messages += mapper.handle(keyframe_of(shot, number))
+        messages += mapper.handle(boxes_of(shot, number, known, **fields))
+    return messages
 
 
-def of(kind: type, messages: Iterable[Message]) -> list:
+def of_kind(kind: type, messages: Iterable[Message]) -> list:
     return [message for message in messages if isinstance(message, kind)]
 
 
-def followed(messages: Iterable[Message]) -> MapReplica:
-    follower = MapReplica()
-    for message in messages:
-        if isinstance(message, MapDelta | MapSnapshot):
-            follower.apply(message)
-    return follower
-
-
 # --- objects --------------------------------------------------------------------------------------
-def test_objects_are_told_with_each_keyframe_that_was_looked_at() -> None:
-    made = walk(Mapper(CONFIG), np.tile(AHEAD, (5, 1, 1)), known=(BALL,))
-    told = of(MapObjects, made)
-    assert [len(message.objects) for message in told] == [0, 0, 1, 1, 1]
-    (ball,) = told[-1].objects
+def test_objects_are_published_with_each_keyframe_with_detections() -> None:
+    messages = walk(Mapper(CONFIG), np.tile(AHEAD, (5, 1, 1)), known=(BALL,))
+    published = of_kind(MapObjects, messages)
+    assert [len(message.objects) for message in published] == [0, 0, 1, 1, 1]
+    (ball,) = published[-1].objects
     assert ball.name == "sports ball"
     center = np.array(ball.T_map_object.translation)
     assert np.linalg.norm(center - BALL.solid.center_m) < 0.15
     assert (ball.observation_count, ball.first_keyframe, ball.last_keyframe) == (5, 0, 4)
-    seen = of(ObjectObservation, made)
+    seen = of_kind(ObjectObservation, messages)
     assert [(one.keyframe, one.object, one.is_miss) for one in seen] == [
         (3, 0, False),
         (4, 0, False),
@@ -150,37 +127,44 @@ def test_objects_are_told_with_each_keyframe_that_was_looked_at() -> None:
     assert seen[0].stamp_ns == 3 * STAMP_NS
 
 
-def test_an_object_that_is_not_found_again_is_told_as_missed() -> None:
+def test_undetected_object_is_published_as_a_miss() -> None:
     mapper = Mapper(CONFIG)
     walk(mapper, np.tile(AHEAD, (4, 1, 1)), known=(COUCH,))
-    made = walk(mapper, AHEAD[None], first=4, known=())
-    (missed,) = of(ObjectObservation, made)
+    messages = walk(mapper, AHEAD[None], first=4, known=())
+    (missed,) = of_kind(ObjectObservation, messages)
     assert (missed.object, missed.keyframe, missed.is_miss) == (0, 4, True)
 
 
-def test_where_nobody_looked_nothing_is_said_of_objects_and_no_bit_differs() -> None:
+def test_detections_without_network_leave_outputs_bitwise_equal() -> None:
     plain, mapper = Mapper(CONFIG), Mapper(CONFIG)
-    alone: list[Message] = []
+    without_boxes: list[Message] = []
     for number, T in enumerate(WAY[:4]):
-        alone += plain.handle(keyframe_of(shoot(SCENE_OBJECTS, T, number), number))
-    made = walk(mapper, WAY[:4], known=(), network="")
+        without_boxes += plain.handle(keyframe_of(shoot(SCENE_OBJECTS, T, number), number))
+    messages = walk(mapper, WAY[:4], known=(), network="")
     ask = RefineMap(stamp_ns=0, iterations=2, initial_rate=1.0, final_rate=1.0)
     turned = correction_to_message(0, 1, {0: se3.exp(np.full(6, 0.1)) @ WAY[0]})
-    for one, said in ((plain, alone), (mapper, made)):
+    for one, outputs in ((plain, without_boxes), (mapper, messages)):
         for message in (ask, turned):
-            said += one.handle(message)
-        said += one.on_stop()
-    assert of(MapObjects, made) == of(ObjectObservation, made) == of(LabelRequest, made) == []
-    assert [encode(message) for message in made] == [encode(message) for message in alone]
+            outputs += one.handle(message)
+        outputs += one.on_stop()
+    assert (
+        of_kind(MapObjects, messages)
+        == of_kind(ObjectObservation, messages)
+        == of_kind(LabelRequest, messages)
+        == []
+    )
+    assert [encode(message) for message in messages] == [
+        encode(message) for message in without_boxes
+    ]
 
 
 def test_corrections_move_objects_with_the_map() -> None:
     mapper = Mapper(CONFIG)
-    (*_, before) = of(MapObjects, walk(mapper, np.tile(AHEAD, (4, 1, 1))))
+    (*_, before) = of_kind(MapObjects, walk(mapper, np.tile(AHEAD, (4, 1, 1))))
     T = se3.exp(np.array([0, 0, 0.3, 1.0, 0.5, -0.2]))
-    made = list(mapper.handle(correction_to_message(0, 7, dict.fromkeys(range(4), T @ AHEAD))))
-    (after,) = of(MapObjects, made)
-    (delta,) = of(MapDelta, made)
+    messages = list(mapper.handle(correction_to_message(0, 7, dict.fromkeys(range(4), T @ AHEAD))))
+    (after,) = of_kind(MapObjects, messages)
+    (delta,) = of_kind(MapDelta, messages)
     assert (after.graph_version, after.version) == (7, delta.version)
     assert [one.id for one in after.objects] == [one.id for one in before.objects]
     for one, moved in zip(before.objects, after.objects, strict=True):
@@ -188,24 +172,24 @@ def test_corrections_move_objects_with_the_map() -> None:
         np.testing.assert_allclose(moved.centroid, expected, atol=0.03)
 
 
-def test_the_last_word_on_objects_is_that_of_the_last_map() -> None:
+def test_final_objects_have_the_version_of_the_final_map() -> None:
     mapper = Mapper(CONFIG)
     walk(mapper, WAY[:6])
     refined = list(mapper.handle(RefineMap(stamp_ns=0, iterations=5, initial_rate=1, final_rate=1)))
     assert isinstance(refined[-1], MapObjects)
     *_, last = mapper.on_stop()
     assert isinstance(last, MapObjects)
-    assert last.version == followed(mapper.on_stop()).version
+    assert last.version == replicate(mapper.on_stop()).version
     assert last.objects == refined[-1].objects
 
 
-def test_a_successor_goes_on_with_objects_bit_for_bit(tmp_path: Path) -> None:
-    """Also with what was asked, what was answered, and what waits."""
+def test_restored_mapper_continues_objects_bitwise_equal(tmp_path: Path) -> None:
+    """The state includes open and answered label requests, and boxes before their keyframe."""
     config = replace(CONFIG, folder=str(tmp_path / "first"))
     first = Mapper(config, has_labeller=True)
-    made = walk(first, WAY[:5], known=(BALL,))
-    *_, question = of(LabelRequest, made)
-    list(first.handle(answer(of(LabelRequest, made)[0], "samovar")))
+    messages = walk(first, WAY[:5], known=(BALL,))
+    *_, open_request = of_kind(LabelRequest, messages)
+    list(first.handle(label_result(of_kind(LabelRequest, messages)[0], "samovar")))
     list(first.handle(boxes_of(shoot(SCENE_OBJECTS, WAY[6], 6), 6, (BALL,))))
     state = decode_state(encode_state(first.checkpoint()))
     shutil.copytree(tmp_path / "first", tmp_path / "second")
@@ -213,24 +197,27 @@ def test_a_successor_goes_on_with_objects_bit_for_bit(tmp_path: Path) -> None:
     second.restore(state)
     ends = []
     for mapper in (first, second):
-        made = [*mapper.handle(answer(question, "lava lamp")), *walk(mapper, WAY[5:12], first=5)]
-        ends.append([*made, *mapper.on_stop()])
+        messages = [
+            *mapper.handle(label_result(open_request, "lava lamp")),
+            *walk(mapper, WAY[5:12], first=5),
+        ]
+        ends.append([*messages, *mapper.on_stop()])
     for kind in (MapObjects, ObjectObservation, LabelRequest):
-        one, other = ([encode(unversioned(m)) for m in of(kind, end)] for end in ends)
+        one, other = ([encode(unversioned(m)) for m in of_kind(kind, end)] for end in ends)
         assert one == other
         assert one
-    maps = [followed(end) for end in ends]
+    maps = [replicate(end) for end in ends]
     assert maps[0].map.labels.tobytes() == maps[1].map.labels.tobytes()
     assert maps[0].label_names == maps[1].label_names
 
 
 def unversioned(message: Message) -> Message:
-    """A successor's versions of the map are far ahead."""
+    """Return a message without map version, which a restored mapper sets far ahead."""
     return msgspec.structs.replace(message, version=0) if hasattr(message, "version") else message
 
 
-# --- names ----------------------------------------------------------------------------------------
-def answer(request: LabelRequest, label: str, confidence: float = 0.9) -> LabelResult:
+# --- label results --------------------------------------------------------------------------------
+def label_result(request: LabelRequest, label: str, confidence: float = 0.9) -> LabelResult:
     return LabelResult(
         stamp_ns=request.stamp_ns,
         region=request.region,
@@ -241,10 +228,10 @@ def answer(request: LabelRequest, label: str, confidence: float = 0.9) -> LabelR
     )
 
 
-def shown_in(request: LabelRequest) -> SceneObject | None:
-    """The thing whose true box a question's is most like."""
+def thing_in_box(request: LabelRequest) -> SceneObject | None:
+    """Return the object with a true box that overlaps most with that of the request."""
     shot = shoot(SCENE_OBJECTS, WAY[request.keyframe % len(WAY)], request.keyframe)
-    best, most = None, 0.5
+    best_thing, best_iou = None, 0.5
     for number, thing in enumerate(SCENE_OBJECTS, 1):
         v, u = np.nonzero(shot.instances == number)
         if len(u) == 0:
@@ -255,170 +242,181 @@ def shown_in(request: LabelRequest) -> SceneObject | None:
         both = float(np.prod(np.clip(high - low, 0, None)))
         area = (np.ptp(u) + 1) * (np.ptp(v) + 1)
         iou = both / (area + (x1 - x0) * (y1 - y0) - both)
-        if iou > most:
-            best, most = thing, iou
-    return best
+        if iou > best_iou:
+            best_thing, best_iou = thing, iou
+    return best_thing
 
 
-def test_without_a_labeller_nobody_is_asked() -> None:
-    assert of(LabelRequest, walk(Mapper(CONFIG), WAY[:5], score=0.3)) == []
+def test_without_labeller_no_label_request_is_sent() -> None:
+    assert of_kind(LabelRequest, walk(Mapper(CONFIG), WAY[:5], score=0.3)) == []
 
 
-def test_what_the_detector_does_not_know_is_asked_about_and_what_it_is_sure_of_is_not() -> None:
-    made = walk(Mapper(CONFIG, has_labeller=True), known=(COUCH,))
-    asked = {shown_in(request) for request in of(LabelRequest, made)}
-    assert BALL in asked
-    assert COUCH not in asked
+def test_only_regions_without_confident_detection_are_requested() -> None:
+    messages = walk(Mapper(CONFIG, has_labeller=True), known=(COUCH,))
+    requested = {thing_in_box(request) for request in of_kind(LabelRequest, messages)}
+    assert BALL in requested
+    assert COUCH not in requested
 
 
 @pytest.mark.parametrize("late", [0, 4])
-def test_answers_land_on_the_gaussians_they_speak_of_however_late(late: int) -> None:
-    """Of each region that is truly a thing its own name, of others none; twice around."""
-    mapper, waiting, made = Mapper(CONFIG, has_labeller=True), [], []
+def test_late_label_results_reach_the_gaussians_of_their_region(late: int) -> None:
+    """Regions of an object get its own label, others none, on two rounds."""
+    mapper, waiting, messages = Mapper(CONFIG, has_labeller=True), [], []
     for number, T in enumerate(np.tile(WAY, (2, 1, 1))):
         new = walk(mapper, T[None], first=number, known=(COUCH,))
-        named = [(request, shown_in(request)) for request in of(LabelRequest, new)]
-        waiting += [(number + late, answer(r, f"my {one.name}" if one else "")) for r, one in named]
-        for due, message in waiting:
-            new += mapper.handle(message) if due == number else []
-        made += new
-    made += mapper.on_stop()
-    follower = followed(made)
-    top = top_labels(follower.map.labels)
-    truth = true_objects(follower.map.means, SCENE_OBJECTS, WAY)
+        shown = [(request, thing_in_box(request)) for request in of_kind(LabelRequest, new)]
+        waiting += [
+            (number + late, label_result(r, f"my {one.name}" if one else "")) for r, one in shown
+        ]
+        for due_keyframe, message in waiting:
+            new += mapper.handle(message) if due_keyframe == number else []
+        messages += new
+    messages += mapper.on_stop()
+    replica = replicate(messages)
+    top, truth = top_labels(replica.map.labels), true_objects(replica.map.means, SCENE_OBJECTS, WAY)
     names = np.array([f"my {thing.name}" for thing in SCENE_OBJECTS] + ["background"])
-    said = np.array(follower.label_names)[top]
-    mine = np.char.startswith(said, "my ")
-    is_wrong = mine & (said != names[truth])
-    assert np.count_nonzero(is_wrong & (truth >= 0)) < 0.05 * np.count_nonzero(mine), "another's"
-    # splats of 128x96 pixels reach over edges: of what an exact box makes couch, 0.16 is none
-    assert np.count_nonzero(is_wrong) < 0.33 * np.count_nonzero(mine)
+    assigned = np.array(replica.label_names)[top]
+    is_labelled = np.char.startswith(assigned, "my ")
+    is_wrong = is_labelled & (assigned != names[truth])
+    of_other_object = np.count_nonzero(is_wrong & (truth >= 0))
+    assert of_other_object < 0.05 * np.count_nonzero(is_labelled)
+    # Splats of 128x96 pixels reach over edges: in an exact box, 0.16 of the couch is background.
+    assert np.count_nonzero(is_wrong) < 0.33 * np.count_nonzero(is_labelled)
     chairs = truth == SCENE_OBJECTS.index(CHAIR)
-    assert np.mean(said[chairs] == "my chair") > 0.6
-    *_, last = of(MapObjects, made)
-    for thing in (CHAIR, TABLE):  # the vase is some 10 px wide, and not set apart from its table
+    assert np.mean(assigned[chairs] == "my chair") > 0.6
+    *_, last = of_kind(MapObjects, messages)
+    for thing in (CHAIR, TABLE):  # The vase is 10 px wide and not separable.
         center_m = np.array(thing.solid.center_m)
-        named = [one for one in last.objects if one.name == f"my {thing.name}"]
-        assert len(named) <= sum(other.name == thing.name for other in SCENE_OBJECTS), "one of each"
-        assert min(np.linalg.norm(np.array(one.centroid) - center_m) for one in named) < 0.3
+        found = [one for one in last.objects if one.name == f"my {thing.name}"]
+        assert len(found) <= sum(other.name == thing.name for other in SCENE_OBJECTS), "one of each"
+        assert min(np.linalg.norm(np.array(one.centroid) - center_m) for one in found) < 0.3
 
 
-def test_an_answer_speaks_of_all_views_that_were_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    """But for what the detector knows: it has spoken of that where it saw it."""
+def test_label_result_applies_to_all_views_of_its_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A label that the detector knows is the exception: other views have its own boxes."""
 
     def labelled(name: str) -> int:
         mapper = Mapper(CONFIG, has_labeller=True)
-        made = walk(mapper, known=(COUCH,))
-        for request in of(LabelRequest, made):
-            if shown_in(request) == CHAIR:
-                made += mapper.handle(answer(request, name))
-        follower = followed([*made, *mapper.on_stop()])
-        said = np.array(follower.label_names)[top_labels(follower.map.labels)]
-        return int(np.count_nonzero(said == name))
+        messages = walk(mapper, known=(COUCH,))
+        for request in of_kind(LabelRequest, messages):
+            if thing_in_box(request) == CHAIR:
+                messages += mapper.handle(label_result(request, name))
+        replica = replicate([*messages, *mapper.on_stop()])
+        assigned = np.array(replica.label_names)[top_labels(replica.map.labels)]
+        return int(np.count_nonzero(assigned == name))
 
-    beyond, of_the_detector = labelled("my chair"), labelled(COUCH.name)
+    new_label, detector_label = labelled("my chair"), labelled(COUCH.name)
     monkeypatch.setattr(OpenVocabularyLabeling, "shown_in", lambda *_: ())
-    assert beyond > 1.05 * labelled("my chair") > 0
-    assert of_the_detector == labelled(COUCH.name) > 0
+    assert new_label > 1.05 * labelled("my chair") > 0
+    assert detector_label == labelled(COUCH.name) > 0
 
 
 @pytest.mark.parametrize(
-    ("rule", "boxes_vote", "sure", "named"),
+    ("rule", "boxes_vote", "confidence", "expected_label"),
     [
-        ("adaptive", False, 0.7, "samovar"),  # 0.7 beside at most 0.5: alpha 0.34
-        ("adaptive", False, 0.35, "couch"),  # 0.35 beside 0.5, where a splat lies inside: 0.67
-        ("fixed", False, 0.55, "samovar"),  # half of 0.55 beside half of 0.5
+        ("adaptive", False, 0.7, "samovar"),  # 0.7 against at most 0.5: alpha 0.34.
+        ("adaptive", False, 0.35, "couch"),  # 0.35 against 0.5 for splats inside: 0.67.
+        ("fixed", False, 0.55, "samovar"),  # Half of 0.55 against half of 0.5.
         ("detector", True, 0.95, "couch"),
         ("detector", False, 0.95, "couch"),
     ],
 )
-def test_a_box_and_an_answer_are_weighed_as_printed_or_the_box_alone_counts(
-    rule: Literal["adaptive", "fixed", "detector"], boxes_vote: bool, sure: float, named: str
+def test_fusion_rule_decides_between_detection_and_label_result(
+    rule: Literal["adaptive", "fixed", "detector"],
+    boxes_vote: bool,
+    confidence: float,
+    expected_label: str,
 ) -> None:
     regions = replace(REGIONS, boxes_vote=boxes_vote, least_votes=0)
     labelling = SemanticFusionConfig(fusion=FusionConfig(rule=rule))
     naming = OpenVocabularyConfig(trigger=TRIGGER, regions=regions)
     semantics = SemanticMapConfig(labelling=labelling, naming=naming)
-    mapper, made = Mapper(replace(CONFIG, semantics=semantics), has_labeller=True), []
+    mapper, messages = Mapper(replace(CONFIG, semantics=semantics), has_labeller=True), []
     for number, T in enumerate(np.tile(WAY, (2, 1, 1))):
         new = walk(mapper, T[None], first=number, known=(COUCH,), score=0.5)
-        about_it = [one for one in of(LabelRequest, new) if shown_in(one) == COUCH]
-        made += [
+        about_it = [one for one in of_kind(LabelRequest, new) if thing_in_box(one) == COUCH]
+        messages += [
             *new,
-            *(m for one in about_it for m in mapper.handle(answer(one, "samovar", sure))),
+            *(
+                m
+                for one in about_it
+                for m in mapper.handle(label_result(one, "samovar", confidence))
+            ),
         ]
     assert mapper.metrics()["answers_named"] > 0
-    follower = followed([*made, *mapper.on_stop()])
-    top = top_labels(follower.map.labels)
-    truth = true_objects(follower.map.means, SCENE_OBJECTS, WAY)
-    said = np.array(follower.label_names)[top]
-    assert np.mean(said[truth == SCENE_OBJECTS.index(COUCH)] == named) > 0.6
+    replica = replicate([*messages, *mapper.on_stop()])
+    top, truth = top_labels(replica.map.labels), true_objects(replica.map.means, SCENE_OBJECTS, WAY)
+    assigned = np.array(replica.label_names)[top]
+    assert np.mean(assigned[truth == SCENE_OBJECTS.index(COUCH)] == expected_label) > 0.6
 
 
-def test_names_beyond_the_cap_are_other_and_no_opinion_is_no_label() -> None:
+def test_label_beyond_the_maximum_is_other_and_empty_result_labels_nothing() -> None:
     semantics = replace(CONFIG.semantics, most_names=83)
     mapper = Mapper(replace(CONFIG, semantics=semantics), has_labeller=True)
-    made = walk(mapper, known=())
-    first, second, third, *_ = of(LabelRequest, made)
+    messages = walk(mapper, known=())
+    first, second, third, *_ = of_kind(LabelRequest, messages)
     for request, label in ((first, "samovar"), (second, "lava lamp"), (third, "")):
-        made += mapper.handle(answer(request, label))
-    made += mapper.handle(answer(first, "again"))
-    made += mapper.on_stop()
-    follower = followed(made)
-    assert follower.label_names[-1] == "samovar"
-    assert set(top_labels(follower.map.labels).tolist()) == {0, 1, 82}
+        messages += mapper.handle(label_result(request, label))
+    messages += mapper.handle(label_result(first, "again"))
+    messages += mapper.on_stop()
+    replica = replicate(messages)
+    assert replica.label_names[-1] == "samovar"
+    assert set(top_labels(replica.map.labels).tolist()) == {0, 1, 82}
     facts = mapper.metrics()
     assert (facts["answers_named"], facts["answers_unnamed"], facts["answers_unknown"]) == (2, 1, 1)
     assert facts["label_names_rejected"] >= 1
 
 
-def test_walls_and_floors_are_background_whoever_names_them() -> None:
+def test_structural_labels_count_as_background() -> None:
     mapper = Mapper(CONFIG, has_labeller=True)
-    made = walk(mapper, WAY[:4], known=())
-    for request in of(LabelRequest, made):
-        made += mapper.handle(answer(request, "Ceiling"))
-    made += mapper.on_stop()
-    assert not top_labels(followed(made).map.labels).any()
+    messages = walk(mapper, WAY[:4], known=())
+    for request in of_kind(LabelRequest, messages):
+        messages += mapper.handle(label_result(request, "Ceiling"))
+    messages += mapper.on_stop()
+    assert not top_labels(replicate(messages).map.labels).any()
     assert mapper.metrics()["answers_unnamed"] > 0
 
 
-def test_an_answer_about_a_forgotten_keyframe_labels_nothing() -> None:
+def test_label_result_for_a_forgotten_keyframe_labels_nothing() -> None:
     mapper = Mapper(CONFIG, has_labeller=True)
-    made = walk(mapper, WAY[:4], known=())
-    request = of(LabelRequest, made)[0]
+    messages = walk(mapper, WAY[:4], known=())
+    request = of_kind(LabelRequest, messages)[0]
     mapper._map.views.store.keep_only([])
-    assert list(mapper.handle(answer(request, "samovar"))) == []
+    assert list(mapper.handle(label_result(request, "samovar"))) == []
     assert mapper.metrics()["answers_without_images"] == 1
-    assert not top_labels(followed([*made, *mapper.on_stop()]).map.labels).any()
+    assert not top_labels(replicate([*messages, *mapper.on_stop()]).map.labels).any()
 
 
-def test_what_only_the_labeller_knows_the_detector_cannot_miss_however_it_came_to_be_known() -> (
-    None
-):
-    """Here where the answer's own keyframe is forgotten, and later ones show its region again."""
+def test_label_unknown_to_the_detector_is_undetectable_after_a_late_result() -> None:
+    """The keyframe of the request is forgotten, and later ones observe its region again."""
     mapper = Mapper(CONFIG, has_labeller=True)
-    made = walk(mapper, np.tile(AHEAD, (5, 1, 1)), known=())
-    for request in of(LabelRequest, made):
+    messages = walk(mapper, np.tile(AHEAD, (5, 1, 1)), known=())
+    for request in of_kind(LabelRequest, messages):
         mapper._map.views.store.keep_only([])
-        assert list(mapper.handle(answer(request, "samovar"))) == []
-    made += walk(mapper, AHEAD[None], first=5, known=(COUCH,))
-    names = followed(made).label_names
+        assert list(mapper.handle(label_result(request, "samovar"))) == []
+    messages += walk(mapper, AHEAD[None], first=5, known=(COUCH,))
+    names = replicate(messages).label_names
     assert "samovar" in names
-    spared = mapper._semantics._undetectable_labels()
-    assert spared is not None
-    assert np.flatnonzero(spared).tolist() == [names.index("samovar")]
+    undetectable = mapper._semantics._undetectable_labels()
+    assert undetectable is not None
+    assert np.flatnonzero(undetectable).tolist() == [names.index("samovar")]
 
 
-def test_the_map_looks_the_same_whoever_names_it() -> None:
-    plain, asking = Mapper(CONFIG), Mapper(CONFIG, has_labeller=True)
-    alone, made = walk(plain, WAY[:6], known=(BALL,)), walk(asking, WAY[:6], known=(BALL,))
-    for request in of(LabelRequest, made):
-        made += asking.handle(answer(request, "samovar"))
+def test_label_results_do_not_change_renderings_or_gaussians() -> None:
+    plain, with_labeller = Mapper(CONFIG), Mapper(CONFIG, has_labeller=True)
+    without_labels, messages = (
+        walk(plain, WAY[:6], known=(BALL,)),
+        walk(with_labeller, WAY[:6], known=(BALL,)),
+    )
+    for request in of_kind(LabelRequest, messages):
+        messages += with_labeller.handle(label_result(request, "samovar"))
     views = [
-        [encode(unversioned(view)) for view in of(MapRendering, said)] for said in (alone, made)
+        [encode(unversioned(view)) for view in of_kind(MapRendering, end)]
+        for end in (without_labels, messages)
     ]
     assert views[0] == views[1]
     rows = [
-        followed([*said, *m.on_stop()]).map.rows for said, m in ((alone, plain), (made, asking))
+        replicate([*end, *m.on_stop()]).map.rows
+        for end, m in ((without_labels, plain), (messages, with_labeller))
     ]
     assert rows[0].tobytes() == rows[1].tobytes()

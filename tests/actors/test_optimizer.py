@@ -1,4 +1,4 @@
-"""The optimizer owns the keyframe poses."""
+"""Corrections of the optimizer from keyframes and their measurements."""
 
 import msgspec
 import numpy as np
@@ -12,19 +12,16 @@ from ldo_service.conversions.poses import (
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import T_map_submap
 from ldo_service.schemas import Keyframe, MeasuredPose, Pose
+from tests.actors.conftest import handle_all
 
 
-def handled(optimizer: Optimizer, keyframes: list[Keyframe]) -> list:
-    return [out for keyframe in keyframes for out in optimizer.handle(keyframe)]
-
-
-def chained(keyframes: list[Keyframe]) -> list[Keyframe]:
-    """Measured from their references alone."""
+def with_references_only(keyframes: list[Keyframe]) -> list[Keyframe]:
+    """Return keyframes that are measured against their references alone."""
     return [msgspec.structs.replace(keyframe, window_measurements=()) for keyframe in keyframes]
 
 
 def test_each_keyframe_gives_a_correction_of_all_poses(keyframes) -> None:
-    corrections = handled(Optimizer(), chained(keyframes))
+    corrections = handle_all(Optimizer(), with_references_only(keyframes))
     assert [c.graph_version for c in corrections] == list(range(1, len(keyframes) + 1))
     last = keyframe_poses_from_correction(corrections[-1])
     assert list(last) == [k.keyframe for k in keyframes]
@@ -36,15 +33,17 @@ def test_each_keyframe_gives_a_correction_of_all_poses(keyframes) -> None:
 
 def test_a_keyframe_sent_twice_counts_once(keyframes) -> None:
     optimizer = Optimizer()
-    handled(optimizer, keyframes[:2])
-    assert handled(optimizer, keyframes[1:2]) == []
+    handle_all(optimizer, keyframes[:2])
+    assert handle_all(optimizer, keyframes[1:2]) == []
     assert optimizer.metrics()["keyframes_repeated"] == 1
 
 
 def test_a_missing_reference_is_bridged_by_odometry(keyframes, caplog) -> None:
     optimizer = Optimizer()
     missing = next(k.reference for k in keyframes if k.reference)
-    (*_, last) = handled(optimizer, [k for k in chained(keyframes) if k.keyframe != missing])
+    (*_, last) = handle_all(
+        optimizer, [k for k in with_references_only(keyframes) if k.keyframe != missing]
+    )
     assert "was never received; using odometry" in caplog.text
     poses = keyframe_poses_from_correction(last)
     newest = keyframes[-1]
@@ -53,12 +52,12 @@ def test_a_missing_reference_is_bridged_by_odometry(keyframes, caplog) -> None:
     )
 
 
-def test_a_window_stands_in_for_a_missing_reference(keyframes) -> None:
+def test_window_measurement_replaces_a_missing_reference(keyframes) -> None:
     optimizer = Optimizer()
     *_, last = keyframes
     older = last.window_measurements[-1]
-    handled(optimizer, [k for k in keyframes if k.keyframe <= older.reference])
-    (correction,) = handled(optimizer, [last])
+    handle_all(optimizer, [k for k in keyframes if k.keyframe <= older.reference])
+    (correction,) = handle_all(optimizer, [last])
     poses = keyframe_poses_from_correction(correction)
     T_older_last = se3.inverse(poses[older.reference]) @ poses[last.keyframe]
     np.testing.assert_allclose(
@@ -67,7 +66,7 @@ def test_a_window_stands_in_for_a_missing_reference(keyframes) -> None:
     assert optimizer.metrics()["keyframes_odometry_fallback"] == 0
 
 
-def test_windows_bring_the_keyframes_nearer_to_the_truth(keyframes, room) -> None:
+def test_window_measurements_reduce_the_pose_error(keyframes, room) -> None:
     truth = room.truth().T_world_camera
 
     def error_m(corrections: list) -> float:
@@ -77,40 +76,40 @@ def test_windows_bring_the_keyframes_nearer_to_the_truth(keyframes, room) -> Non
         true = [(T_first_world @ truth[k.frame])[:3, 3] for k in keyframes]
         return float(np.sqrt(np.mean(np.square(np.subtract(estimated, true)).sum(axis=1))))
 
-    alone = error_m(handled(Optimizer(), chained(keyframes)))
-    together = error_m(handled(Optimizer(), keyframes))
-    assert together < 0.8 * alone
+    without_windows = error_m(handle_all(Optimizer(), with_references_only(keyframes)))
+    with_windows = error_m(handle_all(Optimizer(), keyframes))
+    assert with_windows < 0.8 * without_windows
 
 
-def test_a_successor_says_the_last_correction_anew_and_goes_on(keyframes) -> None:
+def test_restored_optimizer_republishes_last_correction_and_continues(keyframes) -> None:
     first, second = Optimizer(), Optimizer()
-    *_, last = handled(first, keyframes[:-1])
+    *_, last = handle_all(first, keyframes[:-1])
     second.restore(first.snapshot())
     (again,) = second.on_restored()
-    assert again.graph_version == last.graph_version + 1, "it may have been sent before"
+    assert again.graph_version == last.graph_version + 1, "the last version may have been sent"
     assert (again.stamp_ns, again.keyframes) == (last.stamp_ns, last.keyframes)
-    (expected,) = handled(first, keyframes[-1:])
-    (correction,) = handled(second, keyframes[-1:])
+    (expected,) = handle_all(first, keyframes[-1:])
+    (correction,) = handle_all(second, keyframes[-1:])
     for keyframe, T in keyframe_poses_from_correction(correction).items():
         np.testing.assert_allclose(T, keyframe_poses_from_correction(expected)[keyframe], atol=1e-6)
 
 
-def test_two_runs_say_the_same_bytes(keyframes) -> None:
+def test_same_keyframes_give_bitwise_equal_corrections(keyframes) -> None:
     one, two = (
-        [msgspec.msgpack.encode(c) for c in handled(Optimizer(), keyframes)] for _ in range(2)
+        [msgspec.msgpack.encode(c) for c in handle_all(Optimizer(), keyframes)] for _ in range(2)
     )
     assert one == two
 
 
 def test_an_information_of_zero_does_not_break_the_graph(keyframes) -> None:
-    blind = msgspec.structs.replace(keyframes[1], information=(0.0,) * 36)
-    assert len(handled(Optimizer(), [keyframes[0], blind])) == 2
+    without_information = msgspec.structs.replace(keyframes[1], information=(0.0,) * 36)
+    assert len(handle_all(Optimizer(), [keyframes[0], without_information])) == 2
 
 
 # --- submaps -------------------------------------------------------------------------------------
 def in_two_submaps(keyframes: list[Keyframe], split: int) -> list[Keyframe]:
-    """As if tracking had been lost before keyframe `split`, and had begun anew."""
-    keyframes = chained(keyframes)
+    """Return keyframes, those from `split` on in a second submap."""
+    keyframes = with_references_only(keyframes)
     second = msgspec.structs.replace(keyframes[split], submap=1, reference=None)
     later = [
         msgspec.structs.replace(
@@ -128,8 +127,8 @@ def between(known: Keyframe, keyframe: Keyframe) -> Pose:
     return pose_to_message(se3.inverse(T_odom_known) @ T_odom_keyframe)
 
 
-def joining(keyframe: Keyframe, known: Keyframe) -> Keyframe:
-    """The keyframe, which sees what an old one saw."""
+def with_submap_measurement(keyframe: Keyframe, known: Keyframe) -> Keyframe:
+    """Return the keyframe with a submap measurement against a known one."""
     pose = MeasuredPose(
         reference=known.keyframe,
         keyframe=keyframe.keyframe,
@@ -140,7 +139,7 @@ def joining(keyframe: Keyframe, known: Keyframe) -> Keyframe:
 
 
 def test_a_new_submap_is_placed_far_from_the_others(keyframes) -> None:
-    (*_, last) = handled(Optimizer(), in_two_submaps(keyframes, 3))
+    (*_, last) = handle_all(Optimizer(), in_two_submaps(keyframes, 3))
     assert last.merged_submaps == ()
     for k in keyframes:
         T_odom_keyframe = pose_from_message(k.T_odom_keyframe)
@@ -150,14 +149,14 @@ def test_a_new_submap_is_placed_far_from_the_others(keyframes) -> None:
         )
 
 
-def test_a_join_brings_the_younger_submap_into_the_older_ones_frame(keyframes, caplog) -> None:
+def test_submap_measurement_merges_newer_submap_into_the_older_frame(keyframes, caplog) -> None:
     caplog.set_level("INFO")
     *before, last = in_two_submaps(keyframes, 3)
-    first, successor = Optimizer(), Optimizer()
-    handled(first, before)
-    successor.restore(first.snapshot())
-    for optimizer in (first, successor):
-        (correction,) = handled(optimizer, [joining(last, keyframes[1])])
+    first, restored = Optimizer(), Optimizer()
+    handle_all(first, before)
+    restored.restore(first.snapshot())
+    for optimizer in (first, restored):
+        (correction,) = handle_all(optimizer, [with_submap_measurement(last, keyframes[1])])
         assert correction.merged_submaps == ((1, 0),)
         for k in keyframes:
             np.testing.assert_allclose(
@@ -169,10 +168,10 @@ def test_a_join_brings_the_younger_submap_into_the_older_ones_frame(keyframes, c
     assert first.metrics()["submaps_unmerged"] == 1
 
 
-def test_a_join_to_a_keyframe_that_never_came_is_left_out(keyframes, caplog) -> None:
+def test_submap_measurement_to_an_unknown_keyframe_is_discarded(keyframes, caplog) -> None:
     *before, last = in_two_submaps(keyframes, 3)
     optimizer = Optimizer()
-    handled(optimizer, [k for k in before if k.keyframe != 1])
-    (correction,) = handled(optimizer, [joining(last, keyframes[1])])
+    handle_all(optimizer, [k for k in before if k.keyframe != 1])
+    (correction,) = handle_all(optimizer, [with_submap_measurement(last, keyframes[1])])
     assert correction.merged_submaps == ()
     assert "submap measurement to unknown keyframe 1" in caplog.text

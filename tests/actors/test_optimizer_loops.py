@@ -1,4 +1,4 @@
-"""Loop closures and objects as messages: what corrections say then."""
+"""Corrections of the optimizer from loop closures and object observations."""
 
 from collections.abc import Iterable, Iterator
 
@@ -28,11 +28,11 @@ from ldo_service.storage.state_codec import decode_state, encode_state
 CAMERA = CameraModel(width=320, height=240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)
 COLOR, DEPTH = np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32)
 INFORMATION = np.diag([1e4] * 6)
-CENTER = np.array([0.0, 0.0, 0.0])  # of the circle, where an object stands
+CENTER = np.array([0.0, 0.0, 0.0])  # Center of the circle and position of the object.
 
 
-def circle(count: int, each: int, radius_m: float = 2.0) -> list[np.ndarray]:
-    """Around an object, always looking at it."""
+def poses_on_circle(count: int, each: int, radius_m: float = 2.0) -> list[np.ndarray]:
+    """Return camera poses on a circle around an object, all directed at it."""
     poses = []
     for angle in 2 * np.pi * np.arange(count) / each:
         T = se3.exp(np.array([0, angle, 0, 0, 0, 0]))
@@ -41,11 +41,11 @@ def circle(count: int, each: int, radius_m: float = 2.0) -> list[np.ndarray]:
     return poses
 
 
-TRUTH = circle(90, 40)
+TRUTH = poses_on_circle(90, 40)
 
 
 def T_of_step(k: int) -> np.ndarray:
-    """As odometry measures it, which drifts."""
+    """Return the motion to pose k as measured by drifting odometry."""
     T = se3.inverse(TRUTH[k - 1]) @ TRUTH[k]
     T[:3, 3] *= 1.01
     return T @ se3.exp(np.array([0, 1.5e-3, 0, 0, 0, 0]))
@@ -75,7 +75,7 @@ def closure(a: int, b: int, T_a_b: np.ndarray | None = None) -> LoopClosure:
     return LoopClosure(stamp_ns=b * 10**8, pose=pose, overlap=0.6, rmse_m=0.01)
 
 
-def seen(k: int, p: float = 0.9, entropy: float = 0.4) -> ObjectObservation:
+def observation(k: int, p: float = 0.9, entropy: float = 0.4) -> ObjectObservation:
     u, v, z = se3.transform(se3.inverse(TRUTH[k]), CENTER)
     u, v = 250 * u / z + 159.5, 250 * v / z + 119.5
     return ObjectObservation(
@@ -88,13 +88,13 @@ def seen(k: int, p: float = 0.9, entropy: float = 0.4) -> ObjectObservation:
     )
 
 
-def story() -> Iterator[Message]:
-    """Keyframes, the object in most of them a little late, and a closure every five."""
+def messages_with_closures() -> Iterator[Message]:
+    """Yield keyframes, observations one keyframe late, and a closure every five keyframes."""
     for message in keyframes():
         k = message.keyframe
         yield message
         if k % 3 != 0 and k > 1:
-            yield seen(k - 1)
+            yield observation(k - 1)
         if k > 50 and k % 5 == 0:
             yield closure(k - 40, k)
 
@@ -109,18 +109,21 @@ def error_m(correction: GraphCorrection) -> float:
     return float(np.sqrt(np.mean(np.square(off).sum(axis=1))))
 
 
-def test_closures_undo_what_odometry_drifted() -> None:
+def test_closures_correct_odometry_drift() -> None:
     drifted = corrections(Optimizer(), keyframes())[-1]
     optimizer = Optimizer()
-    *_, last = corrections(optimizer, story())
+    *_, last = corrections(optimizer, messages_with_closures())
     assert last.accepted_closures == tuple((k - 40, k) for k in range(55, 90, 5))
     assert last.rejected_closures == ()
-    assert error_m(last) < error_m(drifted) / 3, "steps that are 1 % too long stay so"
+    assert error_m(last) < error_m(drifted) / 3, (
+        "closures do not correct the length of steps, 1 % too long"
+    )
     assert optimizer.metrics()["closures"] == 7
-    assert optimizer.metrics()["graph_variables"] < 45  # the newest 20, and ends of closures
+    # The newest 20 keyframes and ends of closures.
+    assert optimizer.metrics()["graph_variables"] < 45
 
 
-def test_a_false_closure_is_told_as_not_believed_and_moves_nothing() -> None:
+def test_false_closure_is_published_as_rejected_and_moves_nothing() -> None:
     optimizer = Optimizer()
     *_, before = corrections(optimizer, keyframes())
     (after,) = corrections(optimizer, [closure(10, 70, np.eye(4))])
@@ -140,7 +143,7 @@ def test_a_closure_waits_for_its_keyframe() -> None:
 
 
 def test_an_object_becomes_a_landmark_with_its_name() -> None:
-    *_, last = corrections(Optimizer(), story())
+    *_, last = corrections(Optimizer(), messages_with_closures())
     (landmark,) = last.landmarks
     assert landmark.object == 4
     assert landmark.distribution[0][0] == "chair"
@@ -148,25 +151,25 @@ def test_an_object_becomes_a_landmark_with_its_name() -> None:
     assert np.linalg.norm(np.subtract(landmark.centroid, CENTER)) < 0.1
 
 
-def test_observations_are_taken_in_when_enough_of_them_wait() -> None:
+def test_observations_are_optimized_in_batches() -> None:
     optimizer = Optimizer()
-    corrections(optimizer, story())
-    facts = optimizer.metrics()
-    assert facts["landmarks"] == 1
-    assert facts["optimizations_skipped"] > 40
+    corrections(optimizer, messages_with_closures())
+    metrics = optimizer.metrics()
+    assert metrics["landmarks"] == 1
+    assert metrics["optimizations_skipped"] > 40
 
 
-def test_an_observation_of_a_keyframe_that_is_under_way_waits_for_it() -> None:
+def test_early_observation_waits_for_its_keyframe() -> None:
     messages = list(keyframes())
     optimizer = Optimizer()
     corrections(optimizer, messages[:10])
-    assert corrections(optimizer, [seen(10), *messages[10:13], seen(12)]) != []
+    assert corrections(optimizer, [observation(10), *messages[10:13], observation(12)]) != []
     assert optimizer.metrics()["early_messages_discarded"] == 0
     assert len(optimizer.snapshot()["rest"]["waiting"]) == 2
 
 
-def test_a_successor_says_the_same_bits() -> None:
-    messages = list(story())
+def test_restored_optimizer_continues_bitwise_equal() -> None:
+    messages = list(messages_with_closures())
     for split in (40, 101, 131):
         first, second = Optimizer(), Optimizer()
         corrections(first, messages[:split])

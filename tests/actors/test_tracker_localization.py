@@ -1,4 +1,4 @@
-"""A camera in the map of a finished run."""
+"""Localization of a camera in the map of a finished run."""
 
 from pathlib import Path
 
@@ -16,13 +16,13 @@ from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking.keyframe_database import DATABASE_FILE, load_keyframe_database
 
 
-def localizing(finished_run: Path) -> Tracker:
+def localizing_tracker(finished_run: Path) -> Tracker:
     return Tracker(TrackerConfig(localise=str(finished_run)))
 
 
 def test_poses_are_in_the_frame_of_the_map(room: Sequence, finished_run: Path, frames) -> None:
-    """The run saw frames 0 to 15; the camera starts at the 12th and leaves."""
-    tracker = localizing(finished_run)
+    """The map has frames 0 to 15; the camera starts at frame 12 and leaves the mapped area."""
+    tracker = localizing_tracker(finished_run)
     made = [out for frame in frames[12:30] for out in tracker.handle(frame)]
     assert all(isinstance(message, TrackedPose) for message in made), "no keyframe is made"
     assert [pose.status for pose in made[:2]] == ["LOST", "OK"]
@@ -37,26 +37,26 @@ def test_poses_are_in_the_frame_of_the_map(room: Sequence, finished_run: Path, f
 
 
 @pytest.mark.parametrize("split", [1, 8])
-def test_a_successor_goes_on_bit_for_bit(finished_run: Path, frames, split: int) -> None:
-    first, second = localizing(finished_run), localizing(finished_run)
+def test_restored_tracker_continues_bitwise_equal(finished_run: Path, frames, split: int) -> None:
+    first, second = localizing_tracker(finished_run), localizing_tracker(finished_run)
     for frame in frames[: split + 1]:
         list(first.handle(frame))
     state = {name: decode_state(encode_state(part)) for name, part in first.snapshot().items()}
     second.restore(state)
     for frame in frames[split + 1 : split + 10]:
-        (mine,), (expected,) = second.handle(frame), first.handle(frame)
-        assert msgspec.msgpack.encode(mine) == msgspec.msgpack.encode(expected)
+        (pose,), (expected,) = second.handle(frame), first.handle(frame)
+        assert msgspec.msgpack.encode(pose) == msgspec.msgpack.encode(expected)
 
 
-def test_the_state_of_a_mapping_service_is_refused_and_the_other_way_round(
+def test_state_of_mapping_and_localizing_trackers_is_not_interchangeable(
     finished_run: Path, frames
 ) -> None:
     mapping = Tracker()
     list(mapping.handle(frames[0]))
-    tracker = localizing(finished_run)
+    tracker = localizing_tracker(finished_run)
     list(tracker.handle(frames[0]))
     with pytest.raises(ConfigError, match="--state"):
-        localizing(finished_run).restore(mapping.snapshot())
+        localizing_tracker(finished_run).restore(mapping.snapshot())
     with pytest.raises(ConfigError, match=str(finished_run)):
         Tracker().restore(tracker.snapshot())
 
@@ -67,13 +67,13 @@ def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("body", [b"", b"nonsense", encode_state({"places": [{"id": 1}]})])
-def test_a_file_that_no_run_wrote_is_refused(tmp_path: Path, body: bytes) -> None:
+def test_invalid_keyframe_database_is_refused(tmp_path: Path, body: bytes) -> None:
     (tmp_path / DATABASE_FILE).write_bytes(body)
     with pytest.raises(DataError, match="is not a keyframe database of `ldo run`"):
         load_keyframe_database(tmp_path)
 
 
-def test_a_run_that_made_no_keyframe_is_refused(tmp_path: Path) -> None:
+def test_keyframe_database_without_records_is_refused(tmp_path: Path) -> None:
     (tmp_path / DATABASE_FILE).write_bytes(encode_state({"places": []}))
     with pytest.raises(DataError, match="no keyframe record"):
         load_keyframe_database(tmp_path)

@@ -1,4 +1,4 @@
-"""A frame enters `ldo_service.tracking` once, whatever becomes of it."""
+"""Calls of the tracker actor into `ldo_service.tracking`: one per frame."""
 
 import sys
 from collections.abc import Sequence as Many
@@ -17,21 +17,21 @@ ACTOR, TRACKING = "ldo_service.actors.tracker", "ldo_service.tracking."
 
 
 def calls_into_tracking(tracker: Tracker, message: Message) -> tuple[list[str], list[Message]]:
-    """Return the functions of tracking that the actor's module calls, and what the actor makes.
+    """Return the functions of tracking that the actor's module calls, and its messages.
 
     Calls by `ldo_service.conversions` do not count: they read a result. Constructors would count,
     and the actor needs none.
     """
     calls: list[str] = []
 
-    def note(frame: FrameType, event: str, _: object) -> None:
+    def record_call(frame: FrameType, event: str, _: object) -> None:
         caller = frame.f_back
         if event != "call" or caller is None or caller.f_globals.get("__name__") != ACTOR:
             return
         if frame.f_globals.get("__name__", "").startswith(TRACKING):
             calls.append(frame.f_code.co_qualname)
 
-    sys.setprofile(note)
+    sys.setprofile(record_call)
     try:
         made = list(tracker.handle(message))
     finally:
@@ -40,7 +40,7 @@ def calls_into_tracking(tracker: Tracker, message: Message) -> tuple[list[str], 
 
 
 def kind_of(made: Many[Message], tracker: Tracker) -> str:
-    """Return what became of a frame."""
+    """Return the kind of result that a frame gave."""
     keyframes = [message for message in made if isinstance(message, Keyframe)]
     if not made:
         return "nothing"

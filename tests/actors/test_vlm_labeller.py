@@ -1,4 +1,4 @@
-"""Names for regions, and what becomes of labellers that fail, hang or are not there."""
+"""Label results for regions, and labellers that fail, hang or are missing."""
 
 import asyncio
 import logging
@@ -27,13 +27,13 @@ from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_REQUEST, LA
 from ldo_service.service.service import open_recorder
 from ldo_service.storage.state_store import MemoryStore
 from ldo_service.transport.interface import MemoryTransport
-from tests.detection.labellers.encoders import ColorPair, embeddings, plain_image, vocabulary
-from tests.detection.labellers.server import hangs, replies_with, responds, serving
+from tests.detection.labellers.encoders import ColorPair, embeddings, plain, vocabulary
+from tests.detection.labellers.server import hangs, replies_with, sends, serving
 from tests.runtime.fake_actors import QUICK, eventually, running, send
 
 
 def crop_message(color: np.ndarray) -> Image:
-    """A crop [h, w, 3] uint8 RGB as JPEG."""
+    """Return a crop [h, w, 3] uint8 RGB as JPEG."""
     height, width = color.shape[:2]
     data = memoryview(codecs.encode_jpeg(color))
     return Image(encoding="jpeg", width=width, height=height, data=data)
@@ -46,19 +46,19 @@ def request(region: int = 7, color: str = "red", **fields) -> LabelRequest:
             "region": region,
             "keyframe": 3,
             "box_px": (1.0, 2.0, 30.0, 40.0),
-            "crops": (crop_message(plain_image(color)),),
+            "crops": (crop_message(plain(color)),),
             **fields,
         }
     )
 
 
-def only(messages) -> LabelResult:
+def only_result(messages) -> LabelResult:
     (message,) = messages
     assert isinstance(message, LabelResult)
     return message
 
 
-def added(actor: VlmLabeller, name: str) -> LabelNames:
+def add_name(actor: VlmLabeller, name: str) -> LabelNames:
     (answer,) = actor.handle(AddLabel(stamp_ns=5, name=name))
     assert isinstance(answer, LabelNames)
     return answer
@@ -67,7 +67,7 @@ def added(actor: VlmLabeller, name: str) -> LabelNames:
 @pytest.fixture
 def pair(tmp_path: Path) -> Path:
     """A folder with a pair of encoders and a text encoder."""
-    folder = tmp_path / "colours"
+    folder = tmp_path / "colors"
     folder.mkdir()
     ColorPair().image(folder / "model.onnx")
     ColorPair().text(folder / "text.onnx")
@@ -82,8 +82,8 @@ def names(tmp_path: Path) -> Path:
     return path
 
 
-class Scripted:
-    """Says what it is told, waits where it is told."""
+class FakeLabeller:
+    """Labeller with fixed opinions, which it returns once its gate is open."""
 
     identity, names = "scripted 1", ("cup",)
 
@@ -107,36 +107,36 @@ class Scripted:
 # --- answers --------------------------------------------------------------------------------------
 def test_a_region_gets_its_name(pair: Path, names: Path) -> None:
     actor = VlmLabeller(VlmLabellerConfig(model=str(pair), names=str(names)))
-    answer = only(actor.handle(request(region=12, color="green")))
+    answer = only_result(actor.handle(request(region=12, color="green")))
     assert (answer.region, answer.keyframe, answer.stamp_ns) == (12, 3, 1012)
     assert answer.label == "green"
     assert 0.9 < answer.confidence <= 1
-    assert answer.labeller.startswith("colours ")
+    assert answer.labeller.startswith("colors ")
     facts = actor.metrics()
     assert (facts["labellers"], facts["regions_named"], facts["names"]) == (1, 1, 2)
 
 
-def test_it_tells_what_else_a_region_may_be() -> None:
-    told = [("cup", 0.5), ("vase", 0.3), ("bowl", 0.1)]
-    answer = only(VlmLabeller(labeller=Scripted(told)).handle(request()))
+def test_result_lists_alternative_labels_up_to_the_maximum() -> None:
+    opinions = [("cup", 0.5), ("vase", 0.3), ("bowl", 0.1)]
+    answer = only_result(VlmLabeller(labeller=FakeLabeller(opinions)).handle(request()))
     assert (answer.label, answer.alternatives) == ("cup", (("vase", 0.3), ("bowl", 0.1)))
     many = [(f"name {k}", 0.01) for k in range(99)]
     assert (
-        len(only(VlmLabeller(labeller=Scripted(many)).handle(request())).alternatives)
+        len(only_result(VlmLabeller(labeller=FakeLabeller(many)).handle(request())).alternatives)
         == MAX_ALTERNATIVES
     )
 
 
-def test_without_a_labeller_it_idles_and_answers_at_once() -> None:
+def test_without_labeller_requests_get_empty_results_at_once() -> None:
     actor = VlmLabeller()
-    answer = only(actor.handle(request()))
+    answer = only_result(actor.handle(request()))
     assert (answer.label, answer.confidence, answer.labeller) == ("", 0, "")
     assert (actor.metrics()["labellers"], actor.metrics()["labellers_missing"]) == (0, 0)
-    assert "vlm_labeller.model" in added(actor, "teapot").error
+    assert "vlm_labeller.model" in add_name(actor, "teapot").error
 
 
-def test_no_opinion_is_told_from_nobody_who_could_look() -> None:
-    answer = only(VlmLabeller(labeller=Scripted([])).handle(request()))
+def test_result_without_a_label_still_names_the_labeller() -> None:
+    answer = only_result(VlmLabeller(labeller=FakeLabeller([])).handle(request()))
     assert (answer.label, answer.confidence, answer.labeller) == ("", 0, "scripted 1")
 
 
@@ -149,7 +149,7 @@ def test_no_opinion_is_told_from_nobody_who_could_look() -> None:
         {"url": "http://127.0.0.1:1/v1", "names": "absent.txt"},
     ],
 )
-def test_a_labeller_that_cannot_be_used_is_said_once_and_the_service_goes_on(
+def test_unusable_labeller_is_logged_once_and_gives_empty_results(
     tmp_path: Path, caplog, config: dict
 ) -> None:
     if config.get("model") == "garbage":
@@ -158,7 +158,7 @@ def test_a_labeller_that_cannot_be_used_is_said_once_and_the_service_goes_on(
         config = {"model": str(tmp_path)}
     actor = VlmLabeller(VlmLabellerConfig(**config))
     for _ in range(3):
-        assert only(actor.handle(request())).labeller == ""
+        assert only_result(actor.handle(request())).labeller == ""
     (record,) = caplog.records
     assert record.levelno == logging.ERROR
     assert actor.metrics()["labellers_missing"] == 1
@@ -166,8 +166,8 @@ def test_a_labeller_that_cannot_be_used_is_said_once_and_the_service_goes_on(
         require_labeller(VlmLabellerConfig(**config))
 
 
-def test_failures_are_counted_and_told_once_until_it_works_again(caplog) -> None:
-    class Failing(Scripted):
+def test_failures_are_counted_and_logged_once_until_recovery(caplog) -> None:
+    class Failing(FakeLabeller):
         def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
             if len(self.seen) in (1, 2):
                 self.seen.append(0)
@@ -176,7 +176,7 @@ def test_failures_are_counted_and_told_once_until_it_works_again(caplog) -> None
 
     actor = VlmLabeller(labeller=Failing([("cup", 0.5)]))
     caplog.set_level(logging.INFO)
-    answers = [only(actor.handle(request())) for _ in range(5)]
+    answers = [only_result(actor.handle(request())) for _ in range(5)]
     assert [answer.label for answer in answers] == ["cup", "", "", "cup", "cup"]
     assert [bool(answer.labeller) for answer in answers] == [True, False, False, True, True]
     assert len(caplog.records) == 2
@@ -184,10 +184,10 @@ def test_failures_are_counted_and_told_once_until_it_works_again(caplog) -> None
     assert actor.metrics()["labeller_failing"] == 0
 
 
-def test_a_crop_that_is_no_image_leaves_its_region_unnamed() -> None:
-    labeller = Scripted([("cup", 0.5)])
+def test_undecodable_crop_leaves_its_region_unnamed() -> None:
+    labeller = FakeLabeller([("cup", 0.5)])
     broken = Image(encoding="jpeg", width=9, height=9, data=memoryview(b"no jpeg"))
-    answer = only(VlmLabeller(labeller=labeller).handle(request(crops=(broken,))))
+    answer = only_result(VlmLabeller(labeller=labeller).handle(request(crops=(broken,))))
     assert answer.label == ""
     assert labeller.seen == []
 
@@ -196,17 +196,14 @@ def test_a_crop_that_is_no_image_leaves_its_region_unnamed() -> None:
     ("behaves", "facts"),
     [
         (replies_with("cup", 0.75), {"regions_named": 1}),
-        (
-            replies_with("a kind of thing, I believe", 0.9),
-            {"answers_refused": 1, "regions_unnamed": 1},
-        ),
-        (responds(500), {"labellings_failed": 1, "labeller_failing": 1}),
-        (responds(200, b"nonsense"), {"labellings_failed": 1, "labeller_failing": 1}),
+        (replies_with("a kind of thing, I believe", 0.9), {"answers_refused": 1, "regions_unnamed": 1}),
+        (sends(500), {"labellings_failed": 1, "labeller_failing": 1}),
+        (sends(200, b"nonsense"), {"labellings_failed": 1, "labeller_failing": 1}),
         (hangs, {"labellings_failed": 1, "labeller_failing": 1}),
     ],
     ids=["good", "nonsense", "500", "no json", "hangs"],
 )
-def test_whatever_a_server_does_nothing_is_mislabelled(
+def test_only_a_valid_server_answer_labels_the_region(
     tmp_path: Path, behaves, facts: dict[str, float]
 ) -> None:
     (tmp_path / "names.txt").write_text("cup\nvase\n")
@@ -216,7 +213,7 @@ def test_whatever_a_server_does_nothing_is_mislabelled(
             url=server.url, names=str(tmp_path / "names.txt"), http=HttpConfig(endpoint=quick)
         )
         actor = VlmLabeller(config)
-        answer = only(actor.handle(request()))
+        answer = only_result(actor.handle(request()))
     is_good = "regions_named" in facts
     assert (answer.label, answer.confidence) == (
         ("cup", pytest.approx(0.75)) if is_good else ("", 0)
@@ -224,33 +221,33 @@ def test_whatever_a_server_does_nothing_is_mislabelled(
     assert facts.items() <= actor.metrics().items()
 
 
-def test_a_model_and_a_server_are_one_too_many() -> None:
+def test_model_and_server_together_are_refused() -> None:
     with pytest.raises(ConfigError, match="choose one"):
         VlmLabellerConfig(model="clip", url="http://127.0.0.1:1/v1")
 
 
-# --- names that are added -------------------------------------------------------------------------
-def test_a_name_that_is_added_is_found_and_survives_a_restart(pair: Path, names: Path) -> None:
+# --- added names ----------------------------------------------------------------------------------
+def test_added_name_is_recognized_and_survives_a_restart(pair: Path, names: Path) -> None:
     config = VlmLabellerConfig(model=str(pair), names=str(names))
-    first, plain_one = VlmLabeller(config), VlmLabeller(config)
-    assert added(first, "Blue").names == ("red", "green", "blue")
+    first, unchanged = VlmLabeller(config), VlmLabeller(config)
+    assert add_name(first, "Blue").names == ("red", "green", "blue")
     state = first.snapshot()
-    assert first.snapshot() is state, "nothing new is written"
-    successor = VlmLabeller(config)
-    successor.restore(state)
-    for actor in (first, successor):
-        assert only(actor.handle(request(color="blue"))).label == "blue"
-    assert only(plain_one.handle(request(color="blue"))).confidence < 0.6
-    assert successor.metrics()["names_added"] == 1
+    assert first.snapshot() is state, "an unchanged state is not written again"
+    restored = VlmLabeller(config)
+    restored.restore(state)
+    for actor in (first, restored):
+        assert only_result(actor.handle(request(color="blue"))).label == "blue"
+    assert only_result(unchanged.handle(request(color="blue"))).confidence < 0.6
+    assert restored.metrics()["names_added"] == 1
 
 
-def test_a_name_that_cannot_be_placed_is_refused_and_later_remembered(
+def test_name_without_text_encoder_is_refused_and_kept_in_restored_state(
     tmp_path: Path, pair: Path, caplog
 ) -> None:
     ColorPair().image(tmp_path / "model.onnx")
     embeddings(tmp_path / "embeddings.npz")
     cached = VlmLabeller(VlmLabellerConfig(model=str(tmp_path)))
-    answer = added(cached, "teapot")
+    answer = add_name(cached, "teapot")
     assert "--text and --vocabulary" in answer.error
     assert answer.names == ("red", "green", "blue")
     assert cached.metrics()["names_refused"] == 1
@@ -258,39 +255,41 @@ def test_a_name_that_cannot_be_placed_is_refused_and_later_remembered(
     assert "saved name 'teapot' not added" in caplog.text
     able = VlmLabeller(VlmLabellerConfig(model=str(pair)))
     able.restore(cached.snapshot())
-    assert "teapot" in added(able, "samovar").names
+    assert "teapot" in add_name(able, "samovar").names
 
 
-# --- at work --------------------------------------------------------------------------------------
-def stage(transport: MemoryTransport, labeller: Scripted, **fields) -> Stage:
+# --- in a stage -----------------------------------------------------------------------------------
+def stage(transport: MemoryTransport, labeller: FakeLabeller, **fields) -> Stage:
     return Stage(lambda: VlmLabeller(labeller=labeller), transport, config=QUICK, **fields)
 
 
-async def test_a_slow_labeller_keeps_the_newest_of_each_region_and_no_more_than_32() -> None:
-    transport, gate, heard = MemoryTransport(), Event(), []
-    transport.subscribe(LABEL_RESULT.name, lambda _, body: heard.append(decode(body, LabelResult)))
-    labeller = Scripted([("cup", 0.5)], gate)
+async def test_slow_labeller_queues_newest_request_per_region_and_at_most_32() -> None:
+    transport, gate, results = MemoryTransport(), Event(), []
+    transport.subscribe(
+        LABEL_RESULT.name, lambda _, body: results.append(decode(body, LabelResult))
+    )
+    labeller = FakeLabeller([("cup", 0.5)], gate)
     slow = stage(transport, labeller)
     mapper = Outlet(Out(LABEL_REQUEST), "mapper", 1, transport)
     async with running(slow):
         await send(mapper, request(0))
         await eventually(lambda: labeller.seen)
         for region in (1, 1, 1, *range(2, 41)):
-            await send(mapper, request(region, crops=(crop_message(plain_image("red")),) * 2))
+            await send(mapper, request(region, crops=(crop_message(plain("red")),) * 2))
         await eventually(lambda: slow.health().inputs[0].queued == 32)
-        assert len(heard) == 0, "nobody waited for an answer"
+        assert len(results) == 0, "sending waits for no result"
         gate.set()
-        await eventually(lambda: len(heard) == 33)
+        await eventually(lambda: len(results) == 33)
         dropped = slow.health().inputs[0].dropped
-    assert [answer.region for answer in heard] == [0, *range(9, 41)]
+    assert [answer.region for answer in results] == [0, *range(9, 41)]
     assert dropped == 2 + 8
 
 
-async def test_who_adds_a_name_waits_for_one_region_and_not_for_all_that_wait() -> None:
-    transport, gate, said = MemoryTransport(), Event(), []
+async def test_added_name_is_handled_before_queued_requests() -> None:
+    transport, gate, topic_names = MemoryTransport(), Event(), []
     for topic in (LABEL_RESULT, LABEL_NAMES):
-        transport.subscribe(topic.name, lambda *_, name=topic.name: said.append(name))
-    labeller = Scripted([("cup", 0.5)], gate)
+        transport.subscribe(topic.name, lambda *_, name=topic.name: topic_names.append(name))
+    labeller = FakeLabeller([("cup", 0.5)], gate)
     mapper = Outlet(Out(LABEL_REQUEST), "mapper", 1, transport)
     operator = Outlet(Out(LABEL_ADD), "operator", 1, transport)
     async with running(stage(transport, labeller)):
@@ -299,29 +298,33 @@ async def test_who_adds_a_name_waits_for_one_region_and_not_for_all_that_wait() 
         await eventually(lambda: labeller.seen)
         await send(operator, AddLabel(stamp_ns=1, name="teapot"))
         gate.set()
-        await eventually(lambda: len(said) == 6)
-    assert said == [LABEL_RESULT.name, LABEL_NAMES.name, *[LABEL_RESULT.name] * 4]
+        await eventually(lambda: len(topic_names) == 6)
+    assert topic_names == [LABEL_RESULT.name, LABEL_NAMES.name, *[LABEL_RESULT.name] * 4]
 
 
-async def test_a_state_survives_the_stage(pair: Path, names: Path) -> None:
+async def test_added_names_survive_a_restart_of_the_stage(pair: Path, names: Path) -> None:
     config = VlmLabellerConfig(model=str(pair), names=str(names))
-    store, transport, told = MemoryStore(), MemoryTransport(), []
-    transport.subscribe(LABEL_NAMES.name, lambda _, body: told.append(decode(body, LabelNames)))
+    store, transport, name_lists = MemoryStore(), MemoryTransport(), []
+    transport.subscribe(
+        LABEL_NAMES.name, lambda _, body: name_lists.append(decode(body, LabelNames))
+    )
     operator = Outlet(Out(LABEL_ADD), "operator", 1, transport)
     for name, count in (("blue", 3), ("teapot", 4)):
         one = Stage(lambda: VlmLabeller(config), transport, config=QUICK, store=store)
         async with running(one) as tasks:
             await send(operator, AddLabel(stamp_ns=count, name=name))
-            await eventually(lambda count=count: told and told[-1].stamp_ns == count)
+            await eventually(lambda count=count: name_lists and name_lists[-1].stamp_ns == count)
             one.drain()
             await asyncio.gather(*tasks)
-        assert len(told[-1].names) == count
+        assert len(name_lists[-1].names) == count
 
 
-async def recorded(folder: Path, config: VlmLabellerConfig) -> list[LabelResult]:
-    """A life with two regions and a name between them."""
-    transport, heard = MemoryTransport(), []
-    transport.subscribe(LABEL_RESULT.name, lambda _, body: heard.append(decode(body, LabelResult)))
+async def run_recorded(folder: Path, config: VlmLabellerConfig) -> list[LabelResult]:
+    """Record two requests with a name added between them, and return the results."""
+    transport, results = MemoryTransport(), []
+    transport.subscribe(
+        LABEL_RESULT.name, lambda _, body: results.append(decode(body, LabelResult))
+    )
     settings = VlmLabellerSettings(config.model, config.url, class_names=config.names)
     whole = Config(vlm_labeller=settings)
     journal = open_recorder(folder, "vlm_labeller", "robot", whole)
@@ -330,21 +333,19 @@ async def recorded(folder: Path, config: VlmLabellerConfig) -> list[LabelResult]
     operator = Outlet(Out(LABEL_ADD), "operator", 1, transport)
     async with running(one) as tasks:
         await send(mapper, request(0, "blue"))
-        await eventually(lambda: len(heard) == 1)
+        await eventually(lambda: len(results) == 1)
         await send(operator, AddLabel(stamp_ns=1, name="blue"))
         await send(mapper, request(1, "blue"))
-        await eventually(lambda: len(heard) == 2)
+        await eventually(lambda: len(results) == 2)
         one.drain()
         await asyncio.gather(*tasks)
-    return heard
+    return results
 
 
-async def test_encoders_replay_with_the_names_that_were_added(
-    tmp_path: Path, pair: Path, names: Path
-) -> None:
+async def test_encoders_replay_with_added_names(tmp_path: Path, pair: Path, names: Path) -> None:
     config = VlmLabellerConfig(model=str(pair), names=str(names))
-    heard = await recorded(tmp_path / "recording", config)
-    assert heard[1].label == "blue"
+    results = await run_recorded(tmp_path / "recording", config)
+    assert results[1].label == "blue"
     (replayed,) = open_recording(tmp_path / "recording")
     assert replayed.verify().made == {LABEL_RESULT.name: 2, LABEL_NAMES.name: 1}
     names.write_text("red\nblue\n")
@@ -352,14 +353,14 @@ async def test_encoders_replay_with_the_names_that_were_added(
         replayed.verify()
 
 
-async def test_a_server_is_not_asked_again_in_a_replay(tmp_path: Path, names: Path) -> None:
+async def test_replay_sends_no_requests_to_the_server(tmp_path: Path, names: Path) -> None:
     names.write_text("red\n")
     with serving(replies_with("blue", 0.5)) as server:
         config = VlmLabellerConfig(url=server.url, names=str(names))
-        heard = await recorded(tmp_path / "recording", config)
-        asked = len(server.requests)
+        results = await run_recorded(tmp_path / "recording", config)
+        count = len(server.requests)
         (replayed,) = open_recording(tmp_path / "recording")
         result = replayed.verify()
-        assert len(server.requests) == asked == 2
-    assert [answer.label for answer in heard] == ["", "blue"]
+        assert len(server.requests) == count == 2
+    assert [answer.label for answer in results] == ["", "blue"]
     assert (result.steps, result.made) == (4, {})
