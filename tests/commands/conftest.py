@@ -1,3 +1,5 @@
+"""Fixtures of the tests of commands."""
+
 import shutil
 from pathlib import Path
 
@@ -6,5 +8,5 @@ import pytest
 
 @pytest.fixture
 def run(finished_run: Path, tmp_path: Path) -> Path:
-    """A copy, to be changed."""
+    """A copy of the finished run that tests may change."""
     return shutil.copytree(finished_run, tmp_path / "run")

@@ -1,4 +1,4 @@
-"""The command line: one clear paragraph and the right exit code."""
+"""Output, errors and exit codes of the command line."""
 
 import json
 import resource
@@ -14,7 +14,7 @@ LDO = (sys.executable, "-m", "ldo_service")
 
 
 def ldo(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of a call in this process."""
+    """Run a command in this process; return its exit code, output and error output."""
     try:
         cli.main([str(argument) for argument in arguments])
         code = 0
@@ -38,7 +38,7 @@ def test_help_names_every_verb(capsys) -> None:
 
 
 @pytest.mark.parametrize("verb", list(cli.verbs()))
-def test_every_verb_explains_itself(capsys, verb: str) -> None:
+def test_every_verb_has_a_help_text(capsys, verb: str) -> None:
     code, out, _ = ldo(capsys, verb, "--help")
     assert code == 0
     assert f"usage: ldo {verb}" in out
@@ -75,28 +75,28 @@ def test_bad_arguments_are_a_configuration_error(capsys, tmp_path: Path, argumen
     assert_one_paragraph(err)
 
 
-@pytest.mark.parametrize("beside", [(), ("config.yaml",), ("config.yaml", "summary.json")])
-def test_a_full_folder_is_refused_and_left_alone(capsys, tmp_path: Path, beside) -> None:
+@pytest.mark.parametrize("existing", [(), ("config.yaml",), ("config.yaml", "summary.json")])
+def test_a_full_folder_is_refused_and_left_unchanged(capsys, tmp_path: Path, existing) -> None:
     (tmp_path / "src").mkdir()
     (tmp_path / "src" / "thesis.tex").write_text("years of work")
-    for name in beside:
+    for name in existing:
         (tmp_path / name).write_text("{}")
     for extra in ((), ("--overwrite",)):
         code, _, err = ldo(capsys, "run", "synthetic:room", "--out", str(tmp_path), *extra)
         assert code == 2
         assert_one_paragraph(err)
     assert (tmp_path / "src" / "thesis.tex").read_text() == "years of work"
-    assert all((tmp_path / name).read_text() == "{}" for name in beside)
+    assert all((tmp_path / name).read_text() == "{}" for name in existing)
 
 
-def test_an_unwritable_folder_is_said(capsys) -> None:
+def test_unwritable_folder_is_reported(capsys) -> None:
     code, _, err = ldo(capsys, "run", "synthetic:room", "--out", "/proc/nowhere")
     assert code == 2
     assert_one_paragraph(err)
     assert "cannot be written" in err
 
 
-def test_a_full_disk_is_said(capsys, tmp_path: Path) -> None:
+def test_full_disk_is_reported(capsys, tmp_path: Path) -> None:
     """A limit on the size of files fails a write as a full disk does."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
@@ -111,13 +111,13 @@ def test_a_full_disk_is_said(capsys, tmp_path: Path) -> None:
     assert "Traceback" not in err
 
 
-def test_evaluating_something_else_than_a_run_is_said(capsys, tmp_path: Path) -> None:
+def test_evaluating_a_folder_without_a_run_is_bad_data(capsys, tmp_path: Path) -> None:
     code, _, err = ldo(capsys, "eval", str(tmp_path), "synthetic:room")
     assert code == 3
     assert_one_paragraph(err)
 
 
-def test_a_publisher_without_a_service_is_told_to_start_one(capsys) -> None:
+def test_publishing_without_a_service_suggests_to_start_one(capsys) -> None:
     code, _, err = ldo(
         capsys, "publish", "synthetic:room", "--endpoint", "tcp/127.0.0.1:1", "--max-frames", "1"
     )
@@ -175,7 +175,7 @@ def test_bench_prints_one_json_object_or_a_table(capsys) -> None:
 
 
 @pytest.mark.parametrize("change", [("--size", "64"), ("--size", "0x3"), ("--threads", "0")])
-def test_bench_refuses_what_cannot_be(capsys, change: tuple[str, str]) -> None:
+def test_bench_refuses_invalid_arguments(capsys, change: tuple[str, str]) -> None:
     code, _, err = ldo(capsys, "bench", "render", *change)
     assert code == 2
     assert_one_paragraph(err)

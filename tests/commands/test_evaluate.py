@@ -1,4 +1,4 @@
-"""`ldo eval` over what `ldo run` wrote of 16 frames, 3 of them held out."""
+"""`ldo eval` on a run over 16 frames, 3 of them held out."""
 
 import json
 import shutil
@@ -21,12 +21,12 @@ def last_line(text: str) -> str:
 
 @pytest.fixture
 def without_truth(room_folder: Path, tmp_path: Path) -> Path:
-    folder = shutil.copytree(room_folder, tmp_path / "untrue")
+    folder = shutil.copytree(room_folder, tmp_path / "without_truth")
     (folder / "groundtruth.txt").unlink()
     return folder
 
 
-def test_the_protocol_stands_above_the_figures(capsys, run: Path, room_folder: Path) -> None:
+def test_protocol_is_printed_above_the_scores(capsys, run: Path, room_folder: Path) -> None:
     code, out, _ = ldo(capsys, "eval", run, room_folder)
     assert code == 0
     parts = (
@@ -47,7 +47,7 @@ def test_the_protocol_stands_above_the_figures(capsys, run: Path, room_folder: P
     assert sheet.shape[0] > 3 * 240, "a row for each held-out frame"
 
 
-def test_a_run_that_localized_has_no_map_and_its_trajectory_is_judged(
+def test_localization_run_without_a_map_has_its_trajectory_evaluated(
     capsys, run: Path, room_folder: Path, tmp_path: Path
 ) -> None:
     again = tmp_path / "again"
@@ -74,7 +74,7 @@ def test_a_run_that_localized_has_no_map_and_its_trajectory_is_judged(
         assert f"{again} has no" in err
 
 
-def test_a_source_without_truth_says_nothing_about_a_run_without_a_map(
+def test_run_without_map_and_ground_truth_has_nothing_to_evaluate(
     capsys, run: Path, without_truth: Path, tmp_path: Path
 ) -> None:
     again = tmp_path / "again"
@@ -84,7 +84,7 @@ def test_a_source_without_truth_says_nothing_about_a_run_without_a_map(
     assert "no map, so there is nothing to evaluate" in " ".join(err.split())
 
 
-def test_json_has_every_figure_of_every_frame(capsys, run: Path, room_folder: Path) -> None:
+def test_json_has_all_scores_of_every_frame(capsys, run: Path, room_folder: Path) -> None:
     code, out, _ = ldo(capsys, "eval", run, room_folder, "--json")
     assert code == 0
     found = json.loads(out)
@@ -101,19 +101,19 @@ def test_json_has_every_figure_of_every_frame(capsys, run: Path, room_folder: Pa
     assert fitted["mean"]["psnr_db"] > held_out["mean"]["psnr_db"] > 25
 
 
-def test_ate_is_what_evo_finds_in_the_files(capsys, run: Path, room_folder: Path) -> None:
+def test_ate_equals_that_of_evo(capsys, run: Path, room_folder: Path) -> None:
     _, out, _ = ldo(capsys, "eval", run, room_folder, "--json")
     files = (room_folder / "groundtruth.txt", run / "trajectory.txt")
     loaded = (file_interface.read_tum_trajectory_file(file) for file in files)
     truth, estimate = sync.associate_trajectories(*loaded, max_diff=0.02)
     estimate.align(truth)
-    judge = metrics.APE(metrics.PoseRelation.translation_part)
-    judge.process_data((truth, estimate))
-    theirs, ours = judge.get_all_statistics(), json.loads(out)["trajectory"]["final"]["ate_m"]
-    assert ours == pytest.approx({name: theirs[name] for name in ours}, abs=1e-6)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((truth, estimate))
+    evo_statistics, ate = ape.get_all_statistics(), json.loads(out)["trajectory"]["final"]["ate_m"]
+    assert ate == pytest.approx({name: evo_statistics[name] for name in ate}, abs=1e-6)
 
 
-def test_a_source_without_truth_has_its_map_judged(capsys, run: Path, without_truth: Path) -> None:
+def test_map_is_evaluated_without_ground_truth(capsys, run: Path, without_truth: Path) -> None:
     code, out, _ = ldo(capsys, "eval", run, without_truth)
     assert code == 0
     assert "no ground truth" in out
@@ -123,7 +123,7 @@ def test_a_source_without_truth_has_its_map_judged(capsys, run: Path, without_tr
     assert json.loads(out)["trajectory"] is None
 
 
-def test_nothing_to_judge_is_bad_data(capsys, run: Path, without_truth: Path) -> None:
+def test_run_with_nothing_to_evaluate_is_bad_data(capsys, run: Path, without_truth: Path) -> None:
     lines = (run / "frames.csv").read_text().replace(",OK,", ",LOST,")
     (run / "frames.csv").write_text(lines)
     code, _, err = ldo(capsys, "eval", run, without_truth)
@@ -131,7 +131,7 @@ def test_nothing_to_judge_is_bad_data(capsys, run: Path, without_truth: Path) ->
     assert "nothing to evaluate" in last_line(err)
 
 
-def test_a_refined_map_has_rows_of_its_own(capsys, run: Path, room_folder: Path) -> None:
+def test_refined_map_has_its_own_rows(capsys, run: Path, room_folder: Path) -> None:
     (run / "refined").mkdir()
     for name in MAP_FILES:
         shutil.copy(run / name, run / "refined")
@@ -145,12 +145,12 @@ def test_a_refined_map_has_rows_of_its_own(capsys, run: Path, room_folder: Path)
     assert found["trajectory"]["refined"] == found["trajectory"]["final"]
 
 
-def test_without_held_out_frames_it_says_how_to_get_some(
+def test_without_held_out_frames_the_option_for_them_is_named(
     capsys, run: Path, room_folder: Path
 ) -> None:
     header, *lines = (run / "frames.csv").read_text().splitlines()
-    place = header.split(",").index("held_out")
-    rows = [[*row[:place], "0", *row[place + 1 :]] for row in (line.split(",") for line in lines)]
+    column = header.split(",").index("held_out")
+    rows = [[*row[:column], "0", *row[column + 1 :]] for row in (line.split(",") for line in lines)]
     (run / "frames.csv").write_text("\n".join([header, *map(",".join, rows)]))
     code, out, _ = ldo(capsys, "eval", run, room_folder)
     assert code == 0
@@ -179,13 +179,13 @@ def test_a_truncated_map_is_one_clear_error(capsys, run: Path, room_folder: Path
         assert "map.ply" in err
 
 
-def test_another_source_than_the_runs_is_refused(capsys, run: Path) -> None:
+def test_source_other_than_that_of_the_run_is_refused(capsys, run: Path) -> None:
     code, _, err = ldo(capsys, "eval", run, "synthetic:tour")
     assert code == 3
     assert "the run was made from" in last_line(err)
 
 
-def test_a_bad_network_is_refused_before_anything_is_rendered(
+def test_invalid_lpips_network_is_refused_before_rendering(
     capsys, run: Path, room_folder: Path
 ) -> None:
     (run / "lpips.onnx").write_text("no network")
@@ -195,7 +195,7 @@ def test_a_bad_network_is_refused_before_anything_is_rendered(
     assert "cannot be opened" in err
 
 
-def test_what_eval_drew_can_be_overwritten(capsys, run: Path, room_folder: Path) -> None:
+def test_new_run_may_replace_images_of_eval(capsys, run: Path, room_folder: Path) -> None:
     ldo(capsys, "eval", run, room_folder)
     prepare(run, overwrite=True)
     assert list(run.iterdir()) == []

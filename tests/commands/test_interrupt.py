@@ -1,4 +1,4 @@
-"""Programs that end by SIGINT or SIGTERM, also when a script started them in the background."""
+"""Exit of programs on SIGINT and SIGTERM, also when started in the background of a script."""
 
 import signal
 import subprocess
@@ -42,7 +42,7 @@ class Program:
 
         wait_until(is_ready_while_running, 20, "the program is ready")
 
-    def end_by(self, number: signal.Signals) -> int:
+    def end_with(self, number: signal.Signals) -> int:
         """Send a signal and return the exit code."""
         self.process.send_signal(number)
         return self.process.wait(PATIENCE * 20)
@@ -59,7 +59,7 @@ def started(log: Path, *arguments: str | Path) -> Iterator[Program]:
 
 
 @both_signals
-def test_a_viewer_serves_a_run_on_loopback_and_ends_with_0(
+def test_viewer_serves_a_run_on_loopback_and_exits_with_0(
     run: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
     with started(tmp_path / "log", "view", run, "--set", "viewer.port=0") as viewer:
@@ -69,34 +69,36 @@ def test_a_viewer_serves_a_run_on_loopback_and_ends_with_0(
         assert words[-1].startswith("http://127.0.0.1:")
         with urllib.request.urlopen(words[-1]) as page:
             assert page.headers["Content-Type"] == "text/html"
-        assert viewer.end_by(number) == 0
+        assert viewer.end_with(number) == 0
         assert len(viewer.log.splitlines()) == 1
 
 
-def test_a_service_ends_with_0(tmp_path: Path) -> None:
+def test_interrupted_service_exits_with_0(tmp_path: Path) -> None:
     with started(tmp_path / "log", "serve", "--endpoint", free_endpoint()) as service:
         service.wait_until(lambda: "serving" in service.log)
-        assert service.end_by(signal.SIGINT) == 0
+        assert service.end_with(signal.SIGINT) == 0
         assert "Traceback" not in service.log
 
 
 @both_signals
-def test_a_run_ends_with_130_and_keeps_what_is_done(tmp_path: Path, number: signal.Signals) -> None:
+def test_interrupted_run_exits_with_130_and_keeps_partial_results(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     out = tmp_path / "out"
     with started(tmp_path / "log", "run", "synthetic:room", "--out", out) as run:
         run.wait_until(out.exists)
-        assert run.end_by(number) == 130
+        assert run.end_with(number) == 130
         assert "ldo: interrupted; partial results are kept." in run.log
         assert "Traceback" not in run.log
 
 
-def test_a_publisher_ends_with_130(tmp_path: Path) -> None:
+def test_interrupted_publisher_exits_with_130(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     slowly = "--rate", "1", "--endpoint", endpoint
     with open_session(Endpoint("robot", endpoint), router=True) as session:
         frames = session.declare_subscriber("ldo/robot/camera/rgbd", zenoh.handlers.RingChannel(1))
         with started(tmp_path / "log", "publish", "synthetic:room", *slowly) as publisher:
             publisher.wait_until(lambda: frames.try_recv() is not None)
-            assert publisher.end_by(signal.SIGINT) == 130
+            assert publisher.end_with(signal.SIGINT) == 130
             assert "ldo: interrupted." in publisher.log
             assert "Traceback" not in publisher.log

@@ -1,4 +1,4 @@
-"""ldo keys"""
+"""`ldo keys`: certificates of robots and programs."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def test_keys_are_made_listed_and_revoked(capsys, tmp_path: Path) -> None:
     assert "desk" not in out
 
 
-def test_a_router_of_its_own_gets_the_same_rules(capsys, tmp_path: Path) -> None:
+def test_router_configuration_has_the_access_rules_of_the_keys(capsys, tmp_path: Path) -> None:
     keys = tmp_path / "keys"
     ldo(capsys, "keys", "init", keys)
     ldo(capsys, "keys", "add", keys, "camera", "front", "--robot", "mule")
@@ -36,7 +36,7 @@ def test_a_router_of_its_own_gets_the_same_rules(capsys, tmp_path: Path) -> None
     assert subject["cert_common_names"][0].startswith("front-")
 
 
-def test_what_is_there_is_not_overwritten(capsys, tmp_path: Path) -> None:
+def test_existing_keys_are_not_overwritten(capsys, tmp_path: Path) -> None:
     ldo(capsys, "keys", "init", tmp_path / "keys")
     code, _, err = ldo(capsys, "keys", "init", tmp_path / "keys")
     assert code == 2
@@ -44,7 +44,7 @@ def test_what_is_there_is_not_overwritten(capsys, tmp_path: Path) -> None:
     assert "never overwritten" in err
 
 
-def test_keys_may_be_named_in_the_configuration(capsys, tmp_path: Path) -> None:
+def test_keys_folder_can_be_set_in_the_configuration(capsys, tmp_path: Path) -> None:
     setting = ("--set", f"service.keys={tmp_path}")
     code, _, err = ldo(capsys, "serve", "--endpoint", "tls/127.0.0.1:7447", *setting)
     assert code == 2

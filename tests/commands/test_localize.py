@@ -1,4 +1,4 @@
-"""`ldo run --localize DIR`: poses in the map of DIR, which stays as it is."""
+"""`ldo run --localize DIR`: poses in the unchanged map of DIR."""
 
 import csv
 from pathlib import Path
@@ -17,7 +17,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
-def test_a_second_run_is_in_the_frame_of_the_first(
+def test_localized_poses_are_in_the_map_frame_of_the_first_run(
     capsys, tmp_path: Path, finished_run: Path, room_folder: Path
 ) -> None:
     before, out = contents(finished_run), tmp_path / "again"
@@ -30,20 +30,20 @@ def test_a_second_run_is_in_the_frame_of_the_first(
     assert [row["status"] for row in rows] == ["LOST"] + ["OK"] * 15
     truth = open_sequence(str(room_folder)).truth()
     assert truth is not None
-    T_map_world = se3.inverse(truth.T_world_camera[0])  # the first run began there
+    T_map_world = se3.inverse(truth.T_world_camera[0])  # The first run started there.
     T_map_camera = Trajectory.load(out / "trajectory.txt").T_world_camera
     expected = T_map_world @ truth.T_world_camera[1:16]
     np.testing.assert_allclose(T_map_camera[:, :3, 3], expected[:, :3, 3], atol=0.01)
 
 
 @pytest.mark.parametrize(
-    ("ok", "says"), [(0, "that maps is a map of this place"), (1, "unchanged")]
+    ("ok", "hint"), [(0, "that maps is a map of this place"), (1, "unchanged")]
 )
-def test_where_no_frame_is_recognized_the_map_is_asked_about(ok: int, says: str) -> None:
-    assert says in format_localization({"OK": ok, "WEAK": 0, "LOST": 3}, Path("maps"))
+def test_summary_without_localized_frames_questions_the_map(ok: int, hint: str) -> None:
+    assert hint in format_localization({"OK": ok, "WEAK": 0, "LOST": 3}, Path("maps"))
 
 
-def test_a_folder_that_is_no_run_is_bad_data(capsys, tmp_path: Path, room_folder: Path) -> None:
+def test_folder_without_a_run_is_bad_data(capsys, tmp_path: Path, room_folder: Path) -> None:
     for verb in (("run", room_folder, "--out", tmp_path / "out"), ("serve",)):
         code, _, err = ldo(capsys, *verb, "--localize", room_folder)
         assert code == 3
@@ -53,7 +53,7 @@ def test_a_folder_that_is_no_run_is_bad_data(capsys, tmp_path: Path, room_folder
 
 
 @pytest.mark.parametrize("options", [("--refine-iterations", "5"), ("--overwrite",)])
-def test_the_map_cannot_be_changed_or_replaced(
+def test_map_for_localization_cannot_be_refined_or_replaced(
     capsys, tmp_path: Path, finished_run: Path, room_folder: Path, options
 ) -> None:
     before = contents(finished_run)

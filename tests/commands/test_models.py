@@ -1,4 +1,4 @@
-"""ldo models, and what the other verbs say of networks."""
+"""`ldo models`, and the use of registered models by other commands."""
 
 from pathlib import Path
 
@@ -22,8 +22,8 @@ def file(tmp_path: Path) -> Path:
     return SQUARES["yolov5"].write(tmp_path / "squares.onnx")
 
 
-def test_add_list_remove(capsys, file: Path, tmp_path: Path) -> None:
-    (tmp_path / "LICENSE").write_text("Licence of squares\n\nAll rights reversed.\n")
+def test_model_is_added_listed_and_removed(capsys, file: Path, tmp_path: Path) -> None:
+    (tmp_path / "LICENSE").write_text("License of squares\n\nAll rights reversed.\n")
     license = ("--license", tmp_path / "LICENSE")
     code, out, _ = ldo(capsys, "models", "add", "mine", file, *license)
     assert code == 0
@@ -31,7 +31,7 @@ def test_add_list_remove(capsys, file: Path, tmp_path: Path) -> None:
     assert Models().get("mine").about.license.endswith("All rights reversed.\n")
     code, out, _ = ldo(capsys, "models", "list")
     assert code == 0
-    for word in ("mine", "yolov5", "Licence of squares", Models().get("mine").about.sha256[:12]):
+    for word in ("mine", "yolov5", "License of squares", Models().get("mine").about.sha256[:12]):
         assert word in out
     assert ldo(capsys, "models", "remove", "mine")[0] == 0
     code, out, _ = ldo(capsys, "models", "list")
@@ -43,25 +43,27 @@ def test_a_pair_is_added_by_its_files(capsys, tmp_path: Path) -> None:
     image, text = ColorPair().image(tmp_path / "i.onnx"), ColorPair().text(tmp_path / "t.onnx")
     merges, names = vocabulary(tmp_path / "bpe.gz"), tmp_path / "names.txt"
     names.write_text("red\nblue\n")
-    add = ("models", "add", "colours", image, "--text", text)
+    add = ("models", "add", "colors", image, "--text", text)
     code, _, err = ldo(capsys, *add)
     assert (code, "--vocabulary" in err) == (2, True)
     assert_one_paragraph(err)
     code, out, _ = ldo(capsys, *add, "--vocabulary", merges, "--names", names)
     assert code == 0
-    assert "colours is registered: clip, 2 classes (red, blue" in out
+    assert "colors is registered: clip, 2 classes (red, blue" in out
     (finding,) = doctor.networks()
-    assert finding.text == "network colours: clip, 2 classes"
+    assert finding.text == "network colors: clip, 2 classes"
     code, _, err = ldo(capsys, *add, "--vocabulary", merges, "--layout", "yolox")
     assert (code, "applies to a detector" in err) == (2, True)
 
 
-def test_a_license_may_be_a_text(capsys, file: Path) -> None:
+def test_license_can_be_given_as_text(capsys, file: Path) -> None:
     ldo(capsys, "models", "add", "mine", file, "--license", "Apache-2.0, of the authors" * 20)
     assert Models().get("mine").about.license == "Apache-2.0, of the authors" * 20
 
 
-def test_garbage_is_refused_in_one_paragraph(capsys, tmp_path: Path, folder: Path) -> None:
+def test_invalid_network_file_is_refused_in_one_paragraph(
+    capsys, tmp_path: Path, folder: Path
+) -> None:
     (tmp_path / "net.onnx").write_text("garbage")
     code, _, err = ldo(capsys, "models", "add", "mine", tmp_path / "net.onnx")
     assert code == 2
@@ -76,7 +78,7 @@ def test_a_wrong_layout_is_refused(capsys, file: Path) -> None:
 
 
 @pytest.mark.parametrize("verb", ["run", "simulate"])
-def test_a_run_over_a_file_with_an_unknown_model_does_not_begin(
+def test_offline_run_with_an_unknown_model_does_not_start(
     capsys, tmp_path: Path, verb: str
 ) -> None:
     out = ("--out", tmp_path / "out") if verb == "run" else ()
@@ -87,7 +89,7 @@ def test_a_run_over_a_file_with_an_unknown_model_does_not_begin(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_doctor_says_what_is_missing_and_what_is_damaged(capsys, file: Path) -> None:
+def test_doctor_reports_missing_and_damaged_models(capsys, file: Path) -> None:
     (finding,) = doctor.networks()
     assert finding.mark == "absent"
     assert "ldo models add" in finding.text

@@ -1,4 +1,4 @@
-"""ldo query, of a run and of a running service."""
+"""`ldo query` for a finished run and for a running service."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ assert isinstance(EXAMPLE, MapObjects)
 PLANT = EXAMPLE.objects[0]
 
 
-def thing(number: int, name: str, probability: float, x_m: float) -> msgspec.Struct:
+def map_object(number: int, name: str, probability: float, x_m: float) -> msgspec.Struct:
     return msgspec.structs.replace(
         PLANT,
         id=number,
@@ -40,19 +40,19 @@ def thing(number: int, name: str, probability: float, x_m: float) -> msgspec.Str
     )
 
 
-THINGS = (
-    thing(1, "chair", 0.9, 3.0),
-    thing(4, "couch", 0.8, -1.0),
-    thing(5, "chair", 0.9, 1.5),
-    thing(9, "chair", 0.95, 7.0),
+OBJECTS_IN_MAP = (
+    map_object(1, "chair", 0.9, 3.0),
+    map_object(4, "couch", 0.8, -1.0),
+    map_object(5, "chair", 0.9, 1.5),
+    map_object(9, "chair", 0.95, 7.0),
 )
-FOUND = msgspec.structs.replace(EXAMPLE, objects=THINGS)
+OBJECTS_MESSAGE = msgspec.structs.replace(EXAMPLE, objects=OBJECTS_IN_MAP)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """What a run leaves that this verb reads; its camera ended at x = 1 m."""
-    write_objects(tmp_path, FOUND)
+    """Files of a run that the command reads; the last camera position is x = 1 m."""
+    write_objects(tmp_path, OBJECTS_MESSAGE)
     T = np.tile(np.eye(4), (2, 1, 1))
     T[1, 0, 3] = 1
     Trajectory(np.array([0.0, 1.0]), T).save(tmp_path / "trajectory.txt")
@@ -60,23 +60,23 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("submap", [0, 3])
-def test_from_a_submap_that_is_not_joined_no_distance_is_known(
+def test_distance_is_unknown_in_an_unmerged_submap(
     capsys, monkeypatch: pytest.MonkeyPatch, submap: int
 ) -> None:
     here = Pose((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    nowhere = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    map_origin = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     pose = msgspec.structs.replace(
-        EXAMPLES["tracked_pose"], T_odom_camera=here, T_map_odom=nowhere, submap=submap
+        EXAMPLES["tracked_pose"], T_odom_camera=here, T_map_odom=map_origin, submap=submap
     )
-    service = Mock(objects=lambda: FOUND, latest=lambda _topic: [pose])
+    service = Mock(objects=lambda: OBJECTS_MESSAGE, latest=lambda _topic: [pose])
     monkeypatch.setattr(query, "connect", lambda *_: nullcontext(service))
     _, out, _ = ldo(capsys, "query", "live", "couch", "--json")
     (answer,) = json.loads(out)
     assert answer["distance"] == (None if submap else 2.0)
 
 
-def test_objects_survive_the_file(folder: Path) -> None:
-    assert read_objects(folder) == FOUND
+def test_objects_are_read_back_from_their_file(folder: Path) -> None:
+    assert read_objects(folder) == OBJECTS_MESSAGE
     before = (folder / OBJECTS).read_bytes()
     write_objects(folder, read_objects(folder))
     assert (folder / OBJECTS).read_bytes() == before
@@ -84,7 +84,7 @@ def test_objects_survive_the_file(folder: Path) -> None:
     assert plain["objects"][1]["T_map_object"]["translation"] == [-1.0, 0.0, 0.0]
 
 
-def test_the_best_and_of_equals_the_nearest_comes_first(capsys, folder: Path) -> None:
+def test_objects_are_sorted_by_score_and_then_by_distance(capsys, folder: Path) -> None:
     code, out, _ = ldo(capsys, "query", folder, "chair", "--json")
     assert code == 0
     answers = json.loads(out)
@@ -100,7 +100,7 @@ def test_the_best_and_of_equals_the_nearest_comes_first(capsys, folder: Path) ->
     }
 
 
-def test_another_word_finds_it_in_a_table(capsys, folder: Path) -> None:
+def test_synonym_finds_the_object_and_prints_a_table(capsys, folder: Path) -> None:
     code, out, _ = ldo(capsys, "query", folder, "Sofa")
     assert code == 0
     (row,) = [line for line in out.splitlines() if "couch" in line]
@@ -112,7 +112,7 @@ def test_another_word_finds_it_in_a_table(capsys, folder: Path) -> None:
     ("text", "complaint"),
     [("chiar", "Did you mean chair?"), ("piano", "There is chair, couch.")],
 )
-def test_what_is_not_there_is_told_with_what_is(
+def test_query_without_a_match_names_the_known_labels(
     capsys, folder: Path, text: str, complaint: str
 ) -> None:
     code, out, err = ldo(capsys, "query", folder, text)
@@ -128,7 +128,10 @@ def test_what_is_not_there_is_told_with_what_is(
         (b"{", "is not what `ldo run` writes"),
         (b"\xff\xfe", "is not what `ldo run` writes"),
         (json.dumps({"type": "MapObjects"}).encode(), "is not what `ldo run` writes"),
-        (msgspec.json.encode(msgspec.structs.replace(FOUND, objects=())), "has no objects yet"),
+        (
+            msgspec.json.encode(msgspec.structs.replace(OBJECTS_MESSAGE, objects=())),
+            "has no objects yet",
+        ),
     ],
 )
 def test_a_run_without_objects_is_bad_data(capsys, tmp_path: Path, content, complaint) -> None:
@@ -140,17 +143,17 @@ def test_a_run_without_objects_is_bad_data(capsys, tmp_path: Path, content, comp
     assert complaint in err
 
 
-def test_a_folder_that_is_not_there_is_bad_data(capsys, tmp_path: Path) -> None:
+def test_missing_folder_is_bad_data(capsys, tmp_path: Path) -> None:
     code, _, err = ldo(capsys, "query", tmp_path / "absent", "chair")
     assert code == 3
     assert_one_paragraph(err)
     assert "is not a folder" in err
 
 
-# --- by what words mean ---------------------------------------------------------------------------
+# --- text embeddings ------------------------------------------------------------------------------
 @pytest.fixture
 def pair(tmp_path: Path) -> Path:
-    """A pair in whose space a throne is nearly a chair, and a piano nothing of the kind."""
+    """A pair of encoders that embeds a throne close to a chair, and a piano far from it."""
     folder = tmp_path / "pair"
     folder.mkdir()
     shutil.copy(IMAGE_ENCODER, folder)
@@ -162,7 +165,7 @@ def pair(tmp_path: Path) -> Path:
     return folder
 
 
-def test_what_no_table_knows_is_found_by_what_it_means(capsys, folder: Path, pair: Path) -> None:
+def test_word_without_synonym_is_found_by_text_embedding(capsys, folder: Path, pair: Path) -> None:
     code, _, err = ldo(capsys, "query", folder, "throne")
     assert (code, "--model NAME" in err) == (3, True)
     code, out, _ = ldo(capsys, "query", folder, "throne", "--model", pair, "--json")
@@ -177,7 +180,7 @@ def test_what_no_table_knows_is_found_by_what_it_means(capsys, folder: Path, pai
         assert_one_paragraph(err)
 
 
-def test_a_run_is_asked_by_the_labeller_that_it_had(capsys, folder: Path, pair: Path) -> None:
+def test_query_uses_the_labeller_model_of_the_run(capsys, folder: Path, pair: Path) -> None:
     (folder / "config.yaml").write_text(f"vlm_labeller: {{model: {pair}}}\n")
     code, out, _ = ldo(capsys, "query", folder, "throne", "--json")
     assert (code, [one["id"] for one in json.loads(out)]) == (0, [9, 5, 1])
@@ -188,22 +191,24 @@ def test_a_run_is_asked_by_the_labeller_that_it_had(capsys, folder: Path, pair: 
     assert ldo(capsys, "query", folder, "sofa")[0] == 0
 
 
-def test_a_pair_that_cannot_be_opened_is_a_configuration_error(capsys, folder: Path) -> None:
-    assert ldo(capsys, "query", folder, "chair", "--model", "absent")[0] == 0, "words will do"
+def test_unusable_model_is_a_configuration_error_only_when_needed(capsys, folder: Path) -> None:
+    assert ldo(capsys, "query", folder, "chair", "--model", "absent")[0] == 0, (
+        "the model is not needed for a known label"
+    )
     code, _, err = ldo(capsys, "query", folder, "throne", "--model", "absent")
     assert code == 2
     assert_one_paragraph(err)
 
 
 # --- live -----------------------------------------------------------------------------------------
-def test_nobody_to_ask_is_a_configuration_error(capsys) -> None:
+def test_query_without_a_running_service_is_a_configuration_error(capsys) -> None:
     code, _, err = ldo(capsys, "query", "live", "chair", "--endpoint", free_endpoint())
     assert code == 2
     assert_one_paragraph(err)
 
 
-def test_the_running_service_is_asked(capsys) -> None:
-    """A router that answers as the mapper's stage does."""
+def test_live_query_receives_objects_of_the_running_service(capsys) -> None:
+    """A router replies in place of the stage of the mapper."""
     endpoint = free_endpoint()
     config = zenoh.Config.from_json5(
         json.dumps(
@@ -218,7 +223,7 @@ def test_the_running_service_is_asked(capsys) -> None:
 
     def reply(query: zenoh.Query) -> None:
         with query:
-            query.reply(key, encode(FOUND))
+            query.reply(key, encode(OBJECTS_MESSAGE))
 
     handler = zenoh.handlers.Callback(reply, indirect=False)
     with zenoh.open(config) as router:
@@ -226,7 +231,7 @@ def test_the_running_service_is_asked(capsys) -> None:
             service.objects(timeout_s=0.5)
         with router.declare_queryable(key, handler):
             with connect("robot", endpoint) as service:
-                assert service.objects() == FOUND
+                assert service.objects() == OBJECTS_MESSAGE
             code, out, _ = ldo(capsys, "query", "live", "sofa", "--json", "--endpoint", endpoint)
     assert code == 0
     (one,) = json.loads(out)

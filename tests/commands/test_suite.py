@@ -1,4 +1,4 @@
-"""`ldo suite`: real runs of six frames."""
+"""`ldo suite` with runs of six frames."""
 
 import json
 from pathlib import Path
@@ -24,9 +24,9 @@ def suite(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_suite_runs_what_it_can_and_goes_on_where_it_stopped(capsys, suite: Path) -> None:
-    words = "suite", suite, "--data", suite.parent, "--out", suite.parent / "out"
-    code, out, err = ldo(capsys, *words)
+def test_suite_runs_available_sequences_and_continues_where_it_stopped(capsys, suite: Path) -> None:
+    arguments = "suite", suite, "--data", suite.parent, "--out", suite.parent / "out"
+    code, out, err = ldo(capsys, *arguments)
     assert code == 1, "one failed"
     assert "1 of 3: room/plain@0" in err
     row = next(line for line in out.splitlines() if line.startswith("| plain"))
@@ -34,37 +34,38 @@ def test_a_suite_runs_what_it_can_and_goes_on_where_it_stopped(capsys, suite: Pa
     assert 0 < float(ate_cm) < 1
     assert (away, broken, average) == ("no data", "failed", "-")
     assert (suite.parent / "out" / "table.md").read_text() == out
-    made = suite.parent / "out" / "room" / "plain@0" / "summary.json"
-    before = made.stat().st_mtime_ns
-    assert ldo(capsys, *words)[1] == out
-    assert made.stat().st_mtime_ns == before, "it is not run again"
-    assert ldo(capsys, *words, "--set", "mapper.iterations=1")[1] != "", (
+    summary = suite.parent / "out" / "room" / "plain@0" / "summary.json"
+    before = summary.stat().st_mtime_ns
+    assert ldo(capsys, *arguments)[1] == out
+    assert summary.stat().st_mtime_ns == before, "it is not run again"
+    assert ldo(capsys, *arguments, "--set", "mapper.iterations=1")[1] != "", (
         "other settings, other runs"
     )
-    assert made.stat().st_mtime_ns > before
-    (made.parent / "eval.json").write_text("{")
+    assert summary.stat().st_mtime_ns > before
+    (summary.parent / "eval.json").write_text("{")
     assert (
-        "| failed | no data | failed |" in ldo(*(capsys, *words, "--set", "mapper.iterations=1"))[1]
+        "| failed | no data | failed |"
+        in ldo(*(capsys, *arguments, "--set", "mapper.iterations=1"))[1]
     )
 
 
-def test_variants_may_take_the_front_end_of_the_first(capsys, tmp_path: Path) -> None:
+def test_later_variants_can_reuse_the_front_end_of_the_first(capsys, tmp_path: Path) -> None:
     variants = {"whole": ["mapper.iterations=1"], "rougher": ["mapper.iterations=0"]}
     path = tmp_path / "rooms.yaml"
     one = {"sequences": {"room": "synthetic:room"}, "variants": variants, "front_end": "whole"}
     path.write_text(json.dumps(SUITE | one | {"figures": ["ate_cm"]}))
-    words = "suite", path, "--out", tmp_path / "out"
-    assert ldo(capsys, *words)[0] == 0
-    whole, rougher = (tmp_path / "out/room" / f"{name}@0" for name in variants)
+    arguments = "suite", path, "--out", tmp_path / "out"
+    assert ldo(capsys, *arguments)[0] == 0
+    first_run, second_run = (tmp_path / "out/room" / f"{name}@0" for name in variants)
     online = "trajectory_online.txt"
-    assert (whole / online).read_bytes() == (rougher / online).read_bytes()
-    assert (whole / "map.ply").read_bytes() != (rougher / "map.ply").read_bytes()
-    stages = json.loads((rougher / "summary.json").read_text())["stage_ms"]
+    assert (first_run / online).read_bytes() == (second_run / online).read_bytes()
+    assert (first_run / "map.ply").read_bytes() != (second_run / "map.ply").read_bytes()
+    stages = json.loads((second_run / "summary.json").read_text())["stage_ms"]
     assert "tracker" not in stages
     assert "mapper" in stages
 
 
-def test_a_suite_that_is_not_there_is_named(capsys, tmp_path: Path) -> None:
+def test_missing_suite_is_named_in_the_error(capsys, tmp_path: Path) -> None:
     code, _, err = ldo(capsys, "suite", tmp_path / "none.yaml", "--out", tmp_path / "out")
     assert code == 2
     assert "there is no suite" in err

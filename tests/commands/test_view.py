@@ -1,4 +1,4 @@
-"""ldo view; tests/commands/test_interrupt.py starts and ends it."""
+"""Errors of `ldo view`; tests/commands/test_interrupt.py starts and stops it."""
 
 import sys
 from pathlib import Path
@@ -9,7 +9,7 @@ from tests.commands.test_cli import assert_one_paragraph, ldo
 from tests.ports import free_endpoint
 
 
-def test_without_the_extra_one_line_says_how_to_get_it(
+def test_without_viewer_extra_the_error_names_the_install_command(
     capsys, monkeypatch: pytest.MonkeyPatch, run: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
@@ -20,13 +20,13 @@ def test_without_the_extra_one_line_says_how_to_get_it(
 
 
 @pytest.mark.parametrize("name", ["absent", "."])
-def test_a_folder_that_no_run_wrote_is_bad_data(capsys, tmp_path: Path, name: str) -> None:
+def test_folder_without_a_run_is_bad_data(capsys, tmp_path: Path, name: str) -> None:
     code, _, err = ldo(capsys, "view", tmp_path / name)
     assert code == 3
     assert_one_paragraph(err)
 
 
-def test_nobody_to_look_at_is_a_configuration_error(capsys) -> None:
+def test_view_without_a_running_service_is_a_configuration_error(capsys) -> None:
     code, _, err = ldo(capsys, "view", "live", "--endpoint", free_endpoint())
     assert code == 2
     assert_one_paragraph(err)
@@ -35,7 +35,7 @@ def test_nobody_to_look_at_is_a_configuration_error(capsys) -> None:
 @pytest.mark.parametrize(
     "setting", ["viewer.max_gaussians=0", "viewer.update_interval_s=0", "viewer.port=70000"]
 )
-def test_limits_that_make_no_sense_are_refused(capsys, run: Path, setting: str) -> None:
+def test_invalid_viewer_settings_are_refused(capsys, run: Path, setting: str) -> None:
     code, _, err = ldo(capsys, "view", run, "--set", setting)
     assert code == 2
     assert_one_paragraph(err)

@@ -1,4 +1,4 @@
-"""What a stranger gets wrong: each verb says it in one paragraph, with the right exit code."""
+"""Errors of all commands for wrong arguments, folders and files."""
 
 from pathlib import Path
 
@@ -11,8 +11,8 @@ ROS = "publish", "ros2", "--color", "/c/image_raw"
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder, a full one, those of a run and of a service, and files that are nothing."""
+def example_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with an empty, a full and an invalid folder, a run, a service state and files."""
     monkeypatch.chdir(tmp_path)
     for name in ("empty", "full", "junk", "ran", "kept/state"):
         (tmp_path / name).mkdir(parents=True)
@@ -26,7 +26,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "says"),
+    ("arguments", "code", "expected"),
     [
         ("suite nosuch --out s", 2, "no suite nosuch"),
         ("suite broken.yaml --out s", 2, "is not a suite"),
@@ -76,17 +76,19 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("replay junk --verify", 3, "not an MCAP file"),
     ],
 )
-def test_it_is_said_in_one_paragraph(capsys, here: Path, words: str, code: int, says: str) -> None:
-    left, _, err = ldo(capsys, *words.split())
-    told = err.splitlines()[-1]
-    assert_one_paragraph(told)
-    assert says in told
-    assert left == code
-    assert (here / "full" / "thesis.tex").read_text() == "years of work"
+def test_wrong_input_is_reported_in_one_paragraph_with_its_exit_code(
+    capsys, example_folders: Path, arguments: str, code: int, expected: str
+) -> None:
+    exit_code, _, err = ldo(capsys, *arguments.split())
+    message = err.splitlines()[-1]
+    assert_one_paragraph(message)
+    assert expected in message
+    assert exit_code == code
+    assert (example_folders / "full" / "thesis.tex").read_text() == "years of work"
 
 
-@pytest.mark.usefixtures("here")
-def test_a_router_with_keys_needs_a_bridge_of_its_own(capsys) -> None:
+@pytest.mark.usefixtures("example_folders")
+def test_router_with_keys_needs_the_bridge_option(capsys) -> None:
     assert ldo(capsys, "keys", "init", "keys")[0] == 0
     assert ldo(capsys, "keys", "add", "keys", "camera", "front")[0] == 0
     with_keys = "--keys", "keys/front", "--endpoint", "tls/127.0.0.1:1"
