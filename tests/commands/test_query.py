@@ -176,7 +176,7 @@ def test_word_without_synonym_is_found_by_text_embedding(capsys, folder: Path, p
     for word, is_known in (("piano", True), ("unicorn", False)):
         code, _, err = ldo(capsys, "query", folder, word, "--model", pair)
         assert (code, "none of 4 objects" in err) == (3, True)
-        assert ("has no text 'unicorn'" in err) != is_known
+        assert ("has no vector for 'unicorn'" in err) != is_known
         assert_one_paragraph(err)
 
 
