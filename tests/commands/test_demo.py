@@ -1,4 +1,4 @@
-"""`ldo demo` on the first frames of its room."""
+"""The command `ldo demo` on the first frames of its room."""
 
 import cv2
 import pytest

@@ -1,4 +1,4 @@
-"""`ldo eval` on a run over 16 frames, 3 of them held out."""
+"""The command `ldo eval` on a run over 16 frames, 3 of them held out."""
 
 import json
 import shutil

@@ -24,7 +24,7 @@ both_signals = pytest.mark.parametrize(
 
 
 class Program:
-    """`ldo` in a process that was started with SIGINT ignored."""
+    """The program `ldo` in a process that was started with SIGINT ignored."""
 
     def __init__(self, log: Path, *arguments: str | Path) -> None:
         self._log = log

@@ -1,4 +1,4 @@
-"""`ldo keys`: certificates of robots and programs."""
+"""The command `ldo keys`: certificates of robots and programs."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""`ldo run --localize DIR`: poses in the unchanged map of DIR."""
+"""The command `ldo run --localize DIR`: poses in the unchanged map of DIR."""
 
 import csv
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`ldo models`, and the use of registered models by other commands."""
+"""The command `ldo models`, and the use of registered models by other commands."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""`ldo query` for a finished run and for a running service."""
+"""The command `ldo query` for a finished run and for a running service."""
 
 import json
 import shutil

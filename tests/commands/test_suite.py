@@ -1,4 +1,4 @@
-"""`ldo suite` with runs of six frames."""
+"""The command `ldo suite` with runs of six frames."""
 
 import json
 from pathlib import Path
