@@ -11,7 +11,7 @@ from ldo_service.actors.detector import Detector, DetectorConfig, require_detect
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.errors import ConfigError, ModelError
 from ldo_service.schemas import Array, CameraModel, DetectionBoxes, Keyframe, encode
-from tests.detection.networks import SQUARES, changed, squares_image
+from tests.detection.networks import SQUARES, squares_image, squares_network
 
 SIZE = 128, 96
 

@@ -37,7 +37,15 @@ from ldo_service.semantics.semantic_fusion import FusionConfig, SemanticFusionCo
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
 from tests.actors.conftest import replicate
-from tests.semantics.scenes import CAMERA, SCENE_OBJECTS, Shot, SceneObject, poses, shoot, true_objects
+from tests.semantics.scenes import (
+    CAMERA,
+    SCENE_OBJECTS,
+    SceneObject,
+    Shot,
+    poses,
+    shoot,
+    true_objects,
+)
 
 # Images have 128x96 pixels; a wall covers a fifth of them, and the ball is 20 pixels wide.
 TRIGGER = RegionProposalConfig(min_side_px=10)
@@ -68,12 +76,18 @@ def keyframe_of(shot: Shot, number: int) -> Keyframe:
 
 
 def boxes_of(
-    shot: Shot, number: int, things: Iterable[SceneObject], score: float = 0.9, network: str = "exact"
+    shot: Shot,
+    number: int,
+    things: Iterable[SceneObject],
+    score: float = 0.9,
+    network: str = "exact",
 ) -> DetectionBoxes:
     """Return exact boxes of the given objects, the only ones that the detector knows."""
     known = [thing.name for thing in things]
-    claims = shot.claims(SCENE_OBJECTS)
-    names = [thing.name for k, thing in enumerate(SCENE_OBJECTS, 1) if np.sum(shot.instances == k) >= 40]
+    claims = shot.detections(SCENE_OBJECTS)
+    names = [
+        thing.name for k, thing in enumerate(SCENE_OBJECTS, 1) if np.sum(shot.instances == k) >= 40
+    ]
     found = zip(names, claims.boxes.tolist(), strict=True)
     return DetectionBoxes(
         stamp_ns=number * STAMP_NS,

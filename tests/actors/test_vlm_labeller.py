@@ -27,8 +27,8 @@ from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_REQUEST, LA
 from ldo_service.service.service import open_recorder
 from ldo_service.storage.state_store import MemoryStore
 from ldo_service.transport.interface import MemoryTransport
-from tests.detection.labellers.encoders import ColorPair, embeddings, plain, vocabulary
-from tests.detection.labellers.server import hangs, replies_with, sends, serving
+from tests.detection.labellers.encoders import ColorPair, embeddings, plain_image, vocabulary
+from tests.detection.labellers.server import hangs, replies_with, responds, serving
 from tests.runtime.fake_actors import QUICK, eventually, running, send
 
 
@@ -46,7 +46,7 @@ def request(region: int = 7, color: str = "red", **fields) -> LabelRequest:
             "region": region,
             "keyframe": 3,
             "box_px": (1.0, 2.0, 30.0, 40.0),
-            "crops": (crop_message(plain(color)),),
+            "crops": (crop_message(plain_image(color)),),
             **fields,
         }
     )
@@ -196,9 +196,12 @@ def test_undecodable_crop_leaves_its_region_unnamed() -> None:
     ("behaves", "facts"),
     [
         (replies_with("cup", 0.75), {"regions_named": 1}),
-        (replies_with("a kind of thing, I believe", 0.9), {"answers_refused": 1, "regions_unnamed": 1}),
-        (sends(500), {"labellings_failed": 1, "labeller_failing": 1}),
-        (sends(200, b"nonsense"), {"labellings_failed": 1, "labeller_failing": 1}),
+        (
+            replies_with("a kind of thing, I believe", 0.9),
+            {"answers_refused": 1, "regions_unnamed": 1},
+        ),
+        (responds(500), {"labellings_failed": 1, "labeller_failing": 1}),
+        (responds(200, b"nonsense"), {"labellings_failed": 1, "labeller_failing": 1}),
         (hangs, {"labellings_failed": 1, "labeller_failing": 1}),
     ],
     ids=["good", "nonsense", "500", "no json", "hangs"],
@@ -275,7 +278,7 @@ async def test_slow_labeller_queues_newest_request_per_region_and_at_most_32() -
         await send(mapper, request(0))
         await eventually(lambda: labeller.seen)
         for region in (1, 1, 1, *range(2, 41)):
-            await send(mapper, request(region, crops=(crop_message(plain("red")),) * 2))
+            await send(mapper, request(region, crops=(crop_message(plain_image("red")),) * 2))
         await eventually(lambda: slow.health().inputs[0].queued == 32)
         assert len(results) == 0, "sending waits for no result"
         gate.set()
