@@ -1,5 +1,4 @@
-"""A process that collects numbers: arguments endpoint, path of the file that gets them, seconds
-that each takes."""
+"""Process that collects numbers. Arguments: endpoint, output file, seconds per number."""
 
 import asyncio
 import signal
@@ -47,10 +46,10 @@ async def main(endpoint: str, path: str, step_s: str) -> None:
             transport,
             config=SupervisionConfig(heartbeat_s=0.1),
         )
-        leaving = asyncio.create_task(exit_with_parent())
-        leaving.add_done_callback(lambda task: None if task.cancelled() else stop.request())
+        watching_parent = asyncio.create_task(exit_with_parent())
+        watching_parent.add_done_callback(lambda task: None if task.cancelled() else stop.request())
         await supervise([stage], stop, drain_s=2)
-        leaving.cancel()
+        watching_parent.cancel()
         transport.close()
 
 

@@ -1,4 +1,4 @@
-"""Fixtures of the transport's tests that the runtime's tests share."""
+"""Fixtures shared with the tests of the transport."""
 
 from tests.transport.conftest import client, network
 

@@ -1,4 +1,4 @@
-"""Messages, topics and actors that the tests of the runtime play with."""
+"""Messages, topics and actors for the tests of the runtime."""
 
 import asyncio
 import time
@@ -14,7 +14,8 @@ from ldo_service.schemas import Message, encode
 from ldo_service.schemas.topics import Topic
 from ldo_service.transport.interface import Transport
 
-PATIENCE_S = 60.0  # before a test gives up; no test passes or fails by how long something takes
+# Limit after which a test gives up. No test result depends on how long a step takes.
+PATIENCE_S = 60.0
 
 
 class Number(Message, frozen=True, kw_only=True):
@@ -53,12 +54,12 @@ async def send(outlet: Outlet, message: Message) -> None:
 async def eventually(condition: Callable[[], object]) -> None:
     deadline_s = time.monotonic() + PATIENCE_S
     while not condition():
-        assert time.monotonic() < deadline_s, "what was waited for did not happen"
+        assert time.monotonic() < deadline_s, "the condition was not met in time"
         await asyncio.sleep(0.002)
 
 
 class Collector(Actor):
-    """Puts every number into a list, by way of `think`."""
+    """An actor that calls `think` with each number and appends it to a list."""
 
     name = "collector"
     inputs = (In(NUMBERS, Lossless(4)),)
@@ -118,9 +119,9 @@ class Runs(Protocol):
 
 @asynccontextmanager
 async def running(*runners: Runs) -> AsyncIterator[Sequence[asyncio.Task[None]]]:
-    """Stages under way; they are cancelled at the end, and what they raised is raised."""
+    """Run stages until the block ends, then cancel them and raise what they raised."""
     tasks = [asyncio.create_task(runner.run()) for runner in runners]
-    await asyncio.sleep(0)  # each has opened its ports
+    await asyncio.sleep(0)  # Lets each stage open its ports.
     try:
         yield tasks
     finally:

@@ -16,7 +16,7 @@ def actor(kind: str, inputs: list[tuple[Topic, Policy]], outputs: list[Topic]) -
     return type(kind, (Actor,), members)
 
 
-def test_a_cycle_of_lossless_inputs_is_refused_and_named() -> None:
+def test_lossless_cycle_is_rejected_with_its_path() -> None:
     one = actor("one", [(C, Lossless())], [A])
     two = actor("two", [(A, Lossless())], [B])
     three = actor("three", [(B, Lossless())], [C])
@@ -24,34 +24,34 @@ def test_a_cycle_of_lossless_inputs_is_refused_and_named() -> None:
         check_graph([one, two, three])
 
 
-def test_an_actor_that_feeds_itself_is_a_cycle() -> None:
+def test_actor_that_feeds_itself_is_rejected_as_a_cycle() -> None:
     with pytest.raises(LosslessCycle, match="one -> one"):
         check_graph([actor("one", [(A, Lossless())], [A])])
 
 
-def test_a_cycle_with_one_latest_input_is_taken() -> None:
+def test_cycle_with_one_latest_input_is_accepted() -> None:
     one = actor("one", [(B, Latest())], [A])
     two = actor("two", [(A, Lossless())], [B])
     check_graph([one, two])
 
 
-def test_a_diamond_is_no_cycle() -> None:
+def test_diamond_graph_is_accepted() -> None:
     source = actor("source", [], [A])
     left = actor("left", [(A, Lossless())], [B])
     right = actor("right", [(A, Lossless())], [C])
     check_graph([source, left, right, actor("sink", [(B, Lossless()), (C, Lossless())], [])])
 
 
-def test_two_producers_of_one_topic_are_refused() -> None:
+def test_two_producers_of_one_topic_are_rejected() -> None:
     with pytest.raises(ConfigError, match="topic a has two producers, one and two"):
         check_graph([actor("one", [], [A]), actor("two", [], [A])])
 
 
-def test_consumers_that_must_not_miss_a_message_are_found() -> None:
-    keen = actor("keen", [(A, Lossless())], [B])
-    casual = actor("casual", [(A, Latest())], [])
-    assert lossless_consumers([keen, casual], "a") == {"keen"}
-    assert producers([keen, casual]) == {"b": "keen"}
+def test_lossless_consumers_and_producers_of_topics_are_listed() -> None:
+    lossless = actor("lossless", [(A, Lossless())], [B])
+    latest = actor("latest", [(A, Latest())], [])
+    assert lossless_consumers([lossless, latest], "a") == {"lossless"}
+    assert producers([lossless, latest]) == {"b": "lossless"}
 
 
 @pytest.mark.parametrize(
@@ -63,6 +63,6 @@ def test_consumers_that_must_not_miss_a_message_are_found() -> None:
         lambda: In(A, Latest(per_key=True)),
     ],
 )
-def test_an_impossible_policy_is_refused(make: object) -> None:
+def test_invalid_policy_is_rejected(make: object) -> None:
     with pytest.raises(ConfigError):
         make()  # type: ignore[operator]

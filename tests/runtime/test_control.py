@@ -1,4 +1,4 @@
-"""One answer for the whole service, whatever is asked and whoever does not obey."""
+"""Tests of the control command: one answer for the whole service, also if an actor fails."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -31,13 +31,13 @@ class Source(Actor):
         yield message
 
 
-class Unsaveable(MemoryStore):
+class FullStore(MemoryStore):
     def save(self, actor: str, state) -> None:  # noqa: ARG002
         raise OSError("disk full")
 
 
 class Scene:
-    """A source and a collector, and their service's control."""
+    """A source, a collector and the control of their service."""
 
     def __init__(self, store: StateStore | None = None, timeout_s: float = 5.0) -> None:
         self.transport, self.seen = MemoryTransport(), []
@@ -46,15 +46,15 @@ class Scene:
         self._timeout_s = timeout_s
 
     @asynccontextmanager
-    async def played(self) -> AsyncIterator[None]:
+    async def started(self) -> AsyncIterator[None]:
         async with running(self.source, self.collector):
             actors = ("source", "collector")
             self.control = Control(self.transport, actors, ("source",), "here", self._timeout_s)
             yield
 
-    async def ask(self, verb: str) -> ControlAnswer:
-        request = encode(ControlRequest(stamp_ns=7, command=verb))
-        return decode(await self.control.answer(request), ControlAnswer)
+    async def request(self, verb: str) -> ControlAnswer:
+        body = encode(ControlRequest(stamp_ns=7, command=verb))
+        return decode(await self.control.answer(body), ControlAnswer)
 
     def send(self, *values: int) -> None:
         for value in values:
@@ -64,80 +64,80 @@ class Scene:
         return self.source.health(), self.collector.health()
 
 
-async def test_paused_frames_are_left_out_until_resume() -> None:
+async def test_frames_are_dropped_and_counted_while_paused() -> None:
     scene = Scene()
-    async with scene.played():
+    async with scene.started():
         scene.send(1)
         await eventually(lambda: scene.seen == [1])
-        assert (await scene.ask("pause")).ok
+        assert (await scene.request("pause")).ok
         scene.send(2, 3)
-        assert (await scene.ask("resume")).ok
+        assert (await scene.request("resume")).ok
         scene.send(4)
         await eventually(lambda: scene.seen == [1, 4])
         assert scene.health()[0].inputs[0].dropped_paused == 2
 
 
-async def test_a_reset_begins_every_epoch_anew_and_the_stream_goes_on() -> None:
+async def test_reset_starts_new_epochs_and_stream_continues() -> None:
     scene = Scene()
-    async with scene.played():
+    async with scene.started():
         scene.send(1)
         await eventually(lambda: scene.seen == [1])
         before = [health.epoch for health in scene.health()]
-        answer = await scene.ask("reset")
+        answer = await scene.request("reset")
         assert (answer.ok, answer.stamp_ns) == (True, 7)
         assert all(health.epoch != old for health, old in zip(scene.health(), before, strict=True))
         scene.send(2)
         await eventually(lambda: scene.seen == [1, 2])
 
 
-async def test_a_reset_while_paused_stays_paused() -> None:
+async def test_service_stays_paused_after_reset() -> None:
     scene = Scene()
-    async with scene.played():
-        await scene.ask("pause")
-        assert "stay paused" in (await scene.ask("reset")).message
+    async with scene.started():
+        await scene.request("pause")
+        assert "stay paused" in (await scene.request("reset")).message
         source, collector = scene.health()
         assert (source.paused, collector.paused) == (True, False)
 
 
-async def test_an_actor_that_cannot_save_is_named() -> None:
-    scene = Scene(store=Unsaveable())
-    async with scene.played():
-        answer = await scene.ask("save")
+async def test_failed_save_names_the_actor() -> None:
+    scene = Scene(store=FullStore())
+    async with scene.started():
+        answer = await scene.request("save")
         assert not answer.ok
         assert "source OSError: disk full" in answer.message
 
 
-async def test_an_actor_that_does_not_answer_is_named_and_the_others_go_on() -> None:
+async def test_reset_names_unresponsive_actor_and_resumes_the_others() -> None:
     scene = Scene(timeout_s=0.05)
-    async with scene.played():
+    async with scene.started():
         scene.control._actors = ("source", "absent", "collector")
-        answer = await scene.ask("reset")
+        answer = await scene.request("reset")
         assert not answer.ok
         assert "absent did not answer" in answer.message
         assert not any(health.paused for health in scene.health())
 
 
-async def test_another_verb_is_answered_with_those_there_are() -> None:
+async def test_unknown_command_is_answered_with_the_valid_ones() -> None:
     scene = Scene()
-    async with scene.played():
-        answer = await scene.ask("localise-only")
+    async with scene.started():
+        answer = await scene.request("localise-only")
         assert not answer.ok
         assert "pause, resume, save, reset" in answer.message
 
 
-async def test_bytes_that_are_no_request_are_answered_all_the_same() -> None:
+async def test_malformed_request_is_answered_with_an_error() -> None:
     scene = Scene()
-    async with scene.played():
+    async with scene.started():
         for body in (b"", b"\xc1", encode(number(1))):
             answer = decode(await scene.control.answer(body), ControlAnswer)
             assert not answer.ok
             assert "malformed ControlRequest" in answer.message
 
 
-async def test_a_source_that_was_restarted_is_told_of_the_pause() -> None:
+async def test_restarted_source_is_paused_again() -> None:
     scene = Scene()
-    async with scene.played():
-        await scene.ask("pause")
-    successor = Stage(Source, scene.transport, config=QUICK)
-    async with running(successor):
-        await eventually(lambda: successor.health().paused)
+    async with scene.started():
+        await scene.request("pause")
+    restarted = Stage(Source, scene.transport, config=QUICK)
+    async with running(restarted):
+        await eventually(lambda: restarted.health().paused)

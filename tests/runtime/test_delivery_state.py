@@ -1,4 +1,4 @@
-"""What a stage keeps beside a state: each message takes effect once, whoever is killed."""
+"""Tests of the delivery state of a stage: each message takes effect once, also after a kill."""
 
 import asyncio
 from collections.abc import Iterator
@@ -42,38 +42,38 @@ from .fake_actors import (
 )
 
 
-class Giver(Actor):
-    """Hands on each value, where there is room, with a number of its own."""
+class Numberer(Actor):
+    """An actor that publishes 1, 2, 3, ..., one number for each input while it has credit."""
 
-    name = "giver"
+    name = "numberer"
     inputs = (In(LATEST_NUMBER, Latest(64)),)
     outputs = (Out(NUMBERS, is_nonblocking=True),)
 
     def __init__(self) -> None:
         super().__init__()
-        self.given = 0
+        self.published = 0
 
     def handle(self, message: Message) -> Iterator[Message]:
         assert isinstance(message, Number)
         if self.has_credit(NUMBERS):
-            self.given += 1
-            yield number(self.given)
+            self.published += 1
+            yield number(self.published)
 
     def snapshot(self) -> State:
-        return {"given": self.given}
+        return {"published": self.published}
 
     def restore(self, state: State) -> None:
-        self.given = state["given"]
+        self.published = state["published"]
 
 
 class Adder(Actor):
-    """Two messages for each value: their order, and that both come, matters. Its state lags."""
+    """An actor that publishes two messages for each value. Its state lags behind its inputs."""
 
     name = "adder"
     lags = True
     inputs = (In(NUMBERS, Lossless(4)),)
     outputs = (Out(DOUBLES),)
-    unlucky: int | None = None  # fails
+    failing_value: int | None = None  # The handler raises at this value.
 
     def __init__(self) -> None:
         super().__init__()
@@ -83,8 +83,8 @@ class Adder(Actor):
     def handle(self, message: Message) -> Iterator[Message]:
         assert isinstance(message, Number)
         self.values.append(message.value)
-        if message.value == self.unlucky:
-            raise ValueError("unlucky")
+        if message.value == self.failing_value:
+            raise ValueError("failing value")
         yield Double(stamp_ns=1, value=2 * message.value)
         yield Double(stamp_ns=1, value=2 * message.value + 1)
 
@@ -99,8 +99,8 @@ class Adder(Actor):
         self.values = list(state["values"])
 
 
-class Keeper(Actor):
-    name = "keeper"
+class SavingCollector(Actor):
+    name = "collector"
     inputs = (In(DOUBLES, Lossless(3)),)
 
     def __init__(self) -> None:
@@ -119,12 +119,12 @@ class Keeper(Actor):
         self.seen = list(state["seen"])
 
 
-MAKERS = {"giver": Giver, "adder": Adder, "keeper": Keeper}
-EXPECTED = {NUMBERS.name: frozenset({"adder"}), DOUBLES.name: frozenset({"keeper"})}
+MAKERS = {"numberer": Numberer, "adder": Adder, "collector": SavingCollector}
+EXPECTED = {NUMBERS.name: frozenset({"adder"}), DOUBLES.name: frozenset({"collector"})}
 
 
-class Company:
-    """The three of them; each may be killed and started again, at any point of its step."""
+class Pipeline:
+    """The three actors; each can be killed and restarted at any point of its step."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.transport = folder, MemoryTransport()
@@ -141,13 +141,13 @@ class Company:
     async def kill(self, name: str) -> None:
         self.tasks[name].cancel()
         await asyncio.gather(self.tasks[name], return_exceptions=True)
-        self.stages[name]._worker.join(10)  # a process would not write on
+        self.stages[name]._worker.join(10)  # A killed process stops writing.
         self.transport.leave(name)
 
     def is_quiet(self) -> bool:
-        """Nothing waits or is under way, and all that was made is handled and saved."""
+        """Return whether no message is queued or in progress and all outputs are handled."""
         healths = [stage.health() for stage in self.stages.values()]
-        outlets = self.stages["giver"]._outlets[Number], self.stages["adder"]._outlets[Double]
+        outlets = self.stages["numberer"]._outlets[Number], self.stages["adder"]._outlets[Double]
         unhandled = [past.unhandled for outlet in outlets if (past := outlet.position())]
         waiting = [count.queued for health in healths for count in health.inputs]
         return not any((*unhandled, *waiting, *(health.current_step_s for health in healths)))
@@ -157,105 +157,105 @@ class Company:
 
 
 @pytest.mark.parametrize("seed", range(4))
-async def test_whoever_is_killed_and_when_each_value_arrives_once(
+async def test_each_value_arrives_once_although_actors_are_killed(
     tmp_path: Path, seed: int
 ) -> None:
-    rng, company = Random(seed), Company(tmp_path)
-    feed = Outlet(Out(LATEST_NUMBER), "feed", new_epoch(), company.transport)
+    rng, pipeline = Random(seed), Pipeline(tmp_path)
+    feed = Outlet(Out(LATEST_NUMBER), "feed", new_epoch(), pipeline.transport)
     for name in MAKERS:
-        company.start(name)
+        pipeline.start(name)
     await asyncio.sleep(0)
     for value in range(40):
         await send(feed, number(value))
         if rng.random() < 0.3:
             killed = rng.sample(list(MAKERS), rng.choice([1, 1, 2, 3]))
             for name in killed:
-                await company.kill(name)
+                await pipeline.kill(name)
             for name in killed:
-                company.start(name)
-            await asyncio.sleep(0)  # they have begun
+                pipeline.start(name)
+            await asyncio.sleep(0)  # Lets the stages start.
         await asyncio.sleep(rng.random() * 0.03)
-    await eventually(company.is_quiet)
+    await eventually(pipeline.is_quiet)
     for name in MAKERS:
-        await company.kill(name)
-    given = company.saved("giver")["given"]
-    assert given > 3
-    assert company.saved("keeper")["seen"] == [*range(2, 2 * given + 2)]
+        await pipeline.kill(name)
+    published = pipeline.saved("numberer")["published"]
+    assert published > 3
+    assert pipeline.saved("collector")["seen"] == [*range(2, 2 * published + 2)]
 
 
-# --- a disk that takes nothing --------------------------------------------------------------------
-class Moody(MemoryStore):
+# --- failing disk ---------------------------------------------------------------------------------
+class FailingStore(MemoryStore):
     is_full = False
-    fails = ""  # for this actor alone
+    failing_actor = ""  # Saves of this actor fail although the disk is not full.
 
     def save(self, actor: str, state: State) -> None:
-        if self.is_full or self.fails == actor:
+        if self.is_full or self.failing_actor == actor:
             raise OSError(28, "No space left on device")
         super().save(actor, state)
 
 
-async def test_a_step_that_is_not_saved_is_neither_acknowledged_nor_told() -> None:
-    transport, store = MemoryTransport(), Moody()
+async def test_unsaved_step_is_neither_acknowledged_nor_published() -> None:
+    transport, store = MemoryTransport(), FailingStore()
     adder = Stage(Adder, transport, config=QUICK, store=store, expected=EXPECTED)
-    keeper = Stage(Keeper, transport, config=QUICK)
+    collector = Stage(SavingCollector, transport, config=QUICK)
     numbers = Outlet(Out(NUMBERS), "source", new_epoch(), transport, ("adder",))
-    async with running(adder, keeper):
+    async with running(adder, collector):
         await eventually(lambda: numbers.credits() == 4)
         store.is_full = True
         await send(numbers, number(1))
         await eventually(lambda: adder.health().failures == 1)
-        await asyncio.sleep(0.05)  # heartbeats, and grants with them
+        await asyncio.sleep(0.05)  # Enough for several heartbeats and their credit messages.
         assert [sent.seq for sent in (numbers.position() or OutletPosition(0, 0)).unhandled] == [0]
-        assert keeper.health().steps == 0
+        assert collector.health().steps == 0
         store.is_full = False
-        await eventually(lambda: keeper.health().steps == 2)
+        await eventually(lambda: collector.health().steps == 2)
         assert adder.health().steps == 1
         assert adder.health().metrics["checkpoints_failed"] >= 1
     assert RestoredState.of(store.load("adder")).inputs[NUMBERS.name].handled == 1
 
 
-async def test_who_never_waits_goes_on_without_a_disk_and_makes_nothing_to_lose() -> None:
-    transport, store = MemoryTransport(), Moody()
-    giver = Stage(Giver, transport, config=QUICK, store=store, expected=EXPECTED)
+async def test_nonblocking_actor_continues_on_full_disk_and_holds_its_output() -> None:
+    transport, store = MemoryTransport(), FailingStore()
+    numberer = Stage(Numberer, transport, config=QUICK, store=store, expected=EXPECTED)
     adder = Stage(Adder, transport, config=QUICK)
     feed = Outlet(Out(LATEST_NUMBER), "feed", new_epoch(), transport)
-    async with running(giver, adder):
-        await eventually(lambda: giver._outlets[Number].credits() == 4)
+    async with running(numberer, adder):
+        await eventually(lambda: numberer._outlets[Number].credits() == 4)
         store.is_full = True
         for value in range(5):
             await send(feed, number(value))
-        await eventually(lambda: giver.health().steps == 5)
-        assert adder.health().steps == 0, "the first is held, and for the others there is no room"
+        await eventually(lambda: numberer.health().steps == 5)
+        assert adder.health().steps == 0, "the first output is held, and the others have no credit"
         store.is_full = False
-        await eventually(lambda: adder.health().steps == 1)  # though no message comes
+        await eventually(lambda: adder.health().steps == 1)  # The retry needs no new message.
         await send(feed, number(7))
         await eventually(lambda: adder.health().steps == 2)
-    assert store.load("giver")["given"] == 2
+    assert store.load("numberer")["published"] == 2
 
 
-@pytest.mark.parametrize("kind", ["giver", "adder"])
-async def test_a_soft_stop_does_not_wait_for_a_disk(kind: str, caplog) -> None:
-    """And who goes on from there does the step again."""
-    transport, store = MemoryTransport(), Moody()
-    giver = Stage(Giver, transport, config=QUICK, store=store, expected=EXPECTED)
+@pytest.mark.parametrize("kind", ["numberer", "adder"])
+async def test_soft_stop_does_not_wait_for_a_failing_disk(kind: str, caplog) -> None:
+    """The unsaved step is not part of the state, so the restored actor repeats it."""
+    transport, store = MemoryTransport(), FailingStore()
+    numberer = Stage(Numberer, transport, config=QUICK, store=store, expected=EXPECTED)
     adder = Stage(Adder, transport, config=QUICK, store=store)
     feed = Outlet(Out(LATEST_NUMBER), "feed", new_epoch(), transport)
-    ending = {"giver": giver, "adder": adder}[kind]
-    async with running(giver, adder) as tasks:
-        await eventually(lambda: giver._outlets[Number].credits() == 4)
-        store.fails = kind
+    ending = {"numberer": numberer, "adder": adder}[kind]
+    async with running(numberer, adder) as tasks:
+        await eventually(lambda: numberer._outlets[Number].credits() == 4)
+        store.failing_actor = kind
         await send(feed, number(1))
         await eventually(lambda: ending.health().failures == 1)
         ending.drain()
         await eventually(tasks[kind == "adder"].done)
     assert f"{kind}: stopped with one unsaved step" in caplog.text
     past = RestoredState.of(store.load(kind))
-    assert past.own.get("given", 0) == 0
+    assert past.own.get("published", 0) == 0
     assert past.own.get("values", []) == []
 
 
-async def test_a_stage_that_waits_for_its_disk_says_so_to_its_producers() -> None:
-    transport, store = MemoryTransport(), Moody()
+async def test_stage_waiting_for_its_disk_is_not_evicted() -> None:
+    transport, store = MemoryTransport(), FailingStore()
     adder = Stage(Adder, transport, config=QUICK, store=store)
     evicted: list[str] = []
     numbers = Outlet(
@@ -263,35 +263,35 @@ async def test_a_stage_that_waits_for_its_disk_says_so_to_its_producers() -> Non
     )
     async with running(adder):
         await eventually(lambda: numbers.credits() == 4)
-        store.fails = "adder"
+        store.failing_actor = "adder"
         for value in range(4):
             await send(numbers, number(value))
         await eventually(lambda: adder.health().failures == 1)
         loop = asyncio.get_running_loop()
 
         def on_grant(_header: bytes, _body: memoryview) -> None:
-            """Check after each grant: a pause of the whole process is no silence of the adder."""
+            """Check after each credit message, so that a paused process does not count."""
             loop.call_soon_threadsafe(numbers.evict_stalled)
 
         transport.subscribe(credit_key(NUMBERS.name), on_grant)
-        await asyncio.sleep(0.3)  # three times the patience
+        await asyncio.sleep(0.3)  # Three times `evict_after_s`.
         assert numbers.credits() == 0
-        store.fails = ""
+        store.failing_actor = ""
         await eventually(lambda: adder.health().steps == 4)
     assert evicted == []
 
 
-async def test_a_state_that_cannot_be_made_is_no_full_disk(caplog) -> None:
-    """The step fails as any other, and is set aside the second time."""
+async def test_failing_snapshot_is_a_failed_step_not_a_full_disk(caplog) -> None:
+    """The message becomes a dead letter at its second failure."""
 
-    class Broken(Adder):
+    class Unsaveable(Adder):
         def snapshot(self) -> State:
             if self.values[-1:] == [2]:
                 raise TypeError("no state")
             return super().snapshot()
 
     transport = MemoryTransport()
-    adder = Stage(Broken, transport, config=QUICK)
+    adder = Stage(Unsaveable, transport, config=QUICK)
     numbers = Outlet(Out(NUMBERS), "source", new_epoch(), transport, ("adder",))
     async with running(adder):
         for value in (1, 2, 3):
@@ -303,58 +303,60 @@ async def test_a_state_that_cannot_be_made_is_no_full_disk(caplog) -> None:
     assert "Free some disk space" not in caplog.text
 
 
-# --- what a lagging actor took --------------------------------------------------------------------
-def taken(value: int) -> LoggedInput:
+# --- write-ahead log ------------------------------------------------------------------------------
+def logged_input(value: int) -> LoggedInput:
     return LoggedInput.of(NUMBERS.name, encode(number(value)), FlowStatus())
 
 
-def test_a_successor_handles_again_what_the_state_does_not_know() -> None:
-    past = RestoredState(own={"values": [1, 2]}, taken=(taken(3), taken(4)))
+def test_restored_actor_replays_logged_inputs() -> None:
+    past = RestoredState(own={"values": [1, 2]}, taken=(logged_input(3), logged_input(4)))
     actor = restore_actor(Adder(), past, Adder)
     assert actor.values == [1, 2, 3, 4]
 
 
-def test_what_fails_then_is_left_out_without_a_trace(caplog: pytest.LogCaptureFixture) -> None:
-    class Unlucky(Adder):
-        unlucky = 3
+def test_logged_input_that_fails_in_replay_leaves_the_state_unchanged(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    class FailingAdder(Adder):
+        failing_value = 3
 
-    past = RestoredState(own={"values": [1, 2]}, taken=(taken(3), taken(4)))
-    assert restore_actor(Unlucky(), past, Unlucky).values == [1, 2, 4]
+    past = RestoredState(own={"values": [1, 2]}, taken=(logged_input(3), logged_input(4)))
+    assert restore_actor(FailingAdder(), past, FailingAdder).values == [1, 2, 4]
     assert "replaying a logged input of test/number failed" in caplog.text
 
 
-async def test_what_was_taken_is_bounded() -> None:
-    class Slow(Adder):
-        """Would never save by itself."""
+async def test_write_ahead_log_is_bounded() -> None:
+    class NeverSaving(Adder):
+        """An actor that never makes a checkpoint on its own."""
 
         def snapshot(self) -> State:
             return self._saved
 
     transport, store = MemoryTransport(), MemoryStore()
-    slow = Stage(Slow, transport, config=QUICK, store=store)
+    adder = Stage(NeverSaving, transport, config=QUICK, store=store)
     numbers = Outlet(Out(NUMBERS), "source", new_epoch(), transport, ("adder",))
-    async with running(slow):
+    async with running(adder):
         for value in range(MAX_WAL_ENTRIES + 3):
             await send(numbers, number(value))
-        await eventually(lambda: slow.health().steps == MAX_WAL_ENTRIES + 3)
+        await eventually(lambda: adder.health().steps == MAX_WAL_ENTRIES + 3)
     past = RestoredState.of(store.load("adder"))
     assert past.own["values"] == list(range(MAX_WAL_ENTRIES + 1))
     assert len(past.taken) == 2
 
 
-def test_a_state_is_taken_apart_as_it_was_put_together() -> None:
+def test_stored_state_is_parsed_into_its_parts() -> None:
     sent = tuple(UnackedMessage(seq, b"header", b"body %d" % seq) for seq in (9, 10, 11))
     state = {
         "values": [1],
         "stage.offsets": {"in": {NUMBERS.name: (5, 3)}, "out": {DOUBLES.name: (7, 12)}},
         **{f"stage.outbox test.double {one.seq}": one for one in reversed(sent)},
-        "stage.wal 4": taken(8),
+        "stage.wal 4": logged_input(8),
     }
     past = RestoredState.of(state)
     assert past.own == {"values": [1]}
     assert past.inputs == {NUMBERS.name: InletPosition(5, 3)}
     assert past.outputs == {DOUBLES.name: OutletPosition(7, 12, sent)}
     assert past.outputs[DOUBLES.name].handled == 9
-    assert past.taken == (taken(8),)
+    assert past.taken == (logged_input(8),)
     assert past.has_passed
     assert RestoredState.of(None).is_none

@@ -1,4 +1,4 @@
-"""The graph over a file: what comes out depends on the input and the latencies alone."""
+"""Tests of offline runs: the outputs depend only on the inputs and the declared latencies."""
 
 import random
 import threading
@@ -16,18 +16,18 @@ from ldo_service.schemas import Message
 from .fake_actors import DOUBLES, NUMBERS, PIECES, Double, Doubler, Number, Piece, number
 
 
-class Sleepy(Doubler):
-    """Takes a random time for each message."""
+class SlowDoubler(Doubler):
+    """An actor that takes a random time for each message."""
 
     def handle(self, message: Message) -> Iterator[Message]:
         time.sleep(random.random() * 0.004)
         yield from super().handle(message)
 
 
-class Mixer(Actor):
-    """Mixes what it sees in the order in which it sees it."""
+class OrderCollector(Actor):
+    """An actor that records the messages of two inputs in their order of arrival."""
 
-    name = "mixer"
+    name = "collector"
     inputs = (In(NUMBERS, Lossless()), In(DOUBLES, Lossless()))
 
     def __init__(self) -> None:
@@ -48,133 +48,133 @@ def source(count: int) -> list[Number]:
 def run(
     actors: list[Actor], latency_ticks: dict[str, int], count: int
 ) -> list[tuple[str, Message]]:
-    made: list[tuple[str, Message]] = []
+    outputs: list[tuple[str, Message]] = []
     with LogicalClock(
-        actors, latency_ticks, lambda actor, message, _step_ms: made.append((actor, message))
+        actors, latency_ticks, lambda actor, message, _step_ms: outputs.append((actor, message))
     ) as clock:
         assert list(clock.run(source(count))) == list(range(count))
         clock.finish()
-    return made
+    return outputs
 
 
-def test_the_result_does_not_depend_on_how_long_actors_take() -> None:
-    def once() -> tuple[list[str], list[tuple[str, Message]]]:
-        mixer = Mixer()
-        return mixer.seen, run([Sleepy(), mixer], {"doubler": 2}, 25)
+def test_result_is_independent_of_step_durations() -> None:
+    def run_once() -> tuple[list[str], list[tuple[str, Message]]]:
+        collector = OrderCollector()
+        return collector.seen, run([SlowDoubler(), collector], {"doubler": 2}, 25)
 
-    first = once()
-    assert all(once() == first for _ in range(3))
+    first = run_once()
+    assert all(run_once() == first for _ in range(3))
     assert len(first[0]) == 50
 
 
-def test_an_answer_becomes_visible_after_the_declared_latency() -> None:
-    mixer = Mixer()
-    run([Doubler(), mixer], {"doubler": 2}, 5)
-    assert mixer.seen == ["N0", "N1", "N2", "D0", "N3", "D2", "N4", "D4", "D6", "D8"]
+def test_output_becomes_visible_after_the_declared_latency() -> None:
+    collector = OrderCollector()
+    run([Doubler(), collector], {"doubler": 2}, 5)
+    assert collector.seen == ["N0", "N1", "N2", "D0", "N3", "D2", "N4", "D4", "D6", "D8"]
 
 
-def test_without_latency_an_answer_is_visible_within_its_tick() -> None:
-    mixer = Mixer()
-    run([Doubler(), mixer], {}, 3)
-    assert mixer.seen == ["N0", "D0", "N1", "D2", "N2", "D4"]
+def test_output_without_latency_is_visible_within_its_tick() -> None:
+    collector = OrderCollector()
+    run([Doubler(), collector], {}, 3)
+    assert collector.seen == ["N0", "D0", "N1", "D2", "N2", "D4"]
 
 
-def test_actors_compute_side_by_side() -> None:
-    """Each waits for the other, which one thread alone could never do."""
+def test_actors_run_in_parallel() -> None:
+    """Each actor waits for the other, so a single thread would never finish."""
 
-    class Partner(Doubler):
-        both: ClassVar[threading.Barrier] = threading.Barrier(2, timeout=60)
+    class BarrierActor(Doubler):
+        barrier: ClassVar[threading.Barrier] = threading.Barrier(2, timeout=60)
 
         def handle(self, _message: Message) -> Iterator[Message]:
-            self.both.wait()
+            self.barrier.wait()
             yield from ()
 
-    class Other(Partner):
+    class SecondBarrierActor(BarrierActor):
         name = "other"
         outputs = ()
 
-    run([Partner(), Other()], {"doubler": 1, "other": 1}, 3)
+    run([BarrierActor(), SecondBarrierActor()], {"doubler": 1, "other": 1}, 3)
 
 
-def test_nothing_is_dropped_not_even_by_latest() -> None:
-    class Newest(Mixer):
+def test_latest_inputs_drop_no_messages() -> None:
+    class Newest(OrderCollector):
         inputs = (In(NUMBERS, Latest(1)),)
 
     newest = Newest()
-    run([newest], {"mixer": 3}, 10)
+    run([newest], {"collector": 3}, 10)
     assert len(newest.seen) == 10
 
 
-class Talker(Doubler):
+class FinalDoubler(Doubler):
     def on_stop(self) -> Iterator[Message]:
         yield Double(stamp_ns=9, value=-1)
 
 
-class Counter(Mixer):
+class CountPublisher(OrderCollector):
     outputs = (Out(PIECES),)
 
     def on_stop(self) -> Iterator[Message]:
         yield Piece(stamp_ns=0, version=len(self.seen), part=0, parts=1)
 
 
-def test_last_words_come_producers_first_after_everything_else() -> None:
-    counter = Counter()
-    made = run([Talker(), counter], {"doubler": 4}, 3)
-    assert counter.seen[-2:] == ["D4", "D-1"]
-    assert made[-1] == ("mixer", Piece(stamp_ns=0, version=7, part=0, parts=1))
+def test_final_messages_come_last_and_producers_first() -> None:
+    collector = CountPublisher()
+    outputs = run([FinalDoubler(), collector], {"doubler": 4}, 3)
+    assert collector.seen[-2:] == ["D4", "D-1"]
+    assert outputs[-1] == ("collector", Piece(stamp_ns=0, version=7, part=0, parts=1))
 
 
-def test_who_tells_what_came_of_the_others_last_words_comes_last() -> None:
-    class LastTalker(Talker):
+def test_actor_that_finishes_last_publishes_after_all_others() -> None:
+    class LastFinalDoubler(FinalDoubler):
         finishes_last = True
 
-    made = run([LastTalker(), Counter()], {"doubler": 4}, 3)
-    assert [name for name, _ in made[-2:]] == ["mixer", "doubler"]
+    outputs = run([LastFinalDoubler(), CountPublisher()], {"doubler": 4}, 3)
+    assert [name for name, _ in outputs[-2:]] == ["collector", "doubler"]
 
 
-def test_an_empty_source_still_lets_actors_finish() -> None:
-    assert run([Talker()], {}, 0) == [("doubler", Double(stamp_ns=9, value=-1))]
+def test_actors_finish_after_an_empty_source() -> None:
+    assert run([FinalDoubler()], {}, 0) == [("doubler", Double(stamp_ns=9, value=-1))]
 
 
 @pytest.mark.parametrize("latency", [0, 3])
-def test_a_failure_names_the_actor_and_ends_the_threads(latency: int) -> None:
-    class Fragile(Doubler):
+def test_failure_names_the_actor_and_ends_the_threads(latency: int) -> None:
+    class FailingDoubler(Doubler):
         def handle(self, message: Message) -> Iterator[Message]:
             assert isinstance(message, Number)
             yield Double(stamp_ns=0, value=10 // (2 - message.value))
 
     with pytest.raises(StageError, match=r"doubler failed at tick \d: ZeroDivisionError") as caught:
-        run([Fragile(), Mixer()], {"doubler": latency}, 10)
+        run([FailingDoubler(), OrderCollector()], {"doubler": latency}, 10)
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
     assert not [thread for thread in threading.enumerate() if "doubler" in thread.name]
 
 
-def test_a_run_that_is_broken_off_ends_its_threads() -> None:
+def test_aborted_run_ends_its_threads() -> None:
     with LogicalClock([Doubler()], {}) as clock:
         assert next(iter(clock.run(source(5)))) == 0
     assert not [thread for thread in threading.enumerate() if "doubler" in thread.name]
 
 
-def test_a_second_source_goes_on_where_the_first_ended() -> None:
-    mixer = Mixer()
-    with LogicalClock([Doubler(), mixer], {"doubler": 2}) as clock:
+def test_second_source_continues_after_the_first() -> None:
+    collector = OrderCollector()
+    with LogicalClock([Doubler(), collector], {"doubler": 2}) as clock:
         assert list(clock.run(source(2))) == [0, 1]
-        assert mixer.seen == ["N0", "N1", "D0", "D2"], "nothing is left under way"
+        assert collector.seen == ["N0", "N1", "D0", "D2"], "no message is in progress"
         clock.finish()
         assert list(clock.run(source(1))) == [2]
-    assert mixer.seen[4:] == ["N0", "D0"]
+    assert collector.seen[4:] == ["N0", "D0"]
 
 
-def test_step_times_are_kept_by_actor() -> None:
-    with LogicalClock([Doubler(), Mixer()], {}) as clock:
+def test_step_times_are_recorded_per_actor() -> None:
+    with LogicalClock([Doubler(), OrderCollector()], {}) as clock:
         list(clock.run(source(4)))
     assert {name: len(times) for name, times in clock.step_ms().items()} == {
         "doubler": 4,
-        "mixer": 8,
+        "collector": 8,
     }
 
 
-def test_a_cycle_is_refused_before_anything_starts() -> None:
+def test_lossless_cycle_is_rejected_at_construction() -> None:
     class Loop(Doubler):
         inputs = (In(DOUBLES, Lossless()),)
 
@@ -182,8 +182,8 @@ def test_a_cycle_is_refused_before_anything_starts() -> None:
         LogicalClock([Loop()], {})
 
 
-def test_messages_that_come_together_share_a_tick() -> None:
-    mixer = Mixer()
-    with LogicalClock([Doubler(), mixer], {"doubler": 1}) as clock:
+def test_messages_of_one_batch_share_a_tick() -> None:
+    collector = OrderCollector()
+    with LogicalClock([Doubler(), collector], {"doubler": 1}) as clock:
         assert list(clock.run([(number(0), number(1)), number(2)])) == [0, 1]
-    assert mixer.seen == ["N0", "N1", "N2", "D0", "D2", "D4"]
+    assert collector.seen == ["N0", "N1", "N2", "D0", "D2", "D4"]

@@ -1,4 +1,4 @@
-"""Inputs of policy Latest, and what arrives from outside."""
+"""Tests of the mailbox: inputs of policy Latest and messages of other programs."""
 
 from ldo_service.runtime import In, Latest, Lossless
 from ldo_service.runtime.inlet import Delivery
@@ -11,7 +11,7 @@ from .fake_actors import DOUBLES, NUMBERS, collector, eventually, number, runnin
 
 
 class Feed:
-    """A producer without a link: what it sends, it sends."""
+    """A producer without flow control."""
 
     def __init__(self, transport: MemoryTransport, topic: str = NUMBERS.name) -> None:
         self._transport, self._topic, self._seq = transport, topic, 0
@@ -24,7 +24,7 @@ class Feed:
 
 
 async def take_all(mailbox: Mailbox) -> list[tuple[str, int]]:
-    """Key and stamp of all that waits."""
+    """Return the key and stamp of all queued messages."""
     mailbox.close()
     taken: list[Delivery] = []
     while delivery := await mailbox.take():
@@ -33,7 +33,7 @@ async def take_all(mailbox: Mailbox) -> list[tuple[str, int]]:
     return [(delivery.header.key, delivery.header.stamp_ns) for delivery in taken]
 
 
-async def test_latest_drops_the_oldest_and_counts() -> None:
+async def test_latest_drops_and_counts_the_oldest() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Latest(2)),), transport)
     feed = Feed(transport)
@@ -44,19 +44,19 @@ async def test_latest_drops_the_oldest_and_counts() -> None:
     assert (counted.delivered, counted.dropped, counted.peak_queued, counted.queued) == (2, 8, 2, 0)
 
 
-async def test_what_goes_first_is_taken_before_all_that_waits_and_in_its_own_order() -> None:
+async def test_priority_input_is_taken_first_and_in_order() -> None:
     transport = MemoryTransport()
     ports = In(NUMBERS, Latest(8)), In(DOUBLES, Latest(8), has_priority=True)
     mailbox = Mailbox("me", ports, transport)
-    patient, hasty = Feed(transport), Feed(transport, DOUBLES.name)
+    normal, urgent = Feed(transport), Feed(transport, DOUBLES.name)
     for value in range(3):
-        patient.send(value)
-        hasty.send(10 + value)
+        normal.send(value)
+        urgent.send(10 + value)
     assert [stamp for _, stamp in await take_all(mailbox)] == [10, 11, 12, 0, 1, 2]
     assert [counted.delivered for counted in mailbox.counts()] == [3, 3]
 
 
-async def test_latest_per_key_keeps_the_newest_of_each() -> None:
+async def test_latest_per_key_keeps_the_newest_of_each_key() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Latest(1, per_key=True)),), transport)
     feed = Feed(transport)
@@ -66,7 +66,7 @@ async def test_latest_per_key_keeps_the_newest_of_each() -> None:
     assert mailbox.counts()[0].dropped == 3
 
 
-async def test_beyond_max_keys_the_key_that_waited_longest_makes_room() -> None:
+async def test_exceeding_max_keys_drops_the_longest_waiting_key() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Latest(2, per_key=True, max_keys=2)),), transport)
     feed = Feed(transport)
@@ -85,7 +85,7 @@ async def test_inputs_are_merged_in_order_of_arrival() -> None:
     assert await take_all(mailbox) == [("", value) for value in range(6)]
 
 
-async def test_a_message_whose_header_cannot_be_read_is_rejected_and_counted() -> None:
+async def test_unreadable_header_is_rejected_and_counted() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Latest(8)), In(DOUBLES, Lossless(2))), transport)
     for noise in (
@@ -100,14 +100,14 @@ async def test_a_message_whose_header_cannot_be_read_is_rejected_and_counted() -
     assert [counted.rejected for counted in mailbox.counts()] == [4, 4]
 
 
-async def test_a_foreign_program_may_send_to_a_latest_input_without_a_header() -> None:
+async def test_latest_input_accepts_messages_without_header() -> None:
     transport, seen = MemoryTransport(), []
     async with running(collector(transport, seen, policy=Latest(4))):
         transport.deliver(NUMBERS.name, b"", encode_message(number(5)))
         await eventually(lambda: seen == [5])
 
 
-async def test_a_flood_into_a_lossless_input_stays_within_its_window() -> None:
+async def test_flooded_lossless_input_queues_only_its_window() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Lossless(3)),), transport)
     transport.deliver("link/welcome/test/number", b"", encode_link([1, {"me": 0}]))
@@ -119,7 +119,7 @@ async def test_a_flood_into_a_lossless_input_stays_within_its_window() -> None:
     assert await take_all(mailbox) == [("", 0), ("", 1), ("", 2)]
 
 
-async def test_a_body_that_does_not_decode_is_rejected_and_the_next_is_handled() -> None:
+async def test_undecodable_body_is_rejected_and_the_next_is_handled() -> None:
     transport, seen = MemoryTransport(), []
     stage = collector(transport, seen, policy=Latest(8))
     async with running(stage):
@@ -132,16 +132,16 @@ async def test_a_body_that_does_not_decode_is_rejected_and_the_next_is_handled()
         assert stage.health().failures == 0
 
 
-async def test_a_message_over_the_size_limit_is_rejected_before_it_is_decoded() -> None:
+async def test_oversized_message_is_rejected_before_decoding() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Latest(4)),), transport, max_bytes=100)
     transport.deliver(NUMBERS.name, b"", bytes(101))
-    transport.deliver(NUMBERS.name, b"", bytes(100))  # no message either, but that shows later
+    transport.deliver(NUMBERS.name, b"", bytes(100))  # It is malformed, but not yet decoded.
     (counted,) = mailbox.counts()
     assert (counted.rejected, counted.queued) == (1, 1)
 
 
-async def test_rejections_are_said_once_an_episode_and_counted_each(caplog) -> None:
+async def test_rejections_are_logged_once_per_episode_and_each_counted(caplog) -> None:
     transport, seen = MemoryTransport(), []
     stage = collector(transport, seen, policy=Latest(8))
     good, bad = encode_message(number(3)), b"\x80"
@@ -152,21 +152,21 @@ async def test_rejections_are_said_once_an_episode_and_counted_each(caplog) -> N
     assert len([r for r in caplog.records if "rejected" in r.message]) == 2
 
 
-async def test_what_never_came_is_counted_by_the_numbers_of_what_did() -> None:
+async def test_lost_messages_are_counted_from_sequence_numbers() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Latest(64)),), transport)
 
-    def arrives(epoch: int, *numbers: int) -> int:
+    def lost_after(epoch: int, *numbers: int) -> int:
         for seq in numbers:
             header = encode_link(Header("source", epoch, seq, 0))
             transport.deliver(NUMBERS.name, header, encode_message(number(seq)))
         return mailbox.counts()[0].lost
 
-    assert arrives(1, 5, 6, 7) == 0, "who comes late has lost nothing"
-    assert arrives(1, 10) == 2
-    assert arrives(1, 9) == 1, "it was only late"
-    assert arrives(1, 9, 10, 7) == 1, "these came again"
-    assert arrives(2, 0, 1, 3) == 2, "another producer counts anew"
+    assert lost_after(1, 5, 6, 7) == 0, "messages before the first one are not lost"
+    assert lost_after(1, 10) == 2
+    assert lost_after(1, 9) == 1, "the message was only late"
+    assert lost_after(1, 9, 10, 7) == 1, "repeated messages do not count"
+    assert lost_after(2, 0, 1, 3) == 2, "a new epoch is counted separately"
     transport.deliver(NUMBERS.name, b"", encode_message(number(0)))
-    assert mailbox.counts()[0].lost == 2, "a foreign program numbers nothing"
+    assert mailbox.counts()[0].lost == 2, "messages without header have no number"
     mailbox.disconnect()

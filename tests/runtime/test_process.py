@@ -1,4 +1,4 @@
-"""Actors in processes of their own, which get killed and stopped."""
+"""Tests of actors in their own processes, which are killed and stopped."""
 
 import asyncio
 import os
@@ -47,12 +47,12 @@ def child(code: str, **options: Any) -> ChildProcess:
 
 
 def pid_of(process: ChildProcess) -> int:
-    """Return the number of a process that was started: 0 would be the group of the tests."""
+    """Return the id of a started process; a signal to 0 would go to the group of the tests."""
     assert process.pid
     return process.pid
 
 
-async def test_a_killed_consumer_nobody_expects_releases_the_window(
+async def test_killed_unexpected_consumer_releases_the_window(
     network: Endpoint, client: Callable[[], zenoh.Session], tmp_path: Path
 ) -> None:
     source = Outlet(Out(NUMBERS), "producer", 1, ZenohTransport(client(), network))
@@ -73,7 +73,7 @@ async def test_a_killed_consumer_nobody_expects_releases_the_window(
         process.wait()
 
 
-async def test_a_killed_and_a_stopped_process_are_replaced_and_nothing_is_lost(
+async def test_killed_and_stopped_processes_are_restarted_without_loss(
     network: Endpoint, client: Callable[[], zenoh.Session], tmp_path: Path
 ) -> None:
     numbers, transport = tmp_path / "numbers", ZenohTransport(client(), network)
@@ -99,31 +99,30 @@ async def test_a_killed_and_a_stopped_process_are_replaced_and_nothing_is_lost(
     await service
     handled = read(numbers)
     assert set(handled) == set(range(60))
-    assert (
-        len(handled) - 60 <= 2 * process.restarts
-    )  # a step under way is done again, and one not yet granted
+    # Each restart repeats at most the step in progress and one that was not yet acknowledged.
+    assert len(handled) - 60 <= 2 * process.restarts
     assert process.pid is not None
     with pytest.raises(ProcessLookupError):
         os.kill(process.pid, 0)
 
 
-async def test_a_process_that_keeps_dying_exhausts_its_restarts(
+async def test_process_that_keeps_failing_exhausts_its_restarts(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    dying = child("import sys; sys.exit(3)", max_restarts=2)
+    failing = child("import sys; sys.exit(3)", max_restarts=2)
     with pytest.raises(RestartsExhausted, match="child failed 3 times"):
-        await dying.run()
-    assert dying.restarts == 2
+        await failing.run()
+    assert failing.restarts == 2
     assert "ended with exit code 3" in caplog.text
 
 
-async def test_a_process_that_never_reports_is_started_again() -> None:
+async def test_silent_process_is_restarted() -> None:
     silent = child("import time; time.sleep(1e6)", start_within_s=0.1, silent_after_s=0.1)
     async with running(silent):
         await eventually(lambda: silent.restarts >= 2)
 
 
-async def test_a_cancelled_child_is_gone() -> None:
+async def test_cancelled_child_process_has_ended() -> None:
     sleeping = child("import time; time.sleep(1e6)")
     async with running(sleeping):
         await eventually(lambda: sleeping.pid is not None)
@@ -131,7 +130,7 @@ async def test_a_cancelled_child_is_gone() -> None:
         os.kill(pid_of(sleeping), 0)
 
 
-async def test_a_child_that_is_drained_while_it_starts_ends() -> None:
+async def test_child_drained_during_its_start_ends() -> None:
     sleeping = child("import time; time.sleep(1e6)")
     task = asyncio.create_task(sleeping.run())
     await asyncio.sleep(0)
@@ -141,7 +140,7 @@ async def test_a_child_that_is_drained_while_it_starts_ends() -> None:
     assert sleeping.restarts == 0
 
 
-async def test_a_process_leaves_when_its_parent_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_process_exits_after_its_parent_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(PARENT_VARIABLE, "12345")
     monkeypatch.setattr(os, "getppid", lambda: 12345)
     waiting = asyncio.create_task(exit_with_parent(0.001))
@@ -151,7 +150,9 @@ async def test_a_process_leaves_when_its_parent_is_gone(monkeypatch: pytest.Monk
     await asyncio.wait_for(waiting, 60)
 
 
-async def test_a_process_started_by_hand_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_process_without_parent_variable_keeps_running(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv(PARENT_VARIABLE, raising=False)
     waiting = asyncio.create_task(exit_with_parent(0.001))
     await asyncio.sleep(0.02)
@@ -159,8 +160,8 @@ async def test_a_process_started_by_hand_stays(monkeypatch: pytest.MonkeyPatch) 
     waiting.cancel()
 
 
-def test_a_child_of_a_killed_parent_does_not_outlive_it(network: Endpoint, tmp_path: Path) -> None:
-    """The whole chain: parent killed, child sees it, drains and goes."""
+def test_child_process_ends_after_its_parent_is_killed(network: Endpoint, tmp_path: Path) -> None:
+    """The child detects the end of its parent, drains and exits."""
     numbers = tmp_path / "numbers"
     parent = subprocess.Popen(
         [sys.executable, "-c", PARENT, *command(network, numbers)], stdout=subprocess.PIPE
@@ -191,11 +192,11 @@ def is_running(pid: int) -> bool:
 
 
 @pytest.mark.skipif(
-    not platform.libc_ver()[0].startswith("glibc"), reason="needs glibc: its malloc is meant"
+    not platform.libc_ver()[0].startswith("glibc"), reason="needs the malloc of glibc"
 )
-def test_memory_that_was_let_go_goes_back_to_the_system() -> None:
+def test_trim_memory_returns_freed_memory_to_the_system() -> None:
     blocks = [bytearray(60_000) for _ in range(2000)]
-    kept = blocks[::20]  # which lie between those that go
+    kept = blocks[::20]  # The kept blocks lie between the freed ones.
     del blocks
     before_mb = resident_mb()
     trim_memory()

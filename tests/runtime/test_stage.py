@@ -1,4 +1,4 @@
-"""One actor at work: failures, stalls, soft stops, health."""
+"""Tests of a stage: failures, stalls, soft stops and health."""
 
 import asyncio
 from collections.abc import Callable, Iterator
@@ -40,20 +40,20 @@ def source(transport: MemoryTransport, *expected: str) -> Outlet:
 
 
 class Adder(Actor):
-    """Sums up; keeps the sum, and fails where `trouble` says so."""
+    """An actor that publishes the sum so far; `inject` raises at chosen values."""
 
     name = "adder"
     inputs = (In(NUMBERS, Lossless(4)),)
     outputs = (Out(DOUBLES),)
 
-    def __init__(self, trouble: Callable[[int], None] = lambda _value: None) -> None:
+    def __init__(self, inject: Callable[[int], None] = lambda _value: None) -> None:
         super().__init__()
-        self._trouble, self._sum = trouble, 0
+        self._inject, self._sum = inject, 0
 
     def handle(self, message: Message) -> Iterator[Message]:
         assert isinstance(message, Number)
         self._sum += message.value
-        self._trouble(message.value)
+        self._inject(message.value)
         yield Double(stamp_ns=message.stamp_ns, value=self._sum)
 
     def on_stop(self) -> Iterator[Message]:
@@ -63,8 +63,8 @@ class Adder(Actor):
         return {"sum": self._sum}
 
     def on_saved(self) -> None:
-        if isinstance(self._trouble, Trouble):
-            self._trouble.saved.append(self._sum)
+        if isinstance(self._inject, InjectedFailure):
+            self._inject.saved.append(self._sum)
 
     def restore(self, state: State) -> None:
         self._sum = state["sum"]
@@ -73,12 +73,12 @@ class Adder(Actor):
         return {"sum": float(self._sum)}
 
 
-class Trouble:
-    """Fails on a value, so many times."""
+class InjectedFailure:
+    """An error that is raised at one value a number of times."""
 
     def __init__(self, value: int, times: int, error: BaseException | None = None) -> None:
-        self._value, self._left, self._error = value, times, error or RuntimeError("trouble")
-        self.saved: list[int] = []  # sums, as the adder was told
+        self._value, self._left, self._error = value, times, error or RuntimeError("injected")
+        self.saved: list[int] = []  # The sum at each call of `on_saved`.
 
     def __call__(self, value: int) -> None:
         if value == self._value and self._left > 0:
@@ -86,10 +86,12 @@ class Trouble:
             raise self._error
 
 
-async def run_adder(trouble: Trouble, values: list[int], **options: Any) -> tuple[list[int], Stage]:
-    """What an adder that meets trouble says, and its stage."""
+async def run_adder(
+    failure: InjectedFailure, values: list[int], **options: Any
+) -> tuple[list[int], Stage]:
+    """Run an adder with an injected failure and return its published sums and its stage."""
     transport, sums = MemoryTransport(), []
-    adder = Stage(lambda: Adder(trouble), transport, config=QUICK, **options)
+    adder = Stage(lambda: Adder(failure), transport, config=QUICK, **options)
     numbers = source(transport, "adder")
     async with running(adder, Stage(lambda: DoubleCollector(sums), transport, config=QUICK)):
         for value in values:
@@ -100,7 +102,7 @@ async def run_adder(trouble: Trouble, values: list[int], **options: Any) -> tupl
     return sums, adder
 
 
-async def test_messages_travel_from_actor_to_actor() -> None:
+async def test_messages_pass_from_actor_to_actor() -> None:
     transport, seen = MemoryTransport(), []
     numbers = source(transport, "doubler")
     expected = {DOUBLES.name: frozenset({"double_collector"})}
@@ -115,46 +117,46 @@ async def test_messages_travel_from_actor_to_actor() -> None:
     assert seen == [2 * value for value in range(30)]
 
 
-async def test_after_a_failure_a_successor_goes_on_from_the_last_state() -> None:
-    sums, stage = await run_adder(Trouble(value=3, times=1), [1, 2, 3, 4])
-    assert sums == [1, 3, 6, 10]  # the half step before the failure left no trace
+async def test_failed_actor_is_restored_from_its_last_state() -> None:
+    sums, stage = await run_adder(InjectedFailure(value=3, times=1), [1, 2, 3, 4])
+    assert sums == [1, 3, 6, 10]  # The failed step has no effect.
     health = stage.health()
     assert (health.steps, health.failures, health.restarts, health.dead_lettered) == (4, 1, 1, 0)
 
 
-async def test_a_message_that_fails_twice_is_set_aside_and_the_rest_is_handled() -> None:
-    sums, stage = await run_adder(Trouble(value=3, times=99), [1, 2, 3, 4])
+async def test_message_that_fails_twice_is_dead_lettered_and_the_rest_handled() -> None:
+    sums, stage = await run_adder(InjectedFailure(value=3, times=99), [1, 2, 3, 4])
     assert sums == [1, 3, 7]
     health = stage.health()
     assert (health.steps, health.failures, health.restarts, health.dead_lettered) == (3, 2, 2, 1)
 
 
 @pytest.mark.parametrize("error", [StopIteration(), SystemExit(1), KeyboardInterrupt()])
-async def test_whatever_a_handler_raises_is_a_failed_step(error: BaseException) -> None:
-    sums, stage = await run_adder(Trouble(value=2, times=1, error=error), [1, 2])
+async def test_any_exception_of_a_handler_is_a_failed_step(error: BaseException) -> None:
+    sums, stage = await run_adder(InjectedFailure(value=2, times=1, error=error), [1, 2])
     assert sums == [1, 3]
     assert stage.health().failures == 1
 
 
-async def test_an_actor_is_told_when_its_state_is_saved() -> None:
-    peace = Trouble(value=-1, times=0)
-    await run_adder(peace, [1, 2, 3])
-    assert peace.saved[:4] == [0, 1, 3, 6]
+async def test_on_saved_is_called_after_each_save() -> None:
+    no_failure = InjectedFailure(value=-1, times=0)
+    await run_adder(no_failure, [1, 2, 3])
+    assert no_failure.saved[:4] == [0, 1, 3, 6]
 
 
-async def test_the_next_process_goes_on_from_the_folder(tmp_path: Path) -> None:
-    peace = Trouble(value=-1, times=0)
-    await run_adder(peace, [1, 2, 3], store=FolderStore(tmp_path))
-    sums, _ = await run_adder(peace, [4], store=FolderStore(tmp_path))
+async def test_next_process_continues_from_the_stored_state(tmp_path: Path) -> None:
+    no_failure = InjectedFailure(value=-1, times=0)
+    await run_adder(no_failure, [1, 2, 3], store=FolderStore(tmp_path))
+    sums, _ = await run_adder(no_failure, [4], store=FolderStore(tmp_path))
     assert sums == [10]
 
 
-async def test_a_message_that_is_none_of_the_outputs_is_a_failure_of_the_actor() -> None:
-    class Stranger(Doubler):
+async def test_undeclared_output_is_a_failed_step() -> None:
+    class UndeclaredOutput(Doubler):
         outputs = ()
 
     transport = MemoryTransport()
-    stage = Stage(Stranger, transport, config=QUICK)
+    stage = Stage(UndeclaredOutput, transport, config=QUICK)
     numbers = source(transport, "doubler")
     async with running(stage):
         await send(numbers, number(1))
@@ -177,14 +179,16 @@ def _always_fail(_value: int) -> None:
     raise RuntimeError("always")
 
 
-async def test_a_state_that_cannot_be_restored_exhausts_the_restarts() -> None:
-    class Picky(Adder):
+async def test_unrestorable_state_exhausts_the_restarts() -> None:
+    class Unrestorable(Adder):
         def restore(self, state: State) -> None:
-            raise KeyError(f"what is {state}?")
+            raise KeyError(f"cannot restore {state}")
 
     transport, store = MemoryTransport(), MemoryStore()
     config = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=2)
-    stage = Stage(lambda: Picky(Trouble(2, 1)), transport, config=config, store=store)
+    stage = Stage(
+        lambda: Unrestorable(InjectedFailure(2, 1)), transport, config=config, store=store
+    )
     numbers = source(transport, "adder")
     running_stage = asyncio.create_task(stage.run())
     await asyncio.sleep(0)
@@ -194,23 +198,23 @@ async def test_a_state_that_cannot_be_restored_exhausts_the_restarts() -> None:
         await running_stage
 
 
-async def test_a_handler_that_does_not_return_is_a_stall() -> None:
-    transport, stuck = MemoryTransport(), Event()
+async def test_handler_that_does_not_return_raises_stage_stalled() -> None:
+    transport, release = MemoryTransport(), Event()
     config = SupervisionConfig(heartbeat_s=0.01, stall_after_s=0.05)
-    stage = collector(transport, [], lambda _value: stuck.wait(60) and None, config=config)
+    stage = collector(transport, [], lambda _value: release.wait(60) and None, config=config)
     numbers = source(transport, "collector")
     running_stage = asyncio.create_task(stage.run())
     await send(numbers, number(0))
     with pytest.raises(StageStalled, match="collector has been busy"):
         await running_stage
-    stuck.set()
+    release.set()
 
 
-async def test_a_soft_stop_handles_what_has_arrived_and_says_the_last_words() -> None:
-    transport, sums, go = MemoryTransport(), [], Event()
+async def test_soft_stop_handles_queued_messages_and_publishes_final_ones() -> None:
+    transport, sums, release = MemoryTransport(), [], Event()
 
     def wait(_value: int) -> None:
-        go.wait(60)
+        release.wait(60)
 
     adder = Stage(lambda: Adder(wait), transport, config=QUICK)
     numbers = source(transport, "adder")
@@ -219,30 +223,30 @@ async def test_a_soft_stop_handles_what_has_arrived_and_says_the_last_words() ->
             await send(numbers, number(value))
         adder.drain()
         assert adder.health().state == "draining"
-        go.set()
+        release.set()
         await run[0]
         await eventually(lambda: len(sums) == 4)
     assert sums == [1, 3, 6, -6]
 
 
-async def test_a_soft_stop_before_the_start_ends_at_once() -> None:
+async def test_soft_stop_before_the_start_ends_at_once() -> None:
     stage = Stage(Doubler, MemoryTransport(), config=QUICK)
     stage.drain()
     await asyncio.wait_for(stage.run(), 60)
 
 
-async def test_last_words_that_fail_do_not_hinder_the_stop() -> None:
-    class Speechless(Doubler):
+async def test_failing_on_stop_does_not_prevent_the_stop() -> None:
+    class FailingOnStop(Doubler):
         def on_stop(self) -> Iterator[Message]:
-            raise RuntimeError("no words")
+            raise RuntimeError("failing on_stop")
 
-    stage = Stage(Speechless, MemoryTransport(), config=QUICK)
+    stage = Stage(FailingOnStop, MemoryTransport(), config=QUICK)
     stage.drain()
     await asyncio.wait_for(stage.run(), 60)
     assert stage.health().failures == 1
 
 
-async def test_heartbeats_carry_the_counters() -> None:
+async def test_heartbeats_contain_the_counters() -> None:
     transport, beats = MemoryTransport(), []
     transport.subscribe("health/adder", lambda _header, body: beats.append(decode(body, Health)))
     stage = Stage(Adder, transport, config=QUICK)
@@ -262,26 +266,26 @@ async def test_heartbeats_carry_the_counters() -> None:
     assert last.step_ms_p95 >= last.step_ms_p50 >= 0
 
 
-async def test_a_busy_stage_says_so_in_its_heartbeat() -> None:
-    transport, beats, stuck = MemoryTransport(), [], Event()
+async def test_heartbeat_reports_a_busy_stage() -> None:
+    transport, beats, release = MemoryTransport(), [], Event()
     transport.subscribe(
         "health/collector", lambda _header, body: beats.append(decode(body, Health))
     )
-    stage = collector(transport, [], lambda _value: stuck.wait(60) and None)
+    stage = collector(transport, [], lambda _value: release.wait(60) and None)
     numbers = source(transport, "collector")
     async with running(stage):
         await send(numbers, number(0))
         await eventually(
             lambda: beats and beats[-1].state == "busy" and beats[-1].current_step_s > 0
         )
-        stuck.set()
+        release.set()
         await eventually(lambda: beats[-1].state == "ready" and beats[-1].steps == 1)
 
 
-class Sometimes(Actor):
-    """Makes a number of what it sees, where there is room."""
+class NonblockingForwarder(Actor):
+    """An actor that forwards numbers while it has credit."""
 
-    name = "sometimes"
+    name = "forwarder"
     inputs = (In(LATEST_NUMBER, Latest(64)),)
     outputs = (Out(NUMBERS, is_nonblocking=True),)
 
@@ -291,33 +295,34 @@ class Sometimes(Actor):
             yield message
 
 
-async def test_an_output_that_never_waits_is_made_only_where_there_is_room() -> None:
-    transport, seen, stuck = MemoryTransport(), [], Event()
+async def test_nonblocking_output_is_published_only_with_credit() -> None:
+    transport, seen, release = MemoryTransport(), [], Event()
     expected = {NUMBERS.name: frozenset({"collector"})}
-    stage = Stage(Sometimes, transport, config=QUICK, expected=expected)
+    stage = Stage(NonblockingForwarder, transport, config=QUICK, expected=expected)
     feed = Outlet(Out(LATEST_NUMBER), "feed", 1, transport)
     async with running(stage):
-        await send(feed, number(0))  # nobody there yet: no room
+        await send(feed, number(0))  # A stage without consumer has no credit.
         await eventually(lambda: stage.health().steps == 1)
-        async with running(collector(transport, seen, lambda _value: stuck.wait(60) and None)):
+        async with running(collector(transport, seen, lambda _value: release.wait(60) and None)):
             await eventually(lambda: stage._outlets[Number].credits() == 4)
             for value in range(1, 21):
                 await send(feed, number(value))
-            await eventually(lambda: stage.health().steps == 21)  # it never waited
+            # The stage never waited for credit.
+            await eventually(lambda: stage.health().steps == 21)
             assert stage.health().outputs[0].backpressure_waits == 0
             assert stage.health().outputs[0].sent == 4
-            stuck.set()
+            release.set()
             await eventually(lambda: seen == [1, 2, 3, 4])
 
 
-async def test_an_actor_that_ignores_the_room_fails_and_nothing_piles_up() -> None:
-    class Pushy(Sometimes):
+async def test_publishing_without_credit_is_a_failed_step() -> None:
+    class CreditIgnoringForwarder(NonblockingForwarder):
         def handle(self, message: Message) -> Iterator[Message]:
             yield message
 
     transport = MemoryTransport()
     expected = {NUMBERS.name: frozenset({"collector"})}
-    stage = Stage(Pushy, transport, config=QUICK, expected=expected)
+    stage = Stage(CreditIgnoringForwarder, transport, config=QUICK, expected=expected)
     feed = Outlet(Out(LATEST_NUMBER), "feed", 1, transport)
     async with running(stage):
         await send(feed, number(0))
@@ -325,7 +330,7 @@ async def test_an_actor_that_ignores_the_room_fails_and_nothing_piles_up() -> No
         assert stage.health().outputs[0].sent == 0
 
 
-async def test_a_state_topic_answers_with_its_last_value_and_all_its_parts() -> None:
+async def test_state_topic_query_returns_all_parts_of_the_last_value() -> None:
     transport = MemoryTransport()
     pieces = Outlet(Out(PIECES), "me", 1, transport)
 
@@ -338,12 +343,12 @@ async def test_a_state_topic_answers_with_its_last_value_and_all_its_parts() -> 
         await send(pieces, Piece(stamp_ns=1, version=1, part=part, parts=3))
     assert answered() == [(1, 0), (1, 1), (1, 2)]
     await send(pieces, Piece(stamp_ns=2, version=2, part=0, parts=2))
-    assert answered() == [(1, 0), (1, 1), (1, 2)]  # half a value is none
+    assert answered() == [(1, 0), (1, 1), (1, 2)]  # An incomplete value is not returned.
     await send(pieces, Piece(stamp_ns=2, version=2, part=1, parts=2))
     assert answered() == [(2, 0), (2, 1)]
 
 
-async def test_a_state_topic_of_one_part_answers_with_the_newest() -> None:
+async def test_state_topic_query_returns_the_newest_value() -> None:
     transport = MemoryTransport()
     latest = Outlet(Out(LATEST_NUMBER), "me", 1, transport)
     for value in range(3):
@@ -362,31 +367,31 @@ async def test_a_state_topic_of_one_part_answers_with_the_newest() -> None:
         {"max_message_mb": 0},
     ],
 )
-def test_an_impossible_configuration_is_refused(options: dict[str, Any]) -> None:
+def test_invalid_configuration_is_rejected(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         SupervisionConfig(**options)
 
 
-class Queued(Actor):
-    """Doubles how many numbers wait behind the one it handles."""
+class BacklogRecorder(Actor):
+    """An actor that records how many numbers are queued behind the one it handles."""
 
-    name = "queued"
+    name = "recorder"
     inputs = (In(NUMBERS, Lossless(4)),)
     outputs = (Out(DOUBLES),)
 
-    def __init__(self, stuck: Event) -> None:
+    def __init__(self, release: Event) -> None:
         super().__init__()
-        self._stuck, self.seen = stuck, []
+        self._release, self.seen = release, []
 
     def handle(self, message: Message) -> Iterator[Message]:
         self.seen.append(self.situation.backlog[NUMBERS])
-        self._stuck.wait(60)
+        self._release.wait(60)
         yield Double(stamp_ns=message.stamp_ns, value=0)
 
 
-async def test_an_actor_sees_how_many_messages_wait() -> None:
-    transport, stuck = MemoryTransport(), Event()
-    actor = Queued(stuck)
+async def test_actor_receives_the_number_of_queued_messages() -> None:
+    transport, release = MemoryTransport(), Event()
+    actor = BacklogRecorder(release)
     stage = Stage(lambda: actor, transport, config=QUICK)
     feed = Outlet(Out(NUMBERS), "feed", 1, transport, (stage.name,))
     async with running(stage):
@@ -394,6 +399,6 @@ async def test_an_actor_sees_how_many_messages_wait() -> None:
         await eventually(lambda: actor.seen)
         for value in (1, 2, 3):
             await send(feed, number(value))
-        stuck.set()
+        release.set()
         await eventually(lambda: stage.health().steps == 4)
     assert actor.seen == [0, 2, 1, 0]

@@ -1,4 +1,4 @@
-"""Stages are held, released, renewed and saved between two steps, even on a bad network."""
+"""Tests of the commands pause, resume, reset and save of a stage, also on a lossy network."""
 
 import asyncio
 from collections.abc import Iterator
@@ -7,8 +7,7 @@ from threading import Event
 
 import pytest
 
-from ldo_service.runtime import Actor, In, Latest, Lossless, Out
-from ldo_service.runtime import stage_commands as orders_module
+from ldo_service.runtime import Actor, In, Latest, Lossless, Out, stage_commands
 from ldo_service.runtime.delivery_state import RestoredState
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
@@ -35,7 +34,7 @@ from .fake_actors import (
 
 
 class Counter(Actor):
-    """Numbers what it sees from 1, and passes the number on."""
+    """An actor that publishes the number of messages so far; it saves only on request."""
 
     name = "counter"
     inputs = (In(LATEST_NUMBER, Latest(4)),)
@@ -68,32 +67,32 @@ def feed(transport: MemoryTransport, *values: int) -> None:
         )
 
 
-async def test_a_held_stage_leaves_out_what_comes_and_counts_it() -> None:
+async def test_paused_stage_drops_and_counts_messages() -> None:
     transport, seen = MemoryTransport(), []
     stage = collector(transport, seen, policy=Latest(2))
     commander = CommandSender(transport)
 
-    def arrive(*values: int) -> None:
+    def deliver(*values: int) -> None:
         for value in values:
             transport.deliver(
                 NUMBERS.name, encode_link(EXTERNAL_HEADER), encode_message(number(value))
             )
 
     async with running(stage):
-        arrive(1)
+        deliver(1)
         await eventually(lambda: seen == [1])
         assert await commander.order("pause", "collector", 60) == ""
         assert stage.health().paused
-        arrive(2, 3, 4)
+        deliver(2, 3, 4)
         assert await commander.order("resume", "collector", 60) == ""
-        arrive(5)
+        deliver(5)
         await eventually(lambda: seen == [1, 5] and stage.health().inputs[0].delivered == 2)
         (counted,) = stage.health().inputs
         assert (counted.dropped_paused, counted.dropped) == (3, 0)
         assert not stage.health().paused
 
 
-async def test_a_held_stage_loses_nothing_of_a_lossless_input() -> None:
+async def test_paused_stage_keeps_messages_of_a_lossless_input() -> None:
     transport, seen = MemoryTransport(), []
     stage, commander = collector(transport, seen), CommandSender(transport)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, {"collector"})
@@ -109,22 +108,22 @@ async def test_a_held_stage_loses_nothing_of_a_lossless_input() -> None:
         await waiting
 
 
-async def test_a_hold_waits_for_the_step_under_way() -> None:
-    transport, seen, go = MemoryTransport(), [], Event()
-    stage = collector(transport, seen, lambda _value: go.wait(60) and None, policy=Latest(1))
+async def test_pause_waits_for_the_current_step() -> None:
+    transport, seen, release = MemoryTransport(), [], Event()
+    stage = collector(transport, seen, lambda _value: release.wait(60) and None, policy=Latest(1))
     commander = CommandSender(transport)
     async with running(stage):
         transport.deliver(NUMBERS.name, encode_link(EXTERNAL_HEADER), encode_message(number(1)))
         await eventually(lambda: stage.health().state == "busy")
-        holding = asyncio.create_task(commander.order("pause", "collector", 60))
+        pausing = asyncio.create_task(commander.order("pause", "collector", 60))
         await asyncio.sleep(0.05)
-        assert not holding.done()
-        go.set()
-        assert await holding == ""
+        assert not pausing.done()
+        release.set()
+        assert await pausing == ""
         assert seen == [1]
 
 
-async def test_a_soft_stop_ends_a_held_stage() -> None:
+async def test_soft_stop_ends_a_paused_stage() -> None:
     transport, seen = MemoryTransport(), []
     stage, commander = collector(transport, seen), CommandSender(transport)
     async with running(stage) as (task,):
@@ -133,7 +132,7 @@ async def test_a_soft_stop_ends_a_held_stage() -> None:
         await asyncio.wait_for(task, 60)
 
 
-async def test_a_renewed_stage_begins_anew_and_its_consumer_follows() -> None:
+async def test_reset_stage_starts_empty_and_its_consumer_continues() -> None:
     transport, seen, store = MemoryTransport(), [], MemoryStore()
     expected = {NUMBERS.name: frozenset({"collector"})}
     counter = Stage(Counter, transport, config=QUICK, store=store, expected=expected)
@@ -145,8 +144,8 @@ async def test_a_renewed_stage_begins_anew_and_its_consumer_follows() -> None:
         await eventually(lambda: seen == [1, 2])
         await commander.order("save", "counter", 60)
         epoch = counter.health().epoch
-        for what in ("pause", "reset", "resume"):
-            assert await commander.order(what, "counter", 5) == ""
+        for command in ("pause", "reset", "resume"):
+            assert await commander.order(command, "counter", 5) == ""
         assert counter.health().epoch != epoch
         assert RestoredState.of(store.load("counter")).own == {}
         feed(transport, 12)
@@ -155,7 +154,7 @@ async def test_a_renewed_stage_begins_anew_and_its_consumer_follows() -> None:
         await eventually(lambda: seen == [1, 2, 1, 2])
 
 
-async def test_a_renewed_consumer_joins_its_producer_again() -> None:
+async def test_reset_consumer_reconnects_to_its_producer() -> None:
     transport, seen = MemoryTransport(), []
     stage, commander = collector(transport, seen), CommandSender(transport)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, {"collector"})
@@ -168,7 +167,7 @@ async def test_a_renewed_consumer_joins_its_producer_again() -> None:
         await eventually(lambda: seen == list(range(9)))
 
 
-async def test_nothing_of_the_time_before_is_handled_after_a_renewal() -> None:
+async def test_messages_from_before_a_reset_are_not_handled() -> None:
     transport, seen = MemoryTransport(), []
     doubles = DoubleCollector(seen)
     stage, commander = Stage(lambda: doubles, transport, config=QUICK), CommandSender(transport)
@@ -185,7 +184,7 @@ async def test_nothing_of_the_time_before_is_handled_after_a_renewal() -> None:
         await eventually(lambda: seen == [2])
 
 
-async def test_a_last_value_of_the_time_before_is_not_given_to_who_asks() -> None:
+async def test_query_returns_no_value_from_before_a_reset() -> None:
     transport = MemoryTransport()
     outlet = Outlet(Out(LATEST_NUMBER), "me", 1, transport)
     await send(outlet, number(1))
@@ -194,7 +193,7 @@ async def test_a_last_value_of_the_time_before_is_not_given_to_who_asks() -> Non
     assert not transport.query(LATEST_NUMBER.name)
 
 
-async def test_a_save_writes_what_the_actor_had_left_for_later(tmp_path: Path) -> None:
+async def test_save_command_writes_a_full_checkpoint(tmp_path: Path) -> None:
     transport, store = MemoryTransport(), FolderStore(tmp_path)
     counter = Stage(Counter, transport, config=QUICK, store=store)
     commander = CommandSender(transport)
@@ -211,7 +210,7 @@ async def test_a_save_writes_what_the_actor_had_left_for_later(tmp_path: Path) -
         assert FolderStore(tmp_path).load("counter") == {"count": 1}
 
 
-async def test_a_save_that_fails_is_reported_and_the_stage_goes_on(tmp_path: Path) -> None:
+async def test_failed_save_is_reported_and_the_stage_continues(tmp_path: Path) -> None:
     transport = MemoryTransport()
     counter = Stage(Counter, transport, config=QUICK, store=FolderStore(tmp_path))
     (tmp_path / "counter").write_text("a file where the folder should be")
@@ -221,10 +220,10 @@ async def test_a_save_that_fails_is_reported_and_the_stage_goes_on(tmp_path: Pat
         await eventually(lambda: counter.health().steps == 1)
 
 
-async def test_an_order_is_obeyed_once_though_orders_and_reports_get_lost(
+async def test_command_runs_once_although_commands_and_replies_are_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(orders_module, "REPEAT_AFTER_S", 0.01)
+    monkeypatch.setattr(stage_commands, "REPEAT_AFTER_S", 0.01)
     losses = iter([True, True, False, True, True, False, True] + [False] * 1000)
     transport = MemoryTransport(lose=lambda key: "link/" in key and next(losses))
     counter, commander = Stage(Counter, transport, config=QUICK), CommandSender(transport)
@@ -236,12 +235,12 @@ async def test_an_order_is_obeyed_once_though_orders_and_reports_get_lost(
         assert counter.health().epoch == epochs[1] != epochs[0]
 
 
-async def test_who_does_not_answer_is_said() -> None:
+async def test_missing_reply_is_reported() -> None:
     commander = CommandSender(MemoryTransport())
-    assert await commander.order("pause", "nobody", 0.01) == "did not answer within 0 s"
+    assert await commander.order("pause", "absent", 0.01) == "did not answer within 0 s"
 
 
-async def test_bytes_that_are_no_order_are_left_alone() -> None:
+async def test_malformed_commands_are_ignored() -> None:
     transport, seen = MemoryTransport(), []
     async with running(collector(transport, seen, policy=Lossless(4))):
         for body in (

@@ -1,4 +1,4 @@
-"""All stages of a process: errors end them all, stops end them in order."""
+"""Tests of supervision: an error ends all stages of a process, a stop ends them in order."""
 
 import asyncio
 import subprocess
@@ -28,7 +28,7 @@ from .fake_actors import (
 )
 
 
-async def test_a_soft_stop_loses_nothing_that_is_under_way() -> None:
+async def test_soft_stop_loses_no_messages_in_flight() -> None:
     transport, seen, stop = MemoryTransport(), [], StopRequest()
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["doubler"])
     expected = {DOUBLES.name: frozenset({"double_collector"})}
@@ -44,7 +44,7 @@ async def test_a_soft_stop_loses_nothing_that_is_under_way() -> None:
     assert seen == [2 * value for value in range(20)]
 
 
-async def test_a_soft_stop_waits_for_what_must_be_sent_again(
+async def test_soft_stop_waits_for_retransmissions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(Outlet, "REPEAT_AFTER_S", 0.01)
@@ -63,9 +63,9 @@ async def test_a_soft_stop_waits_for_what_must_be_sent_again(
     assert seen == [2 * value for value in range(7)]
 
 
-async def test_a_hard_stop_ends_at_once() -> None:
-    transport, stop, stuck = MemoryTransport(), StopRequest(), Event()
-    stage = collector(transport, [], lambda _value: stuck.wait(60) and None)
+async def test_hard_stop_ends_at_once() -> None:
+    transport, stop, release = MemoryTransport(), StopRequest(), Event()
+    stage = collector(transport, [], lambda _value: release.wait(60) and None)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["collector"])
     service = asyncio.create_task(supervise([stage], stop, drain_s=1000))
     await send(numbers, number(0))
@@ -75,10 +75,10 @@ async def test_a_hard_stop_ends_at_once() -> None:
     assert not service.done()
     stop.request()
     await asyncio.wait_for(service, 60)
-    stuck.set()
+    release.set()
 
 
-async def test_a_stage_that_does_not_drain_in_time_is_cancelled() -> None:
+async def test_stage_that_exceeds_its_drain_time_is_cancelled() -> None:
     transport, stop = MemoryTransport(), StopRequest()
     stage = collector(transport, [])
     stage.drain = lambda: None  # type: ignore[method-assign]
@@ -86,7 +86,7 @@ async def test_a_stage_that_does_not_drain_in_time_is_cancelled() -> None:
     await asyncio.wait_for(supervise([stage], stop, drain_s=0.01), 60)
 
 
-async def test_an_exhausted_restart_budget_ends_all_stages_with_that_error() -> None:
+async def test_exhausted_restart_budget_ends_all_stages() -> None:
     def fail(_value: int) -> None:
         raise RuntimeError("always")
 
@@ -102,19 +102,19 @@ async def test_an_exhausted_restart_budget_ends_all_stages_with_that_error() -> 
     assert left == []
 
 
-async def test_a_second_error_during_a_soft_stop_leaves_no_task_behind() -> None:
+async def test_second_error_during_a_soft_stop_leaves_no_task() -> None:
     class Failing:
         name = "failing"
 
         def __init__(self) -> None:
-            self._asked = asyncio.Event()
+            self._is_requested = asyncio.Event()
 
         async def run(self) -> None:
-            await self._asked.wait()
+            await self._is_requested.wait()
             raise RestartsExhausted("failing", 1, 1.0)
 
         def drain(self) -> None:
-            self._asked.set()
+            self._is_requested.set()
 
     stop = StopRequest()
     stop.request()
@@ -159,7 +159,7 @@ asyncio.run(main())
 """
 
 
-def test_the_interpreter_exits_while_a_handler_is_stuck() -> None:
+def test_interpreter_exits_while_a_handler_is_stuck() -> None:
     done = subprocess.run(
         [sys.executable, "-c", STUCK], capture_output=True, text=True, check=False
     )
