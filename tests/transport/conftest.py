@@ -1,4 +1,4 @@
-"""A router on a free port of this machine, and clients of it."""
+"""Fixtures for a router on a free local port and its clients."""
 
 from collections.abc import Callable, Iterator
 
@@ -11,7 +11,7 @@ from tests.ports import free_port
 
 @pytest.fixture
 def network() -> Iterator[Endpoint]:
-    """Of a router that lives as long as the test."""
+    """Yield the endpoint of a router that runs as long as the test."""
     network = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
     with open_session(network, router=True):
         yield network
@@ -19,7 +19,7 @@ def network() -> Iterator[Endpoint]:
 
 @pytest.fixture
 def client(network: Endpoint) -> Iterator[Callable[[], zenoh.Session]]:
-    """Opens sessions, as other processes would."""
+    """Yield a function that opens sessions as other processes would."""
     sessions: list[zenoh.Session] = []
 
     def open_client() -> zenoh.Session:

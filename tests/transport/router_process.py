@@ -1,4 +1,4 @@
-"""A router in a process of its own, to be stopped and continued; argument: its endpoint."""
+"""Router in its own process, which a test stops and continues. Argument: its endpoint."""
 
 import sys
 import time

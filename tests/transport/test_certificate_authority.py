@@ -1,4 +1,4 @@
-"""Keys are made whole, kept secret, and never overwritten."""
+"""Tests of key creation: keys are complete, secret and never overwritten."""
 
 import stat
 from datetime import UTC, date, datetime, timedelta
@@ -22,14 +22,14 @@ def mode(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def test_secrets_are_their_owners_alone(authority: CertificateAuthority) -> None:
+def test_secret_keys_are_readable_by_their_owner_only(authority: CertificateAuthority) -> None:
     made = authority.add("front", "camera", "mule", days=7)
     assert mode(authority.folder) == mode(made) == 0o700
     assert mode(authority.folder / "ca.key") == mode(made / "tls.key") == 0o600
     assert sorted(path.name for path in made.iterdir()) == ["ca.crt", "tls.crt", "tls.key"]
 
 
-def test_keys_hold_for_the_days_that_were_asked_for(authority: CertificateAuthority) -> None:
+def test_certificate_is_valid_for_the_requested_days(authority: CertificateAuthority) -> None:
     noon = datetime(2030, 1, 1, 12, tzinfo=UTC)
     made = authority.add("front", "camera", "mule", days=7, now=noon)
     certificate = read_certificate((made / "tls.crt").read_bytes())
@@ -37,7 +37,7 @@ def test_keys_hold_for_the_days_that_were_asked_for(authority: CertificateAuthor
     assert authority.entries[0].grantee == AccessEntry("camera", "mule", date(2030, 1, 8))
 
 
-def test_every_service_has_the_list_of_who_may_do_what(authority: CertificateAuthority) -> None:
+def test_access_list_of_each_service_holds_all_entries(authority: CertificateAuthority) -> None:
     service = authority.add("mule", "service", "mule", days=7, hosts=["mule.local", "10.0.0.7"])
     authority.add("front", "camera", "mule", days=7)
     entries = {entry.common_name: entry.grantee for entry in authority.entries}
@@ -45,35 +45,37 @@ def test_every_service_has_the_list_of_who_may_do_what(authority: CertificateAut
     assert read_access(authority.folder / "access.yaml") == entries
     assert CertificateAuthority(authority.folder).entries == authority.entries
     authority.remove("front")
-    assert [who.role for who in read_access(service / "access.yaml").values()] == ["service"]
+    assert [grantee.role for grantee in read_access(service / "access.yaml").values()] == [
+        "service"
+    ]
 
 
-def test_keys_made_again_are_others(authority: CertificateAuthority) -> None:
+def test_recreated_keys_get_a_new_common_name(authority: CertificateAuthority) -> None:
     authority.add("front", "camera", "mule", days=7)
-    (lost,) = authority.entries
+    (old,) = authority.entries
     authority.remove("front")
     assert not (authority.folder / "front").exists()
     authority.add("front", "camera", "mule", days=7)
     (new,) = authority.entries
-    assert (new.name, new.common_name != lost.common_name) == ("front", True)
+    assert (new.name, new.common_name != old.common_name) == ("front", True)
 
 
-def test_nothing_is_overwritten(authority: CertificateAuthority) -> None:
+def test_existing_keys_are_never_overwritten(authority: CertificateAuthority) -> None:
     made = authority.add("front", "camera", "mule", days=7)
     before = (made / "tls.key").read_bytes(), (authority.folder / "ca.key").read_bytes()
-    for again in (
+    for create in (
         lambda: authority.add("front", "viewer", "mule", days=7),
         lambda: authority.add("ca.key", "viewer", "mule", days=7),
         lambda: CertificateAuthority.new(authority.folder, days=7),
     ):
         with pytest.raises(ConfigError, match="never overwritten"):
-            again()
+            create()
     assert ((made / "tls.key").read_bytes(), (authority.folder / "ca.key").read_bytes()) == before
     assert len(authority.entries) == 1
 
 
 @pytest.mark.parametrize(
-    ("fields", "says"),
+    ("fields", "message"),
     [
         ({"days": 0}, "--days 0"),
         ({"days": 10**9}, "--days 1000000000"),
@@ -82,12 +84,12 @@ def test_nothing_is_overwritten(authority: CertificateAuthority) -> None:
         ({"hosts": ["mülé"], "role": "service"}, "--host mülé"),
     ],
 )
-def test_what_cannot_be_leaves_nothing_behind(
-    authority: CertificateAuthority, fields, says: str
+def test_invalid_request_leaves_no_files(
+    authority: CertificateAuthority, fields, message: str
 ) -> None:
-    wanted = {"name": "x", "role": "viewer", "robot": "*", "days": 7, **fields}
-    with pytest.raises(ConfigError, match=says):
-        authority.add(**wanted)
+    request = {"name": "x", "role": "viewer", "robot": "*", "days": 7, **fields}
+    with pytest.raises(ConfigError, match=message):
+        authority.add(**request)
     assert sorted(path.name for path in authority.folder.iterdir()) == [
         "access.yaml",
         "ca.crt",
@@ -95,10 +97,10 @@ def test_what_cannot_be_leaves_nothing_behind(
     ]
 
 
-def test_a_folder_that_is_no_authority_is_said(tmp_path: Path) -> None:
+def test_folder_without_authority_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="ldo keys init"):
         CertificateAuthority(tmp_path)
 
 
-def test_what_was_made_can_be_used(authority: CertificateAuthority) -> None:
+def test_created_keys_load_into_a_tls_context(authority: CertificateAuthority) -> None:
     TlsKeys(authority.add("front", "camera", "mule", days=7)).context()

@@ -1,4 +1,4 @@
-"""By default nobody beyond this machine is spoken to."""
+"""Tests of endpoints: by default the service communicates only within this machine."""
 
 import socket
 from pathlib import Path
@@ -13,13 +13,13 @@ from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_port
 
 
-def sockets() -> list[tuple[str, int, str]]:
-    """Address, port and kind of all that this process listens on, as the kernel has it."""
+def listening_sockets() -> list[tuple[str, int, str]]:
+    """Return address, port and kind of each listening socket of this process, from `/proc`."""
     inodes = set()
     for link in Path("/proc/self/fd").iterdir():
         try:
             inodes.add(link.readlink().name.removeprefix("socket:[").rstrip("]"))
-        except OSError:  # closed meanwhile
+        except OSError:  # The file was closed in the meantime.
             continue
     found = []
     for kind, listening in (("tcp", "0A"), ("tcp6", "0A"), ("udp", "07"), ("udp6", "07")):
@@ -32,11 +32,11 @@ def sockets() -> list[tuple[str, int, str]]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="needs Linux' /proc")
-def test_a_router_listens_on_loopback_and_scouts_nobody() -> None:
-    before = sockets()
+def test_router_listens_on_loopback_only_and_does_not_scout() -> None:
+    before = listening_sockets()
     network = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
     with open_session(network, router=True):
-        opened = [one for one in sockets() if one not in before]
+        opened = [one for one in listening_sockets() if one not in before]
     loopback = socket.inet_aton("127.0.0.1")[::-1].hex().upper()
     assert opened == [(loopback, int(network.address[1]), "tcp")]
 
@@ -51,12 +51,12 @@ def test_loopback_needs_no_keys(endpoint: str) -> None:
 @pytest.mark.parametrize(
     "endpoint", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/mule.local:7447", "udp/10.0.0.7:7447"]
 )
-def test_a_network_needs_keys(endpoint: str) -> None:
+def test_network_endpoint_without_keys_is_rejected(endpoint: str) -> None:
     with pytest.raises(ConfigError, match="everybody on the network"):
         Endpoint("mule", endpoint).require_safe()
 
 
-def test_keys_and_tls_go_together(tmp_path: Path) -> None:
+def test_keys_and_tls_require_each_other(tmp_path: Path) -> None:
     keys = TlsKeys(
         CertificateAuthority.new(tmp_path / "keys", days=2).add("mule", "service", "mule", days=1)
     )
@@ -68,12 +68,12 @@ def test_keys_and_tls_go_together(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("endpoint", "here"),
+    ("endpoint", "local"),
     [
         ("tcp/0.0.0.0:7447", "tcp/127.0.0.1:7447"),
         ("tcp/[::]:7447", "tcp/[::1]:7447"),
         ("tcp/10.0.0.7:7447", "tcp/10.0.0.7:7447"),
     ],
 )
-def test_processes_of_the_service_reach_it_where_it_listens(endpoint: str, here: str) -> None:
-    assert Endpoint("mule", endpoint).local_endpoint == here
+def test_local_endpoint_is_an_address_the_service_listens_on(endpoint: str, local: str) -> None:
+    assert Endpoint("mule", endpoint).local_endpoint == local

@@ -1,4 +1,4 @@
-"""Lossless links: over a network that loses messages, past consumers and producers that die."""
+"""Tests of lossless links over a lossy network, with consumers and producers that end."""
 
 import asyncio
 import random
@@ -27,9 +27,9 @@ def outlet(transport: MemoryTransport, *expected: str, epoch: int = 1, **options
     return Outlet(Out(NUMBERS), "producer", epoch, transport, expected, **options)
 
 
-async def test_a_slow_consumer_gets_everything_in_order_within_its_window() -> None:
-    transport, seen, let_go = MemoryTransport(), [], Event()
-    stage = collector(transport, seen, lambda _value: let_go.wait(60) and None)
+async def test_slow_consumer_receives_all_in_order_within_its_window() -> None:
+    transport, seen, release = MemoryTransport(), [], Event()
+    stage = collector(transport, seen, lambda _value: release.wait(60) and None)
     source = outlet(transport, "collector")
 
     async def produce() -> None:
@@ -40,8 +40,8 @@ async def test_a_slow_consumer_gets_everything_in_order_within_its_window() -> N
         producing = asyncio.create_task(produce())
         await eventually(lambda: source.credits() == 0 and source.sent == 4)
         await asyncio.sleep(0.05)
-        assert source.sent == 4  # not one more than the window, however long it takes
-        let_go.set()
+        assert source.sent == 4  # The producer sends at most the window.
+        release.set()
         await producing
         await eventually(lambda: stage.health().inputs[0].delivered == 50)
         counted = stage.health().inputs[0]
@@ -52,12 +52,12 @@ async def test_a_slow_consumer_gets_everything_in_order_within_its_window() -> N
 
 
 @pytest.mark.parametrize("seed", range(5))
-async def test_a_network_that_loses_a_third_still_delivers_each_message_once_in_order(
+async def test_lossy_network_delivers_each_message_once_in_order(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Outlet, "REPEAT_AFTER_S", 0.01)
-    chance = random.Random(seed)
-    transport = MemoryTransport(lose=lambda key: key in KEYS and chance.random() < 0.33)
+    rng = random.Random(seed)
+    transport = MemoryTransport(lose=lambda key: key in KEYS and rng.random() < 0.33)
     one, other = [], []
     source = outlet(transport, "one", "other")
     stages = collector(transport, one, name="one"), collector(transport, other, name="other")
@@ -71,42 +71,44 @@ async def test_a_network_that_loses_a_third_still_delivers_each_message_once_in_
 
 
 @pytest.mark.parametrize("seed", range(4))
-async def test_a_consumer_that_dies_again_and_again_on_a_bad_network_misses_nothing(
+async def test_repeatedly_killed_consumer_on_lossy_network_misses_nothing(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Outlet, "REPEAT_AFTER_S", 0.01)
-    chance = random.Random(seed)
-    transport = MemoryTransport(lose=lambda key: key in KEYS and chance.random() < 0.2)
-    source, lives = outlet(transport, "collector"), []
+    rng = random.Random(seed)
+    transport = MemoryTransport(lose=lambda key: key in KEYS and rng.random() < 0.2)
+    source, runs = outlet(transport, "collector"), []
 
     async def produce() -> None:
         for value in range(80):
             await send(source, number(value))
 
     producing = asyncio.create_task(produce())
-    while not lives or lives[-1][-1:] != [79]:
-        lives.append([])
-        life, length = lives[-1], chance.randint(1, 30)
-        async with running(collector(transport, life)):
-            await eventually(lambda life=life, n=length: len(life) >= n or life[-1:] == [79])
+    while not runs or runs[-1][-1:] != [79]:
+        runs.append([])
+        run, length = runs[-1], rng.randint(1, 30)
+        async with running(collector(transport, run)):
+            await eventually(lambda run=run, n=length: len(run) >= n or run[-1:] == [79])
         transport.leave("collector")
     await producing
-    for life in lives:
-        assert life == list(range(life[0], life[0] + len(life)))
-    for before, after in pairwise(lives):
-        assert after[0] <= before[-1] + 1  # nothing is left out between two lives
+    for run in runs:
+        assert run == list(range(run[0], run[0] + len(run)))
+    for before, after in pairwise(runs):
+        assert after[0] <= before[-1] + 1  # Consecutive runs leave no gap.
 
 
-async def test_a_consumer_that_waits_is_found_as_soon_as_the_producer_starts() -> None:
+async def test_waiting_consumer_is_found_when_the_producer_starts() -> None:
     transport, seen = MemoryTransport(), []
-    patient = SupervisionConfig(heartbeat_s=1000)
-    async with running(collector(transport, seen, config=patient)):
+    config = SupervisionConfig(heartbeat_s=1000)
+    async with running(collector(transport, seen, config=config)):
         source = outlet(transport, "collector")
         await send(source, number(0))
         await eventually(lambda: seen == [0])
 
 
-async def test_everyone_else_sees_a_repeated_message_once(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_other_subscribers_receive_a_retransmitted_message_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(Outlet, "REPEAT_AFTER_S", 0.01)
     dropped: list[str] = []
 
@@ -117,21 +119,21 @@ async def test_everyone_else_sees_a_repeated_message_once(monkeypatch: pytest.Mo
 
     transport = MemoryTransport(lose=lose_the_second)
     seen: list[int] = []
-    overheard: list[bytes] = []
-    transport.subscribe(data_key(NUMBERS.name), lambda _header, body: overheard.append(bytes(body)))
+    received: list[bytes] = []
+    transport.subscribe(data_key(NUMBERS.name), lambda _header, body: received.append(bytes(body)))
     source = outlet(transport, "collector")
     async with running(collector(transport, seen)):
         for value in range(6):
             await send(source, number(value))
         await eventually(lambda: len(seen) == 6)
     assert seen == list(range(6))
-    assert len(overheard) == len(set(overheard)) == 5
+    assert len(received) == len(set(received)) == 5
 
 
-async def test_a_consumer_nobody_expects_releases_the_window_when_it_dies() -> None:
-    transport, stuck = MemoryTransport(), Event()
+async def test_unexpected_consumer_releases_the_window_when_it_ends() -> None:
+    transport, release = MemoryTransport(), Event()
     source = outlet(transport)
-    async with running(collector(transport, [], lambda _value: stuck.wait(60) and None)):
+    async with running(collector(transport, [], lambda _value: release.wait(60) and None)):
         await eventually(lambda: source.credits() == 4)
         for value in range(4):
             await send(source, number(value))
@@ -140,16 +142,16 @@ async def test_a_consumer_nobody_expects_releases_the_window_when_it_dies() -> N
         assert not waiting.done()
         transport.leave("collector")
         await waiting
-        stuck.set()
+        release.set()
 
 
-async def test_an_expected_consumer_that_died_gets_what_it_had_not_handled() -> None:
-    transport, first, second, stuck = MemoryTransport(), [], [], Event()
+async def test_restarted_expected_consumer_receives_unhandled_messages() -> None:
+    transport, first, second, release = MemoryTransport(), [], [], Event()
     source = outlet(transport, "collector")
 
     def hang_at_two(value: int) -> None:
         if value == 2:
-            stuck.wait(60)
+            release.wait(60)
             raise RuntimeError("this process is dead")
 
     async with running(collector(transport, first, hang_at_two)):
@@ -158,14 +160,14 @@ async def test_an_expected_consumer_that_died_gets_what_it_had_not_handled() -> 
         await eventually(lambda: first == [0, 1])
     transport.leave("collector")
     assert source.credits() == 0
-    stuck.set()
+    release.set()
     async with running(collector(transport, second)):
         await eventually(lambda: second == [2, 3, 4, 5] and source.credits() == 4)
         await send(source, number(6))
         await eventually(lambda: second == [2, 3, 4, 5, 6])
 
 
-async def test_before_the_expected_consumer_has_joined_there_is_no_room() -> None:
+async def test_producer_has_no_credit_before_the_expected_consumer_joins() -> None:
     transport, seen = MemoryTransport(), []
     source = outlet(transport, "collector")
     assert source.credits() == 0
@@ -177,14 +179,14 @@ async def test_before_the_expected_consumer_has_joined_there_is_no_room() -> Non
         await eventually(lambda: seen == [0])
 
 
-async def test_a_topic_without_lossless_consumers_is_never_waited_for() -> None:
+async def test_topic_without_lossless_consumers_causes_no_backpressure() -> None:
     source = outlet(MemoryTransport())
     for value in range(100):
         await send(source, number(value))
     assert source.counts().backpressure_waits == 0
 
 
-async def test_a_producer_that_starts_anew_is_followed_from_its_first_message() -> None:
+async def test_restarted_producer_is_received_from_its_first_message() -> None:
     transport, seen = MemoryTransport(), []
     first = outlet(transport, "collector", epoch=7)
     async with running(collector(transport, seen)):
@@ -192,7 +194,7 @@ async def test_a_producer_that_starts_anew_is_followed_from_its_first_message() 
             await send(first, number(value))
         await first.flush()
         first.close()
-        second = outlet(transport, "collector", epoch=3)  # epochs need not ascend
+        second = outlet(transport, "collector", epoch=3)  # Epochs need not increase.
         for value in range(5, 10):
             await send(second, number(value))
         await eventually(lambda: len(seen) == 10)
@@ -211,18 +213,18 @@ async def test_flush_returns_when_the_last_message_has_arrived(
     async with running(stage):
         await send(source, number(0))
         lossy["now"] = True
-        await send(source, number(1))  # the tail gets lost, and nothing follows that shows a gap
+        await send(source, number(1))  # The last message is lost, and no later one reveals the gap.
         await source.flush()
         stage.drain()
         await eventually(lambda: seen == [0, 1])
 
 
-async def test_a_living_consumer_that_takes_nothing_is_evicted_and_returns_when_it_moves() -> None:
-    transport, seen, stuck, evicted = MemoryTransport(), [], Event(), []
+async def test_stalled_consumer_is_evicted_and_returns_when_it_continues() -> None:
+    transport, seen, release, evicted = MemoryTransport(), [], Event(), []
     source = Outlet(
         Out(NUMBERS), "producer", 1, transport, (), evict_after_s=0.05, on_evicted=evicted.append
     )
-    async with running(collector(transport, seen, lambda _value: stuck.wait(60) and None)):
+    async with running(collector(transport, seen, lambda _value: release.wait(60) and None)):
         await eventually(lambda: source.credits() == 4)
         for value in range(4):
             await send(source, number(value))
@@ -234,9 +236,10 @@ async def test_a_living_consumer_that_takes_nothing_is_evicted_and_returns_when_
 
         await eventually(check)
         for value in range(5, 30):
-            await send(source, number(value))  # its heartbeats alone do not let it hold us up again
+            # Heartbeats alone do not let the evicted consumer block the producer again.
+            await send(source, number(value))
         assert evicted == ["collector"]
-        stuck.set()
+        release.set()
         await eventually(lambda: source.credits() == 4)
         await send(source, number(99))
         await eventually(lambda: seen[-1:] == [99])
@@ -244,7 +247,7 @@ async def test_a_living_consumer_that_takes_nothing_is_evicted_and_returns_when_
     assert seen == sorted(seen)
 
 
-async def test_bytes_that_are_no_grant_or_welcome_are_left_alone(
+async def test_malformed_credits_and_handshakes_are_ignored(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     transport, seen = MemoryTransport(), []
@@ -259,7 +262,7 @@ async def test_bytes_that_are_no_grant_or_welcome_are_left_alone(
     assert "malformed credit message" in caplog.text
 
 
-async def test_a_producer_older_than_its_consumer_says_what_to_do(caplog) -> None:
+async def test_producer_older_than_its_consumer_logs_the_remedy(caplog) -> None:
     transport, seen = MemoryTransport(), []
     stage = collector(transport, seen)
     source = outlet(transport, "collector")

@@ -1,4 +1,4 @@
-"""A folder of keys that cannot be used is said before anything is opened."""
+"""Tests of key folders: an unusable folder is reported before a connection is opened."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,55 +21,55 @@ def folder(authority: CertificateAuthority) -> Path:
     return authority.add("mule", "service", "mule", days=1)
 
 
-def test_a_whole_folder_is_taken(folder: Path) -> None:
+def test_complete_key_folder_is_accepted(folder: Path) -> None:
     settings = TlsKeys(folder).settings(router=True)
     assert settings["access_control"]["default_permission"] == "deny"
     assert "access_control" not in TlsKeys(folder).settings(router=False)
 
 
 @pytest.mark.parametrize("name", ["ca.crt", "tls.crt", "tls.key"])
-def test_what_is_missing_is_named(folder: Path, name: str) -> None:
+def test_missing_key_file_is_named(folder: Path, name: str) -> None:
     (folder / name).unlink()
     with pytest.raises(ConfigError, match=f"{name} cannot be read: No such file"):
         TlsKeys(folder)
 
 
-def test_a_secret_that_everybody_may_read_is_refused(folder: Path) -> None:
+def test_world_readable_secret_key_is_rejected(folder: Path) -> None:
     (folder / "tls.key").chmod(0o644)
     with pytest.raises(ConfigError, match="chmod 600"):
         TlsKeys(folder)
-    (folder / "tls.key").chmod(0o640)  # as Kubernetes mounts secrets for a group
+    (folder / "tls.key").chmod(0o640)  # Kubernetes mounts secrets for a group with this mode.
     TlsKeys(folder)
 
 
-def of_another(folder: Path, authority: CertificateAuthority) -> None:
+def replace_secret_key(folder: Path, authority: CertificateAuthority) -> None:
     other = authority.add("other", "viewer", "mule", days=1)
     (folder / "tls.key").write_bytes((other / "tls.key").read_bytes())
 
 
 @pytest.mark.parametrize(
-    ("damage", "says"),
+    ("damage", "message"),
     [
         (lambda folder, _: (folder / "ca.crt").write_text("no"), "ca.crt holds no certificate"),
         (lambda folder, _: (folder / "tls.crt").write_text("no"), "do not belong together"),
         (lambda folder, _: (folder / "tls.key").write_text("no"), "do not belong together"),
-        (of_another, "do not belong together"),
+        (replace_secret_key, "do not belong together"),
     ],
     ids=["no authority", "no certificate", "no key", "another key"],
 )
-def test_damaged_keys_are_refused(
+def test_damaged_keys_are_rejected(
     folder: Path,
     authority: CertificateAuthority,
     damage: Callable[[Path, CertificateAuthority], object],
-    says: str,
+    message: str,
 ) -> None:
     damage(folder, authority)
-    with pytest.raises(ConfigError, match=says):
+    with pytest.raises(ConfigError, match=message):
         TlsKeys(folder)
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         (None, "cannot be read"),
         ("[", "is no valid access list"),
@@ -79,10 +79,8 @@ def test_damaged_keys_are_refused(
         ("x: !!python/object/apply:os.system ['true']", "is no valid access list"),
     ],
 )
-def test_a_list_that_does_not_say_who_may_do_what_is_refused(
-    folder: Path, text: str | None, says: str
-) -> None:
+def test_invalid_access_list_is_rejected(folder: Path, text: str | None, message: str) -> None:
     path = folder / "access.yaml"
     path.unlink() if text is None else path.write_text(text)
-    with pytest.raises(ConfigError, match=says):
+    with pytest.raises(ConfigError, match=message):
         read_access(path)

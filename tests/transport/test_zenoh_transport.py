@@ -1,4 +1,4 @@
-"""The runtime over Zenoh, on this machine's loopback."""
+"""Tests of the runtime over Zenoh on the loopback interface."""
 
 import asyncio
 import signal
@@ -83,16 +83,16 @@ async def test_stages_in_different_sessions_form_a_chain(network: Endpoint, clie
     assert seen == [2 * value for value in range(100)]
 
 
-async def test_an_outside_subscriber_that_sleeps_does_not_slow_the_others(
+async def test_blocked_external_subscriber_does_not_slow_the_others(
     network: Endpoint, client: Client
 ) -> None:
-    awake, asleep = threading.Event(), []
+    release, payload_sizes = threading.Event(), []
 
-    def sleep(sample: zenoh.Sample) -> None:
-        asleep.append(len(sample.payload.to_bytes()))
-        awake.wait(60)  # longer than the whole test takes otherwise
+    def block(sample: zenoh.Sample) -> None:
+        payload_sizes.append(len(sample.payload.to_bytes()))
+        release.wait(60)  # This is longer than the rest of the test takes.
 
-    handler = zenoh.handlers.Callback(sleep, indirect=False)
+    handler = zenoh.handlers.Callback(block, indirect=False)
     client().declare_subscriber(network.expression(NUMBERS.name), handler)
     seen: list[int] = []
     source = outlet(ZenohTransport(client(), network), "collector")
@@ -100,59 +100,58 @@ async def test_an_outside_subscriber_that_sleeps_does_not_slow_the_others(
         for value in range(30):
             await send(source, number(value, data=bytes(1_000_000)))
         await eventually(lambda: len(seen) == 30)
-        assert len(asleep) <= 1
-        awake.set()
+        assert len(payload_sizes) <= 1
+        release.set()
     assert seen == list(range(30))
 
 
-async def test_a_late_joiner_gets_the_last_value_by_a_query(
+async def test_late_client_queries_all_parts_of_the_last_value(
     network: Endpoint, client: Client
 ) -> None:
     transport = ZenohTransport(client(), network)
     pieces = Outlet(Out(PIECES), "me", 1, transport)
     for part in range(3):
         await send(pieces, Piece(stamp_ns=1, version=1, part=part, parts=3))
-    asker = client()
+    requester = client()
 
-    def ask() -> list[int]:
-        replies = asker.get(
+    def query_parts() -> list[int]:
+        replies = requester.get(
             network.expression(PIECES.name),
             timeout=60.0,
-            consolidation=zenoh.ConsolidationMode.NONE,  # else Zenoh keeps one part of a key
+            # Zenoh would otherwise keep only one part of a key.
+            consolidation=zenoh.ConsolidationMode.NONE,
         )
         return [msgpack.unpackb(reply.ok.payload.to_bytes())["part"] for reply in replies]
 
-    assert await asyncio.to_thread(ask) == [0, 1, 2]
+    assert await asyncio.to_thread(query_parts) == [0, 1, 2]
 
 
-async def test_a_query_that_is_answered_slowly_holds_up_nothing(
-    network: Endpoint, client: Client
-) -> None:
+async def test_slow_query_does_not_block_messages(network: Endpoint, client: Client) -> None:
     transport, seen = ZenohTransport(client(), network), []
-    asked, go = threading.Event(), threading.Event()
+    query_arrived, release = threading.Event(), threading.Event()
 
     def slow_values() -> list[tuple[bytes, bytes]]:
-        asked.set()
-        go.wait(60)
+        query_arrived.set()
+        release.wait(60)
         return [(b"", b"value")]
 
     transport.serve_queries("test/slow", slow_values)
-    asker = client()
+    requester = client()
     many = range(MAX_QUERIES + 5)
-    replies = [asker.get(network.expression("test/slow"), timeout=60.0) for _ in many]
+    replies = [requester.get(network.expression("test/slow"), timeout=60.0) for _ in many]
     source = outlet(transport)
     async with running(collector(transport, seen, policy=Latest(8))):
-        await eventually(asked.is_set)
+        await eventually(query_arrived.is_set)
         await send(source, number(1))
         await eventually(lambda: seen == [1])
-        go.set()
+        release.set()
         answers = await asyncio.to_thread(lambda: [next(iter(reply)) for reply in replies])
     assert sum(answer.ok is not None for answer in answers) >= MAX_QUERIES
     assert any(answer.err is not None for answer in answers)
     transport.close()
 
 
-async def test_those_who_watch_learn_who_is_there_joins_and_leaves(
+async def test_liveliness_watcher_sees_present_joining_and_leaving_actors(
     network: Endpoint, client: Client
 ) -> None:
     seen: list[tuple[str, bool]] = []
@@ -168,16 +167,16 @@ async def test_those_who_watch_learn_who_is_there_joins_and_leaves(
     await eventually(lambda: ("late", False) in seen)
 
 
-async def test_a_foreign_program_reads_body_and_header_with_a_plain_library(
+async def test_foreign_program_decodes_body_and_header_with_msgpack(
     network: Endpoint, client: Client
 ) -> None:
     samples: list[tuple[dict[str, object], list[object]]] = []
 
-    def keep(sample: zenoh.Sample) -> None:
+    def store(sample: zenoh.Sample) -> None:
         header = msgpack.unpackb(sample.attachment.to_bytes())
         samples.append((msgpack.unpackb(sample.payload.to_bytes()), header))
 
-    handler = zenoh.handlers.Callback(keep, indirect=False)
+    handler = zenoh.handlers.Callback(store, indirect=False)
     client().declare_subscriber(network.expression(NUMBERS.name), handler)
     source = outlet(ZenohTransport(client(), network))
 
@@ -193,7 +192,7 @@ async def test_a_foreign_program_reads_body_and_header_with_a_plain_library(
     assert header[3:] == [7, "door"]
 
 
-async def test_what_a_foreign_program_sends_reaches_a_latest_input(
+async def test_message_of_a_foreign_program_reaches_a_latest_input(
     network: Endpoint, client: Client
 ) -> None:
     seen: list[int] = []
@@ -212,7 +211,7 @@ async def test_what_a_foreign_program_sends_reaches_a_latest_input(
     assert set(seen) == {5}
 
 
-async def test_heartbeats_travel(network: Endpoint, client: Client) -> None:
+async def test_heartbeats_arrive_over_zenoh(network: Endpoint, client: Client) -> None:
     beats: list[Health] = []
     transport = ZenohTransport(client(), network)
     transport.subscribe("health/doubler", lambda _header, body: beats.append(decode(body, Health)))
@@ -221,9 +220,7 @@ async def test_heartbeats_travel(network: Endpoint, client: Client) -> None:
     assert beats[0].actor == "doubler"
 
 
-async def test_a_newer_post_replaces_one_that_has_not_left(
-    network: Endpoint, client: Client
-) -> None:
+async def test_newer_post_replaces_an_unsent_one(network: Endpoint, client: Client) -> None:
     publisher = ZenohTransport(client(), network).publisher("test/post")
     received: list[bytes] = []
     receiver = ZenohTransport(client(), network)
@@ -237,7 +234,7 @@ async def test_a_newer_post_replaces_one_that_has_not_left(
     await eventually(post_many)
 
 
-async def test_closing_twice_or_after_the_session_harms_nothing(
+async def test_closing_twice_or_after_the_session_is_harmless(
     network: Endpoint, client: Client
 ) -> None:
     session = client()
@@ -252,14 +249,16 @@ async def test_closing_twice_or_after_the_session_harms_nothing(
     transport.close()
 
 
-def test_callbacks_after_the_loop_has_ended_harm_nothing(network: Endpoint, client: Client) -> None:
+def test_callbacks_after_the_end_of_the_loop_are_harmless(
+    network: Endpoint, client: Client
+) -> None:
     session, seen = client(), []
 
-    async def live_briefly() -> None:
+    async def run_briefly() -> None:
         async with running(collector(ZenohTransport(session, network), seen)):
             await asyncio.sleep(0.05)
 
-    asyncio.run(live_briefly())  # the session and its subscriptions live on
+    asyncio.run(run_briefly())  # The session and its subscriptions stay open.
     arrived = threading.Event()
     handler = zenoh.handlers.Callback(lambda _sample: arrived.set(), indirect=False)
     session.declare_subscriber(network.expression(data_key(NUMBERS.name)), handler)
@@ -270,28 +269,28 @@ def test_callbacks_after_the_loop_has_ended_harm_nothing(network: Endpoint, clie
     assert seen == []
 
 
-def test_a_taken_port_and_an_absent_service_are_said_plainly(network: Endpoint) -> None:
+def test_used_port_and_absent_service_are_reported(network: Endpoint) -> None:
     with pytest.raises(ConfigError, match=r"is another `ldo serve` running there\?"):
         open_session(network, router=True)
-    nobody = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
+    absent = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
     with pytest.raises(ConfigError, match="no service replies on"):
-        open_session(nobody)
+        open_session(absent)
 
 
 @pytest.mark.parametrize("robot", ["", "a/b", "*", "a b", "$x", "a?", "#", "@"])
-def test_a_robot_name_that_breaks_topics_is_refused(robot: str) -> None:
+def test_robot_name_invalid_in_topics_is_rejected(robot: str) -> None:
     with pytest.raises(ConfigError, match="robot name"):
         Endpoint(robot)
 
 
-def test_a_number_decodes_as_a_number() -> None:
-    """The process of the kill tests declares the message on its own: the bytes must fit."""
+def test_number_of_the_collector_process_decodes() -> None:
+    """The collector process declares its own message type, which must match these bytes."""
     body = msgpack.packb({"type": "Number", "stamp_ns": 1, "value": 5})
     assert decode(body, Number) == Number(stamp_ns=1, value=5)
 
 
 @pytest.mark.slow
-async def test_a_network_that_hangs_for_seconds_blocks_no_loop_and_loses_nothing() -> None:
+async def test_stopped_router_blocks_no_event_loop_and_loses_nothing() -> None:
     network, seen = Endpoint("test", f"tcp/127.0.0.1:{free_port()}"), []
     program = [sys.executable, str(Path(__file__).with_name("router_process.py"))]
     router = subprocess.Popen([*program, network.endpoint], stdout=subprocess.PIPE)
@@ -304,13 +303,13 @@ async def test_a_network_that_hangs_for_seconds_blocks_no_loop_and_loses_nothing
                 await send_images(source, range(20))
                 router.send_signal(signal.SIGSTOP)
                 sending = asyncio.create_task(send_images(source, range(20, 60)))
-                pauses = [await pause() for _ in range(300)]
+                pauses = [await measure_pause() for _ in range(300)]
                 assert not sending.done()
                 router.send_signal(signal.SIGCONT)
                 await sending
                 await eventually(lambda: len(seen) == 60)
         assert seen == list(range(60))
-        assert max(pauses) < 1.0  # a blocked put would take seconds
+        assert max(pauses) < 1.0  # A blocking put would take seconds.
     finally:
         router.kill()
         router.communicate()
@@ -321,8 +320,8 @@ async def send_images(source: Outlet, values: range) -> None:
         await send(source, number(value, data=bytes(1_000_000)))
 
 
-async def pause() -> float:
-    """How long the event loop took for a moment's sleep."""
+async def measure_pause() -> float:
+    """Return how long the event loop took for a sleep of 10 ms, in seconds."""
     started_s = time.perf_counter()
     await asyncio.sleep(0.01)
     return time.perf_counter() - started_s
