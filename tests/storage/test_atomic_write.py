@@ -1,4 +1,4 @@
-"""A reader sees the old content or the new one, and a failure leaves nothing behind."""
+"""Tests of atomic writes: a reader sees the old or the new content, and failures leave no files."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from ldo_service.storage.atomic_write import folder_made_atomically, write_atomi
 
 
 @pytest.mark.parametrize("unique", [False, True])
-def test_a_file_is_replaced_by_all_parts(tmp_path: Path, unique: bool) -> None:
+def test_file_is_replaced_by_all_parts(tmp_path: Path, unique: bool) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"old")
     assert write_atomically(path, b"new", b" content", unique=unique) == 11
@@ -17,7 +17,7 @@ def test_a_file_is_replaced_by_all_parts(tmp_path: Path, unique: bool) -> None:
 
 
 @pytest.mark.parametrize("unique", [False, True])
-def test_a_failed_write_keeps_the_old_content(
+def test_failed_write_keeps_the_old_content(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unique: bool
 ) -> None:
     path = tmp_path / "file"
@@ -33,7 +33,7 @@ def test_a_failed_write_keeps_the_old_content(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_folder_appears_when_its_block_ends(tmp_path: Path) -> None:
+def test_folder_appears_when_its_block_ends(tmp_path: Path) -> None:
     with folder_made_atomically(tmp_path / "made") as folder:
         folder.mkdir()
         (folder / "file").write_text("content")
@@ -42,7 +42,7 @@ def test_a_folder_appears_when_its_block_ends(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
 
 
-def test_a_folder_whose_block_fails_does_not_appear(tmp_path: Path) -> None:
+def test_folder_does_not_appear_when_its_block_fails(tmp_path: Path) -> None:
     def make() -> None:
         with folder_made_atomically(tmp_path / "made") as folder:
             folder.mkdir()

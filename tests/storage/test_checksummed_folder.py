@@ -8,7 +8,7 @@ from ldo_service.storage.checksummed_folder import ChecksummedFolder
 BODY = bytes(range(40))
 
 
-def test_what_was_written_is_read_and_found_by_a_successor(tmp_path: Path) -> None:
+def test_written_bodies_are_read_also_by_a_new_instance(tmp_path: Path) -> None:
     folder = ChecksummedFolder(tmp_path, "part", "")
     assert folder.write(7, BODY)
     assert folder.write(7, BODY[::-1])
@@ -20,7 +20,7 @@ def test_what_was_written_is_read_and_found_by_a_successor(tmp_path: Path) -> No
     assert ChecksummedFolder(tmp_path, "other", "").sizes == {}
 
 
-def test_every_cut_and_every_changed_byte_is_noticed(tmp_path: Path) -> None:
+def test_every_truncation_and_changed_byte_is_detected(tmp_path: Path) -> None:
     folder = ChecksummedFolder(tmp_path, "part", "")
     folder.write(1, BODY)
     (path,) = tmp_path.iterdir()
@@ -35,7 +35,7 @@ def test_every_cut_and_every_changed_byte_is_noticed(tmp_path: Path) -> None:
     assert bytes(folder.read(1)) == BODY
 
 
-def test_a_removed_file_is_gone(tmp_path: Path) -> None:
+def test_removed_file_cannot_be_read(tmp_path: Path) -> None:
     folder = ChecksummedFolder(tmp_path, "part", "")
     folder.write(1, BODY)
     folder.remove(1)

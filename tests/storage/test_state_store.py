@@ -12,7 +12,7 @@ from ldo_service.errors import DataError
 from ldo_service.storage import atomic_write, state_codec, state_store
 from ldo_service.storage.state_store import FolderStore, MemoryStore
 
-RICH: dict[str, Any] = {
+FULL_STATE: dict[str, Any] = {
     "counters": {"frames": 3, "names": ["a", "b"], "nothing": None},
     "means": np.arange(6, dtype=np.float32).reshape(2, 3),
     "mask": np.array([True, False]),
@@ -37,31 +37,29 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> MemoryStore | Folde
     return MemoryStore() if request.param == "memory" else FolderStore(tmp_path)
 
 
-def test_what_was_saved_is_loaded(store: MemoryStore | FolderStore) -> None:
+def test_loaded_state_equals_the_saved_one(store: MemoryStore | FolderStore) -> None:
     assert store.load("mapper") is None
-    store.save("mapper", RICH)
+    store.save("mapper", FULL_STATE)
     loaded = store.load("mapper")
     assert loaded is not None
-    assert_same(loaded, RICH)
+    assert_same(loaded, FULL_STATE)
     assert store.load("tracker") is None
 
 
-def test_an_actor_without_state_leaves_nothing(
-    store: MemoryStore | FolderStore, tmp_path: Path
-) -> None:
+def test_empty_state_writes_no_files(store: MemoryStore | FolderStore, tmp_path: Path) -> None:
     store.save("mapper", {})
     assert store.load("mapper") is None
     assert list(tmp_path.iterdir()) == []
 
 
-def test_loaded_arrays_can_be_changed(tmp_path: Path) -> None:
-    FolderStore(tmp_path).save("mapper", RICH)
+def test_loaded_arrays_are_writable(tmp_path: Path) -> None:
+    FolderStore(tmp_path).save("mapper", FULL_STATE)
     state = FolderStore(tmp_path).load("mapper")
     assert state is not None
     state["means"][0, 0] = 9
 
 
-def test_a_part_that_did_not_change_is_not_written_again(tmp_path: Path) -> None:
+def test_unchanged_part_is_not_rewritten(tmp_path: Path) -> None:
     store, big = FolderStore(tmp_path), np.zeros(10)
     store.save("mapper", {"big": big, "step": 1000})
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "mapper").glob("big*")}
@@ -71,16 +69,16 @@ def test_a_part_that_did_not_change_is_not_written_again(tmp_path: Path) -> None
     assert FolderStore(tmp_path).load("mapper") == {"big": pytest.approx(big), "step": 1001}
 
 
-def test_a_save_that_breaks_off_leaves_the_whole_old_state(
+def test_interrupted_save_leaves_the_complete_old_state(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = FolderStore(tmp_path)
     store.save("mapper", {"one": [1], "two": [1]})
     store.save("mapper", {"one": [2], "two": [2]})
 
-    for fails in ("one", "two", "contents"):
+    for failing_file in ("one", "two", "contents"):
         monkeypatch.undo()
-        break_off(monkeypatch, fails)
+        interrupt_write(monkeypatch, failing_file)
         with pytest.raises(OSError, match="disk full"):
             store.save("mapper", {"one": [3], "two": [3]})
         assert FolderStore(tmp_path).load("mapper") == {"one": [2], "two": [2]}
@@ -89,8 +87,8 @@ def test_a_save_that_breaks_off_leaves_the_whole_old_state(
     assert FolderStore(tmp_path).load("mapper") == {"one": [4], "two": [4]}
 
 
-def break_off(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Let writing of a file that begins with `name` stop in the middle."""
+def interrupt_write(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Make writing of files whose name starts with `name` fail halfway."""
     write = Path.write_bytes
 
     def write_half(path: Path, data: bytes) -> int:
@@ -102,10 +100,10 @@ def break_off(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(Path, "write_bytes", write_half)
 
 
-def test_files_that_are_named_are_not_written_to_when_what_came_after_their_naming_failed(
+def test_files_listed_before_a_failed_sync_are_not_overwritten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The next save may be cut off in the middle by a kill, as `break_off` does."""
+    """A kill can interrupt the next save, which `interrupt_write` simulates."""
     store, folder, same = FolderStore(tmp_path, syncs=True), tmp_path / "mapper", [0]
     store.save("mapper", {"same": same, "step": [1], "old": [1]})
     sync = atomic_write.sync
@@ -119,40 +117,40 @@ def test_files_that_are_named_are_not_written_to_when_what_came_after_their_nami
     with pytest.raises(OSError, match="fsync failed"):
         store.save("mapper", {"same": same, "step": [2]})
     monkeypatch.undo()
-    break_off(monkeypatch, "step")
+    interrupt_write(monkeypatch, "step")
     with pytest.raises(OSError, match="disk full"):
         store.save("mapper", {"same": same, "step": [3]})
     assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [2]}
     monkeypatch.undo()
     store.save("mapper", {"same": same, "step": [4]})
     assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [4]}
-    assert len(list(folder.iterdir())) == 3, "what was to be removed is"
+    assert len(list(folder.iterdir())) == 3, "files of the old state are removed"
 
 
 @pytest.mark.parametrize("call", ["replace", "unlink"])
-def test_what_the_disk_may_have_done_all_the_same_is_looked_up(
+def test_disk_call_that_reports_a_failure_but_succeeded_is_detected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
 ) -> None:
-    """As on a network, where the answer is lost and not the request."""
+    """This happens on network file systems when the reply is lost and not the request."""
     store, same = FolderStore(tmp_path), [0]
     store.save("mapper", {"same": same, "step": [1], "old": [1]})
-    do = getattr(os, call)
+    call_disk = getattr(os, call)
 
-    def do_and_fail(*arguments: object, **options: object) -> None:
-        do(*arguments, **options)
+    def call_disk_and_fail(*arguments: object, **options: object) -> None:
+        call_disk(*arguments, **options)
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(os, call, do_and_fail)
+    monkeypatch.setattr(os, call, call_disk_and_fail)
     with suppress(OSError):
         store.save("mapper", {"same": same, "step": [2]})
     monkeypatch.undo()
-    break_off(monkeypatch, "step")
+    interrupt_write(monkeypatch, "step")
     with pytest.raises(OSError, match="disk full"):
         store.save("mapper", {"same": same, "step": [3]})
     assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [2]}
 
 
-def test_what_cannot_be_removed_stops_no_save(
+def test_file_that_cannot_be_removed_does_not_stop_a_save(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object, **__: object) -> None:
@@ -167,7 +165,7 @@ def test_what_cannot_be_removed_stops_no_save(
     assert FolderStore(tmp_path).load("mapper") == {"step": [2]}
 
 
-def test_what_was_forgotten_on_a_bad_disk_is_written_whole_again(
+def test_state_is_rewritten_completely_after_a_failed_delete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store, same = FolderStore(tmp_path), [0]
@@ -188,7 +186,7 @@ def test_what_was_forgotten_on_a_bad_disk_is_written_whole_again(
     assert FolderStore(tmp_path).load("mapper") == {"same": [0]}
 
 
-def test_a_disk_that_does_not_answer_is_no_reason_to_begin_anew(
+def test_read_error_raises_and_leaves_the_state_unchanged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     FolderStore(tmp_path).save("mapper", {"step": [1]})
@@ -203,7 +201,7 @@ def test_a_disk_that_does_not_answer_is_no_reason_to_begin_anew(
     assert FolderStore(tmp_path).load("mapper") == {"step": [1]}
 
 
-def test_a_part_that_is_gone_is_gone_from_the_folder(tmp_path: Path) -> None:
+def test_removed_part_is_deleted_from_the_folder(tmp_path: Path) -> None:
     store = FolderStore(tmp_path)
     store.save("mapper", {"one": [1], "two": [1]})
     store.save("mapper", {"one": [1]})
@@ -211,7 +209,7 @@ def test_a_part_that_is_gone_is_gone_from_the_folder(tmp_path: Path) -> None:
     assert not list((tmp_path / "mapper").glob("two*"))
 
 
-def test_many_saves_leave_at_most_two_files_a_part(tmp_path: Path) -> None:
+def test_many_saves_leave_at_most_two_files_per_part(tmp_path: Path) -> None:
     store = FolderStore(tmp_path)
     for step in range(50):
         store.save("mapper", {"step": [step]})
@@ -221,7 +219,7 @@ def test_many_saves_leave_at_most_two_files_a_part(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("file", ["step.a", state_store.CONTENTS])
 @pytest.mark.parametrize("noise", [b"", b"\xc1noise", b"\x93", b"\xc7\x01\x07\x00"])
-def test_a_broken_file_is_left_out_and_said(
+def test_broken_file_is_logged_and_loads_as_none(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, file: str, noise: bytes
 ) -> None:
     FolderStore(tmp_path).save("mapper", {"step": [1]})
@@ -233,17 +231,17 @@ def test_a_broken_file_is_left_out_and_said(
     assert FolderStore(tmp_path).load("mapper") == {"step": [2]}
 
 
-def test_what_could_not_be_read_is_kept_beside_what_is_saved_next(tmp_path: Path) -> None:
+def test_unreadable_state_is_preserved_next_to_the_new_one(tmp_path: Path) -> None:
     for step in (1, 2):
         FolderStore(tmp_path).save("mapper", {"one": [step], "two": [step]})
         (tmp_path / "mapper" / "two.a").write_bytes(b"")
         assert FolderStore(tmp_path).load("mapper") is None
-        assert FolderStore(tmp_path).load("mapper") is None, "as if nothing had been saved"
+        assert FolderStore(tmp_path).load("mapper") is None, "a second load finds no saved state"
         kept = (tmp_path / "mapper.unreadable" / "one.a").read_bytes()
         assert state_codec.decode_state(kept) == [step]
 
 
-def test_a_missing_file_is_left_out_and_said(
+def test_missing_file_is_logged_and_loads_as_none(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     FolderStore(tmp_path).save("mapper", {"step": [1]})
@@ -253,27 +251,27 @@ def test_a_missing_file_is_left_out_and_said(
 
 
 @pytest.mark.parametrize("value", [{1, object()}, np.array([object()])])
-def test_what_is_no_plain_value_is_refused(tmp_path: Path, value: Any) -> None:
+def test_value_that_is_not_plain_is_rejected(tmp_path: Path, value: Any) -> None:
     with pytest.raises((NotImplementedError, TypeError)):
         FolderStore(tmp_path).save("mapper", {"strange": value})
 
 
-def test_what_must_outlive_a_power_cut_is_synced_before_it_is_named(
+def test_files_are_synced_before_the_contents_list_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And nothing of the old state goes before the new one's name is on the disk."""
+    """Old files are removed only after the new contents file is on the disk."""
     synced: list[tuple[str, list[str]]] = []
     folder, sync = tmp_path / "mapper", atomic_write.sync
 
-    def noted(path: Path) -> None:
+    def record_sync(path: Path) -> None:
         sync(path)
         synced.append((path.name, sorted(file.name for file in folder.iterdir())))
 
     for module in (atomic_write, state_store):
-        monkeypatch.setattr(module, "sync", noted)
+        monkeypatch.setattr(module, "sync", record_sync)
     store, same = FolderStore(tmp_path, syncs=True), [0]
     store.save("mapper", {"same": same, "step": [1]})
-    assert synced[0][0] == tmp_path.name, "the name of its folder"
+    assert synced[0][0] == tmp_path.name, "the parent folder is synced first"
     synced.clear()
     store.save("mapper", {"same": same, "step": [2]})
     contents, new = state_store.CONTENTS, f"{state_store.CONTENTS}.new"
@@ -287,7 +285,7 @@ def test_what_must_outlive_a_power_cut_is_synced_before_it_is_named(
     ("contents", "version"),
     [({"step": "step.a"}, 1), ({"files": {"step": "step.a"}, "version": 99}, 99)],
 )
-def test_a_state_of_another_version_is_refused_and_left_as_it_is(
+def test_state_of_another_version_is_rejected_and_unchanged(
     tmp_path: Path, contents: dict, version: int
 ) -> None:
     FolderStore(tmp_path).save("mapper", {"step": [1]})
