@@ -1,4 +1,4 @@
-"""A small actor with everything that a recording has to get right, and recordings of its lives."""
+"""Small actor with failures, lagging state and credit, and recordings of its runs."""
 
 import asyncio
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,13 +29,13 @@ from tests.runtime.fake_actors import (
     send,
 )
 
-UNLUCKY = 13
+FAILING_VALUE = 13
 
 
 class Tally(Actor):
-    """Sums up numbers, fails on 13, and sends a piece when there is room.
+    """An actor that sums up numbers, fails at 13 and sends a piece while it has credit.
 
-    Its state is put away every third step only, so a successor is not where its predecessor was.
+    It updates its state only every third step, so a restored actor lags behind the previous one.
     """
 
     name = "tally"
@@ -50,8 +50,8 @@ class Tally(Actor):
         assert isinstance(message, Number)
         self._sum += message.value
         self._steps += 1
-        if message.value == UNLUCKY:
-            raise ValueError("unlucky")
+        if message.value == FAILING_VALUE:
+            raise ValueError("failing value")
         yield Double(stamp_ns=message.stamp_ns, value=self._sum)
         if self.has_credit(PIECES):
             yield Piece(stamp_ns=message.stamp_ns, version=self._sum, part=0, parts=1)
@@ -68,23 +68,23 @@ class Tally(Actor):
         self._sum = state["sum"]
 
 
-async def live(
+async def run_recorded(
     folder: Path,
     values: Sequence[int],
     *,
     make: Callable[[], Actor] = Tally,
     expected: Mapping[str, frozenset[str]] = {},
     config: RecordConfig | None = None,
-    meanwhile: Callable[[Recorder, int], None] = lambda _recorder, _value: None,
+    before_each: Callable[[Recorder, int], None] = lambda _recorder, _value: None,
     is_killed: bool = False,
 ) -> Stage:
-    """A life of an actor, recorded: it handles the values one by one.
+    """Run and record an actor that handles the values one by one, and return its stage.
 
-    `meanwhile` is called before each value. A killed one says no last words.
+    `before_each` is called before each value. A killed actor publishes no final messages.
     """
     recording = folder / "recording"
     recording.mkdir(exist_ok=True)
-    epoch = 1 + len(list(recording.iterdir()))  # the source begins anew with each life
+    epoch = 1 + len(list(recording.iterdir()))  # Each run has a new source.
     recorder = Recorder(
         new_path(recording, make().name), {"robot": "test"}, config or RecordConfig()
     )
@@ -100,7 +100,7 @@ async def live(
     numbers = Outlet(Out(NUMBERS), "source", epoch, transport, (stage.name,))
     async with running(stage) as (task,):
         for done, value in enumerate(values, 1):
-            meanwhile(recorder, value)
+            before_each(recorder, value)
             await send(numbers, number(value))
             await eventually(
                 lambda n=done: stage.health().steps + stage.health().dead_lettered == n
@@ -120,6 +120,6 @@ def replayed(folder: Path, make: Callable[[], Actor] = Tally) -> ReplayReport:
 
 
 def recorded(folder: Path, values: Sequence[int], **options: Any) -> Path:
-    """The recorded file of one life."""
-    asyncio.run(live(folder, values, **options))
+    """Record one run and return its file."""
+    asyncio.run(run_recorded(folder, values, **options))
     return recorded_actors(folder / "recording")["tally"][-1]

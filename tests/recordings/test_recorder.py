@@ -1,4 +1,4 @@
-"""What a recording holds, and what becomes of the robot when it cannot be written."""
+"""Tests of the recorder: content of a recording, and disks that are slow or full."""
 
 import asyncio
 import json
@@ -39,7 +39,7 @@ from tests.runtime.fake_actors import (
     running,
 )
 
-from .journal_helpers import UNLUCKY, Tally, files, live, recorded
+from .journal_helpers import FAILING_VALUE, Tally, files, recorded, run_recorded
 
 
 def entries(folder: Path) -> list[Started | StepRecord | Gap]:
@@ -50,7 +50,7 @@ def steps(folder: Path) -> list[StepRecord]:
     return [entry for entry in entries(folder) if isinstance(entry, StepRecord)]
 
 
-def test_every_step_is_there_in_order(tmp_path: Path) -> None:
+def test_recording_holds_every_step_in_order(tmp_path: Path) -> None:
     recorded(tmp_path, [1, 2, 3])
     found = entries(tmp_path)
     assert found[0] == Started(step=0, state=None)
@@ -62,7 +62,7 @@ def test_every_step_is_there_in_order(tmp_path: Path) -> None:
     }
 
 
-def test_a_step_names_each_output_with_its_digest(tmp_path: Path) -> None:
+def test_step_lists_its_outputs_and_a_digest(tmp_path: Path) -> None:
     recorded(tmp_path, [1, 2])
     first, second, last = steps(tmp_path)
     assert [output.topic for output in first.outputs] == [DOUBLES.name, PIECES.name]
@@ -70,7 +70,7 @@ def test_a_step_names_each_output_with_its_digest(tmp_path: Path) -> None:
     assert len({first.digest, second.digest, last.digest}) == 3
 
 
-def test_the_message_is_kept_as_it_came(tmp_path: Path) -> None:
+def test_recorded_message_equals_the_received_bytes(tmp_path: Path) -> None:
     recorded(tmp_path, [7])
     (file,), (step, _) = files(tmp_path), steps(tmp_path)
     body = file.taken(step)
@@ -84,12 +84,12 @@ def test_the_message_is_kept_as_it_came(tmp_path: Path) -> None:
     assert checksum(body) == step.checksum
 
 
-def test_a_failed_message_is_kept_once_with_both_attempts_and_both_starts(tmp_path: Path) -> None:
-    recorded(tmp_path, [1, 2, 3, UNLUCKY, 4])
+def test_failed_message_is_stored_once_with_both_attempts(tmp_path: Path) -> None:
+    recorded(tmp_path, [1, 2, 3, FAILING_VALUE, 4])
     kinds = [step.kind for step in steps(tmp_path)]
     assert kinds == ["done"] * 3 + ["failed", "failed", "dead_lettered", "done", "finished"]
     failed = steps(tmp_path)[3]
-    assert failed.error == "ValueError('unlucky')"
+    assert failed.error == "ValueError('failing value')"
     assert failed.outputs == ()
     assert len(files(tmp_path)[0].messages) == 5
     starts = [entry for entry in entries(tmp_path) if isinstance(entry, Started)]
@@ -100,44 +100,44 @@ def test_a_failed_message_is_kept_once_with_both_attempts_and_both_starts(tmp_pa
     ]
 
 
-def test_the_room_that_a_step_saw_is_kept(tmp_path: Path) -> None:
+def test_credits_of_each_step_are_recorded(tmp_path: Path) -> None:
     recorded(tmp_path, [1, 2], expected={PIECES.name: frozenset({"absent"})})
     assert [step.credits for step in steps(tmp_path)] == [{PIECES.name: 0}] * 3
     assert [output.topic for output in steps(tmp_path)[0].outputs] == [DOUBLES.name]
 
 
-def test_what_was_done_is_in_the_file_before_it_is_closed(tmp_path: Path) -> None:
-    """So that a process that is killed leaves it behind."""
+def test_finished_steps_are_in_the_file_before_it_is_closed(tmp_path: Path) -> None:
+    """A killed process must leave its finished steps behind."""
     seen: list[int] = []
 
-    def look(recorder: Recorder, _value: int) -> None:
-        recorder._writer.submit(int).result(10)  # it has caught up
+    def count_steps(recorder: Recorder, _value: int) -> None:
+        recorder._writer.submit(int).result(10)  # Waits until the writer has caught up.
         seen.append(len(steps(tmp_path)))
 
-    recorded(tmp_path, [1, 2, 3, 4], meanwhile=look)
+    recorded(tmp_path, [1, 2, 3, 4], before_each=count_steps)
     assert seen == [0, 1, 2, 3]
 
 
-def test_a_message_without_a_header_keeps_its_own_stamp(tmp_path: Path) -> None:
-    """As programs send it that know nothing of ours."""
+def test_message_without_header_keeps_its_own_stamp(tmp_path: Path) -> None:
+    """Other programs send messages without our header."""
 
-    class FromOutside(Tally):
+    class LatestTally(Tally):
         inputs = (In(LATEST_NUMBER, Latest(4)),)
 
-    async def life() -> None:
+    async def run() -> None:
         transport = MemoryTransport()
         recorder = Recorder(tmp_path / "tally.mcap", {}, RecordConfig())
-        stage = Stage(FromOutside, transport, config=QUICK, journal=recorder)
+        stage = Stage(LatestTally, transport, config=QUICK, journal=recorder)
         async with running(stage):
             for stamp_ns in (100, 200):
                 transport.deliver(LATEST_NUMBER.name, b"", encode(number(stamp_ns)))
             await eventually(lambda: stage.health().steps == 2)
 
-    asyncio.run(life())
+    asyncio.run(run())
     assert [m.stamp_ns for m in JournalFile(tmp_path / "tally.mcap").messages] == [100, 200]
 
 
-def test_other_programs_read_it(tmp_path: Path) -> None:
+def test_recording_is_readable_with_the_mcap_library(tmp_path: Path) -> None:
     path = recorded(tmp_path, [5, 6])
     with path.open("rb") as stream:
         reader = make_reader(stream)
@@ -156,9 +156,9 @@ def test_other_programs_read_it(tmp_path: Path) -> None:
     assert all(one < other for one, other in pairwise(times))
 
 
-# --- when it cannot be written --------------------------------------------------------------------
+# --- slow and full disks --------------------------------------------------------------------------
 class BusyDisk:
-    """Holds up the writer from one value to another."""
+    """A disk that blocks the writer from one value to another."""
 
     def __init__(self, since: int, until: int) -> None:
         self._since, self._until, self._free = since, until, Event()
@@ -168,14 +168,14 @@ class BusyDisk:
             recorder._writer.submit(self._free.wait, 10)
         elif value == self._until:
             self._free.set()
-            recorder._writer.submit(int).result(10)  # it has caught up
+            recorder._writer.submit(int).result(10)  # Waits until the writer has caught up.
 
 
-def test_a_slow_disk_leaves_a_gap_that_is_marked_and_said_once(
+def test_slow_disk_leaves_one_marked_and_logged_gap(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tiny = RecordConfig(queue_mb=0.012)  # six small messages and their steps
-    recorded(tmp_path, range(1, 31), config=tiny, meanwhile=BusyDisk(5, 25))
+    tiny = RecordConfig(queue_mb=0.012)  # Six small messages and their steps.
+    recorded(tmp_path, range(1, 31), config=tiny, before_each=BusyDisk(5, 25))
     gaps = [entry for entry in entries(tmp_path) if isinstance(entry, Gap)]
     (gap,) = gaps
     assert gap.reason == "slow"
@@ -185,25 +185,26 @@ def test_a_slow_disk_leaves_a_gap_that_is_marked_and_said_once(
     assert f"{gap.lost} messages were not recorded" in caplog.text
 
 
-def test_the_robot_does_not_wait_for_the_disk(tmp_path: Path) -> None:
+def test_actor_does_not_wait_for_the_disk(tmp_path: Path) -> None:
     tiny = RecordConfig(queue_mb=0.012)
-    never = BusyDisk(1, until=40)
-    recorded(tmp_path, range(1, 41), config=tiny, meanwhile=never)  # or `eventually` gives up
+    blocked = BusyDisk(1, until=40)
+    # If the actor waited for the disk, `eventually` would fail.
+    recorded(tmp_path, range(1, 41), config=tiny, before_each=blocked)
 
 
-async def test_what_is_lost_shows_in_health(tmp_path: Path) -> None:
+async def test_dropped_messages_are_counted_in_health(tmp_path: Path) -> None:
     tiny = RecordConfig(queue_mb=0.012)
-    stage = await live(tmp_path, range(1, 31), config=tiny, meanwhile=BusyDisk(5, 25))
-    facts = stage.health().metrics
+    stage = await run_recorded(tmp_path, range(1, 31), config=tiny, before_each=BusyDisk(5, 25))
+    metrics = stage.health().metrics
     (gap,) = [entry for entry in entries(tmp_path) if isinstance(entry, Gap)]
-    assert facts["journal_messages_dropped"] == gap.lost
-    last_words = 1
-    assert facts["journal_steps"] == 30 - gap.lost + last_words
+    assert metrics["journal_messages_dropped"] == gap.lost
+    final_step = 1
+    assert metrics["journal_steps"] == 30 - gap.lost + final_step
 
 
 @contextmanager
 def file_size_limit(bytes_: int) -> Iterator[None]:
-    """What a full disk looks like to a process: writing fails with an OSError."""
+    """Simulate a full disk: writing beyond the limit fails with an OSError."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_, hard))
     try:
@@ -212,7 +213,7 @@ def file_size_limit(bytes_: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_full_disk_ends_the_recording_and_not_the_robot(
+def test_full_disk_ends_the_recording_and_not_the_actor(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with file_size_limit(6000):
@@ -223,20 +224,20 @@ def test_a_full_disk_ends_the_recording_and_not_the_robot(
     assert not files(tmp_path)[0].is_whole
 
 
-def test_a_fault_of_the_recorder_ends_the_recording_and_not_the_robot(
+def test_recorder_failure_ends_the_recording_and_not_the_actor(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def spoil(recorder: Recorder, value: int) -> None:
+    def break_recorder(recorder: Recorder, value: int) -> None:
         if value == 3:
             recorder._submit(0, lambda: 1 // 0)  # type: ignore[arg-type]
 
-    recorded(tmp_path, [1, 2, 3, 4, 5], meanwhile=spoil)
+    recorded(tmp_path, [1, 2, 3, 4, 5], before_each=break_recorder)
     assert len(steps(tmp_path)) == 2
     assert caplog.text.count("this recording ends here") == 1
     assert "ZeroDivisionError" in caplog.text
 
 
-def test_the_recording_ends_at_its_limit(
+def test_recording_ends_at_its_size_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(mcap_file, "CHECK_EVERY_BYTES", 100)
@@ -249,7 +250,7 @@ def test_the_recording_ends_at_its_limit(
     assert files(tmp_path)[0].is_whole
 
 
-def test_a_disk_that_is_nearly_full_is_left_alone(
+def test_recording_ends_on_a_nearly_full_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mcap_file, "CHECK_EVERY_BYTES", 100)
@@ -258,18 +259,18 @@ def test_a_disk_that_is_nearly_full_is_left_alone(
 
 
 # --- files ----------------------------------------------------------------------------------------
-def test_each_life_has_a_file_in_order(tmp_path: Path) -> None:
+def test_each_run_of_an_actor_has_a_numbered_file(tmp_path: Path) -> None:
     for _ in range(11):
         new_path(tmp_path, "mapper").touch()
     new_path(tmp_path, "tracker").touch()
     (tmp_path / "notes.txt").touch()
     names = {actor: [path.name for path in paths] for actor, paths in
              recorded_actors(tmp_path).items()}  # fmt: skip
-    lives = [f"mapper.{life}.mcap" for life in range(2, 12)]
-    assert names == {"mapper": ["mapper.mcap", *lives], "tracker": ["tracker.mcap"]}
+    later = [f"mapper.{number}.mcap" for number in range(2, 12)]
+    assert names == {"mapper": ["mapper.mcap", *later], "tracker": ["tracker.mcap"]}
 
 
-def test_a_recording_goes_into_a_folder_of_its_own(tmp_path: Path) -> None:
+def test_recording_needs_an_empty_or_new_folder(tmp_path: Path) -> None:
     prepare_recording(tmp_path / "new")
     prepare_recording(tmp_path / "new")
     (tmp_path / "new" / "tracker.mcap").touch()
@@ -280,6 +281,6 @@ def test_a_recording_goes_into_a_folder_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("field", ["max_gb", "queue_mb"])
-def test_a_recording_of_no_size_is_refused(field: str) -> None:
+def test_recording_of_size_zero_is_rejected(field: str) -> None:
     with pytest.raises(ConfigError):
         RecordConfig(**{field: 0})

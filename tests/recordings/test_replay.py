@@ -1,4 +1,4 @@
-"""A recorded life, lived again: the same, or the first difference is named."""
+"""Tests of replay: a recorded run is reproduced, or the first difference is named."""
 
 import random
 from collections.abc import Iterator
@@ -16,13 +16,13 @@ from ldo_service.schemas import Message
 from ldo_service.storage.state_store import State
 from tests.runtime.fake_actors import DOUBLES, NUMBERS, PIECES, Double
 
-from .journal_helpers import UNLUCKY, Tally, files, recorded, replayed
+from .journal_helpers import FAILING_VALUE, Tally, files, recorded, replayed
 from .test_recorder import BusyDisk
 
 VALUES = [5, 1, 4, 1, 5, 9, 2, 6]
 
 
-def test_a_life_replays(tmp_path: Path) -> None:
+def test_recorded_run_replays(tmp_path: Path) -> None:
     recorded(tmp_path, VALUES)
     result = replayed(tmp_path)
     result.verify()
@@ -32,57 +32,58 @@ def test_a_life_replays(tmp_path: Path) -> None:
     assert result.notes == []
 
 
-def test_the_room_of_the_time_is_what_the_actor_sees(tmp_path: Path) -> None:
+def test_replayed_actor_sees_the_recorded_credits(tmp_path: Path) -> None:
     recorded(tmp_path, VALUES, expected={PIECES.name: frozenset({"absent"})})
     result = replayed(tmp_path)
     result.verify()
     assert result.made == {DOUBLES.name: len(VALUES) + 1}
 
 
-class Counting(Tally):
-    """Says how many numbers wait."""
+class BacklogTally(Tally):
+    """An actor that publishes the number of queued messages."""
 
     def handle(self, message: Message) -> Iterator[Message]:
         yield Double(stamp_ns=message.stamp_ns, value=self.situation.backlog.get(NUMBERS, -1))
 
 
-def test_what_waited_at_the_time_is_what_the_actor_sees(
+def test_replayed_actor_sees_the_recorded_backlog(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counts = iter(range(100))
     monkeypatch.setattr(Mailbox, "waiting", lambda _self: {NUMBERS: next(counts)})
-    recorded(tmp_path, VALUES, make=Counting)
+    recorded(tmp_path, VALUES, make=BacklogTally)
     assert next(counts) > len(VALUES)
-    replayed(tmp_path, Counting).verify()
+    replayed(tmp_path, BacklogTally).verify()
 
 
-def test_failures_and_the_states_after_them_are_lived_again(tmp_path: Path) -> None:
-    recorded(tmp_path, [1, 2, 3, 4, UNLUCKY, 5, 6, UNLUCKY, 7])
+def test_failures_and_restored_states_are_replayed(tmp_path: Path) -> None:
+    recorded(tmp_path, [1, 2, 3, 4, FAILING_VALUE, 5, 6, FAILING_VALUE, 7])
     result = replayed(tmp_path)
     result.verify()
     assert (result.failures, result.failures_repeated, result.dead_lettered) == (4, 4, 2)
     assert (result.starts, result.restored) == (5, 4)
 
 
-def test_a_failure_that_does_not_repeat_is_noted_and_no_difference(tmp_path: Path) -> None:
-    class Fortunate(Tally):
+def test_failure_that_does_not_repeat_is_a_note_not_a_difference(tmp_path: Path) -> None:
+    class NotFailing(Tally):
         def handle(self, message: Message) -> Iterator[Message]:
             try:
                 yield from super().handle(message)
             except ValueError:
                 return
 
-    recorded(tmp_path, [1, 2, 3, UNLUCKY, 4])
-    result = replayed(tmp_path, Fortunate)
+    recorded(tmp_path, [1, 2, 3, FAILING_VALUE, 4])
+    result = replayed(tmp_path, NotFailing)
     result.verify()
     assert (result.failures, result.failures_repeated) == (2, 0)
-    assert "ValueError('unlucky')" in result.notes[0]
+    assert "ValueError('failing value')" in result.notes[0]
 
 
-def test_a_killed_actor_and_its_successor_replay(tmp_path: Path) -> None:
+def test_killed_actor_and_its_restart_replay(tmp_path: Path) -> None:
     first = recorded(tmp_path, [1, 2, 3, 4, 5], is_killed=True)
     last = McapIndex(first).places[-1]
-    first.write_bytes(first.read_bytes()[: last.start + last.size // 2])  # half its last step
+    # The last step is cut in half.
+    first.write_bytes(first.read_bytes()[: last.start + last.size // 2])
     recorded(tmp_path, [5, 6, 7])
     assert [file.is_whole for file in files(tmp_path)] == [False, True]
     result = replayed(tmp_path)
@@ -93,8 +94,8 @@ def test_a_killed_actor_and_its_successor_replay(tmp_path: Path) -> None:
     assert result.steps == 4 + 4
 
 
-def test_a_file_that_was_cut_anywhere_replays_up_to_its_last_whole_step(tmp_path: Path) -> None:
-    path = recorded(tmp_path, [1, 2, UNLUCKY, 3, 4])
+def test_truncated_file_replays_up_to_its_last_complete_step(tmp_path: Path) -> None:
+    path = recorded(tmp_path, [1, 2, FAILING_VALUE, 3, 4])
     whole = path.read_bytes()
     lengths = sorted(random.Random(1).sample(range(8, len(whole)), 60))
     counts = []
@@ -108,7 +109,7 @@ def test_a_file_that_was_cut_anywhere_replays_up_to_its_last_whole_step(tmp_path
     assert counts[-1] == 8
 
 
-def test_changed_code_is_named_with_actor_step_and_output(tmp_path: Path) -> None:
+def test_divergence_names_actor_step_and_output(tmp_path: Path) -> None:
     class Changed(Tally):
         def handle(self, message: Message) -> Iterator[Message]:
             for made in super().handle(message):
@@ -128,57 +129,57 @@ def test_changed_code_is_named_with_actor_step_and_output(tmp_path: Path) -> Non
     assert error.recorded != error.replayed
 
 
-def test_a_state_that_cannot_be_taken_up_any_more_is_a_difference(tmp_path: Path) -> None:
+def test_unrestorable_recorded_state_is_a_difference(tmp_path: Path) -> None:
     class Changed(Tally):
         def restore(self, state: State) -> None:
             self._sum = state["total"]
 
-    recorded(tmp_path, [1, 2, 3, UNLUCKY])
+    recorded(tmp_path, [1, 2, 3, FAILING_VALUE])
     with pytest.raises(ReplayDiverged, match=r"start before step 4 .*rejected, KeyError"):
         replayed(tmp_path, Changed).verify()
 
 
-def test_an_output_more_or_less_is_a_difference(tmp_path: Path) -> None:
-    class Talkative(Tally):
+def test_additional_output_is_a_difference(tmp_path: Path) -> None:
+    class AdditionalOutput(Tally):
         def on_stop(self) -> Iterator[Message]:
             yield from super().on_stop()
             yield Double(stamp_ns=0, value=0)
 
     recorded(tmp_path, [1])
     with pytest.raises(ReplayDiverged, match="1 outputs, now 2"):
-        replayed(tmp_path, Talkative).verify()
+        replayed(tmp_path, AdditionalOutput).verify()
 
 
-def test_a_step_that_fails_only_now_is_a_difference(tmp_path: Path) -> None:
-    class Fragile(Tally):
+def test_step_that_fails_only_in_replay_is_a_difference(tmp_path: Path) -> None:
+    class AlwaysFailing(Tally):
         def handle(self, message: Message) -> Iterator[Message]:
             raise KeyError("new")
             yield from super().handle(message)
 
     recorded(tmp_path, [1])
     with pytest.raises(ReplayDiverged, match=r"step 0 .* a failure, KeyError"):
-        replayed(tmp_path, Fragile).verify()
+        replayed(tmp_path, AlwaysFailing).verify()
 
 
-def test_a_hidden_input_is_found(tmp_path: Path) -> None:
-    """An actor that looks at something outside its messages, here at how many there have been."""
+def test_hidden_input_is_detected(tmp_path: Path) -> None:
+    """The result of the actor depends on something other than its messages."""
     recorded(tmp_path, VALUES, make=lambda: Tally(bias=0))
     with pytest.raises(ReplayDiverged, match="step 0"):
         replayed(tmp_path, lambda: Tally(bias=1)).verify()
 
 
-def test_a_flipped_bit_in_a_message_is_found(tmp_path: Path) -> None:
+def test_flipped_bit_in_a_message_is_detected(tmp_path: Path) -> None:
     path = recorded(tmp_path, VALUES)
     content = bytearray(path.read_bytes())
-    nine = content.index(b"\xa5value\x09") + 6  # message 5
+    nine = content.index(b"\xa5value\x09") + 6  # Message 5.
     content[nine] ^= 1
     path.write_bytes(content)
     with pytest.raises(ReplayDiverged, match=r"step 5 .*checksum of its input"):
         replayed(tmp_path).verify()
 
 
-def test_an_actor_that_talks_to_the_outside_is_left_out(tmp_path: Path) -> None:
-    class Asking(Tally):
+def test_actor_that_talks_outside_is_not_replayed(tmp_path: Path) -> None:
+    class Outside(Tally):
         talks_outside = True
 
         def handle(self, message: Message) -> Iterator[Message]:
@@ -186,15 +187,15 @@ def test_an_actor_that_talks_to_the_outside_is_left_out(tmp_path: Path) -> None:
             yield message
 
     recorded(tmp_path, VALUES)
-    result = replayed(tmp_path, Asking)
+    result = replayed(tmp_path, Outside)
     result.verify()
     assert result.made == {}
 
 
-# --- what was not recorded ------------------------------------------------------------------------
-def test_a_replay_ends_at_a_gap_and_does_not_pass(tmp_path: Path) -> None:
+# --- gaps -----------------------------------------------------------------------------------------
+def test_replay_ends_at_a_gap_and_does_not_pass(tmp_path: Path) -> None:
     tiny = RecordConfig(queue_mb=0.012)
-    recorded(tmp_path, range(20, 60), config=tiny, meanwhile=BusyDisk(25, 50))
+    recorded(tmp_path, range(20, 60), config=tiny, before_each=BusyDisk(25, 50))
     result = replayed(tmp_path)
     assert result.difference is None
     assert 5 <= result.steps < 20
@@ -202,17 +203,17 @@ def test_a_replay_ends_at_a_gap_and_does_not_pass(tmp_path: Path) -> None:
         result.verify()
 
 
-def test_after_a_gap_a_restart_is_replayed_again(tmp_path: Path) -> None:
+def test_replay_resumes_at_a_restart_after_a_gap(tmp_path: Path) -> None:
     tiny = RecordConfig(queue_mb=0.012)
-    values = [*range(20, 60), UNLUCKY, 60, 61]
-    recorded(tmp_path, values, config=tiny, meanwhile=BusyDisk(25, 50))
+    values = [*range(20, 60), FAILING_VALUE, 60, 61]
+    recorded(tmp_path, values, config=tiny, before_each=BusyDisk(25, 50))
     result = replayed(tmp_path)
     assert result.difference is None
     assert (result.starts, result.failures, result.dead_lettered) == (3, 1, 1)
     assert not result.is_complete
 
 
-def test_a_recording_that_ended_at_its_limit_replays(
+def test_recording_that_ended_at_its_limit_replays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mcap_file, "CHECK_EVERY_BYTES", 100)
@@ -223,7 +224,7 @@ def test_a_recording_that_ended_at_its_limit_replays(
     assert result.notes == [f"tally.mcap ends at its size limit, before step {result.steps}."]
 
 
-def test_a_missing_message_is_bad_data(tmp_path: Path) -> None:
+def test_missing_message_raises_data_error(tmp_path: Path) -> None:
     path = recorded(tmp_path, VALUES)
     rewrite(path, CompressionType.NONE, leave_out=(NUMBERS.name, 3))
     with pytest.raises(DataError, match="message of step 3 is missing"):
@@ -232,9 +233,11 @@ def test_a_missing_message_is_bad_data(tmp_path: Path) -> None:
 
 # --- files ----------------------------------------------------------------------------------------
 @pytest.mark.parametrize("compression", list(CompressionType)[::2], ids=lambda c: c.name)
-def test_a_copy_by_another_program_replays(tmp_path: Path, compression: CompressionType) -> None:
-    """In chunks, compressed or not, as the MCAP library and its tools write by default."""
-    path = recorded(tmp_path, [*VALUES, UNLUCKY, 3])
+def test_copy_written_by_another_program_replays(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    """The MCAP library and its tools write chunks by default, compressed or not."""
+    path = recorded(tmp_path, [*VALUES, FAILING_VALUE, 3])
     rewrite(path, compression)
     result = replayed(tmp_path)
     result.verify()
@@ -268,12 +271,12 @@ def rewrite(
 
 
 @pytest.mark.parametrize("compression", list(CompressionType)[::2], ids=lambda c: c.name)
-def test_damage_anywhere_is_bad_data_or_a_difference(
+def test_damage_anywhere_is_a_data_error_or_a_difference(
     tmp_path: Path, compression: CompressionType
 ) -> None:
-    path = recorded(tmp_path, [1, 2, 3, UNLUCKY, 4])
+    path = recorded(tmp_path, [1, 2, 3, FAILING_VALUE, 4])
     rewrite(path, compression)
-    whole, rng, found = path.read_bytes(), random.Random(2), 0
+    whole, rng, detected = path.read_bytes(), random.Random(2), 0
     for place in rng.sample(range(len(whole)), 300):
         damaged = bytearray(whole)
         damaged[place] ^= 1 << rng.randrange(8)
@@ -281,12 +284,12 @@ def test_damage_anywhere_is_bad_data_or_a_difference(
         try:
             replayed(tmp_path).verify()
         except (DataError, ReplayDiverged):
-            found += 1
-    assert found > 20
+            detected += 1
+    assert detected > 20
 
 
 @pytest.mark.parametrize("content", [b"", b"not a recording at all", b"\x89MCAP0\r\n\x05\x01"])
-def test_something_else_is_bad_data(tmp_path: Path, content: bytes) -> None:
+def test_file_that_is_no_recording_raises_data_error(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "recording").mkdir()
     (tmp_path / "recording" / "tally.mcap").write_bytes(content)
     if content.startswith(b"\x89"):
