@@ -1,4 +1,4 @@
-"""A whole service in processes of its own, as a user starts it."""
+"""Fixtures for a complete service in its own processes, as a user starts it."""
 
 import os
 import signal
@@ -24,14 +24,14 @@ from ldo_service.geometry.sequence import Sequence as FrameSequence
 from ldo_service.schemas import CameraRgbd, Health, TrackedPose
 from tests.ports import free_endpoint
 
-PATIENCE = 6  # machines that run tests do other things too: a test waits, it measures no time
-RESEND_AFTER_S = 1.0  # without an answer to a frame
-MAX_COPIES = 1000  # of a frame that is sent again, 1 ns apart
+PATIENCE = 6  # Factor on all time limits, because test machines are busy with other work.
+RESEND_AFTER_S = 1.0  # Time without a pose after which a frame is sent again.
+MAX_COPIES = 1000  # Maximum number of copies of a frame, stamped 1 ns apart.
 LDO = (sys.executable, "-m", "ldo_service")
 
 
 def wait_until(true: Callable[[], bool], timeout_s: float, what: str) -> None:
-    """`timeout_s` on a machine with nothing else to do."""
+    """Wait for a condition; `timeout_s` is the time limit on an idle machine."""
     patience_s = PATIENCE * timeout_s
     until_s = time.monotonic() + patience_s
     while not true():
@@ -41,7 +41,7 @@ def wait_until(true: Callable[[], bool], timeout_s: float, what: str) -> None:
 
 
 class LiveService:
-    """`ldo serve`, its log, and a client that listens to health and poses."""
+    """Process of `ldo serve`, its log, and a client that receives health and poses."""
 
     def __init__(self, folder: Path, *arguments: str, command: Sequence[str] = LDO) -> None:
         self.endpoint, self.state = free_endpoint(), folder / "s"
@@ -76,7 +76,7 @@ class LiveService:
         return self.log_path.read_text()
 
     def _connect(self) -> Client:
-        """Try until the router listens. Where nothing listens a try ends at once."""
+        """Connect as soon as the router listens; an attempt before that fails at once."""
         until_s = time.monotonic() + PATIENCE * 20
         while True:
             try:
@@ -94,7 +94,7 @@ class LiveService:
         wait_until(lambda: len(self.update_health()) == count, 20, "all actors report")
 
     def poses(self) -> list[TrackedPose]:
-        """Those that came since the last call."""
+        """Return the poses received since the last call."""
         return self._poses()
 
     def wait_for_poses(self, count: int, timeout_s: float = 20) -> list[TrackedPose]:
@@ -122,9 +122,9 @@ class LiveService:
             frame: The frame. Each copy is stamped 1 ns after the one before, because a stamp that
                 comes twice is rejected.
             is_done: The condition.
-            timeout_s: The time limit on a machine with nothing else to do.
-            what: The condition in words, for the failure.
-            send: What sends a copy; by default `self.client.send`.
+            timeout_s: The time limit on an idle machine.
+            what: The condition in words, for the failure message.
+            send: The function that sends a copy; by default `self.client.send`.
         """
         copies = count()
         due_s = time.monotonic()
@@ -145,7 +145,7 @@ class LiveService:
     def pose_of(
         self, frame: CameraRgbd, send: Callable[[CameraRgbd], None] | None = None
     ) -> TrackedPose:
-        """Send a frame, as often as it takes, and return its pose."""
+        """Send a frame until its pose arrives, and return the pose."""
         found: list[TrackedPose] = []
 
         def has_come() -> bool:
@@ -178,7 +178,7 @@ class LiveService:
 
         Args:
             frames: The sequence; each frame is stamped with the time at which it is sent.
-            rate_hz: So few that frames in a row have poses on a busy machine, too.
+            rate_hz: The frame rate. It is low, so that a busy machine tracks consecutive frames.
         """
         is_over = threading.Event()
 

@@ -1,7 +1,7 @@
-"""Things of the flat, each with a name of its own, and somebody who knows them by sight.
+"""Synthetic flat with one label per instance, a scripted labeller, and a check of the labels.
 
-A name says which thing it is, not of which kind: a label that lies on another thing is wrong, be it
-another chair.
+A label names the instance, not the class. A label on another instance is wrong, even if both are
+chairs.
 """
 
 import base64
@@ -23,49 +23,51 @@ from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.synthetic.flat import FlatSequence
 from tests.detection.labellers.server import replies_with
 
-FILLED = 0.7  # of a box, by a thing that it is of
-NEAR_M = 0.05  # of a surface, to lie on it: what the depth of a Kinect may be off by
-TOLD_WITHIN_S = 10.0  # of a picture, that it was asked about; or never
-NOT_TOLD = "none"
+FILLED = 0.7  # Minimum fraction of a box that its instance fills.
+NEAR_M = 0.05  # Maximum distance to a surface; the depth error of a Kinect is about as large.
+KNOWN_WITHIN_S = 10.0  # Maximum wait until the label of a requested crop is known.
+NO_LABEL = "none"
 
 
 def flat() -> FlatSequence:
-    """At a quarter of its pixels, so that a map of it is quickly made."""
+    """Return the synthetic flat at a quarter of its pixels, for fast mapping."""
     return FlatSequence.named("flat", width_px=320, height_px=240)
 
 
-def exhibit(instance: int) -> str:
+def instance_label(instance: int) -> str:
     return f"exhibit {instance}"
 
 
-def thing_in(sequence: FlatSequence, frame: int, box_px: Iterable[float]) -> str:
-    """The name of what fills most of a box, x0 y0 x1 y1, in a frame."""
+def label_in_box(sequence: FlatSequence, frame: int, box_px: Iterable[float]) -> str:
+    """Return the label of the instance that fills most of a box (x0, y0, x1, y1) in a frame."""
     x0, y0, x1, y1 = (max(0, round(edge)) for edge in box_px)
     shown = sequence.labels(frame).instance_ids[y0 : y1 + 1, x0 : x1 + 1]
     pixels = np.bincount(shown.ravel())
     instance = int(pixels.argmax())
     is_filled = instance > 0 and pixels[instance] >= FILLED * shown.size
-    return exhibit(instance) if is_filled else NOT_TOLD
+    return instance_label(instance) if is_filled else NO_LABEL
 
 
 @dataclass
 class Guide:
-    """Answers the questions of a labeller, of whose pictures it was told what they show.
+    """Scripted labelling server that knows the true label of each requested crop.
 
-    frames  of the sequence, in the order that a camera sends them again and again
-    waits   with each answer until it is allowed
+    Attributes:
+        frames: Frames of the sequence, in the order in which the camera repeats them.
+        waits: Whether each answer waits until it is allowed.
+        names: Label by crop, as the labeller sends the crop.
     """
 
     sequence: FlatSequence
     frames: Sequence[int]
     waits: bool = False
-    names: dict[str, str] = field(default_factory=dict)  # by picture, as a labeller sends it
+    names: dict[str, str] = field(default_factory=dict)
     _allowed: Semaphore = field(default_factory=lambda: Semaphore(0))
 
-    def told(self, request: LabelRequest, frame: int) -> None:
-        """Of a region that the frame with this number shows."""
+    def add_request(self, request: LabelRequest, frame: int) -> None:
+        """Store the true label of a requested region of the frame with this number."""
         index = self.frames[frame % len(self.frames)]
-        name = thing_in(self.sequence, index, request.box_px)
+        name = label_in_box(self.sequence, index, request.box_px)
         self.names |= {_picture(crop): name for crop in crops_from_request(request)}
 
     def allow(self, answers: int) -> None:
@@ -77,10 +79,10 @@ class Guide:
             if over.is_set():
                 return
         picture = question["messages"][0]["content"][1]["image_url"]["url"].split(",")[1]
-        until_s = time.monotonic() + TOLD_WITHIN_S
+        until_s = time.monotonic() + KNOWN_WITHIN_S
         while picture not in self.names and time.monotonic() < until_s and not over.wait(0.02):
             pass
-        replies_with(self.names.get(picture, NOT_TOLD), 0.9)(handler)
+        replies_with(self.names.get(picture, NO_LABEL), 0.9)(handler)
 
 
 def _picture(crop: np.ndarray) -> str:
@@ -88,10 +90,10 @@ def _picture(crop: np.ndarray) -> str:
     return base64.b64encode(jpeg).decode()
 
 
-# --- where names came to lie ----------------------------------------------------------------------
+# --- labels in the map ----------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """Gaussians with a name, as often as a frame sees them; `right`: on the thing itself."""
+    """Number of observations of labelled Gaussians: all (`seen`) and correct ones (`right`)."""
 
     seen: int
     right: int
@@ -109,8 +111,10 @@ def placed(
     first: int,
     frames: range,
 ) -> Placed:
-    """How many of the Gaussians that are named as an exhibit lie on it. `first`: the frame that the
-    map begins with."""
+    """Count how often labelled Gaussians lie on the instance of their label.
+
+    `first` is the frame in which the map starts.
+    """
     names = np.array(label_names)[top_labels(gaussians.labels)]
     is_named = np.char.startswith(names, "exhibit ")
     instances = np.array([int(name.split()[1]) for name in names[is_named]], int)
@@ -124,8 +128,7 @@ def placed(
 def _shown(
     sequence: FlatSequence, first: int, frames: range, p_map: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Of each frame which points [N, 3] lie on a surface that it shows, and of which thing that
-    is."""
+    """Yield, per frame, the indices of the points [N, 3] on a visible surface and its instances."""
     T, camera = sequence.truth().T_world_camera, sequence.camera
     for frame in frames:
         T_camera_map = se3.inverse(T[frame]) @ T[first]

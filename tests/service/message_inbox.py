@@ -1,4 +1,4 @@
-"""What a live service says of its poses and of names, as it says it."""
+"""Inbox for the poses, label requests and label results of a live service."""
 
 from contextlib import ExitStack
 
@@ -15,27 +15,27 @@ from tests.service.failure_artifacts import Guide
 
 
 class Heard:
-    """Kept by `listen`, to be called often. `guide` is told of each request."""
+    """Messages received so far; call `listen` often. `guide` receives each label request."""
 
     def __init__(self, service: LiveService, stack: ExitStack, guide: Guide | None = None) -> None:
         self.service, self._guide = service, guide
         self.poses: list[TrackedPose] = []
-        self.frame_of: dict[int, int] = {}  # by keyframe
+        self.frame_of: dict[int, int] = {}  # Frame number by keyframe.
         self.requests: list[LabelRequest] = []
         self.answers: list[LabelResult] = []
-        self.late: list[int] = []  # keyframes that were made until each answer came
+        self.late: list[int] = []  # Latency of each answer, in keyframes.
         listen = service.client.poller
         self._requests = stack.enter_context(listen("label/request", LabelRequest))
         self._answers = stack.enter_context(listen("label/result", LabelResult))
 
     def listen(self) -> None:
-        requests = self._requests()  # of keyframes whose poses were told before
+        requests = self._requests()  # Poses of their keyframes were published before.
         for pose in self.service.poses():
             self._take(pose)
         for request in requests:
             self.requests.append(request)
             if self._guide:
-                self._guide.told(request, self.frame_of[request.keyframe])
+                self._guide.add_request(request, self.frame_of[request.keyframe])
         for answer in self._answers():
             self.answers.append(answer)
             self.late.append(max(self.frame_of) - answer.keyframe)
@@ -46,14 +46,14 @@ class Heard:
             self.frame_of[pose.keyframe] = pose.frame
 
     def ask_again(self) -> None:
-        """For the last pose, if it got lost on the way."""
+        """Query the last pose, in case it was lost."""
         for pose in self.service.client.latest(POSE_TRACKED):
             assert isinstance(pose, TrackedPose)
             if pose.frame > max((known.frame for known in self.poses), default=-1):
                 self._take(pose)
 
     def has_all_answers(self) -> bool:
-        """Whatever was asked is answered, and the map has taken it."""
+        """Return whether each label request is answered and the mapper has received the result."""
         self.listen()
         labeller = self.service.update_health()["vlm_labeller"]
         asked, taken = (
@@ -64,7 +64,7 @@ class Heard:
         return is_idle and asked.delivered == taken.delivered + taken.dropped + taken.lost
 
     def input(self, actor: str, topic: str) -> InputCount:
-        """As of the last heartbeat."""
+        """Return the counters of an input as of the last heartbeat."""
         inputs = self.service.update_health()[actor].inputs
         return next(count for count in inputs if count.topic == topic)
 
@@ -72,13 +72,13 @@ class Heard:
         return self.service.update_health()[actor].metrics.get(name, 0.0)
 
     def graph(self) -> dict[int, np.ndarray]:
-        """T_map_keyframe [4, 4] by keyframe, as the optimizer has them."""
+        """Return T_map_keyframe [4, 4] by keyframe from the optimizer."""
         (correction,) = self.service.client.latest(GRAPH_CORRECTION)
         assert isinstance(correction, GraphCorrection)
         return keyframe_poses_from_correction(correction)
 
     def map(self) -> tuple[GaussianMap, tuple[str, ...]]:
-        """As the mapper has it, and the names of its labels."""
+        """Return the map as the mapper saves it, and the names of its labels."""
         answer = self.service.client.control("save")
         assert answer.ok, answer.message
         state = FolderStore(self.service.state / "state").load("mapper")

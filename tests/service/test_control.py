@@ -1,4 +1,4 @@
-"""`ldo control` on a running service, whose optimizer is a process of its own."""
+"""Tests of the command `ldo control` on a running service."""
 
 import os
 import signal
@@ -17,17 +17,19 @@ def ldo_control(service: LiveService, *arguments: str) -> subprocess.CompletedPr
     return subprocess.run(command, capture_output=True, text=True)
 
 
-def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path, room: Sequence) -> None:
+def test_live_service_pauses_refines_resumes_saves_and_resets(
+    tmp_path: Path, room: Sequence
+) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         with service.camera(room):
             service.wait_for_poses(15)
-            # pause: frames come and no pose goes
+            # Pause: frames arrive and no pose is published.
             assert ldo_control(service, "pause").returncode == 0
             service.poses()
             wait_until(lambda: _paused(service) > 5, 10, "paused frames are counted")
             assert service.poses() == []
-            # refine: no keyframe comes, and the mapper iterates
+            # Refine: no keyframe arrives, and the mapper iterates.
             before = _iterations(service)
             assert ldo_control(service, "refine", "--iterations", "501").returncode == 2
             assert ldo_control(service, "refine", "--iterations", "40").returncode == 0
@@ -35,12 +37,12 @@ def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path, room: Sequen
             assert service.client.control("resume").ok
             last = service.wait_for_poses(15)[-1]
             assert last.keyframe is None or last.keyframe > 0
-            # save: the map is on the disk, whole, though no checkpoint was due
+            # Save: the complete map is on the disk before its next regular checkpoint.
             saved = ldo_control(service, "save")
             assert (saved.returncode, str(tmp_path / "s") in saved.stdout) == (0, True)
             for actor in ("frame_source", "tracker", "mapper", "optimizer"):
                 assert (tmp_path / "s" / "state" / actor / "contents.msgpack").exists()
-            # reset: all begin anew, in their processes
+            # Reset: all actors start from an empty state in the same processes.
             before = {name: (h.epoch, h.pid) for name, h in service.update_health().items()}
             assert ldo_control(service, "reset").returncode == 0
             service.wait_for_poses(1)
@@ -76,7 +78,7 @@ def _iterations(service: LiveService) -> float:
 
 
 @pytest.mark.slow
-def test_an_actor_that_does_not_obey_gives_exit_code_4(tmp_path: Path) -> None:
+def test_control_of_unresponsive_actor_exits_with_code_4(tmp_path: Path) -> None:
     arguments = ("--set", "service.control_timeout_s=1", "--set", "service.heartbeat_timeout_s=30")
     with live_service(tmp_path, *arguments) as service:
         service.wait_for_actors()
@@ -91,7 +93,7 @@ def test_an_actor_that_does_not_obey_gives_exit_code_4(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_robot_that_is_not_there_is_said(tmp_path: Path) -> None:
+def test_control_of_unknown_robot_exits_with_code_2(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         done = subprocess.run(

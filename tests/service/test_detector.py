@@ -1,4 +1,4 @@
-"""The detector in a process of its own, with a network and with garbage."""
+"""Tests of the detector in its own process, with a network and with a damaged file."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ APART = ("--set", "service.process_actors=[detector]", "--set", "mapper.iteratio
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_garbage", [False, True], ids=["network", "garbage"])
-def test_every_keyframe_is_answered_whatever_the_network_is(
+def test_keyframes_get_a_detection_message_also_without_a_network(
     tmp_path: Path, is_garbage: bool
 ) -> None:
     model = squares_network("yolox", width=320, height=256).write(tmp_path / "squares.onnx")

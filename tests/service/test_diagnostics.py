@@ -1,4 +1,4 @@
-"""Each of the three levels of health, judged, and what to do."""
+"""Tests of the diagnosis of actors: healthy, note, and problem with advice."""
 
 import msgspec
 import pytest
@@ -11,83 +11,88 @@ def health(**fields) -> Health:
     counts = InputCount(
         topic="frame/rgbd", delivered=9, dropped=0, rejected=0, gaps=0, queued=0, peak_queued=1
     )
-    well = Health(
+    healthy = Health(
         stamp_ns=1, actor="tracker", state="ready", pid=1, epoch=1, steps=9, failures=0, restarts=0,
         dead_lettered=0, step_age_s=0.1, current_step_s=0.0, step_ms_p50=1.0, step_ms_p95=2.0,
         rss_mb=100.0,
         inputs=(counts,), outputs=(),
     )  # fmt: skip
-    return msgspec.structs.replace(well, **fields)
+    return msgspec.structs.replace(healthy, **fields)
 
 
 def inputs(topic: str = "frame/rgbd", **fields) -> tuple[InputCount, ...]:
     return (msgspec.structs.replace(health().inputs[0], topic=topic, **fields),)
 
 
-def seen(of: Health | None, has_token: bool = True, heartbeat_age_s: float = 0.1) -> ActorStatus:
-    return ActorStatus("tracker", has_token, of, 1.5, heartbeat_age_s)
+def status(
+    health_message: Health | None, has_token: bool = True, heartbeat_age_s: float = 0.1
+) -> ActorStatus:
+    return ActorStatus("tracker", has_token, health_message, 1.5, heartbeat_age_s)
 
 
 @pytest.mark.parametrize(
     "actor",
     [
-        seen(health()),
-        seen(health(step_age_s=3600.0)),  # nothing to do is no trouble
-        seen(health(step_age_s=60.0, paused=True, inputs=inputs(queued=3))),
-        seen(health(current_step_s=0.5, state="busy", inputs=inputs(queued=8))),
-        seen(health(current_step_s=4.0, step_age_s=9.0, state="busy", inputs=inputs(queued=8))),
-        seen(health(inputs=inputs(dropped=500, rejected=3))),  # what a slow machine does
+        status(health()),
+        status(health(step_age_s=3600.0)),  # An idle actor is healthy.
+        status(health(step_age_s=60.0, paused=True, inputs=inputs(queued=3))),
+        status(health(current_step_s=0.5, state="busy", inputs=inputs(queued=8))),
+        status(health(current_step_s=4.0, step_age_s=9.0, state="busy", inputs=inputs(queued=8))),
+        status(health(inputs=inputs(dropped=500, rejected=3))),  # A slow machine drops messages.
     ],
 )
-def test_an_actor_that_is_well_has_no_trouble(actor: ActorStatus) -> None:
+def test_healthy_actor_has_no_findings(actor: ActorStatus) -> None:
     assert list(diagnose(actor)) == []
 
 
 @pytest.mark.parametrize(
-    ("actor", "says"),
+    ("actor", "text"),
     [
-        (seen(None, has_token=False), "is not running"),
-        (seen(None), "no heartbeat for 1.5 s"),
-        (seen(health(), heartbeat_age_s=1.6), "no heartbeat for 1.6 s"),
-        (seen(health(), has_token=False), "token is absent"),
+        (status(None, has_token=False), "is not running"),
+        (status(None), "no heartbeat for 1.5 s"),
+        (status(health(), heartbeat_age_s=1.6), "no heartbeat for 1.6 s"),
+        (status(health(), has_token=False), "token is absent"),
         (
-            seen(health(current_step_s=12.0, inputs=inputs(queued=1))),
+            status(health(current_step_s=12.0, inputs=inputs(queued=1))),
             "busy with one message for 12 s",
         ),
         (
-            seen(health(current_step_s=12.0, metrics={"labellers": 1.0})),  # no server's
+            status(health(current_step_s=12.0, metrics={"labellers": 1.0})),  # It uses no server.
             "busy with one message for 12 s",
         ),
-        (seen(health(step_age_s=20.0, inputs=inputs(queued=4))), "none of 4 queued messages"),
         (
-            seen(health(step_age_s=20.0, inputs=inputs(queued=4), metrics={"attempts": 7.0})),
+            status(health(step_age_s=20.0, inputs=inputs(queued=4))),
             "none of 4 queued messages",
         ),
-        (seen(health(dead_lettered=1, failures=2, restarts=2)), "1 messages as dead letters"),
         (
-            seen(health(metrics={"networks_missing": 1.0, "networks": 0.0})),
+            status(health(step_age_s=20.0, inputs=inputs(queued=4), metrics={"attempts": 7.0})),
+            "none of 4 queued messages",
+        ),
+        (status(health(dead_lettered=1, failures=2, restarts=2)), "1 messages as dead letters"),
+        (
+            status(health(metrics={"networks_missing": 1.0, "networks": 0.0})),
             "without the configured network",
         ),
-        (seen(health(metrics={"inferences_failed": 3.0})), "3 failed inferences"),
-        (seen(health(metrics={"labellers_missing": 1.0})), "without the configured labeller"),
+        (status(health(metrics={"inferences_failed": 3.0})), "3 failed inferences"),
+        (status(health(metrics={"labellers_missing": 1.0})), "without the configured labeller"),
         (
-            seen(health(metrics={"labeller_failing": 1.0, "labellings_failed": 2.0})),
+            status(health(metrics={"labeller_failing": 1.0, "labellings_failed": 2.0})),
             "2 regions so far have no label",
         ),
         (
-            seen(health(metrics={"checkpoint_failing": 1.0, "checkpoints_failed": 3.0})),
+            status(health(metrics={"checkpoint_failing": 1.0, "checkpoints_failed": 3.0})),
             "cannot save its last step",
         ),
     ],
 )
-def test_each_trouble_is_told_from_the_others(actor: ActorStatus, says: str) -> None:
-    (trouble,) = diagnose(actor)
-    assert says in trouble.what
-    assert len(trouble.advice) > 20
+def test_each_problem_has_its_own_finding(actor: ActorStatus, text: str) -> None:
+    (finding,) = diagnose(actor)
+    assert text in finding.what
+    assert len(finding.advice) > 20
 
 
 @pytest.mark.parametrize(
-    ("of", "says"),
+    ("health_message", "text"),
     [
         (health(paused=True), "ldo control resume"),
         (health(inputs=inputs("camera/rgbd", delivered=0)), "no frame yet"),
@@ -111,15 +116,15 @@ def test_each_trouble_is_told_from_the_others(actor: ActorStatus, says: str) -> 
         (health(metrics={"iterations_pending": 900.0}), "ldo control refine --iterations 500`"),
     ],
 )
-def test_what_is_no_fault_is_a_remark(of: Health, says: str) -> None:
-    (remark,) = notes(seen(of))
-    assert says in remark
-    assert list(diagnose(seen(of))) == []
+def test_harmless_condition_is_a_note(health_message: Health, text: str) -> None:
+    (note,) = notes(status(health_message))
+    assert text in note
+    assert list(diagnose(status(health_message))) == []
 
 
-def test_a_detector_without_a_model_is_no_trouble_and_is_remarked_upon() -> None:
-    actor = seen(health(metrics={"networks": 0.0, "networks_missing": 0.0}))
+def test_detector_without_model_is_a_note() -> None:
+    actor = status(health(metrics={"networks": 0.0, "networks_missing": 0.0}))
     assert list(diagnose(actor)) == []
-    (remark,) = notes(actor)
-    assert "ldo models" in remark
-    assert list(notes(seen(health(metrics={"networks": 1.0})))) == []
+    (note,) = notes(actor)
+    assert "ldo models" in note
+    assert list(notes(status(health(metrics={"networks": 1.0})))) == []

@@ -1,4 +1,4 @@
-"""What `ldo doctor` and Prometheus say of a running service."""
+"""Tests of the output of `ldo doctor` and Prometheus for a running service."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ from tests.ports import free_port
 from tests.service.conftest import LDO, live_service, wait_until
 
 
-def test_the_doctor_names_a_stopped_process_and_a_service_without_frames(
+def test_doctor_reports_stopped_process_and_missing_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def doctor() -> tuple[int, str]:
@@ -24,12 +24,12 @@ def test_the_doctor_names_a_stopped_process_and_a_service_without_frames(
     with live_service(tmp_path, "--set", "service.heartbeat_timeout_s=60") as service:
         service.wait_for_actors()
 
-        def is_well() -> bool:
+        def is_healthy() -> bool:
             code, out = doctor()
             assert "received no frame yet on camera/rgbd, camera/color, camera/depth" in out
             return code == 0 and "bad " not in out
 
-        wait_until(is_well, 20, "every heartbeat comes")
+        wait_until(is_healthy, 20, "every heartbeat comes")
         stopped = service.health["optimizer"].pid
 
         def is_stopped_process_named() -> bool:
@@ -39,14 +39,14 @@ def test_the_doctor_names_a_stopped_process_and_a_service_without_frames(
             finally:
                 os.kill(stopped, signal.SIGCONT)
             assert code == 1
-            # After some seconds the router forgets a stopped process, and it "is not running".
+            # The router drops a stopped process after some seconds; it then "is not running".
             return "optimizer has a process, but no heartbeat" in out
 
         wait_until(is_stopped_process_named, 60, "the stopped process is named")
 
 
 @pytest.mark.slow
-def test_prometheus_sees_every_actor_count(tmp_path: Path) -> None:
+def test_prometheus_exports_metrics_of_every_actor(tmp_path: Path) -> None:
     port = free_port()
     with live_service(tmp_path, "--metrics-port", str(port)) as service:
         service.wait_for_actors()

@@ -1,4 +1,4 @@
-"""The whole service on the network: TLS, certificates, and a camera that has some."""
+"""Test of the service over TLS, with certificates for each role."""
 
 import subprocess
 from pathlib import Path
@@ -14,7 +14,7 @@ from tests.service.conftest import LDO, wait_until
 
 
 @pytest.mark.slow
-def test_frames_go_in_and_poses_come_out_over_tls(tmp_path: Path) -> None:
+def test_poses_are_received_over_tls_and_roles_are_enforced(tmp_path: Path) -> None:
     keys = tmp_path / "keys"
     authority = CertificateAuthority.new(keys, days=2)
     for role in ("service", "camera", "viewer", "operator"):

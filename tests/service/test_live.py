@@ -1,4 +1,4 @@
-"""The service as its users see it: processes, sockets, signals."""
+"""Tests of the live service as users see it: processes, sockets and signals."""
 
 import os
 import signal
@@ -19,7 +19,7 @@ from tests.service.conftest import LDO, PATIENCE, is_running, live_service, wait
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 EVERY_ACTOR = tuple(box.name for box in GRAPH)
-# A light map: what is watched here is the runtime, and a process that starts anew needs its core.
+# The map is light, because a restarted process needs a free core.
 APART = (
     "--set",
     f"service.process_actors=[{','.join(EVERY_ACTOR)}]",
@@ -28,10 +28,10 @@ APART = (
 )
 
 
-def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
+def test_frames_yield_poses_and_a_map(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        # So slow that a busy machine, which drops some, keeps enough of them.
+        # A busy machine drops frames; at this rate enough of them remain.
         publisher = service.publisher("synthetic:room", "--rate", "5", "--max-frames", "25")
         poses = service.wait_for_poses(8)
         assert publisher.wait(PATIENCE * 20) == 0
@@ -40,10 +40,10 @@ def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
         last = service.client.latest(POSE_TRACKED, timeout_s=60)
         assert isinstance(last[0], TrackedPose)
         assert service.client.latest("pose/tracked", timeout_s=60) == last
-        heard = service.client.messages("health", keep=16)
+        health_messages = service.client.messages("health", keep=16)
         silent = set(EVERY_ACTOR)
         while silent:
-            silent.discard(next(heard)[1].actor)
+            silent.discard(next(health_messages)[1].actor)
         with pytest.raises(ConfigError, match="Did you mean pose/tracked"):
             service.client.latest("pose/traked")
         with pytest.raises(ConfigError, match="map/delta keeps no last value"):
@@ -55,10 +55,10 @@ def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
         assert "Traceback" not in service.log
 
 
-def test_the_examples_run_as_printed(tmp_path: Path) -> None:
+def test_examples_run_as_printed(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        _, ours, plain = (
+        _, package_subscriber, zenoh_subscriber = (
             service.start(
                 [sys.executable, "-c", _at(service.endpoint, EXAMPLES / name), count],
                 stdout=subprocess.PIPE,
@@ -70,14 +70,14 @@ def test_the_examples_run_as_printed(tmp_path: Path) -> None:
                 ("3_without_our_package.py", "5"),
             )
         )
-        for subscriber in (ours, plain):
+        for subscriber in (package_subscriber, zenoh_subscriber):
             printed, _ = subscriber.communicate(timeout=30 * PATIENCE)
             lines = printed.splitlines()
             assert len(lines) == 5
             assert all(line.split()[1] == "OK" for line in lines)
 
 
-def test_the_example_of_an_odometry_is_taken(tmp_path: Path) -> None:
+def test_odometry_example_delivers_its_poses(tmp_path: Path) -> None:
     poses = tmp_path / "odometry.txt"
     poses.write_text(
         "# stamp tx ty tz qx qy qz qw\n1.00 0 0 0 0 0 0 1\n1.02 0 0 0.01 0 0 0.6 0.8\n"
@@ -88,21 +88,21 @@ def test_the_example_of_an_odometry_is_taken(tmp_path: Path) -> None:
         done = subprocess.run([sys.executable, "-c", example, str(poses)])
         assert done.returncode == 0
 
-        def taken() -> int:
+        def delivered_poses() -> int:
             inputs = service.update_health()["tracker"].inputs
             return sum(i.delivered for i in inputs if i.topic == "odometry/prior")
 
-        wait_until(lambda: taken() == 2, 10, "both poses are taken")
+        wait_until(lambda: delivered_poses() == 2, 10, "both poses are delivered")
         assert "rejected" not in service.log
 
 
 def _at(endpoint: str, example: Path) -> str:
-    """The example's text with the service's address in place of the default."""
+    """Return the text of an example with the address of the service instead of the default."""
     text = example.read_text().replace("tcp/127.0.0.1:7447", endpoint)
     return text.replace('connect("robot")', f'connect("robot", "{endpoint}")')
 
 
-def test_a_taken_port_is_said_in_one_paragraph(tmp_path: Path) -> None:
+def test_used_port_is_reported_without_traceback(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         second = subprocess.run(
@@ -113,7 +113,7 @@ def test_a_taken_port_is_said_in_one_paragraph(tmp_path: Path) -> None:
         assert "Traceback" not in second.stderr
 
 
-def test_a_state_folder_is_gone_on_from_and_never_shared_or_taken_in_part(
+def test_state_folder_is_resumed_and_shared_or_partial_ones_rejected(
     tmp_path: Path, room: Sequence
 ) -> None:
     with live_service(tmp_path) as service:
@@ -121,7 +121,7 @@ def test_a_state_folder_is_gone_on_from_and_never_shared_or_taken_in_part(
         for index in range(30):
             service.pose_of(raw_frame_to_message(room.read(index)))
         state = tmp_path / "s"
-        assert "another service keeps its state" in refused(state)
+        assert "another service keeps its state" in start_error(state)
         wait_until(lambda: service.update_health()["mapper"].metrics["keyframes"] > 2, 10, "a map")
         assert service.stop() == 0
         keyframes = service.health["mapper"].metrics["keyframes"]
@@ -132,16 +132,16 @@ def test_a_state_folder_is_gone_on_from_and_never_shared_or_taken_in_part(
         wait_until(
             lambda: service.update_health()["mapper"].metrics.get("keyframes", 0) > keyframes,
             10,
-            "the map goes on",
+            "the map grows",
         )
         assert service.stop() == 0
     for part in (state / "state" / "tracker").iterdir():
-        part.write_bytes(b"torn")
-    assert "no readable state of tracker" in refused(state)
+        part.write_bytes(b"damaged")
+    assert "no readable state of tracker" in start_error(state)
 
 
-def refused(state: Path) -> str:
-    """What a service says that cannot have a state folder."""
+def start_error(state: Path) -> str:
+    """Return the error of a service that cannot use a state folder."""
     done = subprocess.run(
         [*LDO, "serve", "--endpoint", free_endpoint(), "--state", str(state)],
         capture_output=True,
@@ -152,7 +152,7 @@ def refused(state: Path) -> str:
     return done.stderr
 
 
-def test_children_leave_when_the_service_is_killed(tmp_path: Path) -> None:
+def test_child_processes_end_when_the_service_is_killed(tmp_path: Path) -> None:
     with live_service(tmp_path, *APART) as service:
         service.wait_for_actors()
         pids = [health.pid for health in service.health.values()]
@@ -163,10 +163,10 @@ def test_children_leave_when_the_service_is_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_every_actor_may_be_killed_and_the_service_goes_on(tmp_path: Path) -> None:
+def test_service_continues_after_each_actor_is_killed(tmp_path: Path) -> None:
     with live_service(tmp_path, *APART) as service:
         service.wait_for_actors()
-        publisher = service.publisher("synthetic:tour", "--rate", "4")  # 90 s, for seven
+        publisher = service.publisher("synthetic:tour", "--rate", "4")  # 90 s for seven actors.
         service.wait_for_poses(10)
         for actor in EVERY_ACTOR:
             old = service.update_health()[actor]
@@ -190,7 +190,7 @@ def test_every_actor_may_be_killed_and_the_service_goes_on(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_the_publisher_may_be_killed_and_started_again(tmp_path: Path) -> None:
+def test_tracking_continues_after_the_publisher_is_restarted(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         first = service.publisher("synthetic:room", "--rate", "15")
@@ -206,8 +206,8 @@ def test_the_publisher_may_be_killed_and_started_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_sleeping_subscriber_is_its_own_problem(tmp_path: Path) -> None:
-    sleeper = (
+def test_slow_subscriber_does_not_delay_poses(tmp_path: Path) -> None:
+    slow_subscriber = (
         "import time, zenoh, json, sys\n"
         "config = zenoh.Config()\n"
         "config.insert_json5('mode', json.dumps('client'))\n"
@@ -219,7 +219,7 @@ def test_a_sleeping_subscriber_is_its_own_problem(tmp_path: Path) -> None:
     )
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        service.start([sys.executable, "-c", sleeper, service.endpoint])
+        service.start([sys.executable, "-c", slow_subscriber, service.endpoint])
         service.publisher("synthetic:tour", "--rate", "15", "--max-frames", "200")
         poses = service.wait_for_poses(150, timeout_s=40)
         assert sum(pose.status == "OK" for pose in poses) >= 145

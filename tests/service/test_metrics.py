@@ -1,4 +1,4 @@
-"""Prometheus reads what the actors' health messages say."""
+"""Tests of the Prometheus metrics, which are made from health messages."""
 
 import re
 import socket
@@ -21,7 +21,7 @@ from tests.schemas.examples import EXAMPLES
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """Where the example's health is exported."""
+    """Yield the port on which the example health message is exported."""
     collector, port = HealthCollector("mule", ["mapper"]), free_port()
     collector.on_health(b"", memoryview(encode(EXAMPLES["health"])))
     collector.on_health(b"", memoryview(b"\xc1 no health message"))
@@ -30,7 +30,7 @@ def port() -> Iterator[int]:
 
 
 def scraped(port: int) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
-    """Value by name and labels, read by Prometheus's own parser."""
+    """Return the value of each metric by name and labels, read with the parser of Prometheus."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60) as reply:
         text = reply.read().decode()
     return {
@@ -44,8 +44,8 @@ def labels(*own: tuple[str, str]) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((("robot", "mule"), *own)))
 
 
-def asked(port: int) -> tuple[int, str]:
-    """Status and text of /healthz."""
+def read_healthz(port: int) -> tuple[int, str]:
+    """Return the status and text of /healthz."""
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=60) as reply:
             return reply.status, reply.read().decode().strip()
@@ -53,37 +53,40 @@ def asked(port: int) -> tuple[int, str]:
         return error.code, error.read().decode().strip()
 
 
-def test_health_is_of_now_and_of_every_actor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_healthz_requires_a_recent_heartbeat_of_every_actor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     collector, port = HealthCollector("mule", ["mapper", "tracker"]), free_port()
-    mapper = EXAMPLES["health"]  # it has failed and was restarted, which is past
+    mapper = EXAMPLES["health"]  # Past failures and restarts do not count.
     with serve_metrics(collector, port):
-        assert asked(port) == (503, "no heartbeat: mapper, tracker")
+        assert read_healthz(port) == (503, "no heartbeat: mapper, tracker")
         collector.on_health(b"", memoryview(encode(mapper)))
-        assert asked(port) == (503, "no heartbeat: tracker")
+        assert read_healthz(port) == (503, "no heartbeat: tracker")
         tracker = msgspec.structs.replace(mapper, actor="tracker")
         collector.on_health(b"", memoryview(encode(tracker)))
-        assert asked(port) == (200, "every actor reports")
+        assert read_healthz(port) == (200, "every actor reports")
         later_s = time.monotonic() + 2 * (10 + COMES_BACK_S)
         monkeypatch.setattr("ldo_service.service.metrics.time.monotonic", lambda: later_s)
-        assert asked(port) == (503, "no heartbeat: mapper, tracker")
+        assert read_healthz(port) == (503, "no heartbeat: mapper, tracker")
 
 
-def test_who_may_be_silent_for_long_is_not_missed_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    patient, hasty = (HealthCollector("mule", ["mapper"], silent_s) for silent_s in (60, 5))
-    for collector in (patient, hasty):
+def test_actor_is_silent_only_after_its_heartbeat_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow, quick = (HealthCollector("mule", ["mapper"], silent_s) for silent_s in (60, 5))
+    for collector in (slow, quick):
         collector.on_health(b"", memoryview(encode(EXAMPLES["health"])))
     later_s = time.monotonic() + 30
     monkeypatch.setattr("ldo_service.service.metrics.time.monotonic", lambda: later_s)
-    assert (patient.silent_actors(), hasty.silent_actors()) == ([], ["mapper"])
+    assert (slow.silent_actors(), quick.silent_actors()) == ([], ["mapper"])
 
 
 @pytest.mark.parametrize("address", ["localhost", "127.0.0.1", "::1"])
-def test_any_address_of_this_machine_will_do(address: str) -> None:
+def test_metrics_are_served_on_any_local_address(address: str) -> None:
     port = free_port()
+    # IPv6 may be missing on this machine.
     with (
         suppress(ConfigError),
         serve_metrics(HealthCollector("mule"), port, address),
-    ):  # no IPv6 here
+    ):
         url = f"http://{f'[{address}]' if ':' in address else address}:{port}/healthz"
         with urllib.request.urlopen(url, timeout=60) as reply:
             assert reply.status == 200
@@ -91,7 +94,7 @@ def test_any_address_of_this_machine_will_do(address: str) -> None:
     assert address == "::1", "only IPv6 may be missing"
 
 
-def test_every_number_of_a_health_message_is_exported(port: int) -> None:
+def test_every_value_of_a_health_message_is_exported(port: int) -> None:
     values = scraped(port)
     mapper = ("actor", "mapper")
     keyframes, view = ("topic", "keyframe/new"), ("topic", "map/view")
@@ -125,13 +128,13 @@ def test_every_number_of_a_health_message_is_exported(port: int) -> None:
     assert values == pytest.approx(expected)
 
 
-def test_an_actor_that_was_killed_is_counted_and_its_gauges_go(
+def test_killed_actor_is_counted_and_its_gauges_disappear(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     collector, health = HealthCollector("mule"), EXAMPLES["health"]
     for pid in (7, 7, 8, 8, 9):
-        again = msgspec.structs.replace(health, pid=pid)
-        collector.on_health(b"", memoryview(encode(again)))
+        restarted = msgspec.structs.replace(health, pid=pid)
+        collector.on_health(b"", memoryview(encode(restarted)))
     samples = {s.name: s.value for family in collector.collect() for s in family.samples}
     assert samples["ldo_process_restarts_total"] == 2
     assert "ldo_resident_bytes" in samples
@@ -143,7 +146,7 @@ def test_an_actor_that_was_killed_is_counted_and_its_gauges_go(
     assert samples["ldo_steps_total"] == 100
 
 
-def test_only_this_machine_can_read_them(port: int) -> None:
+def test_metrics_are_reachable_from_this_machine_only(port: int) -> None:
     with socket.socket() as probe:
         try:
             probe.connect((_own_address(), port))
@@ -153,16 +156,16 @@ def test_only_this_machine_can_read_them(port: int) -> None:
 
 
 def _own_address() -> str:
-    """Of this machine on its network; loopback's second address where it has none."""
+    """Return the network address of this machine, or a second loopback address without one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(("192.0.2.1", 9))  # sends nothing
+            probe.connect(("192.0.2.1", 9))  # This sends no packet.
             return probe.getsockname()[0]
         except OSError:
             return "127.0.0.2"
 
 
-def test_a_taken_port_is_said_and_can_be_had_again_afterwards(port: int) -> None:
+def test_used_port_is_reported_and_reusable_after_closing(port: int) -> None:
     with (
         pytest.raises(ConfigError, match=re.escape(f"cannot listen on 127.0.0.1:{port}")),
         serve_metrics(HealthCollector("mule"), port),
@@ -175,6 +178,6 @@ def test_a_taken_port_is_said_and_can_be_had_again_afterwards(port: int) -> None
 
 
 @pytest.mark.parametrize("port_", [0, -1, 65536])
-def test_an_impossible_port_is_refused(port_: int) -> None:
+def test_invalid_port_is_rejected(port_: int) -> None:
     with pytest.raises(ConfigError), serve_metrics(HealthCollector("mule"), port_):
         pass

@@ -1,4 +1,4 @@
-"""What a stranger does on the first day, in the order of the manual, each by its command."""
+"""Test of the quickstart: the commands of the manual in their order."""
 
 import subprocess
 from pathlib import Path
@@ -15,7 +15,7 @@ LIGHT = ("--set", "mapper.iterations=4")
 
 
 def ldo(*words: object) -> str:
-    """What a command prints on both its streams."""
+    """Run a command and return what it prints on both streams."""
     done = subprocess.run(
         [*LDO, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
@@ -23,46 +23,48 @@ def ldo(*words: object) -> str:
     return done.stdout
 
 
-def see(service: LiveService, folder: Path, poses: int) -> None:
-    """Have a camera go through a folder of frames, and answer with OK poses in the map; on a slow
-    machine some frames are dropped."""
+def track_folder(service: LiveService, folder: Path, poses: int) -> None:
+    """Publish a folder of frames and require `poses` poses, all OK and in the map.
+
+    A slow machine drops some of the frames.
+    """
     camera = service.publisher(str(folder), "--rate", "5", "--restamp")
-    told = service.wait_for_poses(poses, timeout_s=60)
-    assert {(pose.status, pose.submap) for pose in told} <= {("OK", 0)}
+    tracked = service.wait_for_poses(poses, timeout_s=60)
+    assert {(pose.status, pose.submap) for pose in tracked} <= {("OK", 0)}
     assert camera.wait(60) == 0
 
 
-def test_folder_run_service_query_recording_resume_and_localizing(
+def test_run_serve_query_replay_resume_and_localize_a_folder(
     room_folder: Path, tmp_path: Path
 ) -> None:
     frames = len(open_sequence(str(room_folder)))
-    # a folder of one's own
+    # Offline run of a folder.
     ldo("run", room_folder, "--out", tmp_path / "run", "--hold-out-every", "5", *LIGHT, *NETWORKS)
     assert "ATE" in ldo("eval", tmp_path / "run", room_folder)
     assert "couch" in ldo("query", tmp_path / "run", "sofa")
-    # a service, a camera, another program, and a question
+    # Service with a camera, queried by another program.
     recording = tmp_path / "recording"
     with live_service(tmp_path, *LIGHT, *NETWORKS, "--record", str(recording)) as service:
         service.wait_for_actors()
-        see(service, room_folder, frames // 2)
+        track_folder(service, room_folder, frames // 2)
         at = "--endpoint", service.endpoint
         wait_until(
             lambda: service.update_health()["mapper"].metrics["objects"] > 0, 20, "an object"
         )
         assert "couch" in ldo("query", "live", "sofa", *at)
         assert "mapper" in ldo("doctor", *at)
-        service.process.kill()  # as a power cut would
+        service.process.kill()  # This simulates a power failure.
         service.process.wait()
-    # what was recorded gives the same again, and is a data set
+    # The recording replays identically and can be used as a data set.
     ldo("replay", recording, "--verify")
     ldo("run", recording, "--out", tmp_path / "again", *LIGHT)
-    # gone on from, after the kill
+    # The service resumes after the kill.
     with live_service(tmp_path, *LIGHT, *NETWORKS) as service:
         service.wait_for_actors()
         assert "couch" in ldo("query", "live", "sofa", "--endpoint", service.endpoint)
-        see(service, room_folder, frames // 2)
+        track_folder(service, room_folder, frames // 2)
         assert service.stop() == 0
-    # tracked in the map of the run, which stays as it is
+    # Localization in the map of the run, which stays unchanged.
     before = (tmp_path / "run" / "map.ply").read_bytes()
     ldo("run", room_folder, "--out", tmp_path / "today", "--localize", tmp_path / "run")
     assert "ATE" in ldo("eval", tmp_path / "today", room_folder)

@@ -1,4 +1,4 @@
-"""A live service that is recorded, killed in parts, and replayed."""
+"""Tests of a live service that is recorded while actors are killed, and then replayed."""
 
 import os
 import signal
@@ -26,7 +26,7 @@ def assert_replays(recording: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_recorded_service_replays(tmp_path: Path) -> None:
+def test_recorded_service_replays(tmp_path: Path) -> None:
     recording = tmp_path / "recording"
     with live_service(tmp_path, "--record", str(recording)) as service:
         service.wait_for_actors()
@@ -36,17 +36,19 @@ def test_a_recorded_service_replays(tmp_path: Path) -> None:
     assert_replays(recording)
 
 
-def test_actors_that_are_killed_replay_with_both_their_lives(tmp_path: Path) -> None:
+def test_killed_and_restarted_actors_replay(tmp_path: Path) -> None:
     recording = tmp_path / "recording"
     with live_service(tmp_path, "--record", str(recording), *APART) as service:
         service.wait_for_actors()
-        publisher = service.publisher("synthetic:tour", "--rate", "4")  # 90 s, for seven
+        publisher = service.publisher("synthetic:tour", "--rate", "4")  # 90 s for seven actors.
         for actor in EVERY_ACTOR:
             service.wait_for_poses(10)
             pid = service.update_health()[actor].pid
             os.kill(pid, signal.SIGKILL)
             wait_until(
-                lambda a=actor, pid=pid: service.update_health()[a].pid != pid, 15, "it comes back"
+                lambda a=actor, pid=pid: service.update_health()[a].pid != pid,
+                15,
+                "the actor restarts",
             )
             service.poses()
         service.wait_for_poses(10)

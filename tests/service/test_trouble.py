@@ -1,4 +1,4 @@
-"""An actor that hangs or raises, and bytes that are no frames, in a live service."""
+"""Tests of a live service with an actor that hangs or raises, and with malformed frames."""
 
 import signal
 import sys
@@ -21,18 +21,18 @@ from ldo_service.schemas import CameraRgbd, TrackedPose, encode
 from ldo_service.transport.zenoh_transport import Endpoint, open_session
 from tests.service.conftest import PATIENCE, LiveService, live_service, wait_until
 
-PROGRAM = Path(__file__).with_name("troubled_service.py")
+FAULTY_PROGRAM = Path(__file__).with_name("faulty_tracker.py")
 APART = ("--set", "service.process_actors=[optimizer,tracker]")
 
 
 @pytest.fixture
-def troubled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
-    """A live service whose tracker has trouble at frame 20."""
+def faulty_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
+    """Return a function that starts a live service with a tracker fault at frame 20."""
 
-    def start(trouble: str, *arguments: str):
-        monkeypatch.setenv("TROUBLE", trouble)
-        monkeypatch.setenv("TROUBLE_FOLDER", str(tmp_path))
-        return live_service(tmp_path, *arguments, command=(sys.executable, str(PROGRAM)))
+    def start(fault: str, *arguments: str):
+        monkeypatch.setenv("FAULT", fault)
+        monkeypatch.setenv("FAULT_FOLDER", str(tmp_path))
+        return live_service(tmp_path, *arguments, command=(sys.executable, str(FAULTY_PROGRAM)))
 
     return start
 
@@ -42,15 +42,15 @@ def message(room: Sequence, index: int) -> CameraRgbd:
 
 
 def tracked(service: LiveService, room: Sequence, indices: Iterable[int]) -> list[TrackedPose]:
-    """Send frames, each when the one before has its pose."""
+    """Send frames, each after the previous one has its pose, and return the poses."""
     return [service.pose_of(message(room, index)) for index in indices]
 
 
-def test_a_handler_that_hangs_costs_its_process_which_is_started_again(
-    troubled: Callable, room: Sequence, tmp_path: Path
+def test_process_with_a_hanging_handler_is_restarted(
+    faulty_service: Callable, room: Sequence, tmp_path: Path
 ) -> None:
     # A busy machine must not make other steps exceed the timeout, so it is long.
-    with troubled("hang", *APART, "--set", "supervision.step_timeout_s=12") as service:
+    with faulty_service("hang", *APART, "--set", "supervision.step_timeout_s=12") as service:
         service.wait_for_actors()
         tracked(service, room, range(20))
         first = service.update_health()["tracker"].pid
@@ -64,10 +64,10 @@ def test_a_handler_that_hangs_costs_its_process_which_is_started_again(
 
 
 @pytest.mark.slow
-def test_a_message_that_always_fails_is_set_aside_and_the_stream_goes_on(
-    troubled: Callable, room: Sequence
+def test_failing_message_becomes_a_dead_letter_and_tracking_continues(
+    faulty_service: Callable, room: Sequence
 ) -> None:
-    with troubled("once") as service:
+    with faulty_service("once") as service:
         service.wait_for_actors()
         tracked(service, room, range(20))
         service.client.send(message(room, 20))
@@ -83,13 +83,13 @@ def test_a_message_that_always_fails_is_set_aside_and_the_stream_goes_on(
 
 
 @pytest.mark.slow
-def test_an_actor_that_always_fails_is_given_up_with_exit_code_4(
-    troubled: Callable, room: Sequence
+def test_service_with_an_always_failing_actor_exits_with_code_4(
+    faulty_service: Callable, room: Sequence
 ) -> None:
-    with troubled("always") as service:
+    with faulty_service("always") as service:
         service.wait_for_actors()
         tracked(service, room, range(20))
-        frames = count(20)  # two failures each: the budget is 5
+        frames = count(20)  # Each frame fails twice, and the budget is 5.
         until_s = time.monotonic() + 30 * PATIENCE
         while service.process.poll() is None:
             assert time.monotonic() < until_s, service.log
@@ -99,9 +99,9 @@ def test_an_actor_that_always_fails_is_given_up_with_exit_code_4(
         assert "tracker failed 6 times within 60 s, so the service stops" in service.log
 
 
-# --- bytes that are no frames ---------------------------------------------------------------------
-def not_frames(good: CameraRgbd) -> Iterator[bytes]:
-    """What a confused or hostile program may send in place of a frame."""
+# --- malformed frames -----------------------------------------------------------------------------
+def malformed_frames(good: CameraRgbd) -> Iterator[bytes]:
+    """Yield bodies that a faulty or hostile program may send instead of a frame."""
     body = encode(good)
     fields = msgpack.unpackb(body)
     yield b""
@@ -114,17 +114,17 @@ def not_frames(good: CameraRgbd) -> Iterator[bytes]:
     yield msgpack.packb({**fields, "camera": {**fields["camera"], "fx": float("nan")}})
     yield msgpack.packb({**fields, "depth_scale": 0.0})
     yield b"\x81\xa1y" + b"\x91" * 100_000
-    yield bytes(65_000_000)  # over service.max_decoded_message_mb
+    yield bytes(65_000_000)  # Larger than service.max_decoded_message_mb.
 
 
-def test_what_is_no_frame_is_rejected_and_counted_while_the_stream_goes_on(
+def test_malformed_frames_are_rejected_and_tracking_continues(
     tmp_path: Path, room: Sequence
 ) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         good = message(room, 0)
         service.pose_of(good)
-        bad = list(not_frames(good))
+        bad = list(malformed_frames(good))
         with open_session(Endpoint("robot", service.endpoint)) as session:
             camera = session.declare_publisher(
                 "ldo/robot/camera/rgbd", congestion_control=zenoh.CongestionControl.BLOCK
@@ -142,7 +142,7 @@ def test_what_is_no_frame_is_rejected_and_counted_while_the_stream_goes_on(
 
 
 def send(service: LiveService, camera: zenoh.Publisher, room: Sequence, index: int):
-    """The pose of a frame that a camera without our package sends."""
+    """Send a frame as a camera without our package does, and return its pose."""
     frame = msgspec.structs.replace(message(room, index), stamp_ns=time.time_ns())
     return service.pose_of(frame, send=lambda copy: camera.put(encode(copy)))
 
@@ -151,10 +151,8 @@ def rejected(service: LiveService) -> int:
     return service.update_health()["frame_source"].inputs[0].rejected
 
 
-def test_a_camera_that_goes_blind_and_sees_again_is_tracked_on(
-    tmp_path: Path, room: Sequence
-) -> None:
-    """Colour and depth on two topics; the depth is all zero for a while."""
+def test_tracking_recovers_after_frames_without_depth(tmp_path: Path, room: Sequence) -> None:
+    """Color and depth come on two topics, and the depth is zero for some frames."""
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         service.pose_of(message(room, 0))
@@ -188,7 +186,7 @@ def facts(service: LiveService) -> dict[str, float]:
 
 
 @pytest.mark.slow
-def test_a_service_that_is_stopped_in_the_middle_of_a_long_step_ends_without_an_abort(
+def test_service_stopped_during_a_long_step_exits_with_code_0(
     tmp_path: Path, room: Sequence
 ) -> None:
     with live_service(tmp_path, "--set", "mapper.iterations=100000") as service:

@@ -1,4 +1,4 @@
-"""Names in a live service: added while it runs, and from a labeller that is slow."""
+"""Tests of labels in a live service: labels added while it runs, and a slow labeller."""
 
 import subprocess
 from pathlib import Path
@@ -17,7 +17,7 @@ from tests.detection.labellers.server import hangs, replies_with, serving
 from tests.service.conftest import LDO, live_service, wait_until
 
 
-def test_a_name_is_added_while_it_runs(tmp_path: Path) -> None:
+def test_label_is_added_while_the_service_runs(tmp_path: Path) -> None:
     ColorPair().image(tmp_path / "model.onnx")
     ColorPair().text(tmp_path / "text.onnx")
     vocabulary(tmp_path / "bpe.txt.gz")
@@ -32,7 +32,7 @@ def test_a_name_is_added_while_it_runs(tmp_path: Path) -> None:
         (last,) = service.client.latest(LABEL_NAMES, timeout_s=60)
         assert isinstance(last, LabelNames)
         assert last.names == ("red", "fire hydrant")
-        with pytest.raises(ConfigError, match="cannot be added: a name of 101"):
+        with pytest.raises(ConfigError, match="cannot be added: name has 101"):
             service.client.add_label("x" * 101)
 
         def is_counted() -> bool:
@@ -43,32 +43,32 @@ def test_a_name_is_added_while_it_runs(tmp_path: Path) -> None:
         assert "Traceback" not in service.log
 
 
-ROUGH = ("--set", "mapper.iterations=2")
+LIGHT = ("--set", "mapper.iterations=2")
 
 
-def asking(url: str, *settings: str) -> tuple[str, ...]:
+def labeller_settings(url: str, *settings: str) -> tuple[str, ...]:
     use = (f"vlm_labeller.url={url}", *(f"vlm_labeller.http.{s}" for s in settings))
-    return (*ROUGH, *(word for setting in use for word in ("--set", setting)))
+    return (*LIGHT, *(word for setting in use for word in ("--set", setting)))
 
 
-def test_a_name_that_was_added_is_used_from_then_on(tmp_path: Path, room: Sequence) -> None:
-    """The model says nothing else, and without the name on the list nobody would believe it."""
+def test_added_label_is_used_for_later_regions(tmp_path: Path, room: Sequence) -> None:
+    """The server always returns this label, which is rejected unless it is on the list."""
     (tmp_path / "names.txt").write_text("red\n")
     names = ("--set", f"vlm_labeller.class_names={tmp_path / 'names.txt'}")
     with (
         serving(replies_with("fire hydrant", 0.9)) as server,
-        live_service(tmp_path, *asking(server.url), *names) as service,
+        live_service(tmp_path, *labeller_settings(server.url), *names) as service,
         service.client.poller("map/delta", MapDelta) as deltas,
     ):
         service.wait_for_actors()
         with pytest.raises(ConfigError, match=r"no objects yet\. They need a keyframe"):
             service.client.objects(timeout_s=1)
         assert "fire hydrant" in service.client.add_label("fire hydrant")
-        told: set[str] = set()
+        received_labels: set[str] = set()
 
         def is_used() -> bool:
-            told.update(name for delta in deltas() for name in delta.label_names)
-            return "fire hydrant" in told
+            received_labels.update(name for delta in deltas() for name in delta.label_names)
+            return "fire hydrant" in received_labels
 
         with service.camera(room):
             wait_until(is_used, 30, "used")
@@ -79,9 +79,9 @@ def test_a_name_that_was_added_is_used_from_then_on(tmp_path: Path, room: Sequen
 
 
 @pytest.mark.slow
-def test_a_labeller_that_takes_five_seconds_keeps_nobody_waiting(tmp_path: Path) -> None:
-    """Every frame has its pose while it is busy; what it never says labels nothing."""
-    slow = asking("", "timeout_s=5.0", "max_attempts=1")
+def test_slow_labeller_delays_no_poses(tmp_path: Path) -> None:
+    """Every frame has its pose while the labeller is busy, and it adds no label."""
+    slow = labeller_settings("", "timeout_s=5.0", "max_attempts=1")
     with serving(hangs) as server:
         use = [word.replace("url=", f"url={server.url}") for word in slow]
         with live_service(tmp_path, *use) as service:
@@ -92,22 +92,23 @@ def test_a_labeller_that_takes_five_seconds_keeps_nobody_waiting(tmp_path: Path)
             assert publisher.wait(60) == 0
             assert {pose.status for pose in poses} == {"OK"}
 
-            def is_said() -> bool:
+            def is_reported() -> bool:
                 return service.update_health()["vlm_labeller"].metrics.get("labeller_failing") == 1
 
-            wait_until(is_said, 15, "said")
+            wait_until(is_reported, 15, "reported")
             assert service.client.objects().objects == ()
             server.ended.set()
             assert service.stop() == 0
             assert "Traceback" not in service.log
 
 
-PICTURE = 9  # of the flat: it hangs over the couch, is whole in frame 30, and has no box of COCO
+# Instance of a picture in the flat. It is completely visible in frame 30 and has no COCO class.
+PICTURE = 9
 
 
 @pytest.mark.slow
-def test_a_name_added_while_it_runs_is_found_on_what_is_seen_after(tmp_path: Path) -> None:
-    """The built-in networks in the flat, from a list that lacks the name."""
+def test_object_gets_a_label_that_was_added_while_running(tmp_path: Path) -> None:
+    """The built-in networks label the flat from a list that lacks this label."""
     (tmp_path / "names.txt").write_text("couch\nlamp\ncabinet\nwindow\ndoor\n")
     demo = ("detector.model=demo", "vlm_labeller.model=demo", "mapper.iterations=2")
     use = (*demo, f"vlm_labeller.class_names={tmp_path / 'names.txt'}")
@@ -119,11 +120,11 @@ def test_a_name_added_while_it_runs_is_found_on_what_is_seen_after(tmp_path: Pat
         publisher = service.publisher("synthetic:flat", "--rate", "1", "--max-frames", "50")
         service.wait_for_poses(4, timeout_s=60)
         assert "picture frame" in service.client.add_label("picture frame")
-        p_picture, told = _seen_at(PICTURE, 30), list[MapObject]()
+        p_picture, found = _observed_center(PICTURE, 30), list[MapObject]()
 
         def is_found() -> bool:
-            told[:] = [one for message in objects() for one in message.objects] or told
-            named = [one for one in told if one.name == "picture frame"]
+            found[:] = [one for message in objects() for one in message.objects] or found
+            named = [one for one in found if one.name == "picture frame"]
             return any(np.linalg.norm(np.subtract(o.centroid, p_picture)) < 0.3 for o in named)
 
         wait_until(is_found, 60, "found")
@@ -133,9 +134,11 @@ def test_a_name_added_while_it_runs_is_found_on_what_is_seen_after(tmp_path: Pat
         assert "Traceback" not in service.log
 
 
-def _seen_at(instance: int, frame: int) -> np.ndarray:
-    """[3] m, the middle of what a frame of the flat shows of a thing, in the map's frame, which is
-    that of the first camera."""
+def _observed_center(instance: int, frame: int) -> np.ndarray:
+    """Return the median position of an instance as seen in a frame of the flat.
+
+    The position [3] is in meters, in the map frame, which is the frame of the first camera.
+    """
     sequence = FlatSequence.named("flat")
     truth, T = sequence.labels(frame), sequence.truth().T_world_camera
     depth_m, camera = sequence[frame].depth_m, sequence.camera
