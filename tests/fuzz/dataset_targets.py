@@ -1,4 +1,4 @@
-"""Data sets: each kind of file in each layout, beside files that are good."""
+"""Fuzz targets for data sets: each kind of file in each layout, next to valid files."""
 
 import json
 from pathlib import Path
@@ -74,7 +74,7 @@ LAYOUTS = {"TUM": TUM, "Replica": REPLICA, "ScanNet": SCANNET, "7-Scenes": SEVEN
 
 
 def frames_of(folder: Path) -> None:
-    """All that a run asks of a data set."""
+    """Read all that a run reads from a data set."""
     sequence = open_sequence(str(folder))
     sequence.truth()
     labels = sequence.true_labels()

@@ -4,9 +4,9 @@
     python tests/fuzz/fuzz.py PLY --minutes 5
     python tests/fuzz/fuzz.py all --minutes 1
 
-What is found is kept in build/fuzz/TARGET: `found-*` are bodies that raise what is no refusal, one
-for each place in the code; `crash-*`, `timeout-*` and `oom-*` are libFuzzer's. `--body FILE` tries
-one again. What is found becomes a test.
+Findings are written to build/fuzz/TARGET. `found-*` are bodies that raise an unexpected error, one
+per place in the code. `crash-*`, `timeout-*` and `oom-*` come from libFuzzer. `--body FILE` tries a
+finding again. Each finding becomes a test.
 """
 
 import argparse
@@ -30,19 +30,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("target", nargs="?", default="all")
     parser.add_argument("--minutes", type=float, default=1.0)
-    parser.add_argument("--body", type=Path, help="try this file and nothing else")
+    parser.add_argument("--body", type=Path, help="try only this file")
     parser.add_argument("--list", action="store_true")
     arguments = parser.parse_args()
     sys.path.insert(0, str(ROOT))
     if arguments.target == "all" and not arguments.list:
-        each_in_turn(arguments.minutes)
+        fuzz_all(arguments.minutes)
         return
     from tests.fuzz.targets import TARGETS
 
     if arguments.list:
         print("\n".join(TARGETS))
     elif arguments.target not in TARGETS:
-        sys.exit(f"no target {arguments.target!r}: --list names them.")
+        sys.exit(f"no target {arguments.target!r}; --list prints all targets.")
     elif arguments.body:
         with tempfile.TemporaryDirectory() as folder:
             TARGETS[arguments.target].attempt(arguments.body.read_bytes(), Path(folder))
@@ -50,8 +50,8 @@ def main() -> None:
         fuzz(TARGETS[arguments.target], arguments.minutes)
 
 
-def each_in_turn(minutes: float) -> None:
-    """libFuzzer ends its process, so each target has its own."""
+def fuzz_all(minutes: float) -> None:
+    """Fuzz each target in its own process, because libFuzzer ends its process."""
     program = [sys.executable, __file__]
     names = subprocess.run([*program, "--list"], check=True, capture_output=True, text=True).stdout
     for name in names.splitlines():
@@ -59,12 +59,12 @@ def each_in_turn(minutes: float) -> None:
 
 
 def fuzz(target, minutes: float) -> None:
-    """Does not return."""
+    """Fuzz one target; libFuzzer ends the process, so the function does not return."""
     import atheris
 
     from tests.fuzz.mutation import WORDS
 
-    for function in ours():
+    for function in package_functions():
         atheris.instrument_func(function)
     logging.disable()
     warnings.simplefilter("ignore")
@@ -77,27 +77,29 @@ def fuzz(target, minutes: float) -> None:
     (out / "words").write_text("".join(f'"{word}"\n' for word in short))
     folder, places = Path(tempfile.mkdtemp(prefix="ldo-fuzz-")), set[str]()
 
-    def once(body: bytes) -> None:
+    def attempt(body: bytes) -> None:
         try:
             target.attempt(body, folder)
         except Exception as error:
-            keep(error, body, out, places)
+            write_finding(error, body, out, places)
 
     sys.argv[1:] = [str(corpus), f"-artifact_prefix={out}/", f"-dict={out / 'words'}", *LIMITS]
     sys.argv.append(f"-max_total_time={round(60 * minutes)}")
-    atheris.Setup(sys.argv, once)
+    atheris.Setup(sys.argv, attempt)
     atheris.Fuzz()
 
 
-def ours() -> list[FunctionType]:
-    """The functions of the package that are loaded. Instrumenting at import has no effect on an
-    editable install."""
+def package_functions() -> list[FunctionType]:
+    """Return the loaded functions of the package.
+
+    Instrumentation at import has no effect on an editable install.
+    """
     found = [one for one in gc.get_objects() if isinstance(one, FunctionType)]
     return [one for one in found if (one.__module__ or "").startswith("ldo_service")]
 
 
-def keep(error: Exception, body: bytes, out: Path, places: set[str]) -> None:
-    """The first body of each place that raises."""
+def write_finding(error: Exception, body: bytes, out: Path, places: set[str]) -> None:
+    """Write the first body for each place in the code that raises."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
     place = f"{type(error).__name__} {frame.filename}:{frame.lineno}"
     if place in places:
@@ -105,8 +107,8 @@ def keep(error: Exception, body: bytes, out: Path, places: set[str]) -> None:
     places.add(place)
     path = out / f"found-{sha1(place.encode()).hexdigest()[:10]}"
     path.write_bytes(body)
-    said = "".join(traceback.format_exception(error))
-    path.with_suffix(".txt").write_text(f"{body[:200]!r}\n\n{said}")
+    report = "".join(traceback.format_exception(error))
+    path.with_suffix(".txt").write_text(f"{body[:200]!r}\n\n{report}")
     print(f"{path.name}: {place}: {error}", file=sys.stderr)
 
 

@@ -1,4 +1,4 @@
-"""What comes over the network."""
+"""Fuzz targets for bytes that arrive over the network."""
 
 from functools import partial
 from pathlib import Path
@@ -38,14 +38,14 @@ PNG_DEPTH = compressed("16UC1; png", bytes(12) + cv2.imencode(".png", ros.DEPTH_
 
 
 def messages(body: bytes, _folder: Path) -> None:
-    """What decodes is valid, so it encodes and decodes again."""
+    """Decode a message; a valid one must encode and decode again."""
     if body:
         kind = KINDS[body[0] % len(KINDS)]
         decode(msgspec.msgpack.encode(decode(body[1:], kind)), kind)
 
 
 def frames(body: bytes, _folder: Path) -> None:
-    """The actor rejects and counts frames that it cannot use; none may make it fail."""
+    """Handle a frame in the frame source, which must reject unusable frames without failing."""
     source = FrameSource(FrameSourceConfig(min_side_px=1))
     for kind in CAMERAS:
         try:
@@ -56,7 +56,7 @@ def frames(body: bytes, _folder: Path) -> None:
 
 
 def images(body: bytes, _folder: Path) -> None:
-    """The first bytes are the size and the encoding."""
+    """Decode an image; the first three bytes are its size and encoding."""
     if len(body) < 3:
         return
     width, height, which, data = *body[:3], memoryview(body[3:])
@@ -67,12 +67,12 @@ def images(body: bytes, _folder: Path) -> None:
     decoders[which % len(decoders)](width, height, data)
 
 
-def of_cameras() -> list[bytes]:
+def camera_seeds() -> list[bytes]:
     examples = [EXAMPLES[name] for name in ("camera_rgbd", "camera_color", "camera_depth")]
     return [msgspec.msgpack.encode(example) for example in examples]
 
 
-def of_images() -> list[bytes]:
+def image_seeds() -> list[bytes]:
     def encoded(suffix: str, pixels: np.ndarray) -> bytes:
         return cv2.imencode(suffix, pixels)[1].tobytes()
 
@@ -91,7 +91,7 @@ def of_images() -> list[bytes]:
 
 PLAIN = RosTopics("/c/image_raw", "/d/image_raw")
 COMPRESSED = RosTopics("/c/image_raw/compressed", "/d/image_raw/compressedDepth")
-ROS = [  # topics, which of them the bytes come on, and good bytes for all of them
+ROS = [  # Topics, the topic of the fuzzed bytes, and valid bytes for all topics.
     (topics, topic, {topics.camera_info: INFO, topics.color: color, topics.depth: depth})
     for topics, color, depth in (
         (PLAIN, cdr(image("rgb8", ros.COLOR)), cdr(image("16UC1", ros.DEPTH_MM))),
@@ -101,8 +101,8 @@ ROS = [  # topics, which of them the bytes come on, and good bytes for all of th
 ]
 
 
-def of_ros(body: bytes, _folder: Path) -> None:
-    """A camera takes whatever comes on its topics; the first byte says on which."""
+def ros_sample(body: bytes, _folder: Path) -> None:
+    """Handle a sample in the ROS 2 camera; the first byte selects its topic."""
     topics, changed, good = ROS[body[0] % len(ROS) if body else 0]
     camera = RosCamera(topics, lambda _: None)
     for topic, sample in good.items():
@@ -126,14 +126,14 @@ LINK_BODIES = [
 
 TARGETS = [
     Target("messages", messages, numbered(BODIES), (msgspec.DecodeError,)),
-    Target("camera frames", frames, of_cameras(), ()),
-    Target("images", images, of_images()),
+    Target("camera frames", frames, camera_seeds(), ()),
+    Target("images", images, image_seeds()),
     Target(
         "links",
         chosen(*LINKS),
         [*numbered(LINK_BODIES), b"\0" + encode_link(ConsumerHello("mapper"))],
         (msgspec.DecodeError,),
     ),
-    Target("ROS 2", of_ros, numbered(good[topic] for _, topic, good in ROS), ()),
+    Target("ROS 2", ros_sample, numbered(good[topic] for _, topic, good in ROS), ()),
     Target("answers of a server", lambda body, _: read_answer(body), [ANSWER]),
 ]

@@ -1,10 +1,10 @@
-"""Valid bytes, changed a little: what noise alone would never get past the first check."""
+"""Mutations of valid bytes, because noise alone would not pass the first check of a reader."""
 
 from collections.abc import Sequence
 
 from hypothesis import strategies as st
 
-# What readers of text and of numbers stumble over.
+# Words that are difficult for readers of text and numbers.
 WORDS = (
     *(b"nan", b"-inf", b"1e999", b"-1", b"0", b"99999999999999999999", b"1.#IND", b"null", b"true"),
     *(b"[]", b"{}", b'""', b"\\ud800", b"..", b"/", b"\n", b",", b":", b"#", b"&a *a", b"!!set {}"),
@@ -16,7 +16,7 @@ MAX_BYTES = 1 << 16
 
 @st.composite
 def mutated(draw: st.DrawFn, seeds: Sequence[bytes]) -> bytes:
-    """One of the seeds after one to four edits; now and then just noise."""
+    """Draw a seed with one to four edits, or sometimes noise."""
     body = draw(st.sampled_from(seeds) if draw(st.integers(0, 15)) else st.binary(max_size=64))
     for _ in range(draw(st.integers(1, 4))):
         body = _edited(draw, body)

@@ -1,4 +1,4 @@
-"""What the service and its runs leave on the disk, and read again."""
+"""Fuzz targets for files that the service and its runs write and read again."""
 
 import json
 import tempfile
@@ -57,15 +57,15 @@ FRAMES = b"frame,stamp_ns,status,held_out\n0,0,OK,0\n1,33333333,LOST,1\n"
 
 
 def bytes_of(write: Callable[[Path], object]) -> bytes:
-    """What it writes to a file."""
+    """Return the bytes that `write` writes to a file."""
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder) / "file")
         return (Path(folder) / "file").read_bytes()
 
 
 # --- maps -----------------------------------------------------------------------------------------
-def as_text(body: bytes) -> bytes:
-    """The same Gaussians as a PLY file in text."""
+def as_text_ply(body: bytes) -> bytes:
+    """Return a PLY file in text with the properties of a binary one."""
     header, _, _ = body.partition(b"end_header\n")
     header = header.replace(b"binary_little_endian", b"ascii")
     return header + b"end_header\n" + b"\n".join(b"1 " * header.count(b"property") for _ in ROWS)
@@ -98,8 +98,8 @@ def gaussians_of_a_chunk() -> bytes:
     return chunk.pack(chunk.Chunk(2, ids, ROWS, new_labels(3)))
 
 
-def places_bytes() -> bytes:
-    """Of a place with two features."""
+def database_bytes() -> bytes:
+    """Return a keyframe database with one keyframe and two features."""
     place = KeyframeRecord(
         id=0,
         submap=0,
@@ -133,7 +133,7 @@ RUN = {
 
 # --- recordings and states ------------------------------------------------------------------------
 def record(path: Path, stamp_ns: int = 2) -> None:
-    """A camera's frame, and the step that took it."""
+    """Write a recording of one camera frame and the step that handled it."""
     body = msgspec.msgpack.encode(EXAMPLES["camera_rgbd"])
     file = RecordingFile(path, {"config": "tracker: {hold_out: 5}"}, RecordConfig())
     file.add_entry(Started(step=0, state={"last_stamp_ns": encode_state(1)}))
@@ -144,7 +144,7 @@ def record(path: Path, stamp_ns: int = 2) -> None:
 
 
 def chunked(body: bytes) -> bytes:
-    """The same recording as other tools write it."""
+    """Return a recording rewritten with the MCAP library, as other tools write it."""
     from mcap.reader import make_reader
     from mcap.writer import Writer
 
@@ -160,8 +160,8 @@ def chunked(body: bytes) -> bytes:
     return out.getvalue()
 
 
-def live_again(folder: Path) -> None:
-    """What `ldo replay` does: a difference is an answer, too."""
+def replay_folder(folder: Path) -> None:
+    """Replay a recording as `ldo replay` does; a difference is a valid result."""
     for actor in open_recording(folder):
         actor.caveats()
         actor.verify()
@@ -173,8 +173,8 @@ def frames_of(folder: Path) -> None:
         sequence[index]
 
 
-def state_of(folder: Path) -> None:
-    """None where it cannot be read, which is said in the log."""
+def load_state(folder: Path) -> None:
+    """Load the state of an actor; an unreadable one is logged and loads as None."""
     FolderStore(folder).load("actor")
 
 
@@ -189,7 +189,7 @@ STATE = {"actor/contents.msgpack": CONTENTS, "actor/sum.a": next(states())}
 RECORDING = bytes_of(record)
 
 of_packed: tuple[type[Exception], ...] = (DataError,)
-of_vocabulary = (LdoError, msgspec.DecodeError, ValueError, KeyError, TypeError)
+VOCABULARY_ERRORS = (LdoError, msgspec.DecodeError, ValueError, KeyError, TypeError)
 
 
 def vocabulary(body: bytes, _folder: Path) -> Any:
@@ -197,10 +197,10 @@ def vocabulary(body: bytes, _folder: Path) -> Any:
 
 
 TARGETS = [
-    Target("PLY", as_file("map.ply", read_ply), [MAP, as_text(MAP)]),
+    Target("PLY", as_file("map.ply", read_ply), [MAP, as_text_ply(MAP)]),
     Target("labels of a map", as_file("s.npz", read_semantics), [SEMANTICS]),
     Target("objects.json", in_folder(OBJECTS, read_objects, {}), [objects_bytes()]),
-    Target("places", in_folder(DATABASE_FILE, load_keyframe_database, {}), [places_bytes()]),
+    Target("places", in_folder(DATABASE_FILE, load_keyframe_database, {}), [database_bytes()]),
     Target("summary.json", in_folder("summary.json", vlm_calls, {}), [RUN["summary.json"]]),
     Target("loops.json", in_folder("loops.json", read_loops, {}), [RUN["loops.json"]]),
     Target(
@@ -219,7 +219,7 @@ TARGETS = [
     Target("chunk of Gaussians", lambda body, _: chunk.unpack(body), [gaussians_of_a_chunk()]),
     Target(
         "recording",
-        in_folder("frame_source.mcap", live_again, {}),
+        in_folder("frame_source.mcap", replay_folder, {}),
         [RECORDING, chunked(RECORDING)],
     ),
     Target(
@@ -227,9 +227,14 @@ TARGETS = [
         in_folder("frame_source.mcap", frames_of, {}),
         [RECORDING, chunked(RECORDING)],
     ),
-    Target("state", in_folder("actor/sum.a", state_of, STATE), list(states()), ()),
+    Target("state", in_folder("actor/sum.a", load_state, STATE), list(states()), ()),
     Target(
-        "contents of a state", in_folder("actor/contents.msgpack", state_of, STATE), [CONTENTS], ()
+        "contents of a state",
+        in_folder("actor/contents.msgpack", load_state, STATE),
+        [CONTENTS],
+        (),
     ),
-    Target("vocabulary", vocabulary, [msgspec.msgpack.encode(Vocabulary().pack())], of_vocabulary),
+    Target(
+        "vocabulary", vocabulary, [msgspec.msgpack.encode(Vocabulary().pack())], VOCABULARY_ERRORS
+    ),
 ]

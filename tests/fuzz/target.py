@@ -1,4 +1,4 @@
-"""What is fuzzed: something that reads bytes of strangers, and what it may answer."""
+"""Fuzz target: a reader of untrusted bytes and the errors that it may raise."""
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -12,10 +12,13 @@ Read = Callable[[bytes, Path], object]
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """`read` takes bytes, and a folder that is its own, where it may leave files for the reader.
+    """Reader of untrusted bytes.
 
-    seeds    what is valid, and is changed a little
-    refuses  how bytes may be refused; whatever else is raised is a mistake of ours
+    Attributes:
+        name: Name of the target.
+        read: The reader; it gets the bytes and a folder of its own for files.
+        seeds: Valid bytes, from which mutations are made.
+        refuses: Errors that the reader may raise. Any other error is a bug.
     """
 
     name: str
@@ -27,27 +30,27 @@ class Target:
         return self.name
 
     def attempt(self, body: bytes, folder: Path) -> None:
-        """Raises what is no refusal."""
+        """Read `body` and raise any unexpected error."""
         with suppress(*self.refuses):
             self.read(body, folder)
 
 
 def as_file(name: str, read: Callable[[Path], object]) -> Read:
-    """Reads a file of that name."""
+    """Return a target function that writes the bytes to a file and reads it."""
 
-    def written(body: bytes, folder: Path) -> object:
+    def write_and_read(body: bytes, folder: Path) -> object:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(body)
         return read(path)
 
-    return written
+    return write_and_read
 
 
 def in_folder(name: str, read: Callable[[Path], object], others: dict[str, bytes]) -> Read:
-    """Reads a folder with that file beside others, which are good."""
+    """Return a target function that reads a folder with the file next to valid others."""
 
-    def written(body: bytes, folder: Path) -> object:
+    def write_and_read(body: bytes, folder: Path) -> object:
         for other, good in {**others, name: body}.items():
             path = folder / other
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,18 +58,18 @@ def in_folder(name: str, read: Callable[[Path], object], others: dict[str, bytes
                 path.write_bytes(good)
         return read(folder)
 
-    return written
+    return write_and_read
 
 
 def chosen(*reads: Callable[[bytes], object]) -> Read:
-    """The first byte says which of them reads the rest."""
+    """Return a target function whose read_chosen byte selects the reader of the rest."""
 
-    def first(body: bytes, _folder: Path) -> object:
+    def read_chosen(body: bytes, _folder: Path) -> object:
         return reads[body[0] % len(reads)](body[1:]) if body else None
 
-    return first
+    return read_chosen
 
 
 def numbered(bodies: Iterable[bytes]) -> list[bytes]:
-    """Seeds for `chosen`, one for each reader."""
+    """Return seeds for `chosen`, one for each reader."""
     return [bytes([number]) + body for number, body in enumerate(bodies)]

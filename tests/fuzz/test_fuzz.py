@@ -1,6 +1,6 @@
-"""Whatever bytes arrive, the answer is a value, or a refusal of the kind that callers expect.
+"""Short fuzzing of all targets: the result is a value or one of the expected errors.
 
-A short run; `fuzz.py` beside this file goes on for as long as it is told.
+The program `fuzz.py` runs for any time.
 """
 
 import logging
@@ -15,7 +15,7 @@ from .mutation import mutated
 from .target import Target
 from .targets import TARGETS
 
-SLOW = {"ONNX", "config.yaml"}  # tens of milliseconds each
+SLOW = {"ONNX", "config.yaml"}  # Tens of milliseconds per body.
 
 
 @pytest.fixture(autouse=True)
@@ -25,14 +25,14 @@ def quiet(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("target", TARGETS.values(), ids=str)
-def test_seeds_are_what_they_stand_for(target: Target, tmp_path: Path) -> None:
-    """Or their changes would be judged by the first check alone."""
+def test_seed_is_read_without_error(target: Target, tmp_path: Path) -> None:
+    """Mutations of an invalid seed would only reach the first check of a reader."""
     for seed in target.seeds[:1]:
         target.read(seed, tmp_path)
 
 
 @pytest.mark.parametrize("target", TARGETS.values(), ids=str)
-def test_what_is_damaged_is_refused(target: Target, tmp_path: Path) -> None:
+def test_damaged_bytes_raise_only_expected_errors(target: Target, tmp_path: Path) -> None:
     @settings(
         max_examples=5 if target.name in SLOW else 40,
         deadline=None,

@@ -1,4 +1,4 @@
-"""What fuzzing found, tried again: each of these once raised what nobody expected."""
+"""Regression tests of fuzzing: each of these bodies once raised an unexpected error."""
 
 import logging
 import re
@@ -16,23 +16,23 @@ from .run_folder_targets import RUN, SEMANTICS, bytes_of, gaussians_of_a_chunk, 
 from .targets import TARGETS
 
 DEEP_JSON, DEEP_YAML, DEEP_MSGPACK = b'{"a": ' * 100_000, b"{a: " * 3000, b"\x91" * 100_000
-NO_TEXT = b"\xff\xfe\x80"
+INVALID_UTF8 = b"\xff\xfe\x80"
 LONG_CHUNK = png(IMAGE)[:8] + struct.pack(">I4s", 4_000_000_000, b"IDAT") + bytes(300)
 LARGE_JPEG = jpeg(IMAGE).replace(struct.pack(">HH", *IMAGE.shape[:2]), b"\x7f\xff" * 2)
 LOOPS = RUN["loops.json"]
 ENCRYPTED = re.sub(rb"(PK\x01\x02.{4})..", b"\\g<1>\x01\x00", SEMANTICS, flags=re.DOTALL)
 CHUNK = gaussians_of_a_chunk()
-LARGE_CHUNK = CHUNK[:4] + b"\xe0" + b"\xff" * 7 + b"\x0f" + CHUNK[6:]  # says that it is 10^18 bytes
+LARGE_CHUNK = CHUNK[:4] + b"\xe0" + b"\xff" * 7 + b"\x0f" + CHUNK[6:]  # The stated size is 10^18.
 
 FOUND = [
-    ("Replica: traj.txt", NO_TEXT),
+    ("Replica: traj.txt", INVALID_UTF8),
     ("Replica: cam_params.json", DEEP_JSON),
     ("TUM: rgb.txt", b"0.1 rgb/\0.png\n"),
     ("TUM: rgb.txt", b"99999999999999999999 rgb/a.png\n"),
     ("TUM: rgb/a.png", LONG_CHUNK + b"IEND\xaeB`\x82"),
     ("Replica: results/frame000000.jpg", LARGE_JPEG),
     ("images", bytes([40, 32, 3]) + LONG_CHUNK),
-    ("about.json", b'{"sha256": "' + NO_TEXT + b'"}'),
+    ("about.json", b'{"sha256": "' + INVALID_UTF8 + b'"}'),
     ("objects.json", DEEP_JSON),
     ("loops.json", DEEP_JSON),
     ("keyframes.json", DEEP_JSON),
@@ -46,7 +46,7 @@ FOUND = [
         "contents of a state",
         msgspec.msgpack.encode({"files": {"sum": "\0"}, "version": STATE_VERSION}),
     ),
-    ("state", bytes.fromhex("d80193a32c666390c4080000008000009a0440")),  # the type is ",fc"
+    ("state", bytes.fromhex("d80193a32c666390c4080000008000009a0440")),  # The type is ",fc".
     ("labels of a map", ENCRYPTED),
     ("loops.json", LOOPS.replace(b'"reference": 1', b'"reference": 1e999')),
     ("keyframes.json", RUN["keyframes.json"].replace(b'"keyframe": 0', b'"keyframe": 1e999')),
@@ -56,7 +56,7 @@ FOUND = [
     ("config.yaml", b"tracker: 2027-13-45\n"),
     ("--set", b"tracker.hold_out=" + b"[" * 3000),
     ("suite", DEEP_YAML),
-    ("access.yaml", b"[" * 100_000),  # this one ended the process
+    ("access.yaml", b"[" * 100_000),  # This body ended the process.
     ("access.yaml", b'"\\ud800": {role: camera, robot: mule}'),
     ("names that a network carries", b"{['a', 0]: ''}"),
     ("access.yaml", b"a: {role: camera, robot: mule, until: 2027-13-01}"),
@@ -66,7 +66,7 @@ FOUND = [
 @pytest.mark.parametrize(
     ("name", "body"), FOUND, ids=[f"{name} {number}" for number, (name, _) in enumerate(FOUND)]
 )
-def test_it_is_refused_now(
+def test_fixed_finding_raises_only_expected_errors(
     name: str, body: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.CRITICAL + 1):

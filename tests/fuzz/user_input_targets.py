@@ -1,4 +1,4 @@
-"""What users write and bring: settings, suites, names, keys and networks."""
+"""Fuzz targets for user input: settings, suites, names, keys and networks."""
 
 import gzip
 import hashlib
@@ -45,16 +45,16 @@ EMBEDDINGS = np.eye(2, dtype=np.float32)
 
 
 def config(path: Path) -> None:
-    """What is taken is written and read again as the same."""
-    taken = load_config(path)
-    assert config_of(yaml.safe_load(config_yaml(taken))) == taken
+    """Load a configuration; an accepted one must be the same after writing and reading it."""
+    loaded = load_config(path)
+    assert config_of(yaml.safe_load(config_yaml(loaded))) == loaded
 
 
 def setting(body: bytes, _folder: Path) -> None:
     load_config(settings=(body.decode("utf-8", "replace"),))
 
 
-def of_names(take: Callable[[str], object]) -> Read:
+def as_text(take: Callable[[str], object]) -> Read:
     return lambda body, _: take(body.decode("utf-8", "replace"))
 
 
@@ -77,7 +77,7 @@ def keys(folder: Path) -> None:
     TlsKeys(folder).context()
 
 
-def of_an_authority() -> dict[str, bytes]:
+def key_files() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as name:
         authority = CertificateAuthority.new(Path(name) / "keys", 9)
         made = authority.add("desk", "viewer", "*", 9)
@@ -85,15 +85,15 @@ def of_an_authority() -> dict[str, bytes]:
 
 
 NET = {"net/model.onnx": b"x"}
-KEYS = of_an_authority()
+KEYS = key_files()
 NETWORK = bytes_of(SQUARES["yolox"].write)
 
 TARGETS = [
     Target("config.yaml", as_file("config.yaml", config), [CONFIG]),
     Target("--set", setting, [b"tracker.hold_out=5", b"dataset.T_color_depth=[1, 0]"]),
     Target("suite", as_file("suite.yaml", lambda path: load_suite(str(path))), [SUITE]),
-    Target("names of robots", of_names(Endpoint), [b"mule", b"../up"]),
-    Target("endpoints", of_names(lambda text: Endpoint("r", text).address), [b"tcp/[::1]:7447"]),
+    Target("names of robots", as_text(Endpoint), [b"mule", b"../up"]),
+    Target("endpoints", as_text(lambda text: Endpoint("r", text).address), [b"tcp/[::1]:7447"]),
     Target(
         "access.yaml",
         as_file("access.yaml", lambda path: access_control(read_access(path))),
@@ -107,7 +107,7 @@ TARGETS = [
     Target("names of classes", as_file("names.txt", read_names), [b"chair\nsofa\n"]),
     Target(
         "names that a network carries",
-        of_names(lambda text: class_names(2, metadata=text)),
+        as_text(lambda text: class_names(2, metadata=text)),
         [b"{0: 'chair', 1: 'sofa'}", b"['a', 'b']"],
     ),
     Target("byte pairs", as_file("bpe", read_tokenizer), [MERGES, gzip.compress(MERGES, mtime=0)]),
