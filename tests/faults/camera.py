@@ -1,4 +1,4 @@
-"""A camera that goes to and fro in the synthetic room, at a quarter of its pixels."""
+"""Camera that moves to and fro in the synthetic room, at a quarter of its pixels."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,13 +20,13 @@ STRIDE, PERIOD_NS, FIRST_NS = 2, 100_000_000, 1_000_000_000
 
 
 def frames() -> list[CameraRgbd]:
-    """There and back, without a jump where it begins again."""
+    """Return the frames of a way there and back, which repeats without a jump."""
     room = open_sequence("synthetic:room")
     return _and_back([raw_frame_to_message(_smaller(room.read(i))) for i in _indices(room)])
 
 
 def true_poses() -> list[np.ndarray]:
-    """T_world_camera [4, 4] of each of `frames`."""
+    """Return T_world_camera [4, 4] of each of `frames`."""
     room = open_sequence("synthetic:room")
     truth = room.truth()
     assert truth is not None
@@ -48,12 +48,12 @@ def _smaller(raw: RawFrame) -> RawFrame:
 
 
 def number_of(stamp_ns: int) -> int:
-    """How many frames were sent before the one with this stamp."""
+    """Return the number of frames sent before the one with this stamp."""
     return (stamp_ns - FIRST_NS) // PERIOD_NS
 
 
-class Streaming:
-    """Sends frames in a thread, `rate_hz` of them, with stamps that go on."""
+class CameraStream:
+    """Thread that sends frames at `rate_hz`, with increasing stamps."""
 
     def __init__(self, scene: list[CameraRgbd], rate_hz: float) -> None:
         self._scene, self._period_s = scene, 1 / rate_hz
@@ -70,12 +70,12 @@ class Streaming:
         self._thread.join()
 
     def skip(self, frames: int) -> None:
-        """The camera moves on and nobody sees it."""
+        """Move the camera on without sending the frames."""
         self.sent += frames
 
     @property
     def stamp_ns(self) -> int:
-        """Of the next frame."""
+        """Stamp of the next frame, in nanoseconds."""
         return FIRST_NS + self.sent * PERIOD_NS
 
     def _stream(self, send: Callable[[CameraRgbd], None]) -> None:
@@ -84,5 +84,5 @@ class Streaming:
             try:
                 send(msgspec.structs.replace(frame, frame=self.sent, stamp_ns=self.stamp_ns))
             except zenoh.ZError:
-                return  # the service has ended, and its session with it
+                return  # The service and its session have ended.
             self.sent += 1

@@ -1,9 +1,9 @@
-"""`ldo` on bad ground: arguments of `ldo`, and in the environment
+"""Command `ldo` with faults that files in the folder of the variable FAULT_FOLDER switch on.
 
-FAULT_FOLDER   a file `hang-ACTOR` there makes that actor's next step hang, once, and is removed;
-               while `bad_network` is there, messages to it are lost, late and out of order;
-               while `bad_disk` is there, files are often not renamed, removed or synced, nor
-               folders made; `refusals` gets a byte for each
+- `hang-ACTOR`: The next step of that actor hangs, and the file is removed.
+- `bad_network`: Messages are lost, late and out of order while the file exists.
+- `bad_disk`: Renames, removals, syncs and new folders often fail while the file exists.
+- `refusals`: The service appends a byte for each disk call that failed on purpose.
 """
 
 import errno
@@ -25,10 +25,10 @@ from ldo_service.transport.zenoh_transport import ZenohTransport
 
 FOLDER = Path(os.environ["FAULT_FOLDER"])
 BAD_NETWORK, BAD_DISK = FOLDER / "bad_network", FOLDER / "bad_disk"
-LOST, LATE, LATEST_S = 0.15, 0.4, 0.3  # shares of the messages; and so late at most
-REFUSED, REASONS = 0.5, (errno.ENOSPC, errno.EIO, errno.EROFS)  # share of the calls, and why
+LOST, LATE, MAX_DELAY_S = 0.15, 0.4, 0.3  # Fractions of the messages, and their maximum delay.
+REFUSED, REASONS = 0.5, (errno.ENOSPC, errno.EIO, errno.EROFS)  # Fraction of calls, and errors.
 REFUSALS = "refusals"
-DISK_CALLS = ("rename", "replace", "unlink", "fsync", "mkdir")  # of `os`, which pathlib asks
+DISK_CALLS = ("rename", "replace", "unlink", "fsync", "mkdir")  # Functions of `os`.
 
 
 def hanging(actor: Actor) -> Actor:
@@ -53,7 +53,7 @@ class BadTransport(ZenohTransport):
     def subscribe(self, key: str, on_message: OnMessage) -> None:
         rng = Random(key)
 
-        def maybe(header: bytes, body: memoryview) -> None:
+        def deliver_or_not(header: bytes, body: memoryview) -> None:
             if not BAD_NETWORK.exists():
                 on_message(header, body)
                 return
@@ -61,15 +61,15 @@ class BadTransport(ZenohTransport):
             if fate >= LOST + LATE:
                 on_message(header, body)
             elif fate >= LOST:
-                late = Timer(LATEST_S * rng.random(), on_message, (header, body))
+                late = Timer(MAX_DELAY_S * rng.random(), on_message, (header, body))
                 late.daemon = True
                 late.start()
 
-        super().subscribe(key, maybe)
+        super().subscribe(key, deliver_or_not)
 
 
 def refused_at_times(name: str) -> Callable[..., Any]:
-    """A function of `os`."""
+    """Return a function of `os` that fails at random while the bad disk is switched on."""
     call, rng = getattr(os, name), Random(f"{name}-{os.getpid()}")
 
     def call_or_refuse(*arguments: Any, **options: Any) -> Any:

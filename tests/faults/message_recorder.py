@@ -1,4 +1,4 @@
-"""Who listens from outside and says what must not have happened."""
+"""Recorder of the published messages of a service that detects violated invariants."""
 
 import hashlib
 import time
@@ -22,7 +22,7 @@ from ldo_service.schemas import (
 from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.flow_control import Credit, Header, decode_request
 
-TAKERS = ("detector", "mapper", "loop_closer", "optimizer")  # of keyframes
+CONSUMERS = ("detector", "mapper", "loop_closer", "optimizer")  # Consumers of keyframes.
 KINDS: dict[str, type[Message]] = {
     "keyframe/new": Keyframe,
     "link/again/keyframe/new": Keyframe,
@@ -31,79 +31,82 @@ KINDS: dict[str, type[Message]] = {
     "map/snapshot": MapSnapshot,
     "pose/tracked": TrackedPose,
 }
-BEHIND_S = 5.0  # for what is still on its way
-GRANTS = "link/grant/keyframe/new"
+BEHIND_S = 5.0  # Time after which a message that is still missing counts as lost.
+CREDITS = "link/grant/keyframe/new"
 
 
 @dataclass
-class Witness:
-    """Across all lives of a service on one state folder. `violations` says what was seen."""
+class MessageRecorder:
+    """Messages of all processes of a service on one state folder, and violated invariants."""
 
     violations: list[str] = field(default_factory=list)
-    made: dict[int, bytes] = field(default_factory=dict)  # keyframe: digest of its message
-    numbers: dict[tuple[int, int], int] = field(default_factory=dict)  # epoch, seq: keyframe
-    handled: dict[str, tuple[int, int]] = field(default_factory=dict)  # taker: epoch, next seq
-    placed: set[int] = field(default_factory=set)  # keyframes of the last correction
+    # Digest of the message by keyframe.
+    keyframes: dict[int, bytes] = field(default_factory=dict)
+    # Keyframe by epoch and sequence number.
+    numbers: dict[tuple[int, int], int] = field(default_factory=dict)
+    # Epoch and next sequence number by consumer.
+    handled: dict[str, tuple[int, int]] = field(default_factory=dict)
+    placed: set[int] = field(default_factory=set)  # Keyframes of the last correction.
     graph_version: int = 0
     map_version: int = 0
-    last_delta: tuple[int, int] = (0, -1)  # epoch and number
+    last_delta: tuple[int, int] = (0, -1)  # Epoch and sequence number.
     pose: TrackedPose | None = None
-    first_stamp_ns: int | None = None  # of keyframe 0, whose frame the map's is
+    first_stamp_ns: int | None = None  # Stamp of keyframe 0, which defines the map frame.
     health: dict[str, tuple[float, Health]] = field(default_factory=dict)
-    follower: MapReplica = field(default_factory=MapReplica)  # from the first message on
-    late: MapReplica = field(default_factory=MapReplica)  # from the last fault on
+    replica: MapReplica = field(default_factory=MapReplica)  # Map since the first message.
+    late_replica: MapReplica = field(default_factory=MapReplica)  # Map since the last fault.
     _behind_since: float | None = None
     _subscribers: list[object] = field(default_factory=list)
-    _heard: deque[tuple[str, bytes, bytes]] = field(default_factory=lambda: deque(maxlen=20_000))
+    _received: deque[tuple[str, bytes, bytes]] = field(default_factory=lambda: deque(maxlen=20_000))
 
-    # --- hearing ----------------------------------------------------------------------------------
+    # --- receiving --------------------------------------------------------------------------------
     def listen(self, session: zenoh.Session, network: Endpoint) -> None:
-        """For as long as the session lives. Who listens now may have missed something."""
-        self.follower, self.late = MapReplica(), MapReplica()
+        """Subscribe until the session ends, with empty replicas that may have missed messages."""
+        self.replica, self.late_replica = MapReplica(), MapReplica()
         self._subscribers.clear()
-        for topic in (*KINDS, GRANTS, "health/*"):
+        for topic in (*KINDS, CREDITS, "health/*"):
             prefix = network.expression("")
 
             def store(sample: zenoh.Sample, prefix: str = prefix) -> None:
                 attachment = sample.attachment
                 header = attachment.to_bytes() if attachment is not None else b""
                 topic = str(sample.key_expr).removeprefix(prefix)
-                self._heard.append((topic, header, sample.payload.to_bytes()))
+                self._received.append((topic, header, sample.payload.to_bytes()))
 
             handler = zenoh.handlers.Callback(store, indirect=False)
             expression = network.expression(topic)
             self._subscribers.append(session.declare_subscriber(expression, handler))
 
     def join_late(self, snapshot: Iterable[Message]) -> None:
-        """Follow the map anew, from the last snapshot that there is."""
+        """Start the late replica again from the last snapshot."""
         self.update()
-        self.late = MapReplica()
+        self.late_replica = MapReplica()
         for part in snapshot:
             assert isinstance(part, MapSnapshot)
-            self.late.apply(part)
+            self.late_replica.apply(part)
 
     def _follow(self, message: MapDelta | MapSnapshot) -> None:
-        self.follower.apply(message)
-        self.late.apply(message)
+        self.replica.apply(message)
+        self.late_replica.apply(message)
 
     def update(self) -> None:
-        """Judge what came since the last call."""
-        while self._heard:
-            topic, header, body = self._heard.popleft()
-            if topic == GRANTS:
-                self._granted(decode_request(memoryview(body)))
+        """Check the messages received since the last call."""
+        while self._received:
+            topic, header, body = self._received.popleft()
+            if topic == CREDITS:
+                self._add_credit(decode_request(memoryview(body)))
             elif topic.startswith("health/"):
                 health = decode(body, Health)
                 self.health[health.actor] = time.monotonic(), health
             else:
-                self._told(decode(body, KINDS[topic]), header, body)
+                self._handle(decode(body, KINDS[topic]), header, body)
 
-    def _told(self, message: Message, header: bytes, body: bytes) -> None:
+    def _handle(self, message: Message, header: bytes, body: bytes) -> None:
         match message:
             case Keyframe():
-                self._made(message, decode(header, Header), hashlib.blake2b(body).digest())
+                self._add_keyframe(message, decode(header, Header), hashlib.blake2b(body).digest())
             case GraphCorrection():
-                self._corrected(message)
+                self._add_correction(message)
             case MapDelta():
                 of = decode(header, Header)
                 self.last_delta = of.epoch, of.seq
@@ -115,18 +118,18 @@ class Witness:
             case TrackedPose():
                 self.pose = message
 
-    # --- judging ----------------------------------------------------------------------------------
-    def _made(self, message: Keyframe, header: Header, digest: bytes) -> None:
+    # --- invariants -------------------------------------------------------------------------------
+    def _add_keyframe(self, message: Keyframe, header: Header, digest: bytes) -> None:
         if message.keyframe == 0:
             self.first_stamp_ns = message.stamp_ns
-        known = self.made.setdefault(message.keyframe, digest)
+        known = self.keyframes.setdefault(message.keyframe, digest)
         if known != digest:
             self.violations.append(f"keyframe {message.keyframe} was made twice")
         number = self.numbers.setdefault((header.epoch, header.seq), message.keyframe)
         if number != message.keyframe:
             self.violations.append(f"number {header.seq} was given to {number} and its successor")
 
-    def _granted(self, grant: object) -> None:
+    def _add_credit(self, grant: object) -> None:
         if isinstance(grant, Credit):
             epoch, handled = self.handled.get(grant.consumer, (grant.epoch, 0))
             if epoch == grant.epoch and grant.handled < handled:
@@ -135,7 +138,7 @@ class Witness:
                 )
             self.handled[grant.consumer] = grant.epoch, grant.handled
 
-    def _corrected(self, message: GraphCorrection) -> None:
+    def _add_correction(self, message: GraphCorrection) -> None:
         self._must_grow("graph", self.graph_version, message.graph_version)
         self.graph_version = message.graph_version
         ids = message.keyframes.numpy().tolist()
@@ -149,14 +152,16 @@ class Witness:
         if now <= before:
             self.violations.append(f"version {now} of the {what} came after {before}")
 
-    def acknowledged_by(self, taker: str) -> set[int]:
-        """Keyframes that a consumer has said to have handled."""
-        epoch, handled = self.handled.get(taker, (0, 0))
+    def acknowledged_by(self, consumer: str) -> set[int]:
+        """Return the keyframes that a consumer has acknowledged."""
+        epoch, handled = self.handled.get(consumer, (0, 0))
         return {k for (of, seq), k in self.numbers.items() if of == epoch and seq < handled}
 
     def has_missed_deltas(self) -> bool:
-        """Whether the mapper said a while ago that it sent more than came: the network may lose
-        what goes outside."""
+        """Return whether map deltas that the mapper sent some time ago were not received.
+
+        The network may lose messages to external subscribers.
+        """
         at, mapper = self.health["mapper"]
         sent = {count.topic: count.sent for count in mapper.outputs}["map/delta"]
         epoch, seq = self.last_delta
@@ -167,15 +172,15 @@ class Witness:
         self._behind_since = self._behind_since or at
         if time.monotonic() - self._behind_since < BEHIND_S:
             return False
-        self.follower.is_behind = self.late.is_behind = True
+        self.replica.is_behind = self.late_replica.is_behind = True
         return True
 
     def is_caught_up(self) -> bool:
-        """Whether all consumers have handled every keyframe that was seen."""
-        return all(self.acknowledged_by(taker) == set(self.made) for taker in TAKERS)
+        """Return whether all consumers have handled every received keyframe."""
+        return all(self.acknowledged_by(consumer) == set(self.keyframes) for consumer in CONSUMERS)
 
     def repeated(self) -> Iterator[str]:
-        """Who took a keyframe twice."""
+        """Yield a violation for each actor that handled a keyframe twice."""
         for actor, (_, health) in self.health.items():
             if count := health.metrics.get("keyframes_repeated", 0):
                 yield f"{actor} took {count:g} keyframes twice"

@@ -1,4 +1,4 @@
-"""The service under test: its lives on one state folder, and what its state says from outside."""
+"""Service under test on one state folder, and access to its saved and published state."""
 
 import os
 import shutil
@@ -34,13 +34,13 @@ from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_endpoint
 
-from .message_recorder import Witness
+from .message_recorder import MessageRecorder
 
 PROGRAM = Path(__file__).with_name("faulty_service.py")
-PATIENCE_S = 120.0  # on a machine with much else to do
+PATIENCE_S = 120.0  # Time limit on a busy machine.
 ACTORS = tuple(box.name for box in GRAPH)
 ALL_APART = f"service.process_actors=[{','.join(ACTORS)}]"
-LIGHT = (  # what is tested is the runtime: little work for each keyframe, and little patience
+LIGHT = (  # Little work per keyframe and short timeouts, because the runtime is tested.
     *(
         "mapper.iterations=2",
         "mapper.threads=1",
@@ -52,7 +52,7 @@ LIGHT = (  # what is tested is the runtime: little work for each keyframe, and l
         "supervision.max_restarts=1000",
         "service.shutdown_timeout_s=60",
     ),
-    "detector.model=demo",  # finds some objects in the room
+    "detector.model=demo",  # This model finds some objects in the room.
 )
 
 
@@ -61,17 +61,17 @@ class NotRecovered(Exception):
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What a service shows of its map and its graph."""
+class PublishedState:
+    """Map, objects and graph that a service publishes."""
 
     map: MapReplica
-    objects: tuple[MapObject, ...] | None  # None before any were told, or where nobody looked
+    objects: tuple[MapObject, ...] | None  # Unset (None) before the first message.
     graph: GraphCorrection | None
 
     @classmethod
-    def of(cls, messages: Iterable[Any]) -> "Shown | None":
-        """None where there is no map."""
-        follower, objects, graph = MapReplica(), None, None
+    def of(cls, messages: Iterable[Any]) -> "PublishedState | None":
+        """Build the published state from messages; return None without a map."""
+        replica, objects, graph = MapReplica(), None, None
         for message in messages:
             match message:
                 case MapObjects():
@@ -79,15 +79,15 @@ class Shown:
                 case GraphCorrection():
                     graph = message
                 case _:
-                    follower.apply(message)
-        return cls(follower, objects, graph) if follower.version else None
+                    replica.apply(message)
+        return cls(replica, objects, graph) if replica.version else None
 
 
-class Life:
-    """`start`, and after a `kill` again."""
+class ServiceProcess:
+    """Service that can be started again on the same state after a `kill`."""
 
-    def __init__(self, folder: Path, witness: Witness, settings: tuple[str, ...]) -> None:
-        self.folder, self.witness = folder, witness
+    def __init__(self, folder: Path, recorder: MessageRecorder, settings: tuple[str, ...]) -> None:
+        self.folder, self.recorder = folder, recorder
         self.settings = (*LIGHT, *settings)
         self.log: deque[str] = deque(maxlen=400)
         self._stack = ExitStack()
@@ -96,7 +96,7 @@ class Life:
     def state(self) -> Path:
         return self.folder / "s"
 
-    # --- life and death ---------------------------------------------------------------------------
+    # --- start and stop ---------------------------------------------------------------------------
     def start(self) -> None:
         network = Endpoint("robot", free_endpoint())
         settings = [word for setting in self.settings for word in ("--set", setting)]
@@ -110,11 +110,11 @@ class Life:
             text=True,
         )
         Thread(target=self._read_log, args=(self.process,), daemon=True).start()
-        self.witness.health.clear()
-        self.witness.pose = None
+        self.recorder.health.clear()
+        self.recorder.pose = None
         self.client = self._connect(network)
         session = self._stack.enter_context(open_session(network))
-        self.witness.listen(session, network)
+        self.recorder.listen(session, network)
 
     def _read_log(self, process: subprocess.Popen[str]) -> None:
         assert process.stderr
@@ -131,9 +131,9 @@ class Life:
         raise NotRecovered(f"the service does not answer:\n{self.tail()}")
 
     def kill(self) -> None:
-        """-9, to all its processes at once."""
-        self.witness.update()
-        pids = {self.process.pid, *(health.pid for _, health in self.witness.health.values())}
+        """Send SIGKILL to all processes of the service at once."""
+        self.recorder.update()
+        pids = {self.process.pid, *(health.pid for _, health in self.recorder.health.values())}
         for pid in pids | children_of(self.process.pid):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -155,10 +155,14 @@ class Life:
         return "".join(list(self.log)[-lines:])
 
     def wait(self, what: str, true: Callable[[], object], timeout_s: float = PATIENCE_S) -> float:
-        """Seconds that it took. Raises NotRecovered."""
+        """Wait for a condition and return the seconds it took.
+
+        Raises:
+            NotRecovered: The service has ended, or the time limit is over.
+        """
         started_s = time.monotonic()
         while True:
-            self.witness.update()
+            self.recorder.update()
             if true():
                 return time.monotonic() - started_s
             if self.process.poll() is not None:
@@ -167,21 +171,26 @@ class Life:
                 raise NotRecovered(f"not within {timeout_s:g} s: {what}")
             time.sleep(0.02)
 
-    # --- what is in the map -----------------------------------------------------------------------
+    # --- content of the map -----------------------------------------------------------------------
     def saved_map(self) -> dict[str, np.ndarray]:
-        """Of the checkpoint that is on the disk now."""
+        """Return the state of the mapper from its checkpoint on the disk."""
         state = FolderStore(self.state / "state").load("mapper")
         assert state is not None
         return state["map"]
 
-    def told(self) -> Shown | None:
-        """What who joins now is told."""
+    def published(self) -> PublishedState | None:
+        """Return the published state that a new subscriber receives."""
         topics = MAP_SNAPSHOT, MAP_OBJECTS, GRAPH_CORRECTION
-        return Shown.of(message for topic in topics for message in self.client.latest(topic, 10))
+        return PublishedState.of(
+            message for topic in topics for message in self.client.latest(topic, 10)
+        )
 
-    def expected(self) -> Shown | None:
-        """What a service must show that goes on from the state on the disk: its checkpoint, with
-        what was taken since handled again in this process. None before the first keyframe."""
+    def expected(self) -> PublishedState | None:
+        """Return the state that a service restored from the disk must publish.
+
+        It is the checkpoint with the write-ahead log replayed in this process. It is None before
+        the first keyframe.
+        """
         store = FolderStore(self.state / "state")
         past, of_graph = (
             RestoredState.of(store.load("mapper")),
@@ -201,28 +210,28 @@ class Life:
         def optimizer() -> Optimizer:
             return Optimizer(parameters.optimizer)
 
-        said = [
+        messages = [
             *restore_actor(mapper(), past, mapper).on_restored(),
             *restore_actor(optimizer(), of_graph, optimizer).on_restored(),
         ]
-        return Shown.of(
-            m for m in said if isinstance(m, MapSnapshot | MapObjects | GraphCorrection)
+        return PublishedState.of(
+            m for m in messages if isinstance(m, MapSnapshot | MapObjects | GraphCorrection)
         )
 
 
 def saved_objects(state: Mapping[str, Any]) -> tuple[MapObject, ...]:
-    """Of the mapper's checkpoint."""
+    """Return the objects in the checkpoint of the mapper."""
     semantics = SemanticMap(MapBuilder())
     semantics.restore(state["semantics"])
     return map_objects(semantics.objects.landmarks, semantics.names)
 
 
-def arrays_of(follower: MapReplica) -> dict[str, np.ndarray]:
-    return follower.map.snapshot()
+def arrays_of(replica: MapReplica) -> dict[str, np.ndarray]:
+    return replica.map.snapshot()
 
 
 def difference(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> str:
-    """Of the Gaussians, in a word; empty where there is none, to the bit."""
+    """Describe the first difference of two maps; return "" if they are equal bit by bit."""
     for name in ("ids", "anchors", "rows", "labels"):
         a, b = one[name], other[name]
         if a.shape != b.shape:
@@ -235,7 +244,7 @@ def difference(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -
 
 
 def objects_difference(one: Iterable[MapObject], other: Iterable[MapObject]) -> str:
-    """Of objects, by id: which are in one alone, and what else is not the same."""
+    """Describe the differences of objects by id: missing ones and different fields."""
     a, b = ({thing.id: thing for thing in things} for things in (one, other))
     fields = [
         f"{name} of {k}: {before} and {now}"
