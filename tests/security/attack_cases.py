@@ -1,6 +1,6 @@
-"""What a stranger or a careless program may try on the network, what must come of it, what does.
+"""Attempts of unauthorized and faulty programs on the network, with their expected results.
 
-Each attempt runs against the real thing, and tells in the words of `expected` what it saw.
+Each attempt runs against a real router and returns its result in the words of `expected`.
 """
 
 import asyncio
@@ -34,17 +34,17 @@ from .network_fixture import (
     SETTLED,
     STOLEN,
     Lab,
-    asked,
     direct,
     eventually,
-    heard,
     puts,
+    query,
+    received_topics,
 )
 
 NOTHING, NO_CONNECTION, NO_ANSWER = "nothing comes through", "no connection", "no answer"
 READABLE = sorted(set(NAMES) - {CONTROL.name, SETTLED, *INSIDE})
 ALL_BUT_CONTROL = f"{len(READABLE)} of {len(TOPICS)} topics, without control and links"
-FLOOD = 3000  # messages
+FLOOD = 3000  # Number of messages.
 ATTEMPTS: list[Attempt[Lab]] = []
 attempt = kept_in(ATTEMPTS)
 
@@ -54,7 +54,7 @@ def topics(found: list[str]) -> str:
 
 
 def connecting(network: Endpoint) -> str:
-    """Whether one is let in, or what is said to it."""
+    """Return whether a connection succeeds, or the reason why it fails."""
     try:
         with patch.object(zenoh_transport, "CONNECT_WITHIN_MS", 500), open_session(network):
             return "connected"
@@ -63,7 +63,7 @@ def connecting(network: Endpoint) -> str:
         return f"{NO_CONNECTION}: {why}" if why else NO_CONNECTION
 
 
-# --- who is let in --------------------------------------------------------------------------------
+# --- connections ----------------------------------------------------------------------------------
 @attempt("connect without TLS", NO_CONNECTION)
 def without_tls(lab: Lab) -> str:
     return connecting(Endpoint(ROBOT, lab.network.endpoint.replace("tls/", "tcp/")))
@@ -89,15 +89,15 @@ def without_certificate(lab: Lab) -> str:
 
 @attempt("connect with a certificate of another authority", f"{NO_CONNECTION}: UNKNOWN_CA")
 def other_authority(lab: Lab) -> str:
-    return connecting(stranger(lab, trusts_ours=True)).replace("TLSV1_ALERT_", "")
+    return connecting(foreign_camera(lab, trusts_ours=True)).replace("TLSV1_ALERT_", "")
 
 
 @attempt(
-    "be a router of another authority, which a camera connects to",
+    "connect a camera to a router of another authority",
     f"{NO_CONNECTION}: unable to get local issuer certificate",
 )
 def router_of_another(lab: Lab) -> str:
-    return connecting(stranger(lab, trusts_ours=False))
+    return connecting(foreign_camera(lab, trusts_ours=False))
 
 
 @attempt("connect with a certificate that has expired", f"{NO_CONNECTION}: CERTIFICATE_EXPIRED")
@@ -105,19 +105,19 @@ def expired(lab: Lab) -> str:
     return connecting(lab.keys(EXPIRED)).replace("SSLV3_ALERT_", "")
 
 
-@attempt("put a frame with keys that were lost and made again", NOTHING)
+@attempt("put a frame with revoked keys", NOTHING)
 def stolen(lab: Lab) -> str:
     return topics(lab.through(puts(lab.keys(STOLEN), CAMERA_RGBD.name)))
 
 
-@attempt("put a frame with the keys made in their place", CAMERA_RGBD.name)
+@attempt("put a frame with the keys that replaced them", CAMERA_RGBD.name)
 def made_again(lab: Lab) -> str:
     return topics(lab.through(puts(lab.keys(LOST), CAMERA_RGBD.name), CAMERA_RGBD.name))
 
 
-def stranger(lab: Lab, trusts_ours: bool) -> Endpoint:
-    """A camera of another authority."""
-    folder = lab.folder.with_name(f"strangers {trusts_ours}")
+def foreign_camera(lab: Lab, trusts_ours: bool) -> Endpoint:
+    """Return the endpoint of a camera with keys of another authority."""
+    folder = lab.folder.with_name(f"foreign {trusts_ours}")
     if not folder.exists():
         CertificateAuthority.new(folder, days=2).add("camera", "camera", ROBOT, days=1)
     if trusts_ours:
@@ -125,7 +125,7 @@ def stranger(lab: Lab, trusts_ours: bool) -> Endpoint:
     return Endpoint(ROBOT, lab.network.endpoint, TlsKeys(folder / "camera"))
 
 
-# --- what each may do -----------------------------------------------------------------------------
+# --- permissions of each role ---------------------------------------------------------------------
 @attempt("a camera puts on every topic", "camera/color, camera/depth, camera/rgbd")
 def camera_puts(lab: Lab) -> str:
     expected = ("camera/color", "camera/depth", "camera/rgbd")
@@ -161,52 +161,52 @@ def service_of_another(lab: Lab) -> str:
 
 @attempt("a camera subscribes to every topic", NOTHING)
 def camera_reads(lab: Lab) -> str:
-    return topics(heard(lab, lab.keys("camera"), NAMES))
+    return topics(received_topics(lab, lab.keys("camera"), NAMES))
 
 
 @attempt("a viewer subscribes to every topic", ALL_BUT_CONTROL)
 def viewer_reads(lab: Lab) -> str:
-    return topics(heard(lab, lab.keys("viewer"), NAMES, *READABLE))
+    return topics(received_topics(lab, lab.keys("viewer"), NAMES, *READABLE))
 
 
 @attempt("a viewer subscribes to `**` of its robot", NOTHING)
 def viewer_reads_wildcard(lab: Lab) -> str:
-    return topics(heard(lab, lab.keys("viewer"), ["**"]))
+    return topics(received_topics(lab, lab.keys("viewer"), ["**"]))
 
 
-@attempt("a viewer subscribes to what actors say among themselves", NOTHING)
+@attempt("a viewer subscribes to the topics between actors", NOTHING)
 def viewer_reads_links(lab: Lab) -> str:
-    return topics(heard(lab, lab.keys("viewer"), ["link/**", *INSIDE]))
+    return topics(received_topics(lab, lab.keys("viewer"), ["link/**", *INSIDE]))
 
 
 @attempt("a camera controls", NO_ANSWER)
 def camera_controls(lab: Lab) -> str:
-    return answers(asked(lab.keys("camera"), CONTROL.name))
+    return answers(query(lab.keys("camera"), CONTROL.name))
 
 
 @attempt("a viewer controls, by name and by wildcard", NO_ANSWER)
 def viewer_controls(lab: Lab) -> str:
     viewer = lab.keys("viewer")
-    return answers([a for what in (CONTROL.name, "*", "**") for a in asked(viewer, what)])
+    return answers([a for what in (CONTROL.name, "*", "**") for a in query(viewer, what)])
 
 
 @attempt("an operator controls", "obeyed")
 def operator_controls(lab: Lab) -> str:
-    return answers(asked(lab.keys("operator"), CONTROL.name))
+    return answers(query(lab.keys("operator"), CONTROL.name))
 
 
 @attempt("a viewer answers control in place of the service", "obeyed")
 def viewer_answers(lab: Lab) -> str:
-    def answer(query: zenoh.Query) -> None:
-        with query:
-            query.reply(f"ldo/{ROBOT}/{CONTROL.name}", b"a lie")
+    def answer(request: zenoh.Query) -> None:
+        with request:
+            request.reply(f"ldo/{ROBOT}/{CONTROL.name}", b"a lie")
 
     with open_session(lab.keys("viewer")) as session:
         session.declare_queryable(f"ldo/{ROBOT}/{CONTROL.name}", direct(answer))
-        return answers(asked(lab.keys("operator"), CONTROL.name))
+        return answers(query(lab.keys("operator"), CONTROL.name))
 
 
-@attempt("a camera says that it is an actor which is alive", "not seen")
+@attempt("a camera declares the liveliness token of an actor", "not seen")
 def camera_is_alive(lab: Lab) -> str:
     token = f"ldo/{ROBOT}/{ALIVE}/mapper"
     lab.got.clear()
@@ -223,8 +223,8 @@ def answers(found: list[bytes]) -> str:
     return ", ".join(sorted({body.decode() for body in found})) or NO_ANSWER
 
 
-# --- too much -------------------------------------------------------------------------------------
-@attempt(f"a camera puts {2 * MAX_MB} MB where {MAX_MB} MB is the most", "the next arrives")
+# --- load -----------------------------------------------------------------------------------------
+@attempt(f"a camera puts {2 * MAX_MB} MB where {MAX_MB} MB is the limit", "the next arrives")
 def oversized(lab: Lab) -> str:
     lab.got.clear()
     with open_session(lab.keys("camera")) as session:
@@ -240,10 +240,10 @@ def oversized(lab: Lab) -> str:
 
 
 @attempt(
-    f"a client puts {FLOOD} messages at once on an input that keeps 4", "4 wait, rest is counted"
+    f"a client puts {FLOOD} messages at once on an input that keeps 4", "4 queued, others counted"
 )
 def flood(lab: Lab) -> str:
-    """What arrives is counted beside the input, on the same session."""
+    """Count the arriving messages with a second subscriber on the same session."""
     return asyncio.run(_flooded(lab))
 
 
@@ -266,7 +266,7 @@ async def _flooded(lab: Lab) -> str:
         await fake_actors.eventually(lambda: _accounted(stage) == len(arrived))
         peak = stage.health().inputs[0].peak_queued
     transport.close()
-    return f"{peak} wait, rest is counted"
+    return f"{peak} queued, others counted"
 
 
 def _accounted(stage: fake_actors.Stage) -> int:

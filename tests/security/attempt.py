@@ -1,4 +1,4 @@
-"""What somebody tries, what must come of it, and how to see what does."""
+"""Attempt to misuse the service, with its expected result."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ Where = TypeVar("Where")
 class Attempt(Generic[Where]):
     says: str
     expected: str
-    try_it: Callable[[Where], str]  # tells what was seen, in the words of `expected`
+    try_it: Callable[[Where], str]  # Returns the result in the words of `expected`.
 
     def __str__(self) -> str:
         return self.says
@@ -20,7 +20,7 @@ class Attempt(Generic[Where]):
 def kept_in(
     attempts: list[Attempt[Where]],
 ) -> Callable[[str, str], Callable[[Callable[[Where], str]], None]]:
-    """A decorator that keeps a function as an attempt."""
+    """Return a decorator that adds a function to `attempts`."""
 
     def attempt(says: str, expected: str) -> Callable[[Callable[[Where], str]], None]:
         return lambda try_it: attempts.append(Attempt(says, expected, try_it))

@@ -1,4 +1,4 @@
-"""Names that lead elsewhere, and files that are not what they say: what must come of them."""
+"""Attempts with names that lead out of a folder and with forged files."""
 
 import gzip
 import io
@@ -33,22 +33,22 @@ from tests.detection.networks import SQUARES
 from .attempt import Attempt, kept_in
 
 REFUSED = "refused"
-MUCH_BYTES = 100_000_000  # a file of some kilobytes must not take so much
+MAX_MEMORY_BYTES = 100_000_000  # Maximum memory that reading a file of some kilobytes may take.
 LIES: list[Attempt[Path]] = []
 attempt = kept_in(LIES)
 
 
-def told(*calls: Callable[[], object]) -> str:
-    """Whether each of them is refused by an error of ours, at little cost of memory."""
+def outcome_of(*calls: Callable[[], object]) -> str:
+    """Return whether each call is rejected with an LdoError and with little memory."""
     for call in calls:
         tracemalloc.start()
         try:
             call()
-            return "taken"
+            return "accepted"
         except LdoError:
-            _, most_bytes = tracemalloc.get_traced_memory()
-            if most_bytes > MUCH_BYTES:
-                return f"refused after taking {most_bytes / 1e6:.0f} MB"
+            _, peak_bytes = tracemalloc.get_traced_memory()
+            if peak_bytes > MAX_MEMORY_BYTES:
+                return f"refused after allocating {peak_bytes / 1e6:.0f} MB"
         finally:
             tracemalloc.stop()
     return REFUSED
@@ -58,7 +58,7 @@ def told(*calls: Callable[[], object]) -> str:
 @attempt("robots named `../up`, `a/b`, `*`, `**`, `$*`", REFUSED)
 def robots(_folder: Path) -> str:
     names = ("../up", "a/b", "*", "**", "$*")
-    return told(*(lambda name=name: Endpoint(name) for name in names))
+    return outcome_of(*(lambda name=name: Endpoint(name) for name in names))
 
 
 @attempt("models named `../up`, `/tmp/up`, `.hidden`", REFUSED)
@@ -66,14 +66,14 @@ def models(folder: Path) -> str:
     file = SQUARES["yolox"].write(folder / "net.onnx")
     here = Models(folder / "models")
     names = ("../up", "/tmp/up", ".hidden")
-    return told(*(lambda name=name: here.add(name, file, NetworkConfig()) for name in names))
+    return outcome_of(*(lambda name=name: here.add(name, file, NetworkConfig()) for name in names))
 
 
-@attempt("removing a model named `../keep`, a folder beside those of models", "refused, kept")
+@attempt("removing a model named `../keep`, a folder next to the models", "refused, kept")
 def removed_models(folder: Path) -> str:
     (folder / "keep").mkdir()
     (folder / "models").mkdir()
-    seen = told(lambda: Models(folder / "models").remove("../keep"))
+    seen = outcome_of(lambda: Models(folder / "models").remove("../keep"))
     return f"{seen}, {'kept' if (folder / 'keep').exists() else 'gone'}"
 
 
@@ -82,12 +82,12 @@ def keys(folder: Path) -> str:
     authority = CertificateAuthority.new(folder / "keys", days=1)
     names = ("../up", "a/b", ".x")
     adds = [lambda name=name: authority.add(name, "viewer", "*", 1) for name in names]
-    return told(*adds, lambda: authority.remove(".."))
+    return outcome_of(*adds, lambda: authority.remove(".."))
 
 
 @attempt("an actor named `../../bin/sh` for a process of its own", REFUSED)
 def actors(_folder: Path) -> str:
-    return told(lambda: actor_spec("../../bin/sh"))
+    return outcome_of(lambda: actor_spec("../../bin/sh"))
 
 
 @attempt("a data set that lists `../secret.png`, `/dev/zero`, `a/../../secret.png`", REFUSED)
@@ -101,17 +101,17 @@ def listed(folder: Path) -> str:
         return open_it
 
     (folder / "camera.json").write_text('{"fx":1,"fy":1,"cx":1,"cy":1,"width":9,"height":9}')
-    return told(*map(naming, ("../secret.png", "/dev/zero", "a/../../secret.png")))
+    return outcome_of(*map(naming, ("../secret.png", "/dev/zero", "a/../../secret.png")))
 
 
 # --- models ---------------------------------------------------------------------------------------
 @attempt("a model that is garbage", REFUSED)
 def garbage(folder: Path) -> str:
     (folder / "net.onnx").write_bytes(b"\x08\x07garbage" * 100)
-    return told(lambda: Models(folder / "m").add("x", folder / "net.onnx", NetworkConfig()))
+    return outcome_of(lambda: Models(folder / "m").add("x", folder / "net.onnx", NetworkConfig()))
 
 
-@attempt("a model whose weights are said to lie in `../secret`", REFUSED)
+@attempt("a model with external weights in `../secret`", REFUSED)
 def external_weights(folder: Path) -> str:
     (folder / "secret").write_bytes(bytes(1 << 20))
     model = onnx.load(SQUARES["yolox"].write(folder / "net.onnx"))
@@ -122,33 +122,35 @@ def external_weights(folder: Path) -> str:
         tensor.data_location = onnx.TensorProto.EXTERNAL
         tensor.external_data.add(key="location", value="../secret")
     onnx.save(model, folder / "net.onnx")
-    return told(lambda: Models(folder / "m").add("x", folder / "net.onnx", NetworkConfig()))
+    return outcome_of(lambda: Models(folder / "m").add("x", folder / "net.onnx", NetworkConfig()))
 
 
-@attempt("a registered model whose file was exchanged", REFUSED)
+@attempt("a registered model with a replaced file", REFUSED)
 def exchanged(folder: Path) -> str:
     here = Models(folder / "models")
     file = SQUARES["yolox"].write(folder / "net.onnx")
     registered = here.add("x", file, NetworkConfig())
     SQUARES["yolov8"].write(registered.file)
-    return told(here.get("x").verify)
+    return outcome_of(here.get("x").verify)
 
 
 @attempt("byte pairs that unpack from 66 kB to 67 MB and more", REFUSED)
 def byte_pairs(folder: Path) -> str:
     (folder / "bpe.txt.gz").write_bytes(gzip.compress(bytes(80_000_000)))
-    return told(lambda: read_tokenizer(folder / "bpe.txt.gz"))
+    return outcome_of(lambda: read_tokenizer(folder / "bpe.txt.gz"))
 
 
 @attempt("embeddings with a pickle inside", "refused, not run")
 def pickled(folder: Path) -> str:
     path, ran = folder / "e.npz", folder / "ran"
-    np.savez(path, names=np.array([Runs(ran)], object), embeddings=np.ones((1, 2), np.float32))
-    return f"{told(lambda: CachedEmbeddings(path))}, {'run' if ran.exists() else 'not run'}"
+    np.savez(
+        path, names=np.array([CreatesFile(ran)], object), embeddings=np.ones((1, 2), np.float32)
+    )
+    return f"{outcome_of(lambda: CachedEmbeddings(path))}, {'run' if ran.exists() else 'not run'}"
 
 
-class Runs:
-    """Leaves a file behind when it is unpickled."""
+class CreatesFile:
+    """An object that creates a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -158,9 +160,7 @@ class Runs:
 
 
 # --- archives -------------------------------------------------------------------------------------
-@attempt(
-    "arrays that say that they are 2 TB, or unpack from 16 kB to 16 MB where 1 MB is most", REFUSED
-)
+@attempt("arrays that claim 2 TB, or unpack from 16 kB to 16 MB where 1 MB is the limit", REFUSED)
 def large_arrays(folder: Path) -> str:
     names = npy(np.array(["a"]))
     lying, packed = folder / "lying.npz", folder / "packed.npz"
@@ -169,8 +169,14 @@ def large_arrays(folder: Path) -> str:
         archive.writestr("embeddings.npy", npy_header((1 << 39,)))
     np.savez_compressed(packed, names=np.array(["a"]), embeddings=np.ones((1, 1 << 22), "f4"))
     with patch.object(text_embeddings, "MAX_BYTES", 1_000_000):
-        of_embeddings = told(lambda: CachedEmbeddings(lying), lambda: CachedEmbeddings(packed))
-    return of_embeddings if of_embeddings != REFUSED else told(lambda: read_semantics(lying))
+        embeddings_outcome = outcome_of(
+            lambda: CachedEmbeddings(lying), lambda: CachedEmbeddings(packed)
+        )
+    return (
+        embeddings_outcome
+        if embeddings_outcome != REFUSED
+        else outcome_of(lambda: read_semantics(lying))
+    )
 
 
 @attempt("labels in an archive with a member `../../up.npy`", "refused, nothing written")
@@ -179,7 +185,7 @@ def members(folder: Path) -> str:
     inner.mkdir(parents=True)
     with zipfile.ZipFile(inner / "s.npz", "w") as archive:
         archive.writestr("../../up.npy", npy(np.zeros(3)))
-    seen = told(lambda: read_semantics(inner / "s.npz"))
+    seen = outcome_of(lambda: read_semantics(inner / "s.npz"))
     written = [path for path in folder.rglob("up*") if path.is_file()]
     return f"{seen}, {'something' if written else 'nothing'} written"
 
@@ -187,33 +193,35 @@ def members(folder: Path) -> str:
 @attempt("a recording with a chunk that unpacks from 32 kB to 1 GB", REFUSED)
 def chunk(folder: Path) -> str:
     body = zstandard.ZstdCompressor().compress(bytes(1 << 30))
-    return told(*(lambda n=n: McapIndex(recording(folder, body, says=n)) for n in (10, 1 << 30)))
+    return outcome_of(
+        *(lambda n=n: McapIndex(recording(folder, body, claimed_bytes=n)) for n in (10, 1 << 30))
+    )
 
 
-def recording(folder: Path, body: bytes, says: int) -> Path:
-    """With one chunk, which `says` how much it unpacks to."""
+def recording(folder: Path, body: bytes, claimed_bytes: int) -> Path:
+    """Write a recording with one chunk; its header states an unpacked size of `claimed_bytes`."""
     name = b"zstd"
-    content = struct.pack("<QQQI", 0, 1, says, 0) + struct.pack("<I", len(name)) + name
+    content = struct.pack("<QQQI", 0, 1, claimed_bytes, 0) + struct.pack("<I", len(name)) + name
     content += struct.pack("<Q", len(body)) + body
-    path = folder / f"{says}.mcap"
+    path = folder / f"{claimed_bytes}.mcap"
     path.write_bytes(MCAP0_MAGIC + struct.pack("<BQ", Opcode.CHUNK, len(content)) + content)
     return path
 
 
-@attempt("a map that says that it has 10^12 Gaussians", REFUSED)
+@attempt("a map with 10^12 Gaussians in its header", REFUSED)
 def large_map(folder: Path) -> str:
     properties = "".join(f"property float {name}\n" for name in ("x", "y", "z"))
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {10**12}\n{properties}end_header\n"
     )
     (folder / "map.ply").write_bytes(header.encode())
-    return told(lambda: read_ply(folder / "map.ply"))
+    return outcome_of(lambda: read_ply(folder / "map.ply"))
 
 
 @attempt("a depth image of 4 kB that unpacks to 128 MB", REFUSED)
 def large_depth(_folder: Path) -> str:
     body = memoryview(zstandard.ZstdCompressor().compress(bytes(1 << 27)))
-    return told(lambda: codecs.decode_depth("z16+zstd", 64, 48, body))
+    return outcome_of(lambda: codecs.decode_depth("z16+zstd", 64, 48, body))
 
 
 def npy(values: np.ndarray) -> bytes:
@@ -223,7 +231,7 @@ def npy(values: np.ndarray) -> bytes:
 
 
 def npy_header(shape: tuple[int, ...]) -> bytes:
-    """Of an array of float32, without the array."""
+    """Return the header of a float32 array without the array."""
     file = io.BytesIO()
     about = {"descr": "<f4", "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_2_0(file, about)

@@ -1,4 +1,4 @@
-"""A robot's router on the network, with keys, and all that anybody got through to it."""
+"""Router of a robot with keys for each role, which records all messages that arrive."""
 
 import shutil
 import threading
@@ -24,9 +24,11 @@ ROBOT, OTHER_ROBOT = "mule", "goat"
 MAX_MB = 1
 STEP_S, PATIENCE_S = 0.01, 60.0
 SETTLED = "settled"
-LOST, STOLEN, EXPIRED = "lost", "stolen", "expired"  # a camera's keys that were made again; others
+# Keys of a camera: recreated ones, a copy of the revoked ones, and expired ones.
+LOST, STOLEN, EXPIRED = "lost", "stolen", "expired"
 ROLES: tuple[Role, ...] = ("service", "camera", "odometry", "viewer", "operator")
-INSIDE = ("link/command", "link/grant/keyframe/new", "link/welcome/keyframe/new")  # between actors
+# Topics between actors.
+INSIDE = ("link/command", "link/grant/keyframe/new", "link/welcome/keyframe/new")
 NAMES = (*(f"{t.name}/mapper" if t.is_per_actor else t.name for t in TOPICS), *INSIDE, SETTLED)
 
 
@@ -35,21 +37,23 @@ class Lab:
     folder: Path
     network: Endpoint
     session: zenoh.Session
-    got: list[tuple[str, int]] = field(default_factory=list)  # topic and bytes of what came through
+    got: list[tuple[str, int]] = field(default_factory=list)  # Topic and size of each message.
 
     def keys(self, name: str) -> Endpoint:
         return Endpoint(ROBOT, self.network.endpoint, TlsKeys(self.folder / name))
 
     def through(self, act: Callable[[], None], *expected: str) -> list[str]:
-        """Topics on which something of what `act` puts came through, when all expected have, and
-        after them what a service put later."""
+        """Return the topics on which messages that `act` puts arrive.
+
+        Waits for all `expected` topics, and then for a later message of the service.
+        """
         self.got.clear()
         act()
         eventually(lambda: set(expected) <= {topic for topic, _ in self.got})
-        with open_session(self.keys("service")) as sure:
+        with open_session(self.keys("service")) as service:
 
             def is_settled() -> bool:
-                sure.put(f"ldo/{ROBOT}/{SETTLED}", b"")
+                service.put(f"ldo/{ROBOT}/{SETTLED}", b"")
                 return any(topic == SETTLED for topic, _ in self.got)
 
             eventually(is_settled)
@@ -58,7 +62,7 @@ class Lab:
 
 @contextmanager
 def lab(folder: Path) -> Iterator[Lab]:
-    """`folder` becomes an authority with keys of each role, named as the role."""
+    """Create an authority in `folder` with keys for each role, and run a router with them."""
     authority = CertificateAuthority.new(folder, days=2)
     for role in (*ROLES, LOST):
         authority.add(role, role if role in ROLES else "camera", ROBOT, days=1)
@@ -75,9 +79,9 @@ def lab(folder: Path) -> Iterator[Lab]:
             topic = str(sample.key_expr).split("/", 2)[2]
             here.got.append((topic, len(sample.payload.to_bytes())))
 
-        def answer(query: zenoh.Query) -> None:
-            with query:
-                query.reply(f"ldo/{ROBOT}/{CONTROL.name}", b"obeyed")
+        def answer(request: zenoh.Query) -> None:
+            with request:
+                request.reply(f"ldo/{ROBOT}/{CONTROL.name}", b"obeyed")
 
         for name in NAMES:
             session.declare_subscriber(f"ldo/*/{name}", direct(store))
@@ -90,7 +94,7 @@ def direct(call: Callable[[Any], None]) -> Any:
 
 
 def puts(network: Endpoint, *topics: str, robot: str = ROBOT, size: int = 3) -> Callable[[], None]:
-    """Connect and put on each topic, without asking whether anybody listens."""
+    """Return a function that connects and puts a message on each topic."""
 
     def act() -> None:
         with open_session(network) as session:
@@ -100,25 +104,29 @@ def puts(network: Endpoint, *topics: str, robot: str = ROBOT, size: int = 3) -> 
     return act
 
 
-def heard(there: Lab, network: Endpoint, expressions: Sequence[str], *expected: str) -> list[str]:
-    """The topics that one hears who subscribes, while messages are put on every one of them, until
-    all expected were heard and a service heard the last."""
+def received_topics(
+    lab_: Lab, network: Endpoint, expressions: Sequence[str], *expected: str
+) -> list[str]:
+    """Return the topics that a subscriber receives while messages are put on every topic.
+
+    Waits until all `expected` topics and a message for the service were received.
+    """
     seen: set[str] = set()
     last = threading.Event()
-    with open_session(network) as session, open_session(there.keys("service")) as sure:
+    with open_session(network) as session, open_session(lab_.keys("service")) as service:
         for expression in expressions:
             session.declare_subscriber(
                 f"ldo/{ROBOT}/{expression}",
                 direct(lambda sample: seen.add(str(sample.key_expr).split("/", 2)[2])),
             )
-        sure.declare_subscriber(f"ldo/{ROBOT}/{SETTLED}", direct(lambda _sample: last.set()))
+        service.declare_subscriber(f"ldo/{ROBOT}/{SETTLED}", direct(lambda _sample: last.set()))
 
-        def is_heard() -> bool:
+        def is_received() -> bool:
             for name in NAMES:
-                there.session.put(f"ldo/{ROBOT}/{name}", b"1")
+                lab_.session.put(f"ldo/{ROBOT}/{name}", b"1")
             return set(expected) <= seen and last.is_set()
 
-        eventually(is_heard)
+        eventually(is_received)
     return sorted(seen)
 
 
@@ -128,8 +136,8 @@ def eventually(true: Callable[[], bool]) -> None:
         time.sleep(STEP_S)
 
 
-def asked(network: Endpoint, expression: str) -> list[bytes]:
-    """What a query is answered."""
+def query(network: Endpoint, expression: str) -> list[bytes]:
+    """Return the replies to a query."""
     with open_session(network) as session:
         replies = session.get(f"ldo/{ROBOT}/{expression}", timeout=PATIENCE_S)
         return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]

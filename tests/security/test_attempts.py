@@ -1,4 +1,4 @@
-"""On the network, over TLS: each may do what it is there for, and nothing else."""
+"""Tests of access control over TLS: each role can do what it is made for, and nothing else."""
 
 from collections.abc import Iterator
 
@@ -15,5 +15,5 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 
 
 @pytest.mark.parametrize("attempt", ATTEMPTS, ids=lambda attempt: attempt.says)
-def test_an_attempt_comes_to_what_it_must(attempt: Attempt, here: Lab) -> None:
+def test_attempt_has_the_expected_result(attempt: Attempt, here: Lab) -> None:
     assert attempt.try_it(here) == attempt.expected

@@ -1,4 +1,4 @@
-"""What comes from strangers is refused in a sentence, whatever it says of itself."""
+"""Tests that forged files are rejected with an error and that no code of a file is run."""
 
 import ast
 from pathlib import Path
@@ -13,17 +13,19 @@ RUNS_CODE = {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "j
 
 
 @pytest.mark.parametrize("attempt", LIES, ids=str)
-def test_a_lie_comes_to_what_it_must(attempt: Attempt[Path], tmp_path: Path) -> None:
+def test_forged_file_or_name_is_rejected_as_expected(
+    attempt: Attempt[Path], tmp_path: Path
+) -> None:
     assert attempt.try_it(tmp_path) == attempt.expected
 
 
-def ours() -> list[Path]:
+def package_files() -> list[Path]:
     folders = ("ldo_service", "actors", "schemas", "examples")
     return [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
 
 
-def dangers(source: str) -> list[str]:
-    """What in a program would run what a file says."""
+def unsafe_calls(source: str) -> list[str]:
+    """Return the calls and imports in a program that could run code from a file."""
     found = []
     for node in ast.walk(ast.parse(source)):
         match node:
@@ -37,8 +39,8 @@ def dangers(source: str) -> list[str]:
                 found.append("yaml.load")
             case ast.Call(ast.Attribute(attr="extractall" | "unsafe_load")):
                 found.append("extractall")
-            case ast.Call(ast.Attribute(attr="load", value=ast.Name("np")), keywords=said):
-                forbids = [k for k in said if k.arg == "allow_pickle"]
+            case ast.Call(ast.Attribute(attr="load", value=ast.Name("np")), keywords=keywords):
+                forbids = [k for k in keywords if k.arg == "allow_pickle"]
                 if not forbids or getattr(forbids[0].value, "value", None) is not False:
                     found.append("np.load that may unpickle")
             case ast.keyword("shell", ast.Constant(True)):
@@ -59,11 +61,11 @@ def dangers(source: str) -> list[str]:
         "subprocess.run('x', shell=True)",
     ],
 )
-def test_what_would_run_a_file_is_found(source: str) -> None:
-    assert len(dangers(source)) == 1
+def test_unsafe_call_is_detected(source: str) -> None:
+    assert len(unsafe_calls(source)) == 1
 
 
-def test_nothing_of_ours_runs_what_a_file_says() -> None:
-    found = {str(path): dangers(path.read_text()) for path in ours()}
+def test_package_has_no_unsafe_call() -> None:
+    found = {str(path): unsafe_calls(path.read_text()) for path in package_files()}
     assert len(found) > 100
     assert {path: what for path, what in found.items() if what} == {}
