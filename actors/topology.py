@@ -142,13 +142,14 @@ def mermaid_diagram(boxes: Iterable[ActorSpec] = GRAPH) -> str:
     """Return the graph in Mermaid: solid arrows for lossless inputs, dashed ones for the latest."""
     lines = ["flowchart LR", "    camera([camera])", "    odometry([other odometry])"]
     boxes = tuple(boxes)
-    for box in boxes:
-        lines.append(f"    {box.name}")
+    lines.extend(f"    {box.name}" for box in boxes)
     for box in boxes:
         for port in box.inputs:
             arrow = "-->" if isinstance(port.policy, Lossless) else "-.->"
-            for maker in _makers(port.topic, boxes):
-                lines.append(f"    {maker} {arrow}|{port.topic.name}| {box.name}")
+            lines.extend(
+                f"    {maker} {arrow}|{port.topic.name}| {box.name}"
+                for maker in _makers(port.topic, boxes)
+            )
     return "\n".join(lines)
 
 

@@ -160,9 +160,10 @@ def looked(graph: Graph) -> tuple[str, str, str]:
         Names of the tensors: corners [1, N, 4], logits of the fit [1, 1, N], and logits of the
         names and the background [1, T + 1, N].
     """
-    rows = []
-    for level in network(graph, "images"):
-        rows.append(graph.node("Reshape", level, graph.integers(1, sum(TOLD), -1)))
+    rows = [
+        graph.node("Reshape", level, graph.integers(1, sum(TOLD), -1))
+        for level in network(graph, "images")
+    ]
     raw = graph.node("Concat", *rows, axis=2)
     before, after, fit, logits = graph.split(raw, (2, 2, *TOLD[1:]))
     middles, sides = (graph.constant(part.T[None].copy()) for part in grid())

@@ -282,7 +282,7 @@ class OffloadPlan:
 
 
 def plan_offload(
-    awake: BoundingSpheres,
+    resident: BoundingSpheres,
     recent: Sequence[PlacedCamera],
     config: OffloadConfig,
 ) -> OffloadPlan:
@@ -293,22 +293,22 @@ def plan_offload(
     chunks are chosen first. Chunks of the newest anchor always stay. Deterministic.
 
     Args:
-        awake: Bounding spheres of all Gaussians in memory, by chunk.
+        resident: Bounding spheres of all Gaussians in memory, by chunk.
         recent: Cameras of the last keyframes; the current one is last, and required.
         config: Limits.
     """
-    active = int(awake.counts.sum())
+    active = int(resident.counts.sum())
     if active <= config.max_active:
         return OffloadPlan([], 0)
-    looked_at = awake.anchors == awake.anchors[-1]
+    looked_at = resident.anchors == resident.anchors[-1]
     for camera in recent:
-        looked_at |= camera.may_see(awake.centers, awake.radii_m, config.reach_m)
+        looked_at |= camera.may_see(resident.centers, resident.radii_m, config.reach_m)
     idle = np.flatnonzero(~looked_at)
-    distances_m = recent[-1].distances_m(awake.centers[idle], awake.radii_m[idle])
+    distances_m = recent[-1].distances_m(resident.centers[idle], resident.radii_m[idle])
     chosen: list[int] = []
     for k in idle[np.argsort(-distances_m, kind="stable")]:
         if active <= config.low_water * config.max_active:
             break
         chosen.append(int(k))
-        active -= int(awake.counts[k])
+        active -= int(resident.counts[k])
     return OffloadPlan(chosen, max(0, active - config.max_active))

@@ -223,7 +223,7 @@ void contributions(PassOfPython& held, const WritableArray& indices, const Writa
                    const WritableArray& top, int threads) {
   require_threads(threads);
   const PassOfPython::Use pass(held);
-  require(held.is_rendered, "this pass holds no rendering: call rasterise first.");
+  require(held.is_rendered, "this pass holds no rendering: call rasterize first.");
   const size_t visible = pass->visible;
   require_shape(indices, "indices", {visible});
   require_shape(weights, "weights", {visible});
@@ -253,7 +253,7 @@ struct Backward {
     require_threads(threads);
     require(needle_weight >= 0 && needle_log_ratio >= 0,
             "the needle penalty must not be negative.");
-    require(held.is_rendered, "this pass holds no rendering: call rasterise_planes first.");
+    require(held.is_rendered, "this pass holds no rendering: call rasterize_planes first.");
     const size_t height = pass->view.height, width = pass->view.width;
     require(rows_of(rows, "rows") == pass->rows &&
                 static_cast<int64_t>(rows.shape(0)) == pass->gaussians,

@@ -96,10 +96,8 @@ def segment_geometry(
         ("apart", apart),
         ("standing", apart & joined & ~_on_planes(found, apart)),
     ]
-    for mask in _divided(apart, _concave(seen, config), config):
-        shown.append(("convex", mask))
-    for mask in _colored(color, of_room, config, camera):
-        shown.append(("flat", mask))
+    shown.extend(("convex", mask) for mask in _divided(apart, _concave(seen, config), config))
+    shown.extend(("flat", mask) for mask in _colored(color, of_room, config, camera))
     # Enlarge the segments to the size of the image.
     k = shrink_factor(camera.width, config.planes)
     things = [

@@ -42,7 +42,7 @@ class Selection:
     """Selection of frames of a sequence."""
 
     stride: int = 1
-    max_frames: int | None = None  # No limit if None.
+    max_frames: int | None = None  # Unlimited if None.
 
     def __post_init__(self) -> None:
         if self.stride < 1 or (self.max_frames is not None and self.max_frames < 1):

@@ -59,7 +59,10 @@ KEPT: dict[Topic, int] = {  # Maximum messages kept between two updates; the old
 # Topics whose last value is requested at the start.
 STATES = (MAP_SNAPSHOT, GRAPH_CORRECTION, MAP_OBJECTS, POSE_TRACKED)
 
-ANEW = ("tracker", "mapper")  # If both have restarted, the map is new or is published again.
+RESTARTED_TOGETHER = (
+    "tracker",
+    "mapper",
+)  # If both have restarted, the map is new or is published again.
 # Maximum time between their restarts in one start of a service. Otherwise each restarted alone.
 TOGETHER_S = 30.0
 
@@ -229,7 +232,7 @@ class LiveSource:
 
     def __init__(self, service: Client, config: ViewerConfig, stack: ExitStack) -> None:
         self._service = service
-        self._epochs: dict[str, int] = {}  # Epochs of the actors in ANEW.
+        self._epochs: dict[str, int] = {}  # Epochs of the actors in RESTARTED_TOGETHER.
         self._began_s: dict[str, float] = {}  # Time at which a new epoch was first received.
         self._live = LiveScene(config, time.monotonic)
         self._inboxes = [
@@ -275,13 +278,13 @@ class LiveSource:
         The versions of its messages may then start again from the beginning and cannot be compared
         with earlier ones.
         """
-        if health.actor not in ANEW:
+        if health.actor not in RESTARTED_TOGETHER:
             return
         if self._epochs.setdefault(health.actor, health.epoch) != health.epoch:
             self._epochs[health.actor] = health.epoch
             self._began_s[health.actor] = time.monotonic()
         began_s = self._began_s.values()
-        if len(began_s) == len(ANEW) and max(began_s) - min(began_s) < TOGETHER_S:
+        if len(began_s) == len(RESTARTED_TOGETHER) and max(began_s) - min(began_s) < TOGETHER_S:
             self._began_s.clear()
             self._live.reset()
             self._ask()

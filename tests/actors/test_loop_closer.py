@@ -328,7 +328,7 @@ def test_last_keyframes_are_compared_on_stop(first_walk, second_walk) -> None:
 
 
 def test_keyframes_across_a_jump_share_no_subgraph(room) -> None:
-    """Between such keyframes the camera may have moved a long way."""
+    """The camera may have moved a long way between such keyframes."""
     elsewhere = se3.exp(np.array([0.0, 2.5, 0.0, 0.0, 0.0, 0.0]))
     before = keyframes_of(room, range(0, 4, 2), 0, 0)
     after = keyframes_of(room, range(0, 20, 2), 2, LONG_AFTER, elsewhere)

@@ -530,7 +530,7 @@ def test_between_checkpoints_the_state_is_the_same_object(keyframes) -> None:
 
 
 def test_replica_follows_a_mapper_that_restarted_empty(keyframes) -> None:
-    """Its first delta, before any snapshot, is that of an empty map."""
+    """The first delta, before any snapshot, is that of an empty map."""
     config = replace(CONFIG, snapshot_keyframes=100)
     replica = replicate(changes(handle_all(Mapper(config), keyframes[:4])))
     assert replica.version > 1

@@ -108,7 +108,7 @@ def test_camera_without_distortion_has_no_coefficients() -> None:
     "name", ["brown_conrady", "inverse_brown_conrady", "modified_brown_conrady"]
 )
 def test_opencv_lens_model_agrees_with_librealsense(name: str) -> None:
-    """librealsense gives the reference: it projects a point, or deprojects a pixel."""
+    """The reference is librealsense, which projects a point or deprojects a pixel."""
     theirs = intrinsics(50.0, getattr(rs.distortion, name), LENS)
     ours = camera_from_message(camera_model(rs, theirs))
     if name == "brown_conrady":

@@ -114,7 +114,7 @@ def test_intrinsics_are_required_and_extrinsics_are_not(scannet_folder: Writer) 
 
 
 def test_depth_of_a_separate_camera_is_registered_to_color(scannet_folder: Writer) -> None:
-    """With 0.1 m between the cameras, a wall at 2 m moves by 40 * 0.1 / 2 = 2 color pixels."""
+    """A wall at 2 m moves by 40 * 0.1 / 2 = 2 color pixels for 0.1 m between the cameras."""
     T_sensor_depth = se3.exp(np.array([0, 0, 0, 0.1, 0, 0]))
     sequence = open_sequence(str(scannet_folder([0, 1], T_sensor_depth)))
     frame = sequence[1]

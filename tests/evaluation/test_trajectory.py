@@ -158,9 +158,8 @@ def test_errors_agree_with_evo_on_a_real_trajectory(data: Path) -> None:
 
 def test_errors_agree_with_evo_on_a_tracked_trajectory(data: Path) -> None:
     kitchen, odometry = open_sequence(str(data / "tum/kitchen")), Odometry()
-    poses, indices = [], range(0, 160, 4)
-    for index in indices:
-        poses.append(odometry.process(kitchen[index]).T_odom_camera)
+    indices = range(0, 160, 4)
+    poses = [odometry.process(kitchen[index]).T_odom_camera for index in indices]
     truth = kitchen.truth()
     assert truth is not None
     assert_evo_agrees(Trajectory(kitchen.stamps_ns[indices] * 1e-9, np.array(poses)), truth)

@@ -72,7 +72,7 @@ def test_chunks_of_one_anchor_are_offloaded_separately() -> None:
 
 
 def test_chunks_behind_a_wall_are_offloaded() -> None:
-    """All spheres lie in front of the camera, which measured a wall at 4 m."""
+    """The spheres lie in front of the camera, which measured a wall at 4 m."""
     spheres = spheres_at(31, 32, 33, 40, 45, 50)
     wall = MaxDepthGrid.of(np.full((48, 64), 4, np.float32))
     camera_at_wall = replace(camera_at(30), horizon=wall)

@@ -55,7 +55,7 @@ def test_propagated_mask_matches_object_after_camera_motion() -> None:
 
 
 def test_background_inside_the_earlier_mask_is_excluded() -> None:
-    """After 0.3 m the object has moved by 30 px and the wall by 15 px.
+    """The object has moved by 30 px and the wall by 15 px after 0.3 m.
 
     Some of the wall lies in the earlier mask, over a meter behind the object.
     """
@@ -78,7 +78,7 @@ def test_missing_object_or_depth_gives_no_mask() -> None:
 
 
 def test_fewer_than_twelve_samples_give_no_mask() -> None:
-    """Only the left columns of the disc are visible, with a varying number of sampled pixels."""
+    """The left columns of the disc alone are visible, with a varying number of sampled pixels."""
     counts = {}
     for columns in range(37, 61, STRIDE_PX):
         now_m, _ = scene(0.0)

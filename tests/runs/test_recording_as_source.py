@@ -44,7 +44,7 @@ def test_run_over_a_recording_equals_the_run_over_its_source(
 
 
 def test_frame_recorded_twice_is_read_once(recording_copy: Path) -> None:
-    """After a crash the new process receives unhandled frames again."""
+    """The new process receives unhandled frames again after a crash."""
     (recording_copy / "frame_source.2.mcap").write_bytes(
         (recording_copy / "frame_source.mcap").read_bytes()
     )

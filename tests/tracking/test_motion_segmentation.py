@@ -201,7 +201,7 @@ def test_odometry_does_not_track_against_the_walking_person(walk: PersonWalk) ->
 
 
 def test_odometry_does_not_track_against_a_detected_person(walk: PersonWalk) -> None:
-    """No motion has been observed yet; the mask also holds after a restart."""
+    """The tracker has observed no motion yet; the mask also holds after a restart."""
     frame, person = walk.frame(OCCUPIED), walk.person(OCCUPIED)
     odometry = Odometry()
     keyframe = odometry.process(frame).reference
@@ -228,7 +228,7 @@ def box_around(mask: np.ndarray) -> Box:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_tracking_past_a_person_is_accurate_and_always_ok() -> None:
-    """Without segmentation, the ATE is 0.15 cm and 16 frames are WEAK."""
+    """The ATE is 0.15 cm and 16 frames are WEAK without segmentation."""
     sequence = SyntheticSequence.named("person-noisy")
     results = track(sequence)
     T = np.array([r.T_odom_camera for r in results])

@@ -68,7 +68,7 @@ def test_extrapolation_has_constant_velocity_up_to_the_limit() -> None:
 
 
 def test_extrapolation_does_not_amplify_noise_of_close_poses() -> None:
-    """At 200 Hz, 1 mm of noise on the newest pose must not become 1 cm after 50 ms."""
+    """One millimeter of noise on the newest pose at 200 Hz must not become 1 cm after 50 ms."""
     stamps_ns = [k * 5 * MS for k in range(60)]
     poses = [IDENTITY.copy() for _ in stamps_ns]
     poses[-1][0, 3] = 1e-3

@@ -138,8 +138,7 @@ def test_half_of_a_batch_is_regions(trainer: SimpleNamespace) -> None:
 
 
 def test_fitted_scale_is_that_of_the_generated_names(trainer: SimpleNamespace) -> None:
-    """Names drawn with the softmax of a known scale; where two names are right, either may be
-    drawn."""
+    """Names are drawn with the softmax of a known scale; either of two right names may be drawn."""
     rng = np.random.default_rng(0)
     texts = np.linalg.qr(rng.standard_normal((8, 8)))[0]
     images = rng.standard_normal((4000, 8))
