@@ -86,7 +86,7 @@ class MapperConfig:
     semantics: SemanticMapConfig = field(default_factory=SemanticMapConfig)
     # Iterations per keyframe, fewer where the map is dense: 12 FPS on two cores at 640x480.
     iterations: int = 12
-    least_iterations: int = 3  # Minimum, however many keyframes wait: new Gaussians need some.
+    min_iterations: int = 3  # Minimum, however many keyframes wait: new Gaussians need some.
     folder: str = ""  # Keyframe images; empty: a temporary folder, or one within the state.
     threads: int = 0  # Threads of the renderer; 0: all cores but one, which the tracker needs.
     snapshot_keyframes: int = 10  # Minimum keyframes between published snapshots.
@@ -118,7 +118,7 @@ class MapperConfig:
 
     def __post_init__(self) -> None:
         amounts = (
-            *("iterations", "least_iterations", "threads", "snapshot_growth"),
+            *("iterations", "min_iterations", "threads", "snapshot_growth"),
             *("mended_keyframes", "mended_at_end", "mending_iterations"),
             *("due_iterations", "paid_iterations"),
         )
@@ -234,7 +234,7 @@ class Mapper(Actor):
         config = self.config
         return max(
             config.iterations // (1 + self._waiting()) - self._repair.mending_iterations,
-            min(config.least_iterations, config.iterations),
+            min(config.min_iterations, config.iterations),
         )
 
     def _waiting(self) -> int:

@@ -66,13 +66,13 @@ class OptimizerConfig:
     landmarks: ObjectLandmarkConfig = field(default_factory=ObjectLandmarkConfig)
     uses_objects: bool = True  # False optimizes poses alone, to measure the benefit of landmarks.
     # Maximum closures and observations that wait for a keyframe that has not arrived yet.
-    most_early: int = 512
+    max_early: int = 512
     # Newest keyframes for which intrinsics are kept; observations come a few keyframes late.
     cameras: int = 64
 
     def __post_init__(self) -> None:
-        if min(self.most_early, self.cameras) < 1:
-            raise ConfigError(named(self, "most_early", "cameras") + " must be at least 1.")
+        if min(self.max_early, self.cameras) < 1:
+            raise ConfigError(named(self, "max_early", "cameras") + " must be at least 1.")
 
 
 class Optimizer(Actor):
@@ -302,8 +302,8 @@ class Optimizer(Actor):
         return self._classes.index(name) if name in self._classes else 0
 
     def _keep_newest(self, waiting: list[Any]) -> list[Any]:
-        """Return the newest `most_early` messages; the excess is counted and discarded."""
-        excess = max(0, len(waiting) - self.config.most_early)
+        """Return the newest `max_early` messages; the excess is counted and discarded."""
+        excess = max(0, len(waiting) - self.config.max_early)
         self._too_early += excess
         return waiting[excess:]
 

@@ -9,7 +9,7 @@ out  pose/tracked     TrackedPose                   one for every tracked frame
 out  keyframe/new     Keyframe                      made only when every consumer has credit
 
 The actor converts messages, and keeps the ports, the prior and the counters. `Odometry.process`
-does the tracking of a frame in one call. If `TrackerConfig.localise` names a finished run, a
+does the tracking of a frame in one call. If `TrackerConfig.localize` names a finished run, a
 `Localizer` replaces the odometry. It makes no keyframes, so the mapper and the optimizer are idle
 and the map does not change. Subscribers of poses see no difference.
 """
@@ -106,7 +106,7 @@ class TrackerConfig:
     T_base_camera: CameraExtrinsics = field(default_factory=CameraExtrinsics)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     # Folder of a finished run: track in its map, which does not change; empty: map.
-    localise: str = ""
+    localize: str = ""
     hold_out: int = 0  # Every n-th frame is tracked but not mapped, to evaluate the map; 0: none.
 
     def __post_init__(self) -> None:
@@ -218,12 +218,12 @@ class Tracker(Actor):
         state["order"] = [*places]  # The keyframe used last is the last one.
         own = {name: state.pop(name) for name in OWN_PARTS}
         fix = {"fix": state.pop("fix")} if "fix" in state else {}
-        poses, localize = state.pop("poses"), self.config.localise
+        poses, localize = state.pop("poses"), self.config.localize
         return {
             **{f"place_{number}": place for number, place in places.items()},
             **own,
             "graph_correction": self._correction,
-            "now": {"odometry": state, "poses": poses, "localise": localize},
+            "now": {"odometry": state, "poses": poses, "localize": localize},
             "prior": self._prior.pack(),
             **fix,
         }
@@ -235,10 +235,10 @@ class Tracker(Actor):
             ConfigError: The snapshot belongs to another map.
         """
         now = state["now"]
-        if now["localise"] != self.config.localise:
+        if now["localize"] != self.config.localize:
             raise ConfigError(
-                f"the saved state belongs to --localize {now['localise'] or '(none)'}, but this "
-                f"service runs with {self.config.localise or '(none)'}. Choose another folder "
+                f"the saved state belongs to --localize {now['localize'] or '(none)'}, but this "
+                f"service runs with {self.config.localize or '(none)'}. Choose another folder "
                 "with --state."
             )
         places = [state[f"place_{number}"] for number in now["odometry"]["order"]]
@@ -272,9 +272,9 @@ def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry
     Raises:
         DataError: The run left no keyframe database.
     """
-    if not config.localise:
+    if not config.localize:
         return Odometry(config.odometry, T_base_camera)
-    return Localizer(load_keyframe_database(Path(config.localise)), config.odometry, T_base_camera)
+    return Localizer(load_keyframe_database(Path(config.localize)), config.odometry, T_base_camera)
 
 
 def _box(detection: Detection) -> Box:

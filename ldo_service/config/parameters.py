@@ -145,13 +145,13 @@ def _tracker(config: Config) -> TrackerConfig:
             keyframes=_keyframes(config),
             window=WindowConfig(measurements=tracker.window.max_measurements),
             places=_places(config),
-            relocalisation=RelocalizationConfig(
+            relocalization=RelocalizationConfig(
                 alike=tracker.relocalization.appearance_candidates,
                 across_scales=tracker.relocalization.sift_candidates,
             ),
             returning=KeyframeReuseConfig(after=tracker.keyframes.reuse_after),
             submaps=SubmapConfig(begin_after_s=tracker.submaps.start_after_lost_s),
-            judgement=TrackingQualityConfig(
+            tracking_quality=TrackingQualityConfig(
                 min_overlap=tracker.quality.weak_overlap,
                 weak_residual=tracker.quality.weak_residual_ratio,
                 lost_residual=tracker.quality.lost_residual_ratio,
@@ -164,7 +164,7 @@ def _tracker(config: Config) -> TrackerConfig:
                 max_carried_s=tracker.odometry_prior.max_dead_reckoning_s,
             ),
         ),
-        localise=tracker.localization_map,
+        localize=tracker.localization_map,
         hold_out=tracker.hold_out,
     )
 
@@ -206,7 +206,7 @@ def _map_builder(config: Config) -> MapBuilderConfig:
             max_transmittance=mapper.densify.max_transmittance,
             coarsest_px=mapper.densify.max_cell_px,
         ),
-        optimiser=GaussianOptimizerConfig(
+        optimizer=GaussianOptimizerConfig(
             adam=AdamConfig(
                 mean_m=rates.mean_m,
                 log_scale=rates.log_scale,
@@ -246,7 +246,7 @@ def _semantics(config: Config) -> SemanticMapConfig:
         ),
         naming=_naming(config),
         movable=_dynamic_classes(config),
-        most_names=config.mapper.semantics.max_label_names,
+        max_names=config.mapper.semantics.max_label_names,
     )
 
 
@@ -287,7 +287,7 @@ def _naming(config: Config) -> OpenVocabularyConfig:
         regions=RegionTrackerConfig(
             per_keyframe=naming.requests_per_keyframe, boxes_vote=naming.detector_votes
         ),
-        least_sure=naming.min_confidence,
+        min_sure=naming.min_confidence,
     )
 
 
@@ -342,7 +342,7 @@ def _optimizer(config: Config) -> OptimizerConfig:
                 sigma_loop_m=optimizer.noise.loop_translation_m,
             ),
             closures=LoopClosureConfig(
-                most_sigmas=optimizer.loop_closures.max_residual_sigmas,
+                max_sigmas=optimizer.loop_closures.max_residual_sigmas,
                 most=optimizer.loop_closures.max_closures,
             ),
             condense_keyframes=paper.marginalization_interval_keyframes,

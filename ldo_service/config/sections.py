@@ -49,13 +49,13 @@ class Config:
             ConfigError: A request may take longer than a timeout of the service.
         """
         http = self.vlm_labeller.http
-        longest_s = http.deadline_s + http.timeout_s  # The time to connect counts separately.
+        max_s = http.deadline_s + http.timeout_s  # The time to connect counts separately.
         limits = {
             "supervision.step_timeout_s": self.supervision.step_timeout_s,
             "service.control_timeout_s": self.service.control_timeout_s,
         }
         for name, limit_s in limits.items():
-            if self.vlm_labeller.url and longest_s >= limit_s:
+            if self.vlm_labeller.url and max_s >= limit_s:
                 raise ConfigError(
                     f"vlm_labeller.http.deadline_s={http.deadline_s:g} and "
                     f"vlm_labeller.http.timeout_s={http.timeout_s:g} together must be below "

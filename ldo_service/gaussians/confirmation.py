@@ -36,9 +36,9 @@ class Confirmation:
             gaussians: The map.
             newest: Id of the newest keyframe.
         """
-        age, least_px = self._config.confirm_keyframes, self._config.min_weight_px
+        age, min_px = self._config.confirm_keyframes, self._config.min_weight_px
         older = [k for k in self._store.keyframes() if k < newest][: 1 - age or None]
-        if not older or least_px == 0:
+        if not older or min_px == 0:
             return np.zeros(len(gaussians), bool)
         rng = random_for(self._seed, newest, 1)
         chosen = {older[-1], older[int(rng.integers(len(older)))]}
@@ -46,4 +46,4 @@ class Confirmation:
         for keyframe in (newest, *sorted(chosen)):
             made_by = self._renderer.contributions(gaussians, keyframe)
             shown[made_by.indices] = np.maximum(shown[made_by.indices], made_by.weights)
-        return np.isin(gaussians.anchors, list(chosen)) & (shown < least_px)
+        return np.isin(gaussians.anchors, list(chosen)) & (shown < min_px)

@@ -60,7 +60,7 @@ class MapBuilder:
             self.views.store, self._renderer, self.config.pruning, self.config.seed
         )
         self._fitting = Fitting(
-            self.config.optimiser,
+            self.config.optimizer,
             self.config.window,
             self.views,
             self.is_resident,
@@ -354,7 +354,7 @@ class MapBuilder:
         return {
             "map": self.gaussians.snapshot(),
             "sleeping": self.sleeping.snapshot(),
-            "optimiser": self._fitting.snapshot(),
+            "optimizer": self._fitting.snapshot(),
             "views": self.views.snapshot(),
             "told": self._published.snapshot(),
             "newest": self._newest,
@@ -368,7 +368,7 @@ class MapBuilder:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore the state of a snapshot; replicas are assumed to hold the whole map."""
         self.gaussians = GaussianMap.restore(state["map"])
-        self._fitting.restore(state["optimiser"], state["iterations"])
+        self._fitting.restore(state["optimizer"], state["iterations"])
         self.views.restore(state["views"])
         self.sleeping.restore(state["sleeping"])
         self._published.restore(self.views.cameras, state["told"])

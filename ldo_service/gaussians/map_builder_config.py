@@ -17,7 +17,7 @@ class MapBuilderConfig:
     """Settings of the map builder and of its parts."""
 
     insertion: DensificationConfig = field(default_factory=DensificationConfig)
-    optimiser: GaussianOptimizerConfig = field(default_factory=GaussianOptimizerConfig)
+    optimizer: GaussianOptimizerConfig = field(default_factory=GaussianOptimizerConfig)
     window: ViewSamplingConfig = field(default_factory=ViewSamplingConfig)
     pruning: PruningConfig = field(default_factory=PruningConfig)
     merging: DeduplicationConfig = field(default_factory=DeduplicationConfig)

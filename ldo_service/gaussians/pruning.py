@@ -19,7 +19,7 @@ class PruningConfig:
     min_opacity: float = 0.005  # Kerbl et al., 2023, sec. 5.2.
     # Longest axis relative to the mean of its neighborhood (paper, III.A).
     max_relative_scale: float = 10.0
-    neighbourhood_m: float = 0.25  # Edge of the cubes that are the neighborhoods.
+    neighborhood_m: float = 0.25  # Edge of the cubes that are the neighborhoods.
     # A Gaussian must be visible in the image of its own keyframe or of the newest one. This is
     # checked once that many keyframes followed its own, and later at random. Hidden Gaussians are
     # removed: others have grown over them.
@@ -36,10 +36,10 @@ class PruningConfig:
                 named(self, "confirm_keyframes", "min_weight_px")
                 + ": confirm_keyframes must be at least 1, min_weight_px at least 0."
             )
-        if not (self.max_relative_scale > 1 and self.neighbourhood_m > 0):
+        if not (self.max_relative_scale > 1 and self.neighborhood_m > 0):
             raise ConfigError(
-                named(self, "max_relative_scale", "neighbourhood_m")
-                + ": max_relative_scale must exceed 1, neighbourhood_m must be positive."
+                named(self, "max_relative_scale", "neighborhood_m")
+                + ": max_relative_scale must exceed 1, neighborhood_m must be positive."
             )
 
 
@@ -57,10 +57,10 @@ def prunable_mask(rows: np.ndarray, config: PruningConfig | None = None) -> np.n
     """
     config = config or PruningConfig()
     finite = np.isfinite(rows[:, :14]).all(axis=1)
-    longest_m = np.exp(rows[:, 3:6].max(axis=1).astype(float))
+    max_m = np.exp(rows[:, 3:6].max(axis=1).astype(float))
     transparent = rows[:, 10] < np.log(config.min_opacity / (1 - config.min_opacity))
-    mean_m = _mean_around(rows[:, :3], np.where(finite, longest_m, 0), config.neighbourhood_m)
-    return transparent | ~finite | (longest_m > config.max_relative_scale * mean_m)
+    mean_m = _mean_around(rows[:, :3], np.where(finite, max_m, 0), config.neighborhood_m)
+    return transparent | ~finite | (max_m > config.max_relative_scale * mean_m)
 
 
 def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.ndarray:
@@ -115,11 +115,11 @@ class DeduplicationConfig:
     min_cosine: float = 0.8  # Least |cos| of the angle between the normals: 37 deg.
     # Largest difference in any channel, 0..1: exposures differ, but a picture on a wall is kept.
     max_color: float = 0.25
-    neighbours: int = 4  # Number of nearest older Gaussians that are compared.
+    neighbors: int = 4  # Number of nearest older Gaussians that are compared.
 
     def __post_init__(self) -> None:
-        if self.keyframes_apart < 1 or self.neighbours < 1:
-            raise ConfigError(named(self, "keyframes_apart", "neighbours") + " must be at least 1.")
+        if self.keyframes_apart < 1 or self.neighbors < 1:
+            raise ConfigError(named(self, "keyframes_apart", "neighbors") + " must be at least 1.")
         if min(self.off_m, self.reach_sigmas, self.max_color) <= 0 or not 0 <= self.min_cosine <= 1:
             raise ConfigError(
                 named(self, "off_m", "reach_sigmas", "min_cosine", "max_color")
@@ -152,11 +152,11 @@ def find_duplicates(
     config = config or DeduplicationConfig()
     mask = np.zeros(len(rows), bool)
     own = np.flatnonzero(anchors == keyframe)
-    reach_m = config.off_m + config.reach_sigmas * _longest_m(rows[own]).max(initial=0)
+    reach_m = config.off_m + config.reach_sigmas * _max_m(rows[own]).max(initial=0)
     older = _within(rows, anchors <= keyframe - config.keyframes_apart, rows[own, :3], reach_m)
     if not len(own) or not len(older):
         return mask
-    count = min(config.neighbours, len(older))
+    count = min(config.neighbors, len(older))
     tree = KDTree(rows[older, :3])
     _, found = tree.query(rows[own, :3], k=count)
     for near in np.reshape(found, (len(own), count)).T:
@@ -185,7 +185,7 @@ def _is_duplicate(older: np.ndarray, newer: np.ndarray, config: DeduplicationCon
     aside_m = np.sqrt(np.maximum(np.sum(apart**2, axis=1) - off_m**2, 0))
     return (
         (off_m <= config.off_m)
-        & (aside_m <= config.reach_sigmas * _longest_m(older))
+        & (aside_m <= config.reach_sigmas * _max_m(older))
         & (np.abs(np.sum(normals * others, axis=1)) >= config.min_cosine)
         & (np.abs(older[:, 11:14] - newer[:, 11:14]).max(axis=1) <= config.max_color)
     )
@@ -198,5 +198,5 @@ def _normals(rows: np.ndarray) -> np.ndarray:
     return np.take_along_axis(axes, shortest[:, None, None], axis=2)[:, :, 0]
 
 
-def _longest_m(rows: np.ndarray) -> np.ndarray:
+def _max_m(rows: np.ndarray) -> np.ndarray:
     return np.exp(rows[:, 3:6].max(axis=1, initial=-np.inf))

@@ -41,7 +41,7 @@ class NoiseConfig:
     sigma_box_px: float = 4.0
     sigma_box_share: float = 0.15
     # Observations of an object from one side share that error, so N of them have less information
-    # than N independent ones. The maximum number per landmark (`landmarks.most_sights`) counts as a
+    # than N independent ones. The maximum number per landmark (`landmarks.max_sights`) counts as a
     # tenth of one. Counted as one, they moved odometry by 3 mm that was accurate to 2 mm
     # (docs/decisions/0057-tenth-information.md).
     independent_sights: float = 1 / 320

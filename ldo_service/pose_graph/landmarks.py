@@ -46,11 +46,11 @@ class ObjectLandmarkConfig:
     # Entropy above which an observation has weight exp(-2 H) and a landmark is removed earlier
     # (III.C).
     vague_nats: float = 0.5
-    least_sights: int = 3  # Minimum observations of a landmark in the graph (III.C).
+    min_sights: int = 3  # Minimum observations of a landmark in the graph (III.C).
     # Minimum parallax, 5 deg: an error of 12 px at 2 m and 525 px focal length is 0.5 m in depth.
-    least_parallax_rad: float = 0.09
+    min_parallax_rad: float = 0.09
     # Maximum observations of a landmark in the graph; the first half of them is never replaced.
-    most_sights: int = 32
+    max_sights: int = 32
     misses: int = 10  # Consecutive misses after which a landmark is removed (III.C).
     vague_misses: int = 5  # The same for a landmark with high entropy.
     vague_keyframes: int = 20  # Keyframes without observation after which such a one is removed.
@@ -59,26 +59,26 @@ class ObjectLandmarkConfig:
     # at every keyframe with observations.
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     due_weight: float = 8.0  # Uncertain observations have less weight.
-    most_waiting: int = 256  # Maximum waiting observations, however small their weight.
+    max_waiting: int = 256  # Maximum waiting observations, however small their weight.
 
     def __post_init__(self) -> None:
-        counts = (self.most_sights, self.misses, self.vague_misses, self.most, self.most_waiting)
-        if min(counts) < 1 or self.least_sights < 2:
+        counts = (self.max_sights, self.misses, self.vague_misses, self.most, self.max_waiting)
+        if min(counts) < 1 or self.min_sights < 2:
             raise ConfigError(
                 named(
                     self,
-                    "least_sights",
-                    "most_sights",
+                    "min_sights",
+                    "max_sights",
                     "misses",
                     "vague_misses",
                     "most",
-                    "most_waiting",
+                    "max_waiting",
                 )
-                + " must be at least 1, and least_sights at least 2."
+                + " must be at least 1, and min_sights at least 2."
             )
-        if min(self.lambda_sem, self.due_weight, self.least_parallax_rad) <= 0 or self.w_sem < 0:
+        if min(self.lambda_sem, self.due_weight, self.min_parallax_rad) <= 0 or self.w_sem < 0:
             raise ConfigError(
-                named(self, "lambda_sem", "w_sem", "least_parallax_rad", "due_weight")
+                named(self, "lambda_sem", "w_sem", "min_parallax_rad", "due_weight")
                 + " must be positive, except w_sem, which must not be negative."
             )
 
@@ -173,7 +173,7 @@ class ObjectLandmarks:
         if not self._waiting:
             return False
         weight = sum(self.weight(seen.entropy) for seen in self._waiting if not seen.is_miss)
-        is_enough = weight >= config.due_weight or len(self._waiting) >= config.most_waiting
+        is_enough = weight >= config.due_weight or len(self._waiting) >= config.max_waiting
         if config.schedule == "fixed" or is_enough:
             return True
         self.skipped += 1
@@ -245,8 +245,8 @@ class ObjectLandmarks:
 
     def _thinned(self, sights: list[BoxObservation]) -> tuple[BoxObservation, ...]:
         """Return the first observations, which limit drift, and the newest."""
-        half = self._config.most_sights // 2
-        excess = len(sights) - self._config.most_sights
+        half = self._config.max_sights // 2
+        excess = len(sights) - self._config.max_sights
         return tuple(sights if excess <= 0 else sights[:half] + sights[half + excess :])
 
     def _triangulated(
@@ -258,7 +258,7 @@ class ObjectLandmarks:
         the boxes.
         """
         sights = list(sights)
-        if len(sights) < self._config.least_sights:
+        if len(sights) < self._config.min_sights:
             return None
         T_map = np.array([graph.pose(s.keyframe) for s in sights])
         fx, fy, cx, cy = np.array([s.intrinsics for s in sights]).T
@@ -271,7 +271,7 @@ class ObjectLandmarks:
         except np.linalg.LinAlgError:
             return None
         p = (se3.inverse(T_map) @ np.append(point, 1))[:, :3]
-        if parallax_rad < self._config.least_parallax_rad or p[:, 2].min() <= 0.1:
+        if parallax_rad < self._config.min_parallax_rad or p[:, 2].min() <= 0.1:
             return None
         off_px = np.hypot(fx * p[:, 0] / p[:, 2] + cx - u, fy * p[:, 1] / p[:, 2] + cy - v)
         sigmas_px = np.array([s.sigma_px for s in sights])

@@ -24,9 +24,9 @@ class LoopClosureConfig:
     # Maximum increase of the sum of squares by a closure: chi^2 of six numbers at 3 sigma
     # (99.73 %). The residual of the closure alone is no criterion: a chain of 100 measurements
     # moves by a meter and leaves a residual of 2 sigma.
-    most_cost: float = 20.06
+    max_cost: float = 20.06
     # Maximum residual of an accepted closure in any direction, in sigmas (RTAB-Map's guard).
-    most_sigmas: float = 3.0
+    max_sigmas: float = 3.0
     rivals: int = 3  # Earlier closures to test for removal instead of a new one; worst fit first.
     # Maximum accepted closures, 1 kB each and one more factor to solve. Beyond, the older of the
     # two most similar ones is removed.
@@ -36,9 +36,9 @@ class LoopClosureConfig:
     remembered: int = 256  # Rejected and removed closures kept, each, for publication.
 
     def __post_init__(self) -> None:
-        if min(self.most_cost, self.most_sigmas) <= 0 or self.rivals < 0:
+        if min(self.max_cost, self.max_sigmas) <= 0 or self.rivals < 0:
             raise ConfigError(
-                named(self, "most_cost", "most_sigmas", "rivals")
+                named(self, "max_cost", "max_sigmas", "rivals")
                 + " must be positive, except rivals, which must not be negative."
             )
         if min(self.most, self.doubts, self.remembered) < 1:
@@ -85,14 +85,14 @@ class LoopClosureSet:
         _, cost_before = solve(before)
         chosen = [*before, closure]
         variables, cost = solve(chosen)
-        if cost - cost_before > self.config.most_cost:
+        if cost - cost_before > self.config.max_cost:
             rival = self._find_conflicting(closure, before, cost_before, solve, variables, sigmas)
             if rival is None:
                 return ClosureDecision(False), variables
             chosen = [c for c in chosen if c is not rival]
             variables, cost = solve(chosen)
         while chosen and (worst := max(chosen, key=lambda c: sigmas(variables, c))):
-            if sigmas(variables, worst) <= self.config.most_sigmas:
+            if sigmas(variables, worst) <= self.config.max_sigmas:
                 break
             chosen = [c for c in chosen if c is not worst]
             variables, cost = solve(chosen)
@@ -118,7 +118,7 @@ class LoopClosureSet:
             others = [c for c in before if c is not rival]
             _, cost_others = solve(others)
             _, cost = solve([*others, closure])
-            if cost < best_cost and cost - cost_others <= self.config.most_cost:
+            if cost < best_cost and cost - cost_others <= self.config.max_cost:
                 best, best_cost = rival, cost
         return best
 

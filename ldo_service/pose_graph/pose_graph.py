@@ -41,21 +41,21 @@ class PoseGraphConfig:
     window_keyframes: int = 20  # Newest keyframes, not condensed: their measurements still change.
     # A condensed keyframe becomes a variable again if a closure changes it by more sigmas than
     # this. There is at most one group per `keyframes_each` keyframes, to bound the solver's time.
-    most_bent: float = 0.1
+    max_bent: float = 0.1
     keyframes_each: int = 5
-    most_changes: int = 64  # Number between two rebuilds; a restored graph repeats them bit by bit.
+    max_changes: int = 64  # Number between two rebuilds; a restored graph repeats them bit by bit.
 
     def __post_init__(self) -> None:
-        counts = self.condense_keyframes, self.window_keyframes, self.most_changes
+        counts = self.condense_keyframes, self.window_keyframes, self.max_changes
         if min(*counts, self.keyframes_each) < 1:
             raise ConfigError(
                 named(
-                    self, "condense_keyframes", "window_keyframes", "keyframes_each", "most_changes"
+                    self, "condense_keyframes", "window_keyframes", "keyframes_each", "max_changes"
                 )
                 + " must be at least 1."
             )
-        if self.most_bent < 0:
-            raise ConfigError(named(self, "most_bent") + " must not be negative.")
+        if self.max_bent < 0:
+            raise ConfigError(named(self, "max_bent") + " must not be negative.")
 
 
 class PoseGraph:
@@ -192,7 +192,7 @@ class PoseGraph:
         known, config = self._known, self._config
         for keyframe in (closure.a, closure.b):
             is_room = len(known.condensed) * config.keyframes_each < len(self)
-            if is_room and known.interpolation_error_sigmas(keyframe, variables) > config.most_bent:
+            if is_room and known.interpolation_error_sigmas(keyframe, variables) > config.max_bent:
                 follower = known.followers.only(known.rows[keyframe])
                 ends = int(follower.start_variables[0]), int(follower.end_variables[0])
                 T_head, T_tail = (variables[k][None] for k in ends)
@@ -338,7 +338,7 @@ class PoseGraph:
         )
         if group:
             known.condense(group, {k: self.pose(k) for k in group})
-        if group or len(self._changes) > config.most_changes:
+        if group or len(self._changes) > config.max_changes:
             followers = known.rows.keys()
             variables = self._solver.variables()
             self._restart_solver({k: v for k, v in variables.items() if k not in followers})

@@ -206,13 +206,13 @@ class NestingConfig:
 
     inside: float = 0.8  # Minimum fraction of the smaller region that must lie in the larger one.
     times: float = 2.0  # Minimum ratio of their sizes; below it, both show one object.
-    least_score: float = 0.5  # Minimum score of the smaller region; many boxes below are wrong.
+    min_score: float = 0.5  # Minimum score of the smaller region; many boxes below are wrong.
 
     def __post_init__(self) -> None:
-        if not (0 < self.inside <= 1 and self.times > 1 and self.least_score >= 0):
+        if not (0 < self.inside <= 1 and self.times > 1 and self.min_score >= 0):
             raise ConfigError(
-                named(self, "inside", "times", "least_score")
-                + ": inside must be in (0, 1], times above 1, least_score not negative."
+                named(self, "inside", "times", "min_score")
+                + ": inside must be in (0, 1], times above 1, min_score not negative."
             )
 
 
@@ -229,7 +229,7 @@ def without_nested(
     """
     sizes = [np.count_nonzero(part.mask) for part in parts]
     left = [part.mask for part in parts]
-    for i in np.flatnonzero(np.asarray(scores) >= config.least_score).tolist():
+    for i in np.flatnonzero(np.asarray(scores) >= config.min_score).tolist():
         for k in range(len(parts)):
             if 0 < config.times * sizes[i] <= sizes[k] and (both := _shared(parts[i], parts[k])):
                 of_small, of_large = both

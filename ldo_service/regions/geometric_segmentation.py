@@ -111,12 +111,12 @@ def segment_geometry(
     ]
 
 
-def components(mask: np.ndarray, least_px: int = 1) -> Iterator[Foreground]:
+def components(mask: np.ndarray, min_px: int = 1) -> Iterator[Foreground]:
     """Yield the parts of a mask [H, W] bool that are connected by the sides of their pixels."""
     count, parts, boxes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     for part in range(1, count):
         column, row, width, height, area = (int(value) for value in boxes[part])
-        if area >= least_px:
+        if area >= min_px:
             window = np.asarray(parts)[row : row + height, column : column + width]
             yield Foreground(row, column, window == part)
 

@@ -38,18 +38,18 @@ class OpenVocabularyConfig:
     reliable: float = 0.6  # Minimum probability of a label that needs no label request (III.B).
     # Minimum confidence of a label result: with 0.5, the flat's recall is 7 points less.
     # Labellers that recognize regions without an object return few results below.
-    least_sure: float = 0.3
+    min_sure: float = 0.3
     # Labels that are no objects, whatever their source; such regions stay background.
     structure: tuple[str, ...] = ("background", "wall", "floor", "ceiling")
     # Maximum pending label requests, some 10 kB each: the labeller queues 32 regions, and each may
     # be requested three times.
-    most_open: int = 96
+    max_open: int = 96
 
     def __post_init__(self) -> None:
-        if not (0 <= self.reliable <= 1 and 0 <= self.least_sure <= 1) or self.most_open < 1:
+        if not (0 <= self.reliable <= 1 and 0 <= self.min_sure <= 1) or self.max_open < 1:
             raise ConfigError(
-                named(self, "reliable", "least_sure", "most_open")
-                + ": reliable and least_sure must be in [0, 1], most_open at least 1."
+                named(self, "reliable", "min_sure", "max_open")
+                + ": reliable and min_sure must be in [0, 1], max_open at least 1."
             )
 
 
@@ -142,7 +142,7 @@ class OpenVocabularyLabeling:
         self._questions += 1
         asked = PendingRequest(of.box_px, of.part, of.label, of.score, of.kind)
         self._open[region.id, region.keyframe] = asked
-        while len(self._open) > self.config.most_open:
+        while len(self._open) > self.config.max_open:
             del self._open[next(iter(self._open))]
             self._overdue += 1
 
@@ -215,12 +215,12 @@ class OpenVocabularyLabeling:
     def _filter_answer(self, answer: RegionLabelResult, asked: PendingRequest) -> RegionLabelResult:
         """Return a label result without labels that are no objects.
 
-        A label below least_sure is removed, unless the region is a box of the detector.
+        A label below min_sure is removed, unless the region is a box of the detector.
         """
         others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))
         if not self._is_object(answer.label):
             return RegionLabelResult("", answer.confidence)
-        is_sure = answer.confidence >= self.config.least_sure or bool(asked.label)
+        is_sure = answer.confidence >= self.config.min_sure or bool(asked.label)
         return replace(answer, others=others) if is_sure else RegionLabelResult("", 0.0)
 
     @property

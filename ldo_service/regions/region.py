@@ -230,13 +230,13 @@ def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return np.linspace(0, len(rows) - 1, most).astype(int)
 
 
-def merge_observation(region: Region, seen: RegionObservation, most_boxes: float) -> Region:
+def merge_observation(region: Region, seen: RegionObservation, max_boxes: float) -> Region:
     """Return a region with one more observation.
 
     Args:
         region: The region.
         seen: The observation.
-        most_boxes: Maximum sum of the votes of boxes for a label.
+        max_boxes: Maximum sum of the votes of boxes for a label.
     """
     said = seen.candidate
     surer = max(region, said, key=lambda one: one.score)
@@ -248,7 +248,7 @@ def merge_observation(region: Region, seen: RegionObservation, most_boxes: float
         shape=seen if is_larger else region.shape,
         label=surer.label,
         score=surer.score,
-        votes=with_box(region.votes, said.label, said.score, most_boxes),
+        votes=with_box(region.votes, said.label, said.score, max_boxes),
         seen=region.seen + 1,
         is_supported=region.is_supported or said.kind == "standing",
     )

@@ -225,7 +225,7 @@ class RegionMatcher:
         camera: Camera,
         T_map_keyframe: Mapping[int, np.ndarray],
         max_gap_m: float,
-        least_points: int,
+        min_points: int,
     ) -> None:
         """Project the points of known regions into a keyframe.
 
@@ -237,11 +237,11 @@ class RegionMatcher:
             camera: Intrinsics of all keyframes.
             T_map_keyframe: Current poses of all keyframes and this one, [4, 4], by id.
             max_gap_m: Maximum distance from the measured depth of a visible point.
-            least_points: Minimum visible points of a region for any conclusion.
+            min_points: Minimum visible points of a region for any conclusion.
         """
         self._regions = [r for r in regions if r.shape.keyframe in T_map_keyframe]
         self._depth_m, self._camera, self._T_map_keyframe = depth_m, camera, T_map_keyframe
-        self._keyframe, self._max_gap_m, self._least = keyframe, max_gap_m, least_points
+        self._keyframe, self._max_gap_m, self._least = keyframe, max_gap_m, min_points
         T_camera_map = se3.inverse(T_map_keyframe[keyframe])
         args = depth_m, camera, T_camera_map, T_map_keyframe, max_gap_m
         self._seen = projected(self._regions, *args)

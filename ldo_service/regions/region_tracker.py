@@ -52,7 +52,7 @@ class RegionTrackerConfig:
     views: int = 5  # Number of best views in a label request.
     views_first: int = 2  # Minimum views before a request; a single one may show a flaw of depth.
     patience: int = 3  # Keyframes without a better view before a request; one may yet come.
-    most_questions: int = 3  # Maximum label requests for a region.
+    max_questions: int = 3  # Maximum label requests for a region.
     # Label requests per keyframe; pending regions with the best views go first. Half of them show
     # no object. The paper requests on 10-25 % of the frames (IV.B.8); the flat, 1.0 per keyframe.
     per_keyframe: float = 2.5
@@ -66,31 +66,31 @@ class RegionTrackerConfig:
     # a region has the labeller's label only. Regions of a checkpoint keep their votes.
     boxes_vote: bool = True
     # Minimum votes for a label: one box with a score of 0.6, or four with 0.3.
-    least_votes: float = 0.35
-    least_carried: float = 0.5  # Minimum confidence of a label that is applied by mask propagation.
+    min_votes: float = 0.35
+    min_carried: float = 0.5  # Minimum confidence of a label that is applied by mask propagation.
     # Maximum labels of a keyframe by mask propagation: as many as it has proposals.
-    most_carried: int = 32
+    max_carried: int = 32
     overlap: float = 0.6  # Minimum mutual overlap of two observations of one region.
     # Maximum depth difference between a point and the surface measured there (delta_z, III.A).
     max_gap_m: float = 0.1
-    least_points: int = 12  # Minimum points of one observation that are visible in the other.
-    least_quality: float = 0.02  # Minimum quality of a view; worse ones show a labeller nothing.
+    min_points: int = 12  # Minimum points of one observation that are visible in the other.
+    min_quality: float = 0.02  # Minimum quality of a view; worse ones show a labeller nothing.
     # Maximum regions, some 50 kB each: five views of 5 kB, two masks of 12. The region not seen for
     # longest is dropped.
     most: int = 1024
     view: ViewConfig = field(default_factory=ViewConfig)
 
     def __post_init__(self) -> None:
-        counts = self.views, self.views_first, self.most_questions, self.most, self.at_once
-        if min(*counts, self.most_carried) < 1:
+        counts = self.views, self.views_first, self.max_questions, self.most, self.at_once
+        if min(*counts, self.max_carried) < 1:
             raise ConfigError(
                 named(
                     self,
                     "views",
                     "views_first",
-                    "most_questions",
+                    "max_questions",
                     "at_once",
-                    "most_carried",
+                    "max_carried",
                     "most",
                 )
                 + ": each must be at least 1."
@@ -100,9 +100,9 @@ class RegionTrackerConfig:
                 named(self, "patience", "per_keyframe")
                 + ": patience must be at least 0, per_keyframe positive."
             )
-        if not (0 <= self.least_quality <= 1 and 0 <= self.least_carried <= 1):
+        if not (0 <= self.min_quality <= 1 and 0 <= self.min_carried <= 1):
             raise ConfigError(
-                named(self, "least_carried", "least_quality") + ": both must be in [0, 1]."
+                named(self, "min_carried", "min_quality") + ": both must be in [0, 1]."
             )
         if self.views_first > self.views or not self.gain > 1:
             raise ConfigError(
@@ -113,19 +113,19 @@ class RegionTrackerConfig:
             raise ConfigError(
                 f"views={self.views} must be at most {MAX_VIEWS}, the views in a label request."
             )
-        if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.least_points >= 1):
+        if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.min_points >= 1):
             raise ConfigError(
-                named(self, "overlap", "max_gap_m", "least_points")
-                + ": overlap must be in (0, 1], max_gap_m positive, least_points at least 1."
+                named(self, "overlap", "max_gap_m", "min_points")
+                + ": overlap must be in (0, 1], max_gap_m positive, min_points at least 1."
             )
-        if not (self.answer_weight > 0 and self.least_votes >= 0):
+        if not (self.answer_weight > 0 and self.min_votes >= 0):
             raise ConfigError(
-                named(self, "answer_weight", "least_votes")
-                + ": answer_weight must be positive, least_votes not negative."
+                named(self, "answer_weight", "min_votes")
+                + ": answer_weight must be positive, min_votes not negative."
             )
 
     @property
-    def most_boxes(self) -> float:
+    def max_boxes(self) -> float:
         """Maximum sum of the votes of all boxes for one label."""
         return self.answer_weight if self.boxes_vote else 0.0
 
@@ -173,14 +173,14 @@ class RegionTracker:
         """
         config, told, taken = self.config, list[tuple[int, RegionProposal]](), set[int]()
         regions, place = [*self._regions.values()], (keyframe, depth_m, camera, T_map_keyframe)
-        known = RegionMatcher(regions, *place, config.max_gap_m, config.least_points)
+        known = RegionMatcher(regions, *place, config.max_gap_m, config.min_points)
         for candidate in found:
             sighting = observe_region(keyframe, candidate, depth_m, camera)
             if sighting is None:
                 continue
             region = self._same(sighting, known, taken) or self._new(sighting)
             taken.add(region.id)
-            region = merge_observation(region, sighting, config.most_boxes)
+            region = merge_observation(region, sighting, config.max_boxes)
             if candidate.score < config.settled:
                 args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
                 region = self._with_view(region, sighting, region_view(*args, config.view))
@@ -191,7 +191,7 @@ class RegionTracker:
             region = sighting and self._same(sighting, known, taken)
             if sighting and region and self._label_of(region)[0]:
                 taken.add(region.id)
-                self._keep(merge_observation(region, sighting, config.most_boxes))
+                self._keep(merge_observation(region, sighting, config.max_boxes))
                 told.append((region.id, candidate))
         told += self._propagated(known, taken)
         opinions = self._opinions(told, known)
@@ -214,9 +214,9 @@ class RegionTracker:
         for number in known.seen():
             region = self._regions[number]
             label, sure = self._label_of(region)
-            if number in taken or not label or sure < self.config.least_carried:
+            if number in taken or not label or sure < self.config.min_carried:
                 continue
-            if len(found) == self.config.most_carried:
+            if len(found) == self.config.max_carried:
                 break
             part = known.carried(number)
             if part is not None:
@@ -240,7 +240,7 @@ class RegionTracker:
             for (other, _), share in zip(named, row.tolist(), strict=True):
                 if share > 0 and other.is_supported == region.is_supported:
                     votes = with_votes_of(votes, other.votes, share)
-            label, sure = winning_label(votes, self.config.least_votes)
+            label, sure = winning_label(votes, self.config.min_votes)
             opinions.append(RegionLabel(of, label, sure))
         return opinions
 
@@ -266,7 +266,7 @@ class RegionTracker:
         if known is None or not label:
             return None
         place = keyframe, depth_m, camera, T_map_keyframe
-        seen = RegionMatcher([known], *place, config.max_gap_m, config.least_points)
+        seen = RegionMatcher([known], *place, config.max_gap_m, config.min_points)
         part = seen.carried(region) if [*seen.seen()] else None
         return part and RegionLabel(RegionProposal(part.box_px, part), label, sure)
 
@@ -303,7 +303,7 @@ class RegionTracker:
 
     def name(self, region: Region) -> tuple[str, float]:
         """Return the label of a region by its own votes, and its confidence; ("", 0) if unknown."""
-        return winning_label(region.votes, self.config.least_votes)
+        return winning_label(region.votes, self.config.min_votes)
 
     def answered(self, region: int, answer: RegionLabelResult) -> str:
         """Add a label result to the votes of a region and return its label now.
@@ -329,7 +329,7 @@ class RegionTracker:
 
     def _with_view(self, region: Region, sighting: RegionObservation, view: RegionView) -> Region:
         """Return a region with a view added, if the view is good enough."""
-        if view.quality < self.config.least_quality:
+        if view.quality < self.config.min_quality:
             return region
         views = sorted((*region.views, view), key=lambda view: -view.quality)
         best = sighting if views[0] is view else region.best
@@ -337,7 +337,7 @@ class RegionTracker:
 
     def _is_due(self, region: Region, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> bool:
         """Return whether a label request for a region is pending."""
-        if self._is_settled(region) or region.questions >= self.config.most_questions:
+        if self._is_settled(region) or region.questions >= self.config.max_questions:
             return False
         best = region.best
         if best is None or best.keyframe not in T_map_keyframe:

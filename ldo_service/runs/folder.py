@@ -179,7 +179,7 @@ class RunWriter:
 
     def __init__(self, folder: Path, config_text: str, tracker: TrackerConfig) -> None:
         self.folder, self._hold_out = folder, tracker.hold_out
-        self._makes_map = not tracker.localise
+        self._makes_map = not tracker.localize
         self._places = DatabaseWriter(tracker.odometry)
         (folder / "config.yaml").write_text(config_text)
         self._csv_file = (folder / "frames.csv").open("w", newline="")

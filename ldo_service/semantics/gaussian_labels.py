@@ -119,7 +119,7 @@ class LabelConfig:
     # A miss with `corrected` is evidence for background if the detector should have seen the
     # object.
     miss_weight: float = 0.3  # Weight of a miss; that of a detection is its confidence.
-    least_px: float = 40.0  # Minimum side (pixels) of an object's box for a miss to count.
+    min_px: float = 40.0  # Minimum side (pixels) of an object's box for a miss to count.
     usual_extent_m: float = 0.5  # Assumed size of an object that was not observed yet.
     hold_back: float = 1.0  # Damping of uncertain observations of settled Gaussians, 0..1.
 
@@ -131,9 +131,9 @@ class LabelConfig:
                 named(self, "keep", "miss_weight", "hold_back")
                 + ": keep must be in [0, 1), miss_weight and hold_back in [0, 1]."
             )
-        if not (1 <= self.miss_limit <= 255 and self.least_px >= 0 and self.usual_extent_m >= 0):
+        if not (1 <= self.miss_limit <= 255 and self.min_px >= 0 and self.usual_extent_m >= 0):
             raise ConfigError(
-                named(self, "miss_limit", "least_px", "usual_extent_m")
+                named(self, "miss_limit", "min_px", "usual_extent_m")
                 + ": miss_limit must be in 1..255, the lengths not negative."
             )
 
@@ -173,7 +173,7 @@ def observe(
     With `corrected`, the mean of all observations is weighted, and the weights decay with age. With
     w = confidence, W <- keep W + w and a = w / W, so that the first observation counts in full. A
     miss is an observation of background with w = miss_weight. It counts if the last observed
-    object, or one of usual_extent_m, would appear at least least_px large.
+    object, or one of usual_extent_m, would appear at least min_px large.
 
     Uncertain observations of settled Gaussians are held back. The step of `paper`, and w, are
     multiplied by 1 - hold_back exp(-2 H) (1 - confidence), with the entropy H of p, once p has a

@@ -311,7 +311,7 @@ def observations(
     miss = NOT_SEEN if is_late else MISS
     labels = np.array([NOT_SEEN, miss, *said], np.int16).take(outcome)
     confidences = np.array([0, 0, *claims.confidences], np.float32).take(outcome)
-    corners, least_px = np.reshape(claims.boxes, (-1, 2, 2)), config.labels.least_px
+    corners, min_px = np.reshape(claims.boxes, (-1, 2, 2)), config.labels.min_px
     sides_px = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1))
     # Regions that have a label of the labeller too are fused per Gaussian.
     is_fused = np.array([False, False, *(claims.open_confidences > 0)])
@@ -331,5 +331,5 @@ def observations(
         confidences[both] = one.confidences
     extents_m = np.fmax(where.depths_m, 0)  # NaN: hidden Gaussians have no extent.
     extents_m /= np.float32(np.sqrt(camera.fx * camera.fy))
-    extents_m *= np.array([least_px, least_px, *sides_px], np.float32).take(outcome)
+    extents_m *= np.array([min_px, min_px, *sides_px], np.float32).take(outcome)
     return Observations(indices, labels, confidences, extents_m)

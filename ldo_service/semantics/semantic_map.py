@@ -41,20 +41,20 @@ class SemanticMapConfig:
     # elsewhere either, and a hole where a picture passed for a person would be worse than the
     # person.
     movable_confidence: float = 0.6
-    most_names: int = MAX_LABELS  # Maximum names in the vocabulary; a later name is `other`.
+    max_names: int = MAX_LABELS  # Maximum names in the vocabulary; a later name is `other`.
     # Maximum keyframes with detections that are not mapped yet: as many as may be on their way to
     # the mapper.
-    most_waiting: int = 8
+    max_waiting: int = 8
     # Newest keyframes with detections that are remembered, to drop repeated messages. After a
     # restart, a window of 8 is sent again.
-    most_said_again: int = 64
+    max_said_again: int = 64
 
     def __post_init__(self) -> None:
-        if self.most_waiting < 0 or self.most_said_again < 1 or self.most_names > MAX_LABELS:
+        if self.max_waiting < 0 or self.max_said_again < 1 or self.max_names > MAX_LABELS:
             raise ConfigError(
-                named(self, "most_names", "most_waiting", "most_said_again")
-                + ": most_waiting must be at least 0, most_said_again at least 1, "
-                + f"most_names at most {MAX_LABELS}."
+                named(self, "max_names", "max_waiting", "max_said_again")
+                + ": max_waiting must be at least 0, max_said_again at least 1, "
+                + f"max_names at most {MAX_LABELS}."
             )
 
     @property
@@ -98,7 +98,7 @@ class SemanticMap:
             threads: Number of threads.
         """
         self.config = config or SemanticMapConfig()
-        self.vocabulary = Vocabulary(self.config.most_names)
+        self.vocabulary = Vocabulary(self.config.max_names)
         self.objects = Objects(self.config.objects)
         is_heard = self.config.hears_labeller
         self.naming = (
@@ -147,7 +147,7 @@ class SemanticMap:
             return self._fuse_keyframe(keyframe, claims)
         else:
             self._waiting[keyframe] = claims
-            while len(self._waiting) > self.config.most_waiting:
+            while len(self._waiting) > self.config.max_waiting:
                 del self._waiting[next(iter(self._waiting))]
                 self._too_early += 1
         return None
@@ -168,7 +168,7 @@ class SemanticMap:
         """
         self._done[keyframe] = None
         self._labelled += 1
-        while len(self._done) > self.config.most_said_again:
+        while len(self._done) > self.config.max_said_again:
             del self._done[next(iter(self._done))]
         if not self._map.views.is_readable(keyframe):
             self._without_images += 1

@@ -15,12 +15,12 @@ UNREADABLE = (
 )
 
 
-def read_arrays(path: Path, largest_bytes: int) -> dict[str, np.ndarray]:
+def read_arrays(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
     """Read all arrays of a file by name, without unpickling.
 
     Args:
         path: The .npz file.
-        largest_bytes: Maximum size of all arrays, checked before any memory is allocated.
+        max_bytes: Maximum size of all arrays, checked before any memory is allocated.
 
     Raises:
         Exception: One of UNREADABLE.
@@ -28,10 +28,9 @@ def read_arrays(path: Path, largest_bytes: int) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(path) as archive:
         packed = sum(entry.file_size for entry in archive.infolist())
         announced = sum(_announced_bytes(archive, entry) for entry in archive.infolist())
-    if max(packed, announced) > largest_bytes:
+    if max(packed, announced) > max_bytes:
         raise ValueError(
-            f"its arrays have {max(packed, announced)} bytes, more than the maximum of "
-            f"{largest_bytes}"
+            f"its arrays have {max(packed, announced)} bytes, more than the maximum of {max_bytes}"
         )
     with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}

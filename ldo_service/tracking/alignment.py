@@ -137,13 +137,13 @@ class AlignConfig:
     # A level has converged when the last step moves the image by less; pixels of the level.
     stop_px: float = 0.02
     # Limit of one step: rotation in rad, and translation as a fraction of the median depth.
-    largest_step: float = 0.15
+    max_step: float = 0.15
     # Damping of the normal equations, fraction of their diagonal: unobserved directions stay fixed.
     damping: float = 1e-6
     # Lower bound of the photometric noise, gray levels: rounding and interpolation.
-    least_intensity_sigma: float = 1.0
+    min_intensity_sigma: float = 1.0
     # Lower bound of the geometric noise, 0.24 mm at the noise floor: rounding to millimeters.
-    least_depth_noise_scale: float = 0.2
+    min_depth_noise_scale: float = 0.2
     # Fraction of the residuals that count as independent: the errors of neighboring residuals are
     # correlated. The measured errors fit a fraction of 0.1 on exact renders. On a Kinect against
     # KinectFusion they fit 1e-4 (next frame) to 3e-5 (half a second), which includes the error of
@@ -155,15 +155,15 @@ class AlignConfig:
             raise ConfigError(
                 f"iterations={self.iterations} must have at least 1 iteration for each level."
             )
-        if min(self.stop_px, self.largest_step, self.independent_fraction) <= 0:
+        if min(self.stop_px, self.max_step, self.independent_fraction) <= 0:
             raise ConfigError(
-                f"stop_px={self.stop_px:g}, largest_step={self.largest_step:g} and "
+                f"stop_px={self.stop_px:g}, max_step={self.max_step:g} and "
                 f"independent_fraction={self.independent_fraction:g} must be positive."
             )
-        if min(self.least_intensity_sigma, self.least_depth_noise_scale) <= 0:
+        if min(self.min_intensity_sigma, self.min_depth_noise_scale) <= 0:
             raise ConfigError(
-                f"least_intensity_sigma={self.least_intensity_sigma:g} and "
-                f"least_depth_noise_scale={self.least_depth_noise_scale:g} must be positive."
+                f"min_intensity_sigma={self.min_intensity_sigma:g} and "
+                f"min_depth_noise_scale={self.min_depth_noise_scale:g} must be positive."
             )
 
 
@@ -275,8 +275,8 @@ def _step(equations: NormalEquations, median_depth_m: float, config: AlignConfig
     hessian[np.diag_indices(8)] += config.damping * np.diag(hessian) + 1e-9
     step = -np.linalg.solve(hessian, equations.gradient)
     size = max(np.linalg.norm(step[:3]), np.linalg.norm(step[3:6]) / median_depth_m)
-    if size > config.largest_step:
-        step[POSE] *= config.largest_step / size
+    if size > config.max_step:
+        step[POSE] *= config.max_step / size
     return step
 
 
@@ -289,8 +289,8 @@ def _improved(
         appearance,
         gain=appearance.gain + float(step[6]),
         bias=appearance.bias + float(step[7]),
-        intensity_sigma=max(sigma, config.least_intensity_sigma),
-        depth_noise_scale=max(scale, config.least_depth_noise_scale),
+        intensity_sigma=max(sigma, config.min_intensity_sigma),
+        depth_noise_scale=max(scale, config.min_depth_noise_scale),
     )
 
 

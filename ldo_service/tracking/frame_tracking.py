@@ -46,8 +46,8 @@ class FrameTracker:
             config.pyramid,
             config.align,
             config.features,
-            config.judgement,
-            config.relocalisation,
+            config.tracking_quality,
+            config.relocalization,
         )
         self._guesses = InitialGuessAligner(
             config.align,
@@ -170,7 +170,7 @@ class FrameTracker:
     def _is_usable(self, view: Pyramid) -> bool:
         """Return whether a view has enough measured depth to align frames to it."""
         measured = float(np.mean(view.levels[0].depth_m > 0))
-        return measured >= self.config.judgement.min_paired
+        return measured >= self.config.tracking_quality.min_paired
 
     def _track_against(
         self, keyframe: ReferenceKeyframe, view: Pyramid, stamp_ns: int
@@ -201,7 +201,9 @@ class FrameTracker:
 
     def _classify(self, candidate: PoseHypothesis) -> TrackingStatus:
         state = self.state
-        return classify_tracking(candidate, state.history, state.status, self.config.judgement)
+        return classify_tracking(
+            candidate, state.history, state.status, self.config.tracking_quality
+        )
 
     # --- relocalization ---------------------------------------------------------------------------
     def _places_when_lost(self) -> KeyframeDatabase:
@@ -285,7 +287,7 @@ class FrameTracker:
         motion = self.state.motion.moved_to(T_odom_camera, frame.stamp_ns)
         is_steady = status is TrackingStatus.OK and self.state.status is TrackingStatus.OK
         if status is TrackingStatus.OK:
-            history = history.extended(alignment, config.judgement)
+            history = history.extended(alignment, config.tracking_quality)
             anchor = self._prior and DeadReckoningStart(T_odom_camera, self._prior)
             trusted = make_thumbnail(self.view(frame))
             self.state = replace(self.state, trusted_thumbnail=trusted, dead_reckoning_start=anchor)

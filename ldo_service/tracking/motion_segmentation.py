@@ -29,14 +29,14 @@ class MotionSegmentationConfig:
     level: int = 1  # Pyramid level of the comparison: 160 pixels wide.
     # Minimum depth difference that contradicts a static scene. It covers pose errors within the
     # range of a keyframe.
-    least_m: float = 0.06
+    min_m: float = 0.06
     # Multiple of the depth noise, as estimated by alignment, that is added to the minimum.
     sigmas: float = 4.0
     # Radius within which the nearest surface counts as the measured one; tolerates outlines that
     # are slightly off.
     edge_px: int = 2
     # Minimum size of a connected region, fraction of the image; smaller regions are noise.
-    least_share: float = 0.0015
+    min_share: float = 0.0015
     # A region must be within this distance of a contradicting pixel of the previous frame.
     streak_px: int = 5
     # The dynamic mask grows to pixels within this distance and this difference of depth. They
@@ -50,17 +50,17 @@ class MotionSegmentationConfig:
     renewed_share: float = 0.005
 
     def __post_init__(self) -> None:
-        lengths = (self.least_m, self.sigmas, self.spread_m, self.least_share, self.renewed_share)
+        lengths = (self.min_m, self.sigmas, self.spread_m, self.min_share, self.renewed_share)
         counts = (self.level, self.edge_px, self.streak_px, self.spread_px, self.rim_px)
         if min(lengths) < 0 or min(counts) < 0 or not 1 <= self.gone_frames <= 255:
             raise ConfigError(
                 named(
                     self,
                     "level",
-                    "least_m",
+                    "min_m",
                     "sigmas",
                     "edge_px",
-                    "least_share",
+                    "min_share",
                     "streak_px",
                     "spread_px",
                     "spread_m",
@@ -123,7 +123,7 @@ class _Pair:
     def limit_m(self, level: Level) -> np.ndarray:
         """Return the depth difference [h, w] in meters that errors of a static scene explain."""
         sigma_m = self.noise_scale * self.noise.sigma_m(level.depth_m)
-        return self.config.least_m + self.config.sigmas * sigma_m
+        return self.config.min_m + self.config.sigmas * sigma_m
 
     def came(self, moved_mask: np.ndarray) -> np.ndarray:
         """Return the pixels [h, w] bool of the frame that have appeared since the keyframe.
@@ -290,7 +290,7 @@ def _in_pieces(
     opened = cv2.morphologyEx(_bytes(contradicts), cv2.MORPH_OPEN, _square(1))
     closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _square(2))
     count, labels, figures, _ = cv2.connectedComponentsWithStats(closed)
-    kept = figures[:, cv2.CC_STAT_AREA] >= max(config.least_share * labels.size, 1)
+    kept = figures[:, cv2.CC_STAT_AREA] >= max(config.min_share * labels.size, 1)
     kept[0] = False  # Label 0 is the background.
     if before is not None:
         near = cv2.dilate(_bytes(before), _square(config.streak_px)) > 0

@@ -73,7 +73,7 @@ class Odometry:
             self.config.pyramid,
             self.config.align,
             self.config.keyframes,
-            self.config.judgement,
+            self.config.tracking_quality,
             self.config.returning,
         )
         self._earlier = RecentKeyframeCache(self.config.pyramid)

@@ -31,17 +31,17 @@ class PyramidConfig:
     # Width of the finest level: the image is halved until it is below 1.5 times this width.
     working_width_px: int = 320
     levels: int = 4  # Maximum number of levels: 320, 160, 80, 40 pixels wide.
-    smallest_side_px: int = 12  # Minimum side of a level; smaller images have too few pixels.
+    min_side_px: int = 12  # Minimum side of a level; smaller images have too few pixels.
     # Relative depth difference within a 2x2 block; blocks across an edge keep the nearer surface.
     depth_tolerance: float = 0.03
     # Larger depths are dropped: no depth camera measures beyond, and 65 m is a stray value.
     max_depth_m: float = 30.0
 
     def __post_init__(self) -> None:
-        if min(self.working_width_px, self.levels, self.smallest_side_px) < 1:
+        if min(self.working_width_px, self.levels, self.min_side_px) < 1:
             raise ConfigError(
                 f"working_width_px={self.working_width_px}, levels={self.levels} and "
-                f"smallest_side_px={self.smallest_side_px} must be at least 1."
+                f"min_side_px={self.min_side_px} must be at least 1."
             )
         if not self.max_depth_m > 0:
             raise ConfigError(f"max_depth_m={self.max_depth_m:g} must be positive.")
@@ -135,7 +135,7 @@ def build_pyramid(
         if scaled.width < 1.5 * config.working_width_px:
             levels.append(Level(_align.pack(image, depth, config.max_depth_m), scaled))
         smallest = min(scaled.width, scaled.height) // 2
-        if len(levels) == config.levels or smallest < config.smallest_side_px:
+        if len(levels) == config.levels or smallest < config.min_side_px:
             break
         # The valid pixels of a partly clipped block are darker than the whole block. Such blocks
         # are excluded down to the finest level. Coarser levels, which only give the initial guess

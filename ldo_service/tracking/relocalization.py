@@ -110,7 +110,7 @@ class Relocalizer:
     pyramid: PyramidConfig
     align: AlignConfig
     features: FeatureConfig
-    judgement: TrackingQualityConfig
+    tracking_quality: TrackingQualityConfig
     config: RelocalizationConfig
 
     def find(
@@ -208,7 +208,7 @@ class Relocalizer:
     ) -> bool:
         agrees = hypothesis_distance_rad(candidate, guess) < self.config.agreement_rad
         witnessed = replace(candidate, is_confirmed=agrees)
-        verdict = classify_tracking(witnessed, history, TrackingStatus.LOST, self.judgement)
+        verdict = classify_tracking(witnessed, history, TrackingStatus.LOST, self.tracking_quality)
         inliers = candidate.alignment.geometric_inliers
         return verdict is TrackingStatus.OK and inliers >= self.config.min_geometric_inliers
 
@@ -299,7 +299,7 @@ class KeyframeReuse:
     pyramid: PyramidConfig
     align: AlignConfig
     keyframes: KeyframeConfig
-    judgement: TrackingQualityConfig
+    tracking_quality: TrackingQualityConfig
     config: KeyframeReuseConfig
 
     def find(
@@ -336,7 +336,7 @@ class KeyframeReuse:
             not left_keyframe_view(T, seen.overlap, candidate.median_depth_m, self.keyframes)
             and seen.geometric_inliers >= self.config.min_geometric_inliers
             and all(
-                classify_tracking(witnessed, history, TrackingStatus.OK, self.judgement)
+                classify_tracking(witnessed, history, TrackingStatus.OK, self.tracking_quality)
                 is TrackingStatus.OK
                 for history in histories
             )

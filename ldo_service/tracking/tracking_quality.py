@@ -44,18 +44,18 @@ class TrackingQualityConfig:
     lost_residual: float = 5.0  # A frame with a larger one is LOST, times the running median.
     lost_overlap: float = 0.08  # A frame with a smaller overlap is LOST.
     # Lower bounds of the running medians: the noise of any camera. Intensity in gray levels.
-    least_intensity_sigma: float = 2.0
-    least_depth_noise_scale: float = 0.5
+    min_intensity_sigma: float = 2.0
+    min_depth_noise_scale: float = 0.5
     # A relocalized camera must have more overlap, unless features confirm the pose: 43 of 43
     # confirmed poses below 0.35 were right (kitchen and flat). It must also fit better. The limit
-    # is relocalised_residual times the running median at the same pose. It grows by
-    # relocalised_residual_per_rad per radian of image motion from the keyframe
+    # is relocalized_residual times the running median at the same pose. It grows by
+    # relocalized_residual_per_rad per radian of image motion from the keyframe
     # (`motion.image_motion_rad`), up to weak_residual. The noise of right poses grows likewise
     # (kitchen, p50 1.4 at 0.15 rad, 2.0 at 0.55). A fixed limit of 1.6 found a third fewer frames
     # of the kitchen, and one more false pose in the ambiguous corridor of the flat.
-    relocalised_overlap: float = 0.35
-    relocalised_residual: float = 1.3
-    relocalised_residual_per_rad: float = 2.0
+    relocalized_overlap: float = 0.35
+    relocalized_residual: float = 1.3
+    relocalized_residual_per_rad: float = 2.0
     # Expected noise while the history is empty. Intensity in gray levels.
     first_intensity_sigma: float = 8.0
     first_depth_noise_scale: float = 2.0
@@ -73,10 +73,10 @@ class TrackingQualityConfig:
                 f"weak_residual={self.weak_residual:g} must be above 1 and at most "
                 f"lost_residual={self.lost_residual:g}."
             )
-        if self.relocalised_residual < 1 or self.relocalised_residual_per_rad < 0:
+        if self.relocalized_residual < 1 or self.relocalized_residual_per_rad < 0:
             raise ConfigError(
-                f"relocalised_residual={self.relocalised_residual:g} must be at least 1, "
-                f"relocalised_residual_per_rad={self.relocalised_residual_per_rad:g} at least 0."
+                f"relocalized_residual={self.relocalized_residual:g} must be at least 1, "
+                f"relocalized_residual_per_rad={self.relocalized_residual_per_rad:g} at least 0."
             )
         if not 0 < self.recovery_margin <= 1 or self.history < 1:
             raise ConfigError(
@@ -104,8 +104,8 @@ class ResidualHistory:
         """Return the noise of an alignment over its running median, the larger of both ratios."""
         usual_sigma = median(self.intensity_sigmas or (config.first_intensity_sigma,))
         usual_scale = median(self.depth_noise_scales or (config.first_depth_noise_scale,))
-        intensity = max(usual_sigma, config.least_intensity_sigma)
-        depth = max(usual_scale, config.least_depth_noise_scale)
+        intensity = max(usual_sigma, config.min_intensity_sigma)
+        depth = max(usual_scale, config.min_depth_noise_scale)
         return max(
             exposure_corrected_sigma(alignment) / intensity, alignment.depth_noise_scale / depth
         )
@@ -163,10 +163,10 @@ def _limits(
         moved_rad = image_motion_rad(
             candidate.alignment.T_reference_camera, candidate.median_depth_m
         )
-        residual = config.relocalised_residual + config.relocalised_residual_per_rad * moved_rad
+        residual = config.relocalized_residual + config.relocalized_residual_per_rad * moved_rad
         overlap = config.min_overlap / config.recovery_margin
         if not candidate.is_confirmed:
-            overlap = max(overlap, config.relocalised_overlap)
+            overlap = max(overlap, config.relocalized_overlap)
         return replace(
             config,
             min_overlap=overlap,

@@ -28,7 +28,7 @@ class WindowConfig:
     reach: int = 6  # Number of the last keyframes to try, newest first.
     # Minimum overlap with the older keyframe; a smaller one is mostly its edges.
     min_overlap: float = 0.35
-    worst_noise: float = 1.5  # Maximum noise of a measurement, in multiples of that of tracking.
+    max_noise: float = 1.5  # Maximum noise of a measurement, in multiples of that of tracking.
     levels: int = 2  # Number of finest pyramid levels to use: the initial guess is good.
     iterations: tuple[int, ...] = (10, 4)  # Maximum per level, the finest first.
 
@@ -38,10 +38,10 @@ class WindowConfig:
                 named(self, "measurements", "reach", "levels")
                 + ": measurements must be at least 0, reach and levels at least 1."
             )
-        if not (0 < self.min_overlap <= 1 and self.worst_noise >= 1):
+        if not (0 < self.min_overlap <= 1 and self.max_noise >= 1):
             raise ConfigError(
-                named(self, "min_overlap", "worst_noise")
-                + ": min_overlap must be within 0..1, worst_noise at least 1."
+                named(self, "min_overlap", "max_noise")
+                + ": min_overlap must be within 0..1, max_noise at least 1."
             )
         if not self.iterations or min(self.iterations) < 1:
             raise ConfigError(
@@ -119,6 +119,6 @@ def _is_sure(alignment: Alignment, usual: BrightnessModel, config: WindowConfig)
     return (
         alignment.converged
         and alignment.overlap >= config.min_overlap
-        and alignment.intensity_sigma <= config.worst_noise * usual.intensity_sigma
-        and alignment.depth_noise_scale <= config.worst_noise * usual.depth_noise_scale
+        and alignment.intensity_sigma <= config.max_noise * usual.intensity_sigma
+        and alignment.depth_noise_scale <= config.max_noise * usual.depth_noise_scale
     )

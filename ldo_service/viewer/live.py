@@ -83,9 +83,9 @@ class LiveScene:
 
     def reset(self) -> None:
         """Start with an empty map, because the service has a new one."""
-        self._gaussians = MapReplica(self._config.most_gaussians)
+        self._gaussians = MapReplica(self._config.max_gaussians)
         self.scene = Scene(camera=self.scene.camera)
-        self._keyframes, self._path = LiveKeyframes(), LivePath(self._config.most_poses)
+        self._keyframes, self._path = LiveKeyframes(), LivePath(self._config.max_poses)
         self._loops: dict[tuple[int, int], None] = {}  # Received loop closures, in order.
         self._correction: GraphCorrection | None = None
         self._pose: panel.HeardPose | None = None
@@ -141,7 +141,7 @@ class LiveScene:
     def _take_objects(self, objects: MapObjects) -> None:
         if self.scene.objects is None:  # Detections from before this viewer subscribed.
             sights = sights_of(objects)
-            newest = sorted(sights)[-self._config.most_keyframes :]
+            newest = sorted(sights)[-self._config.max_keyframes :]
             self.scene.sights = {k: sights[k] for k in newest} | self.scene.sights
             self._changed.add("keyframes")
         self.scene.objects = objects
@@ -151,7 +151,7 @@ class LiveScene:
         found = (ObjectBox(one.label, one.box_px) for one in islice(boxes.detections, MAX_SIGHTS))
         sights = self.scene.sights
         sights[boxes.keyframe] = tuple(found)
-        while len(sights) > self._config.most_keyframes:
+        while len(sights) > self._config.max_keyframes:
             del sights[next(iter(sights))]
         self._changed.add("keyframes")
 

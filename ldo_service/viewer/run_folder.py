@@ -133,7 +133,7 @@ class RunFolder:
         T_map_camera = Trajectory.load(path).T_world_camera
         if len(T_map_camera):
             self.scene.T_map_camera = T_map_camera[-1]
-        return thinned(T_map_camera[:, :3, 3], self._config.most_poses)
+        return thinned(T_map_camera[:, :3, 3], self._config.max_poses)
 
     def read_keyframes(self, path: Path) -> None:
         viewpoints = read_viewpoints(path.parent)
@@ -143,7 +143,7 @@ class RunFolder:
     def read_map(self, path: Path) -> None:
         rows = read_ply(path)
         self._gaussians = len(rows)
-        self.scene.rows = rows[weightiest(rows, self._config.most_gaussians)]
+        self.scene.rows = rows[weightiest(rows, self._config.max_gaussians)]
 
     def read_objects(self, path: Path) -> None:
         """Read the objects with their views, which are the detections that a run keeps."""

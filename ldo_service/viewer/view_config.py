@@ -15,19 +15,19 @@ class ViewerConfig:
     port: int = 8080  # If this port is in use, the next free one is used. 0 uses any free port.
     # Maximum number of Gaussians, those of the largest weight, at 32 bytes each; a quarter more
     # while a map grows.
-    most_gaussians: int = 300_000
+    max_gaussians: int = 300_000
     # Maximum poses of a path, 11 minutes at 30 Hz; a longer one is drawn coarser.
-    most_poses: int = 20_000
+    max_poses: int = 20_000
     # Maximum keyframes; of more, every second, third, ... is drawn.
-    most_keyframes: int = 2_000
+    max_keyframes: int = 2_000
     # Maximum objects, those with the most observations: more labels hide each other.
-    most_objects: int = 200
+    max_objects: int = 200
     update_s: float = 0.2  # Interval of updates; poses move at 5 Hz.
     lines_s: float = 1.0  # Interval of paths, keyframes and boxes, which have at most 4 MB.
     gaussians_s: float = 2.0  # Interval of the Gaussians: at most 6 MB per second.
 
     def __post_init__(self) -> None:
-        counts = (self.most_gaussians, self.most_poses, self.most_keyframes, self.most_objects)
+        counts = (self.max_gaussians, self.max_poses, self.max_keyframes, self.max_objects)
         times_s = (self.update_s, self.lines_s, self.gaussians_s)
         if min(counts) < 1 or min(times_s) <= 0 or not 0 <= self.port <= 65535:
             raise ConfigError(
@@ -41,6 +41,6 @@ def viewer_config(settings: ViewerSettings) -> ViewerConfig:
     return ViewerConfig(
         address=settings.address,
         port=settings.port,
-        most_gaussians=settings.max_gaussians,
+        max_gaussians=settings.max_gaussians,
         update_s=settings.update_interval_s,
     )

@@ -178,7 +178,7 @@ class Window:
         self._draw_lines("final", path_lines(self._scene.final, FINAL))
 
     def _draw_keyframes(self) -> None:
-        scene, most = self._scene, self._config.most_keyframes
+        scene, most = self._scene, self._config.max_keyframes
         chosen = sorted(scene.keyframes)[:: max(1, -(-len(scene.keyframes) // most))]
         keyframes = {k: scene.keyframes[k] for k in chosen}
         self._draw_lines("keyframes", keyframe_lines(keyframes.values(), scene.camera))
@@ -210,7 +210,7 @@ class Window:
         by_sights = sorted(
             found.objects if found else (), key=lambda one: (-one.observation_count, one.id)
         )
-        return by_sights[: self._config.most_objects]
+        return by_sights[: self._config.max_objects]
 
     def _draw_name(self, one: MapObject) -> None:
         text, position = f"{one.name} {one.confidence:.0%}", one.T_map_object.translation

@@ -123,7 +123,7 @@ def test_replica_equals_the_map_while_gaussians_are_offloaded_and_loaded(keyfram
     """Gaussians beyond 3 m are offloaded, and loaded when a camera comes near."""
     offload = OffloadConfig(max_active=500, reach_m=3.0, clump_m=0.5)
     builder = MapBuilderConfig(sleep=offload, recent_cameras=1)
-    config = replace(CONFIG, builder=builder, changed_keyframes=1, iterations=1, least_iterations=1)
+    config = replace(CONFIG, builder=builder, changed_keyframes=1, iterations=1, min_iterations=1)
     mapper, replica = Mapper(replace(config, mended_at_end=0)), MapReplica()
     for version, keyframe in enumerate(keyframes, 1):
         poses = {
@@ -159,7 +159,7 @@ def test_pruned_gaussians_are_removed_from_the_replica(keyframes) -> None:
 
 
 def test_backlog_reduces_iterations_per_keyframe(keyframes) -> None:
-    mapper = Mapper(replace(CONFIG, iterations=12, least_iterations=3))
+    mapper = Mapper(replace(CONFIG, iterations=12, min_iterations=3))
     spent = []
     for keyframe, waiting in zip(keyframes, (0, 1, 3), strict=False):
         before = mapper.metrics()["iterations"]
@@ -194,7 +194,7 @@ def test_refined_map_is_in_the_next_snapshot(keyframes) -> None:
 
 def test_optimized_keyframe_poses_are_published_as_refinements(keyframes) -> None:
     optimizer = GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
-    builder = MapBuilderConfig(optimiser=optimizer)
+    builder = MapBuilderConfig(optimizer=optimizer)
     mapper = Mapper(replace(CONFIG, builder=builder, iterations=6))
     known = {}
     for keyframe in keyframes[:5]:
@@ -215,7 +215,7 @@ def test_optimized_keyframe_poses_are_published_as_refinements(keyframes) -> Non
 
 def test_correction_older_than_a_refinement_does_not_undo_it(keyframes) -> None:
     optimizer = GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
-    builder = MapBuilderConfig(optimiser=optimizer)
+    builder = MapBuilderConfig(optimizer=optimizer)
     mapper, optimizer = Mapper(replace(CONFIG, builder=builder, iterations=6)), Optimizer()
     for keyframe in keyframes[:4]:
         made = list(mapper.handle(keyframe))

@@ -341,7 +341,7 @@ def test_fusion_rule_decides_between_detection_and_label_result(
     confidence: float,
     expected_label: str,
 ) -> None:
-    regions = replace(REGIONS, boxes_vote=boxes_vote, least_votes=0)
+    regions = replace(REGIONS, boxes_vote=boxes_vote, min_votes=0)
     labelling = SemanticFusionConfig(fusion=FusionConfig(rule=rule))
     naming = OpenVocabularyConfig(trigger=TRIGGER, regions=regions)
     semantics = SemanticMapConfig(labelling=labelling, naming=naming)
@@ -365,7 +365,7 @@ def test_fusion_rule_decides_between_detection_and_label_result(
 
 
 def test_label_beyond_the_maximum_is_other_and_empty_result_labels_nothing() -> None:
-    semantics = replace(CONFIG.semantics, most_names=83)
+    semantics = replace(CONFIG.semantics, max_names=83)
     mapper = Mapper(replace(CONFIG, semantics=semantics), has_labeller=True)
     messages = walk(mapper, known=())
     first, second, third, *_ = of_kind(LabelRequest, messages)

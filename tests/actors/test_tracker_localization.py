@@ -17,7 +17,7 @@ from ldo_service.tracking.keyframe_database import DATABASE_FILE, load_keyframe_
 
 
 def localizing_tracker(finished_run: Path) -> Tracker:
-    return Tracker(TrackerConfig(localise=str(finished_run)))
+    return Tracker(TrackerConfig(localize=str(finished_run)))
 
 
 def test_poses_are_in_the_frame_of_the_map(room: Sequence, finished_run: Path, frames) -> None:

@@ -78,7 +78,7 @@ def test_a_frame_with_a_prior_enters_tracking_once(frames: Many[FrameRgbd]) -> N
 def test_a_frame_in_a_finished_map_enters_tracking_once(
     frames: Many[FrameRgbd], finished_run: Path, frame: int
 ) -> None:
-    tracker = Tracker(TrackerConfig(localise=str(finished_run)))
+    tracker = Tracker(TrackerConfig(localize=str(finished_run)))
     calls, (pose,) = calls_into_tracking(tracker, frames[frame])
     assert calls == ["Localizer.process"]
     assert isinstance(pose, TrackedPose)

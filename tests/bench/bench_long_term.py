@@ -120,7 +120,7 @@ def _referents(one: object) -> list[object]:
 
 
 # --- the run --------------------------------------------------------------------------------------
-def journey(keyframes: int, most_laps: int, settings: list[str]) -> Iterator[Sample]:
+def journey(keyframes: int, max_laps: int, settings: list[str]) -> Iterator[Sample]:
     config, scene = load_config(settings=[*LIGHT, *settings]), frames()
     actors, made, laps = make_actors(actor_parameters(config)), 0, 0
 
@@ -131,7 +131,7 @@ def journey(keyframes: int, most_laps: int, settings: list[str]) -> Iterator[Sam
     for actor in actors:
         keep_state(actor)
     with LogicalClock(actors, latency_frames(config), observe) as clock:
-        while made < keyframes and laps < most_laps:
+        while made < keyframes and laps < max_laps:
             for _tick in clock.run(lap(scene, laps)):
                 pass
             laps += 1

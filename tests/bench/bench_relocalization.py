@@ -31,7 +31,7 @@ APART_FRAMES = 30
 RIGHT_M, RIGHT_RAD = 0.10, float(np.radians(5.0))
 CONFIG = OdometryConfig()
 SEARCH = Relocalizer(
-    CONFIG.pyramid, CONFIG.align, CONFIG.features, CONFIG.judgement, CONFIG.relocalisation
+    CONFIG.pyramid, CONFIG.align, CONFIG.features, CONFIG.tracking_quality, CONFIG.relocalization
 )
 
 

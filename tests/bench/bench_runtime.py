@@ -63,15 +63,15 @@ async def throughput(network: Endpoint) -> Throughput:
         async with running(stage):
             await consumer_joined(outlet)
             message = Block(stamp_ns=0, data=memoryview(bytes(MESSAGE_BYTES)))
-            before_mb, most_mb, started_s = resident_mb(), 0.0, time.perf_counter()
+            before_mb, max_mb, started_s = resident_mb(), 0.0, time.perf_counter()
             for _ in range(MESSAGES):
                 await outlet.send(message, encode(message))
-                most_mb = max(most_mb, resident_mb())
+                max_mb = max(max_mb, resident_mb())
             while stage.health().inputs[0].delivered < MESSAGES:
                 await asyncio.sleep(0.001)
             total_s = time.perf_counter() - started_s
             deepest = stage.health().inputs[0].peak_queued
-    return Throughput(total_s, deepest, most_mb - before_mb, outlet.counts().retransmitted)
+    return Throughput(total_s, deepest, max_mb - before_mb, outlet.counts().retransmitted)
 
 
 async def release_ms(network: Endpoint) -> float:

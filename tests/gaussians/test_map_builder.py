@@ -57,7 +57,7 @@ def test_optimization_improves_held_out_views(posed_frames: dict) -> None:
 @pytest.mark.parametrize("threads", [2, 3])
 def test_map_is_bitwise_equal_for_any_thread_count(posed_frames: dict, threads: int) -> None:
     config = MapBuilderConfig(
-        optimiser=GaussianOptimizerConfig(rotation_rate_rad=1e-4, translation_rate_m=1e-4)
+        optimizer=GaussianOptimizerConfig(rotation_rate_rad=1e-4, translation_rate_m=1e-4)
     )
     one, many = (
         build_map(posed_frames, config, iterations=4),
@@ -137,7 +137,7 @@ def test_correction_moves_gaussians_and_views_together(posed_frames: dict) -> No
 
 def test_refined_poses_are_reported_once(posed_frames: dict) -> None:
     config = MapBuilderConfig(
-        optimiser=GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
+        optimizer=GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
     )
     builder = build_map(posed_frames, config, iterations=10)
     refined = builder.refined()

@@ -43,7 +43,7 @@ def test_isolated_gaussian_is_not_pruned() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"min_opacity": 1.0}, {"max_relative_scale": 0.5}, {"neighbourhood_m": 0.0}]
+    "change", [{"min_opacity": 1.0}, {"max_relative_scale": 0.5}, {"neighborhood_m": 0.0}]
 )
 def test_invalid_settings_raise_config_error(change: dict) -> None:
     with pytest.raises(ConfigError):

@@ -267,7 +267,7 @@ def test_landmark_that_cannot_be_solved_is_dropped_and_poses_stay(monkeypatch) -
 
 def test_number_of_observations_per_landmark_is_bounded() -> None:
     graph, landmarks = graph_with_landmarks(
-        kitchen(120), ObjectLandmarkConfig(most_sights=8, due_weight=1)
+        kitchen(120), ObjectLandmarkConfig(max_sights=8, due_weight=1)
     )
     assert {len(landmark.sights) for landmark in landmarks.known.values()} == {8}
     assert len(graph._known.sights) == 8 * len(graph.landmarks())

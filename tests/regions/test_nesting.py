@@ -62,7 +62,7 @@ def test_random_parts_match_pixel_sets() -> None:
             nested = [
                 one
                 for one, score in zip(images, scores, strict=True)
-                if score >= CONFIG.least_score
+                if score >= CONFIG.min_score
                 and 0 < CONFIG.times * one.sum() <= image.sum()
                 and (one & image).sum() >= CONFIG.inside * one.sum()
             ]
@@ -70,7 +70,7 @@ def test_random_parts_match_pixel_sets() -> None:
             assert np.array_equal(left[k].image(SHAPE), expected)
 
 
-@pytest.mark.parametrize("fields", [{"inside": 0}, {"times": 1}, {"least_score": -1}])
+@pytest.mark.parametrize("fields", [{"inside": 0}, {"times": 1}, {"min_score": -1}])
 def test_invalid_settings_raise_config_error(fields: dict) -> None:
     with pytest.raises(ConfigError):
         replace(CONFIG, **fields)

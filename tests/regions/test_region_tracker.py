@@ -26,7 +26,7 @@ from ldo_service.storage.state_codec import decode_state, encode_state
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 SHAPE = 120, 160
 CONFIG = RegionTrackerConfig(
-    views_first=2, views=3, most_questions=2, patience=0, per_keyframe=9, at_once=9
+    views_first=2, views=3, max_questions=2, patience=0, per_keyframe=9, at_once=9
 )
 RNG = np.random.default_rng(3)
 COLOR = RNG.integers(0, 256, (*SHAPE, 3), np.uint8)
@@ -112,7 +112,7 @@ def test_best_view_is_requested_when_no_better_one_follows() -> None:
 
 
 def test_requests_are_limited_and_sorted_by_size() -> None:
-    sequence = KeyframeSequence(replace(CONFIG, per_keyframe=0.5, at_once=1, most_questions=1))
+    sequence = KeyframeSequence(replace(CONFIG, per_keyframe=0.5, at_once=1, max_questions=1))
     many = [proposal(left=5, side=20), proposal(left=40, side=40), proposal(left=100, side=30)]
     requests = [sequence.observe(*many) for _ in range(8)]
     assert requests == [[], [1], [], [2], [], [0], [], []]
@@ -227,7 +227,7 @@ def test_confident_label_is_propagated_without_a_proposal_of_its_region() -> Non
 
 
 def test_small_region_is_not_propagated() -> None:
-    sequence = KeyframeSequence(replace(CONFIG, least_quality=0))
+    sequence = KeyframeSequence(replace(CONFIG, min_quality=0))
     assert [sequence.observe(proposal(side=8)) for _ in range(2)] == [[], [0]]
     sequence.add_label_result("cup", 0.9)
     sequence.T_map_keyframe[2] = pose_at()
@@ -334,7 +334,7 @@ def test_supported_flag_of_a_region_persists() -> None:
 
 
 def test_propagated_labels_per_keyframe_are_limited() -> None:
-    sequence = KeyframeSequence(replace(CONFIG, most_carried=1))
+    sequence = KeyframeSequence(replace(CONFIG, max_carried=1))
     for _ in range(2):
         sequence.observe(proposal(left=20), proposal(left=90))
     for region in (0, 1):

@@ -120,7 +120,7 @@ async def test_reset_names_unresponsive_actor_and_resumes_the_others() -> None:
 async def test_unknown_command_is_answered_with_the_valid_ones() -> None:
     scene = Scene()
     async with scene.started():
-        answer = await scene.request("localise-only")
+        answer = await scene.request("localize-only")
         assert not answer.ok
         assert "pause, resume, save, reset" in answer.message
 

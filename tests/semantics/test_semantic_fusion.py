@@ -149,7 +149,7 @@ def test_detector_rule_ignores_regions_of_the_labeller() -> None:
 
 
 def test_labels_unknown_to_the_detector_are_not_missed() -> None:
-    config = SemanticFusionConfig(labels=LabelConfig(least_px=20))
+    config = SemanticFusionConfig(labels=LabelConfig(min_px=20))
     rows, labels = labelled(config, late=detections(0, 0.9))
     at = np.arange(len(rows), dtype=np.uint32), CAMERA, np.eye(4), depth_image()
     lamps, spared = labels.copy(), np.zeros(256, bool)
@@ -208,7 +208,7 @@ def test_label_image_uses_largest_weight_sum_not_nearest_gaussian() -> None:
 
 def test_earlier_misses_do_not_delay_a_label_unknown_to_the_detector() -> None:
     """Ten keyframes of misses have the weight of two label results of 0.9."""
-    config = SemanticFusionConfig(labels=LabelConfig(least_px=1))
+    config = SemanticFusionConfig(labels=LabelConfig(min_px=1))
     rows, labels = labelled(config, *[NO_DETECTIONS] * 10)
     view = np.arange(len(rows), dtype=np.uint32), CAMERA, np.eye(4), depth_image()
     spared, known = np.zeros(256, bool), labels.copy()

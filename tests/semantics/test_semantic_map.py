@@ -105,7 +105,7 @@ def test_repeated_detections_count_once(posed_frames) -> None:
 
 def test_detections_waiting_for_keyframes_are_bounded(posed_frames) -> None:
     builder = build_map(posed_frames[:1])
-    semantics = SemanticMap(builder, replace(BY_BOX, most_waiting=2))
+    semantics = SemanticMap(builder, replace(BY_BOX, max_waiting=2))
     for keyframe in (7, 8, 9):
         semantics.add_detections(keyframe, detections())
     assert semantics.metrics()["detections_too_early"] == 1
@@ -196,7 +196,7 @@ def test_restored_map_continues_with_labels_names_and_waiting_detections(
 
 
 def test_invalid_settings_raise_config_error() -> None:
-    with pytest.raises(ConfigError, match="most_waiting"):
-        SemanticMapConfig(most_waiting=-1)
-    with pytest.raises(ConfigError, match="most_names"):
-        SemanticMapConfig(most_names=257)
+    with pytest.raises(ConfigError, match="max_waiting"):
+        SemanticMapConfig(max_waiting=-1)
+    with pytest.raises(ConfigError, match="max_names"):
+        SemanticMapConfig(max_names=257)

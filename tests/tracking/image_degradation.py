@@ -117,7 +117,7 @@ class Outcome:
     Attributes:
         ok_percent: Fraction of OK frames outside the degradation, percent.
         ok_percent_meanwhile: The same during the degradation; None if no frame arrived.
-        worst_m: Largest position error, aligned as without the degradation.
+        max_m: Largest position error, aligned as without the degradation.
         worst_frame: Time index of the largest error.
         ate_m: RMSE after alignment.
         recovered_after: Frames from the end of the degradation to the first OK frame, if any.
@@ -125,7 +125,7 @@ class Outcome:
 
     ok_percent: float
     ok_percent_meanwhile: float | None
-    worst_m: float
+    max_m: float
     worst_frame: int
     ate_m: float
     recovered_after: int | None
@@ -134,7 +134,7 @@ class Outcome:
         meanwhile = self.ok_percent_meanwhile
         return (
             f"{self.ok_percent:.1f} | {'-' if meanwhile is None else f'{meanwhile:.1f}'} | "
-            f"{100 * self.worst_m:.1f} "
+            f"{100 * self.max_m:.1f} "
             f"({self.worst_frame}) | {100 * self.ate_m:.2f} | {self.recovered_after}"
         )
 

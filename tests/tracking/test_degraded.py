@@ -79,7 +79,7 @@ def test_ok_poses_are_correct_and_tracking_recovers(walk: Walk, name: str) -> No
     steps = walk.track(degrade, degraded)
     result = outcome(steps, degraded, dict(enumerate(walk.T_world_camera)), np.eye(4))
     max_error_m = MAX_ERRORS_M.get(name, MAX_ERROR_M / 5)  # The room has no noise.
-    assert result.worst_m < max_error_m, result
+    assert result.max_m < max_error_m, result
     assert result.recovered_after is not None, result
     assert result.recovered_after <= MAX_RECOVERY_FRAMES, result
     assert result.ok_percent > 90, result
@@ -129,7 +129,7 @@ def test_full_turn_in_a_noisy_room_has_small_errors() -> None:
         poses.append(T)
     steps = Walk(frames, poses).track(dropped, range(0))
     result = outcome(steps, range(0), dict(enumerate(poses)), poses[0])
-    assert result.worst_m < MAX_ERROR_M, result
+    assert result.max_m < MAX_ERROR_M, result
     assert result.ok_percent > 95, result
 
 
@@ -155,7 +155,7 @@ def test_degraded_real_sequences_have_small_errors_and_recover(
         degraded_frames(sequence.__getitem__, count, degrade, degraded), sequence.stamps_ns
     )
     result = evaluate(steps, degraded)
-    assert result.worst_m < MAX_ERROR_M, result
+    assert result.max_m < MAX_ERROR_M, result
     assert result.recovered_after is not None, result
     assert result.recovered_after <= LATE_RECOVERIES.get(
         (sequence.name, name), MAX_RECOVERY_FRAMES

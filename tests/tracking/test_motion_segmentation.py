@@ -166,7 +166,7 @@ def test_box_without_depth_is_masked_whole_and_one_outside_is_ignored() -> None:
     assert np.count_nonzero(mask) == 20
 
 
-@pytest.mark.parametrize("wrong", [{"least_m": -1.0}, {"gone_frames": 0}, {"rim_px": -1}])
+@pytest.mark.parametrize("wrong", [{"min_m": -1.0}, {"gone_frames": 0}, {"rim_px": -1}])
 def test_impossible_settings_are_rejected(wrong: dict) -> None:
     with pytest.raises(ConfigError):
         MotionSegmentationConfig(**wrong)

@@ -151,7 +151,7 @@ def test_dead_reckoning_ends_at_a_new_session_and_at_its_time_limit() -> None:
 # --- tracking with a covered lens -----------------------------------------------------------------
 BEFORE, COVERED, AFTER = 8, 22, 6
 # SIFT relocalizes the camera in these views too, at many times the cost.
-WITHOUT_SIFT = OdometryConfig(relocalisation=RelocalizationConfig(across_scales=0))
+WITHOUT_SIFT = OdometryConfig(relocalization=RelocalizationConfig(across_scales=0))
 
 
 @dataclass(frozen=True)

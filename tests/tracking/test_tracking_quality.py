@@ -154,5 +154,5 @@ def test_history_keeps_the_newest_residuals() -> None:
 def test_limits_in_the_wrong_order_are_rejected() -> None:
     with pytest.raises(ConfigError, match="residual"):
         TrackingQualityConfig(weak_residual=6.0)
-    with pytest.raises(ConfigError, match="relocalised_residual"):
-        TrackingQualityConfig(relocalised_residual=0.9)
+    with pytest.raises(ConfigError, match="relocalized_residual"):
+        TrackingQualityConfig(relocalized_residual=0.9)

@@ -94,7 +94,7 @@ def test_window_of_zero_keyframes_measures_nothing(keyframes) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"measurements": -1}, {"min_overlap": 0.0}, {"worst_noise": 0.5}, {"iterations": ()}]
+    "wrong", [{"measurements": -1}, {"min_overlap": 0.0}, {"max_noise": 0.5}, {"iterations": ()}]
 )
 def test_impossible_settings_are_rejected(wrong) -> None:
     with pytest.raises(ConfigError):

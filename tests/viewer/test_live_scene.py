@@ -151,7 +151,7 @@ def test_unmerged_submap_leaves_a_gap_in_the_online_path(live: LiveScene) -> Non
 
 def test_long_path_is_thinned_evenly_up_to_its_end(clock: Clock) -> None:
     max_poses = 100
-    live = LiveScene(ViewerConfig(most_poses=max_poses), clock)
+    live = LiveScene(ViewerConfig(max_poses=max_poses), clock)
     for frame in range(1000):
         live.take(tracked_pose(frame, 0.01 * frame, 0, keyframe=0 if frame == 0 else None))
     live.update()
@@ -171,7 +171,7 @@ def test_camera_comes_from_a_keyframe(live: LiveScene) -> None:
 
 
 def test_detections_are_kept_for_the_newest_keyframes(clock: Clock) -> None:
-    live = LiveScene(ViewerConfig(most_keyframes=3), clock)
+    live = LiveScene(ViewerConfig(max_keyframes=3), clock)
     cup = Detection(label="cup", score=0.9, box_px=(1.0, 2.0, 3.0, 4.0))
     for keyframe in range(5):
         boxes = DetectionBoxes(

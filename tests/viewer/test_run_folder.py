@@ -156,7 +156,7 @@ def test_broken_file_is_reported_until_it_is_repaired(run: Path, name: str) -> N
 
 
 def test_viewer_limits_apply_to_a_run(run: Path) -> None:
-    folder = RunFolder(run, ViewerConfig(most_gaussians=100, most_poses=5))
+    folder = RunFolder(run, ViewerConfig(max_gaussians=100, max_poses=5))
     folder.update()
     rows = read_ply(run / "map.ply")
     assert len(folder.scene.rows) == 100

@@ -107,20 +107,20 @@ def confidence(logprobs: tuple[float, ...], how: Sureness) -> float:
     return exp(min(total, 0.0))
 
 
-def name_of(text: str, allowed: Collection[str], most_words: int) -> str | None:
+def name_of(text: str, allowed: Collection[str], max_words: int) -> str | None:
     """Return the name in an answer as in a vocabulary; None if missing or not allowed.
 
     Args:
         text: Answer of the model.
         allowed: Allowed names as in a vocabulary; empty: any.
-        most_words: Maximum words of a name.
+        max_words: Maximum words of a name.
 
     >>> name_of("A Sofa.", (), 4), name_of("sofa", ("chair",), 4), name_of("I am not sure", (), 3)
     ('couch', None, None)
     """
     plain = _MARK.sub("", text).strip().strip("\"'`*.!").strip()
     plain = re.sub(r"^(?:an?|the)\s+", "", plain, flags=re.IGNORECASE)
-    if len(plain) > 100 or len(plain.split()) > most_words or not _NAME.fullmatch(plain):
+    if len(plain) > 100 or len(plain.split()) > max_words or not _NAME.fullmatch(plain):
         return None
     name = canonical(plain)
     if allowed:
@@ -155,17 +155,15 @@ class HttpConfig:
     # Product of the probabilities of an answer's tokens, or their mean.
     confidence: Sureness = "product"
     confidence_untold: float = 0.3  # Confidence if the server returns no log-probabilities.
-    most_words: int = 4  # Maximum words of an answer without a list of names; more is a sentence.
-    most_tokens: int = 16  # Maximum tokens of an answer.
+    max_words: int = 4  # Maximum words of an answer without a list of names; more is a sentence.
+    max_tokens: int = 16  # Maximum tokens of an answer.
     endpoint: HttpClientConfig = field(default_factory=HttpClientConfig)
 
     def __post_init__(self) -> None:
         if self.confidence not in ("product", "mean"):
             raise ConfigError(f"http.confidence={self.confidence!r} must be 'product' or 'mean'.")
-        if min(self.views, self.side_px, self.most_words, self.most_tokens) < 1:
-            raise ConfigError(
-                "http: views, side_px, most_words and most_tokens must be at least 1."
-            )
+        if min(self.views, self.side_px, self.max_words, self.max_tokens) < 1:
+            raise ConfigError("http: views, side_px, max_words and max_tokens must be at least 1.")
         if not 0 <= self.confidence_untold <= 1:
             raise ConfigError(
                 f"http.confidence_untold={self.confidence_untold:g} must be in [0, 1]."
@@ -267,7 +265,7 @@ class HttpLabeller:
         self._questions += 1
         body = self._endpoint.post("/chat/completions", self._question(crop), until_s)
         answer = read_answer(body)
-        name = name_of(answer.text, self.names, self.config.most_words)
+        name = name_of(answer.text, self.names, self.config.max_words)
         if name is None:
             self._undecided += canonical(answer.text.strip(" .\"'")) == NONE
             self._refused += canonical(answer.text.strip(" .\"'")) != NONE
@@ -298,7 +296,7 @@ class HttpLabeller:
         question = {
             "messages": [{"role": "user", "content": content}],
             "temperature": 0,
-            "max_tokens": self.config.most_tokens,
+            "max_tokens": self.config.max_tokens,
             "logprobs": True,
             **({"model": self.config.model} if self.config.model else {}),
         }
