@@ -40,8 +40,9 @@ UNPAIRED_WARNING_COUNT = 30
 class FrameSourceConfig:
     """Limits for pairing, restarts and image sizes of a camera."""
 
-    # Maximum time between the color and depth image of a pair. Below half a period at 30 Hz, so
-    # that the first depth image within it is the nearest. At 1 rad/s it is 0.9 deg of rotation.
+    # Maximum time between the color and depth image of a pair. Below half a period at 30
+    # Hz, so that the first depth image within it is the nearest. At 1 rad/s it is 0.9
+    # deg of rotation.
     max_skew_s: float = 0.015
     # Images per stream that wait for their partner: 0.27 s at 30 Hz, 7 MB for VGA.
     pair_buffer: int = 8

@@ -62,8 +62,8 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     residual_depth: float = 0.0  # Robust sigma relative to that of the sensor model.
     overlap: float = 0.0  # Fraction of the reference keyframe's surface that this frame sees.
     iterations: int = 0
-    # Initial guess that gave the pose: direct, prior, features, gicp, relocalized, reused; first
-    # for the first frame; none without a pose.
+    # Initial guess that gave the pose: direct, prior, features, gicp, relocalized, reused;
+    # first for the first frame; none without a pose.
     pose_source: str = ""
     # Spread of the poses from several initial guesses, rad of image motion.
     hypothesis_spread_rad: float = 0.0

@@ -88,8 +88,8 @@ class NoiseSettings:
 class LoopClosureSettings:
     """Loop closures in the pose graph."""
 
-    # Maximum residual of an accepted loop closure, in standard deviations, as RGBD/OptimizeMaxError
-    # of RTAB-Map.
+    # Maximum residual of an accepted loop closure, in standard deviations, as
+    # RGBD/OptimizeMaxError of RTAB-Map.
     max_residual_sigmas: PositiveFloat = advanced(3.0)
     # Maximum number of loop closures in the pose graph, 1 kB each. Beyond it, the most redundant
     # one is removed.

@@ -157,8 +157,8 @@ class PublishSettings:
     # Maximum number of Gaussians per message, so that it blocks no other for long. 16,384 take 1.2
     # MB, or 1.8 MB with labels.
     max_gaussians_per_message: PositiveInt = advanced(16_384)
-    # Number of keyframes between messages with changed old Gaussians, because each keyframe changes
-    # all Gaussians in view.
+    # Number of keyframes between messages with changed old Gaussians, because each keyframe
+    # changes all Gaussians in view.
     update_interval_keyframes: PositiveInt = advanced(5)
 
 

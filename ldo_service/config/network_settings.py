@@ -27,8 +27,8 @@ class DetectorSettings:
     class_names: str = ""
     # Minimum score of a detection. The default is that of YOLOv5 and YOLOX.
     min_score: Ratio = 0.25
-    # COCO classes of objects that may move by themselves. Poses and loop closures do not rely on
-    # their pixels.
+    # COCO classes of objects that may move by themselves. Poses and loop closures do not
+    # rely on their pixels.
     dynamic_classes: tuple[str, ...] = DynamicClassConfig().classes
     # Output layout of the network. Empty recognizes it by the shape of the output.
     layout: Literal["", "yolov5", "yolox", "yolov8"] = advanced("")
@@ -62,8 +62,8 @@ class EncoderSettings:
     image_mean: tuple[float, ...] = advanced(())
     # Standard deviation that normalizes RGB in 0..1. Empty uses that of the encoder, or of CLIP.
     image_std: tuple[PositiveFloat, ...] = advanced(())
-    # Factor on the similarities before the softmax over names; a larger one sharpens it. 0 uses
-    # that of the pair, or 100 as in CLIP.
+    # Factor on the similarities before the softmax over names; a larger one sharpens it. 0
+    # uses that of the pair, or 100 as in CLIP.
     logit_scale: NonNegativeFloat = advanced(0.0)
     # Names such as wall and floor that compete with the others but are never reported.
     background_names: tuple[str, ...] = advanced(())

@@ -105,8 +105,8 @@ class ServiceSettings:
     keys: str = ""
     # Maximum size of a message, MB. The network drops larger ones. A 4K frame has up to 58 MB.
     max_message_mb: Annotated[int, Meta(ge=1, le=1000)] = MAX_MESSAGE_MB
-    # Address on which Prometheus metrics are served. With 0.0.0.0 anyone on the network can see
-    # when the robot works.
+    # Address on which Prometheus metrics are served. With 0.0.0.0 anyone on the network can
+    # see when the robot works.
     metrics_address: str = LOOPBACK
     # Maximum time for all actors to execute `ldo control`, seconds. The slowest measured took 0.6
     # s; a labeller may wait 50 s for its server.
@@ -121,8 +121,8 @@ class RecordingSettings:
 
     # Maximum size of the folder of a recording in GB, at which the recording ends.
     max_gb: PositiveFloat = 50.0
-    # Minimum free disk space in GB, which the states of actors need. The recording ends when less
-    # is left.
+    # Minimum free disk space in GB, which the states of actors need. The recording ends when
+    # less is left.
     min_free_gb: NonNegativeFloat = 1.0
 
 

@@ -55,8 +55,8 @@ class ImageSettings:
     # More levels let the alignment converge over larger motions. Four levels of 320 pixels end at
     # 40 pixels.
     pyramid_levels: PositiveInt = advanced(4)
-    # Maximum depth that is used, meters. No depth camera measures farther, and a stray 65 m must
-    # not count.
+    # Maximum depth that is used, meters. No depth camera measures farther, and a stray 65 m
+    # must not count.
     max_depth_m: PositiveFloat = 30.0
 
 
@@ -105,8 +105,8 @@ class KeyframeSettings:
     min_interval_frames: PositiveInt = advanced(2)
     # Maximum number of frames between keyframes, if the camera moved at all.
     max_interval_frames: PositiveInt = advanced(30)
-    # Fraction of the two motion limits after which a mapping keyframe is made. Above 1 there are
-    # none. On the kitchen they gain 0.4 dB.
+    # Fraction of the two motion limits after which a mapping keyframe is made. Above 1 there
+    # are none. On the kitchen they gain 0.4 dB.
     mapping_only_ratio: PositiveFloat = advanced(0.33)
     # Number of keyframes from which the tracker searches for a known keyframe before it makes a new
     # one. 0 never searches. Until then new views improve the map.
@@ -191,8 +191,8 @@ class DynamicsSettings:
 class OdometryPriorSettings:
     """Use of an external odometry as prior."""
 
-    # Maximum time between two poses that are interpolated, seconds, because the path between them
-    # is not straight.
+    # Maximum time between two poses that are interpolated, seconds, because the path between
+    # them is not straight.
     max_gap_s: PositiveFloat = advanced(0.25)
     # Maximum duration of dead reckoning while LOST, seconds: 2 % drift at 0.5 m/s is then 30 cm.
     max_dead_reckoning_s: PositiveFloat = advanced(30.0)

@@ -19,8 +19,8 @@ class NetworkConfig:
     """Settings of a detector."""
 
     layout: str = ""  # yolov5, yolox, yolov8; empty: determined by the shape of its output.
-    # File with one class name per line; empty: those it was registered with or contains, or the 80
-    # of COCO.
+    # File with one class name per line; empty: those it was registered with or contains, or the
+    # 80 of COCO.
     names: str = ""
     # Width and height of the input, if the network takes any.
     input_px: tuple[int, int] = (640, 480)

@@ -18,9 +18,9 @@ from .model import GaussianMap
 from .renderer import Rendering, render
 from .rows import ROW
 
-# Densification subtracts this much of the 0.3 px^2 that the renderer adds to every splat. A larger
-# value gives sharper images. Subtracting all of it leaves cracks between Gaussians of one pixel
-# when the camera comes nearer.
+# Densification subtracts this much of the 0.3 px^2 that the renderer adds to every splat. A
+# larger value gives sharper images. Subtracting all of it leaves cracks between Gaussians of one
+# pixel when the camera comes nearer.
 LOW_PASS_TAKEN_BACK_PX2 = 0.2
 
 
@@ -139,14 +139,14 @@ class DensificationConfig:
     max_transmittance: float = 0.3  # Larger is unexplained. 0.5: -0.5 dB, 4 % fewer Gaussians.
     # New surface is nearer than the rendered depth by at least this fraction of it.
     in_front: float = 0.05
-    # A nearer surface is not new if the map shows it within this distance, because depth is noisy
-    # at edges. With 0, each lap of an apartment adds 5 % of the map again although the poses are
-    # exact, and kitchen views lose 0.7 dB.
+    # A nearer surface is not new if the map shows it within this distance, because depth is
+    # noisy at edges. With 0, each lap of an apartment adds 5 % of the map again although the
+    # poses are exact, and kitchen views lose 0.7 dB.
     edge_px: int = 2
-    # Mean error of the channels, 0..1; a larger one is unexplained. Off because colors are not yet
-    # optimized then. 0.1 gives +0.3 dB for +57 % Gaussians, and adds as many at every visit.
-    # Inserting the same 5 frames six times then grows the map from 101 k to 369 k Gaussians;
-    # without, it stays at 79 k.
+    # Mean error of the channels, 0..1; a larger one is unexplained. Off because colors are not
+    # yet optimized then. 0.1 gives +0.3 dB for +57 % Gaussians, and adds as many at every
+    # visit. Inserting the same 5 frames six times then grows the map from 101 k to 369 k
+    # Gaussians; without, it stays at 79 k.
     max_color_error: float = inf
     overlap_px: int = 2  # Margin around unexplained pixels; it closes seams. 0: -1.2 dB.
     # Width of the holes that get the depth around them. Black holes limit the PSNR.

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 MIN_GAIN = 0.1  # A smaller gain does not determine the brightness of the map.
-# Images are compared as averages over blocks, so that a misplaced edge does not count as a change
-# of brightness.
+# Images are compared as averages over blocks, so that a misplaced edge does not count as a
+# change of brightness.
 MIN_BLOCK_PX = 8
 BLOCKS_ACROSS = 40  # Blocks per image row; more give no more information.
 SATURATED = 0.97  # Fraction of the range above which the sensor saturates.

@@ -31,8 +31,8 @@ class ViewSamplingConfig:
     covisible_share: float = 0.3  # Fraction of the iterations that take a covisible keyframe.
     min_shared: float = 0.3  # Least overlap of a covisible keyframe with the newest one.
     recent: int = 32  # Last keyframes that are checked for covisibility.
-    # Random earlier keyframes that are checked too. The number is fixed, so the cost does not grow
-    # with the length of the run.
+    # Random earlier keyframes that are checked too. The number is fixed, so the cost does not
+    # grow with the length of the run.
     earlier: int = 32
 
     def __post_init__(self) -> None:

@@ -74,10 +74,9 @@ class GaussianOptimizerConfig:
     # Number of Gaussians at which an iteration takes half its time per pixel, half per Gaussian.
     usual_reach: int = 60_000
 
-    # Parameters of each frame; 0 switches their optimization off.
-    # Fraction of the way to the estimated gain and bias at each visit; 1 is as good. Gradient steps
-    # with a prior of gain 1 lag behind: this cost 2.3 dB in an apartment where gains vary by a
-    # fifth.
+    # Fraction of the way to the estimated gain and bias of a frame at each visit; 0 leaves the
+    # exposures as they are, 1 is as good. Gradient steps with a prior of gain 1 lag behind: this
+    # cost 2.3 dB in an apartment where gains vary by a fifth.
     exposure_share: float = 0.3
     # Step of keyframe poses per iteration. 2e-4 gains 0.3 dB there. It adds 1 mm of noise to exact
     # poses (90 frames of a Replica apartment: ATE 0.02 cm without, 0.13 cm with).

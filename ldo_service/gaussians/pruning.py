@@ -24,8 +24,8 @@ class PruningConfig:
     # checked once that many keyframes followed its own, and later at random. Hidden Gaussians are
     # removed: others have grown over them.
     confirm_keyframes: int = 5
-    # Least sum of its weights over the image; 0 confirms all. In the kitchen, 430 k Gaussians
-    # without and 165 k with it; the PSNR of held-out views differs by 0.1 dB.
+    # Least sum of its weights over the image; 0 confirms all. In the kitchen, 430 k
+    # Gaussians without and 165 k with it; the PSNR of held-out views differs by 0.1 dB.
     min_weight_px: float = 0.25
 
     def __post_init__(self) -> None:

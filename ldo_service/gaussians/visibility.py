@@ -12,8 +12,8 @@ from ldo_service.geometry import Camera, se3
 from .densification import with_small_holes_filled
 
 BLOCKS = 12, 16  # Blocks of an image, down and to the right: 0.8 kB.
-# Fraction of the depth. A point less than this behind the surface counts as visible, because depth
-# is noisy.
+# Fraction of the depth. A point less than this behind the surface counts as visible, because
+# depth is noisy.
 BEHIND = 0.1
 LOW_PASS_PX = 2.0  # 3.33 times the square root of the 0.3 px^2 that the renderer adds to a splat.
 _HOLE_PX = 4  # Equals the hole_px of densification: the sensor's shadows lie on the surface behind.
@@ -249,13 +249,13 @@ class OffloadConfig:
     max_active: int = 1_500_000
     # Fraction of max_active that remains after offloading, so each batch takes about 0.1 s.
     low_water: float = 0.9
-    # Largest distance at which Gaussians count as visible. Depth cameras measure less far, so
-    # nothing is inserted twice where Gaussians are offloaded. Within it, the measured surface
-    # hides the Gaussians behind it.
+    # Largest distance at which Gaussians count as visible. Depth cameras measure less
+    # far, so nothing is inserted twice where Gaussians are offloaded. Within it, the
+    # measured surface hides the Gaussians behind it.
     reach_m: float = 20.0
-    # Edge of the cubes; the Gaussians of one keyframe in one cube form a chunk. In an apartment of
-    # two rooms the last 8 keyframes may see 36 % of the map; with 0.5 m 28 %, with 2.0 m 54 %. It
-    # is 67 % with whole keyframes as chunks and without occlusion.
+    # Edge of the cubes; the Gaussians of one keyframe in one cube form a chunk. In an
+    # apartment of two rooms the last 8 keyframes may see 36 % of the map; with 0.5 m 28
+    # %, with 2.0 m 54 %. It is 67 % with whole keyframes as chunks and without occlusion.
     clump_m: float = 1.0
 
     def __post_init__(self) -> None:

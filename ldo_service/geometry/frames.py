@@ -62,8 +62,8 @@ class RawFrame:
     index: int  # Running number of the frame in its source.
     stamp_ns: int  # Time of the exposure.
     color: np.ndarray  # [H, W, 3] uint8 RGB.
-    # [H, W] uint16, float32 or float64, z in 1/depth_scale meters; 0, NaN, infinite or negative
-    # where not measured.
+    # [H, W] uint16, float32 or float64, z in 1/depth_scale meters; 0, NaN, infinite or
+    # negative where not measured.
     depth: np.ndarray
     depth_scale: float  # Units of `depth` per meter.
     camera: Camera  # Intrinsics with lens distortion.

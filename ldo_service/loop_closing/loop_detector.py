@@ -41,8 +41,8 @@ BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1
 class VisualWordsConfig:
     """Parameters of the visual words."""
 
-    # Maximum words: 4 kB of counts per subgraph. 512 find 2 % fewer loops on kitchen and flat, 2048
-    # no more.
+    # Maximum words: 4 kB of counts per subgraph. 512 find 2 % fewer loops on kitchen and flat,
+    # 2048 no more.
     count: int = 1024
     # A feature that differs from every word in more of its 256 bits becomes a word.
     apart_bits: int = 64

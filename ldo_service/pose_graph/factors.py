@@ -26,9 +26,10 @@ class NoiseConfig:
     sigma_translation_max_m: float = 0.5
     sigma_odometry_rad: float = 0.05  # Sigma of odometry over a missed keyframe.
     sigma_odometry_m: float = 0.1
-    # Alignment counts pixels as independent and models no bias. On a handheld Kinect, its relative
-    # poses are off by 7 sigma in the median. So a random walk is added: about 1 % and 0.5 deg/m
-    # after some meters. Without it no chain could change as far as a true loop closure requires.
+    # Alignment counts pixels as independent and models no bias. On a handheld Kinect, its
+    # relative poses are off by 7 sigma in the median. So a random walk is added: about 1 % and
+    # 0.5 deg/m after some meters. Without it no chain could change as far as a true loop closure
+    # requires.
     drift_rad_per_sqrt_m: float = 0.02
     drift_m_per_sqrt_m: float = 0.02
     turn_m_per_rad: float = 0.5  # Path length with the same drift as a rotation of 1 rad in place.

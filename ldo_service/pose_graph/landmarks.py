@@ -55,8 +55,8 @@ class ObjectLandmarkConfig:
     vague_misses: int = 5  # The same for a landmark with high entropy.
     vague_keyframes: int = 20  # Keyframes without observation after which such a one is removed.
     most: int = 1000  # Maximum landmarks; beyond, the least recently observed ones are removed.
-    # adaptive: the graph takes observations in once their total weight reaches `due_weight`; fixed:
-    # at every keyframe with observations.
+    # adaptive: the graph takes observations in once their total weight reaches `due_weight`;
+    # fixed: at every keyframe with observations.
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     due_weight: float = 8.0  # Uncertain observations have less weight.
     max_waiting: int = 256  # Maximum waiting observations, however small their weight.

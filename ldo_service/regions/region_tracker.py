@@ -53,8 +53,9 @@ class RegionTrackerConfig:
     views_first: int = 2  # Minimum views before a request; a single one may show a flaw of depth.
     patience: int = 3  # Keyframes without a better view before a request; one may yet come.
     max_questions: int = 3  # Maximum label requests for a region.
-    # Label requests per keyframe; pending regions with the best views go first. Half of them show
-    # no object. The paper requests on 10-25 % of the frames (IV.B.8); the flat, 1.0 per keyframe.
+    # Label requests per keyframe; pending regions with the best views go first. Half of them
+    # show no object. The paper requests on 10-25 % of the frames (IV.B.8); the flat, 1.0 per
+    # keyframe.
     per_keyframe: float = 2.5
     at_once: int = 4  # Maximum requests saved up over keyframes without any.
     gain: float = 1.3  # Minimum ratio of the views' summed quality for another request.

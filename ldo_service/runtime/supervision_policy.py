@@ -48,8 +48,8 @@ class SupervisionConfig:
     stall_after_s: float = 60.0
     # Time without progress after which a consumer is evicted, because it holds up the robot.
     evict_after_s: float = 30.0
-    # Nice value of threads with work that may be late. On a shared core (Linux) they have a tenth
-    # of the weight of threads that a robot waits for.
+    # Nice value of threads with work that may be late. On a shared core (Linux) they have a
+    # tenth of the weight of threads that a robot waits for.
     nice: int = 10
     # Larger messages are not decoded; raw color and depth of 8 MP have 58 MB.
     max_message_mb: float = 64.0

@@ -47,9 +47,9 @@ class KeyframeDatabaseConfig:
     count: int = 1000
     # ORB features of a record: half of those of a frame, which halves the time to match.
     features: int = 500
-    # A new record replaces one within this distance, rad (`motion.image_motion_rad`): the newer one
-    # shows the current state. Half a step between keyframes, so that the database stops growing
-    # while a robot repeats its route.
+    # A new record replaces one within this distance, rad (`motion.image_motion_rad`): the newer
+    # one shows the current state. Half a step between keyframes, so that the database stops
+    # growing while a robot repeats its route.
     same: float = 0.1
     # The newest records are not replaced: new keyframes are measured against them.
     recent: int = 16

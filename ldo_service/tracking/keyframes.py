@@ -33,8 +33,8 @@ class KeyframeConfig:
     still_motion: float = 0.01
     # A frame becomes a mapping keyframe beyond this fraction of max_rotation_rad and
     # max_translation; the reference keyframe stays. The map gains by more views, tracking by fewer
-    # references. Kitchen, held-out views at equal iterations: +0.4 dB, the worst +2 dB. Above 1:
-    # no mapping keyframes.
+    # references. Kitchen, held-out views at equal iterations: +0.4 dB, the worst +2 dB. Above 1: no
+    # mapping keyframes.
     supporting: float = 0.33
 
     def __post_init__(self) -> None:

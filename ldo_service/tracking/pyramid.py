@@ -138,8 +138,8 @@ def build_pyramid(
         if len(levels) == config.levels or smallest < config.min_side_px:
             break
         # The valid pixels of a partly clipped block are darker than the whole block. Such blocks
-        # are excluded down to the finest level. Coarser levels, which only give the initial guess
-        # of finer ones, keep them: they would have too few pixels otherwise.
+        # are excluded down to the finest level. Coarser levels, which only give the initial
+        # guess of finer ones, keep them: they would have too few pixels otherwise.
         image = halved_image(image, least=1 if levels else 4)
         depth, scaled = halved_depth(depth, config.depth_tolerance), scaled.halved()
     if not levels:  # The image is wide and too low to be halved.

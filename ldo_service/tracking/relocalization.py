@@ -256,8 +256,8 @@ Nearby = tuple[KeyframeRecord, np.ndarray]  # A record, and T_keyframe_camera [4
 class KeyframeReuseConfig:
     """Settings of keyframe reuse."""
 
-    # Number of keyframes, mapping keyframes included, from which known ones are reused; 0: never.
-    # Below it, the map gains more by new views than they cost, a few kB each.
+    # Number of keyframes, mapping keyframes included, from which known ones are reused;
+    # 0: never. Below it, the map gains more by new views than they cost, a few kB each.
     after: int = 1500
     tries: int = 2  # Maximum records per frame, the nearest first; 8 ms each at 640x480.
     # Maximum rotation plus parallax between map and images, 3 % of the median depth; above it, new

@@ -47,12 +47,12 @@ class TrackingQualityConfig:
     min_intensity_sigma: float = 2.0
     min_depth_noise_scale: float = 0.5
     # A relocalized camera must have more overlap, unless features confirm the pose: 43 of 43
-    # confirmed poses below 0.35 were right (kitchen and flat). It must also fit better. The limit
-    # is relocalized_residual times the running median at the same pose. It grows by
+    # confirmed poses below 0.35 were right (kitchen and flat). It must also fit better. The
+    # limit is relocalized_residual times the running median at the same pose. It grows by
     # relocalized_residual_per_rad per radian of image motion from the keyframe
     # (`motion.image_motion_rad`), up to weak_residual. The noise of right poses grows likewise
-    # (kitchen, p50 1.4 at 0.15 rad, 2.0 at 0.55). A fixed limit of 1.6 found a third fewer frames
-    # of the kitchen, and one more false pose in the ambiguous corridor of the flat.
+    # (kitchen, p50 1.4 at 0.15 rad, 2.0 at 0.55). A fixed limit of 1.6 found a third fewer
+    # frames of the kitchen, and one more false pose in the ambiguous corridor of the flat.
     relocalized_overlap: float = 0.35
     relocalized_residual: float = 1.3
     relocalized_residual_per_rad: float = 2.0

@@ -18,8 +18,8 @@ except ImportError as error:
     ) from error
 
 MAX_DAYS = 36500
-# Maximum difference between the clocks of machines. The validity of a certificate begins this long
-# before its creation.
+# Maximum difference between the clocks of machines. The validity of a certificate begins this
+# long before its creation.
 CLOCKS_DIFFER = timedelta(hours=1)
 
 PrivateKey = ec.EllipticCurvePrivateKey

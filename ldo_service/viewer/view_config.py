@@ -13,8 +13,8 @@ class ViewerConfig:
 
     address: str = LOOPBACK  # The window needs no keys: anyone who reaches it can see the map.
     port: int = 8080  # If this port is in use, the next free one is used. 0 uses any free port.
-    # Maximum number of Gaussians, those of the largest weight, at 32 bytes each; a quarter more
-    # while a map grows.
+    # Maximum number of Gaussians, those of the largest weight, at 32 bytes each; a quarter
+    # more while a map grows.
     max_gaussians: int = 300_000
     # Maximum poses of a path, 11 minutes at 30 Hz; a longer one is drawn coarser.
     max_poses: int = 20_000
