@@ -53,7 +53,7 @@ class VisibleBoxes:
         return replace(self, boxes_px=self.boxes_px * scale, pixels=self.pixels * scale**2)
 
     def table(self) -> np.ndarray:
-        """Return the boxes as rows [B, 8]."""
+        """Return the boxes as rows [B, 8]: frame, class id, instance, x0, y0, x1, y1, pixels."""
         columns = self.frames, self.class_ids, self.instances, self.boxes_px, self.pixels
         return np.column_stack(columns)
 

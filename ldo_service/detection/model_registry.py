@@ -98,7 +98,7 @@ class Models:
         Args:
             name: Name of the model.
             file: ONNX file of the detector.
-            config: Settings to run it once.
+            config: Settings of the trial run that checks the file.
             license: Text of its license.
 
         Raises:
@@ -120,7 +120,7 @@ class Models:
         Args:
             name: Name of the model.
             pair: Files of the pair.
-            config: Settings to run it once.
+            config: Settings of the trial run that checks the files.
             names: Names to choose from, stored with the pair; empty: those of its embeddings, or
                 COCO's.
             license: Text of its license.

@@ -146,7 +146,10 @@ def answers_to(query: str) -> tuple[str, ...]:
 
 @cache
 def _table(column: str) -> Mapping[str, str]:
-    """Return the class by word of the column `same` or `kinds` of the table."""
+    """Return the mapping from words to classes of a column of synonyms.yaml.
+
+    The column is `same` or `kinds`.
+    """
     text = resources.files("ldo_service.detection").joinpath(TABLE).read_text("utf-8")
     rows: dict[str, dict[str, list[str]]] = yaml.safe_load(text)
     return {word: name for name, row in rows.items() for word in row.get(column, ())}

@@ -144,12 +144,12 @@ class StreamPairer(Generic[A, B]):
 
     @property
     def lost_a(self) -> int:
-        """Number of halves of the first stream that were dropped without a partner."""
+        """Number of measurements of the first stream that were dropped without a partner."""
         return self._a.lost
 
     @property
     def lost_b(self) -> int:
-        """Number of halves of the second stream that were dropped without a partner."""
+        """Number of measurements of the second stream that were dropped without a partner."""
         return self._b.lost
 
     def skews_ms(self) -> list[float]:

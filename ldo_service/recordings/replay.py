@@ -144,7 +144,7 @@ class ReplaySession:
             where = f"the start before step {start.step} ({self._file.path.name})"
             what = "the saved state"
             raise ReplayDiverged(
-                self._replayed.actor, where, what, "restored", f"rejected, {error!r},"
+                self._replayed.actor, where, what, "restored", f"rejected ({error!r})"
             ) from error
 
     def _skip(self, gap: Gap) -> None:

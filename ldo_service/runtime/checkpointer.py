@@ -58,8 +58,8 @@ class Checkpointer:
         Args:
             actor: The actor of the stage.
             links: Positions on its topics, as `links` returns them.
-            taken: Input of the last step if the actor lags, for its write-ahead log.
-            whole: Write a checkpoint instead of a snapshot.
+            taken: Input of the last step, for the write-ahead log; None unless `Actor.lags`.
+            whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`.
         """
         is_whole = whole or self._ledger.is_long
         own = actor.checkpoint() if is_whole else actor.snapshot()

@@ -90,8 +90,8 @@ class StateSaver:
         Args:
             actor: The actor of the stage.
             delivery: The delivery of the current step, which counts as handled.
-            taken: Its log entry if the actor lags.
-            whole: Write a checkpoint instead of a snapshot.
+            taken: Its entry of the write-ahead log; None unless `Actor.lags`.
+            whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`.
 
         Returns:
             False if the state is not saved and the stage need not wait for the disk.

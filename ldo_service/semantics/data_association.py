@@ -103,7 +103,7 @@ class MapView:
             )
         if len(self.classes) != len(self.boxes):
             raise ValueError(
-                f"{len(self.classes)} classes must be one for each of {len(self.boxes)} regions."
+                f"there are {len(self.classes)} classes for {len(self.boxes)} regions, must be one each."
             )
         if self.depth_m.shape != size:
             raise ValueError(

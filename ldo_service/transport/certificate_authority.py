@@ -45,7 +45,7 @@ HEAD = "# Who may do what. `ldo keys` writes this; routers read it when they sta
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Issued keys."""
+    """Name, common name and role of a certificate that the authority issued."""
 
     name: str
     common_name: str
@@ -101,7 +101,7 @@ class CertificateAuthority:
 
     @property
     def entries(self) -> list[Entry]:
-        """Issued keys, sorted by common name."""
+        """Issued certificates, sorted by common name."""
         rows = (Entry(cn.rpartition("-")[0], cn, who) for cn, who in self._access.items())
         return sorted(rows, key=lambda entry: entry.common_name)
 

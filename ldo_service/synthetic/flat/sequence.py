@@ -100,7 +100,7 @@ class FlatSequence(Sequence):
         return FrameLabels(frame.class_ids, frame.instance_ids)
 
     def true_labels(self) -> TrueLabels:
-        """Return the class names and the function `labels`."""
+        """Return the class names, and a function that returns the true labels of a frame."""
         return TrueLabels(CLASS_NAMES, self.labels)
 
     def truth(self) -> Trajectory:
