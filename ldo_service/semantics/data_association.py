@@ -103,7 +103,8 @@ class MapView:
             )
         if len(self.classes) != len(self.boxes):
             raise ValueError(
-                f"there are {len(self.classes)} classes for {len(self.boxes)} regions, must be one each."
+                f"there are {len(self.classes)} classes for {len(self.boxes)} regions, must be one "
+                "per region."
             )
         if self.depth_m.shape != size:
             raise ValueError(
