@@ -107,8 +107,5 @@ def test_build_without_a_compiler_reports_it_in_one_line(tmp_path: Path) -> None
     command += ["--target", str(tmp_path / "target"), "-C", f"build-dir={tmp_path / 'build'}"]
     done = subprocess.run([*command, str(ROOT)], env=environment, capture_output=True, text=True)
     assert done.returncode != 0
-    (line,) = [
-        line for line in done.stderr.splitlines() if "compiler" in line and "CXX" not in line
-    ]
-    assert "finds no C++17 compiler" in line
+    (line,) = [line for line in done.stderr.splitlines() if "finds no C++17 compiler" in line]
     assert "apt install g++" in line
