@@ -107,7 +107,7 @@ class LoopCloser(Actor):
     def handle(
         self, message: Keyframe | DetectionBoxes | GraphCorrection
     ) -> Iterator[LoopClosure | LoopCandidate]:
-        """Yield the candidates and closures of the keyframes that a message completes."""
+        """Yield candidates and closures of the keyframes whose wait for boxes a message ends."""
         if not self.config.is_on:
             return
         self._parts = None

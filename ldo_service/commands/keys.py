@@ -1,4 +1,4 @@
-"""Command `ldo keys`."""
+"""Command `ldo keys`: create a certificate authority and keys for programs and machines."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime

@@ -299,7 +299,8 @@ class MapBuilder:
     def offload_excess(self) -> None:
         """Offload Gaussians to disk if too many are in memory.
 
-        Call it when all changes are published: replicas do not distinguish offloaded Gaussians.
+        Call it only when all changes are published, because it clears the pending ones. Replicas
+        keep the offloaded Gaussians.
         """
         if len(self.gaussians) <= self.config.sleep.max_active:
             return

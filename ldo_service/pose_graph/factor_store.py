@@ -289,7 +289,7 @@ class FactorStore:
         return between_factor(m.a, m.b, m.T_a_b, m.information, robust_sigmas)
 
     def _closure(self, m: RelativePose) -> RelativePose:
-        """Return a closure between variables, with the information that includes all noise."""
+        """Return a closure transferred to variables; its information accounts for all noise."""
         own = closure_information(m, self._noise, self._ends_covariance(m))
         return self.between_variables(RelativePose(m.a, m.b, m.T_a_b, own))
 

@@ -123,7 +123,10 @@ class LoopClosureSet:
         return best
 
     def with_decision(self, closure: RelativePose, verdict: ClosureDecision) -> "LoopClosureSet":
-        """Return the set after a decision; each pair is only in the group where it was put last."""
+        """Return the set after a decision; each pair stays only in its latest group.
+
+        The groups are the accepted, the rejected and the removed closures.
+        """
         pair = pair_of(closure)
         accepted = {p: c for p, c in self.accepted.items() if p not in verdict.dropped}
         if verdict.is_accepted:

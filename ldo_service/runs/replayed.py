@@ -131,5 +131,6 @@ def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedAct
         for file in actor.files:
             file.require_version()
     if not any(actor.steps for actor in actors):
-        raise DataError(f"{folder} holds no step of {', '.join(only) or 'any actor'}.")
+        names = ", ".join(only) or "any actor"
+        raise DataError(f"{folder} has no recorded step of {names}. Record again with frames.")
     return actors
