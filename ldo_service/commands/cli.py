@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 import tyro
 from rich.console import Console
 
-from ldo_service.errors import LdoError
+from ldo_service.errors import ConfigError, LdoError
 
 # Verbs that keep their partial results when they are interrupted.
 KEEPING = ("demo", "run", "suite")
@@ -36,6 +36,19 @@ verbs:
 
 # Names of options in version 0.1, which one more version accepts.
 OLD_OPTIONS = {"--localise": "--localize"}
+# Names of options in version 0.1, which are refused with the new name.
+RENAMED_OPTIONS = {
+    "--elsewhere": "--gaussians-out-of-view",
+    "--front-end": "--reuse-front-end",
+    "--hold-out": "--hold-out-every",
+    "--join": "--client",
+    "--licence": "--license",
+    "--metrics": "--metrics-port",
+    "--only": "--actor",
+    "--prior": "--odometry-prior",
+    "--refine": "--refine-iterations",
+    "--without-keys": "--insecure",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -52,6 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         logging.getLogger("httpx2").setLevel(logging.WARNING)  # It logs every request.
     _handle_interrupts()
     try:
+        _refuse_renamed_options(words)
         if not words or words[0] in ("-h", "--help"):
             print(HELP.format(verbs="\n".join(first_lines())))
             sys.exit(0 if words else 2)
@@ -80,6 +94,14 @@ def _handle_interrupts() -> None:
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
+
+
+def _refuse_renamed_options(words: Sequence[str]) -> None:
+    """Raise ConfigError with the new name of an option that has been renamed."""
+    for word in words:
+        option = word.partition("=")[0]
+        if option in RENAMED_OPTIONS:
+            raise ConfigError(f"{option} is now {RENAMED_OPTIONS[option]}.")
 
 
 def first_lines() -> Iterator[str]:

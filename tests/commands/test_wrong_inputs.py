@@ -48,6 +48,8 @@ def example_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("publish ros2 --color /c --depth /d --stride 0", 2, "--stride 0 and"),
         ("publish ros2 --color /c --depth /d --max-skew-s -1", 2, "--max-skew-s=-1"),
         ("record full", 2, "full is not empty"),
+        ("serve --only tracker", 2, "--only is now --actor."),
+        ("run x --out y --refine=5", 2, "--refine is now --refine-iterations."),
         ("record r --actor nobody", 2, "no actor 'nobody'"),
         ("record r --endpoint tcp/0.0.0.0:7447", 2, "--insecure"),
         ("record r --config broken.yaml", 2, "broken.yaml is not valid YAML"),
