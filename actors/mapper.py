@@ -103,25 +103,10 @@ class MapperConfig:
     checkpoint_keyframes: int = 5  # Keyframes between saved maps; a crash repeats at most so many.
     motion_min_m: float = 2e-4  # A smaller motion by a correction is not visible: 0.1 px.
     motion_min_rad: float = 2e-4  # Equal to MapBuilderConfig.refined_rad.
-    # A keyframe that moves farther is deduplicated: it may overlap surface that the map holds.
-    mending_min_m: float = 0.01
-    mending_min_rad: float = 0.01  # Normal iterations correct smaller motions.
-    mended_keyframes: int = 2  # Deduplicated per new keyframe; 100 moved ones take 50 keyframes.
-    mended_at_end: int = 200  # Newest keyframes deduplicated at the end; takes some seconds.
-    mending_iterations: int = 3  # Iterations of each, as for a new keyframe when many wait.
-    # Refit iterations for a keyframe that a correction moves against the first one, half of them on
-    # other keyframes; as many as for a new keyframe.
-    due_iterations: int = 12
-    # Pending refit iterations that run with each new keyframe while no other waits; mapping then
-    # takes 50 % longer. Offline runs do the rest at the end, `map/refine` does it on request.
-    paid_iterations: int = 6
+    refit: LoopRefitConfig = field(default_factory=LoopRefitConfig)
 
     def __post_init__(self) -> None:
-        amounts = (
-            *("iterations", "min_iterations", "threads", "snapshot_growth"),
-            *("mended_keyframes", "mended_at_end", "mending_iterations"),
-            *("due_iterations", "paid_iterations"),
-        )
+        amounts = (*("iterations", "min_iterations", "threads", "snapshot_growth"),)
         if min(getattr(self, name) for name in amounts) < 0:
             raise ConfigError(named(self, *amounts) + " must not be negative.")
         counts = (
@@ -137,10 +122,6 @@ class MapperConfig:
     def pace(self) -> PublishConfig:
         """Return the settings of the map publisher."""
         return PublishConfig(**{f.name: getattr(self, f.name) for f in fields(PublishConfig)})
-
-    def repair(self) -> LoopRefitConfig:
-        """Return the settings of the refit after corrections."""
-        return LoopRefitConfig(**{f.name: getattr(self, f.name) for f in fields(LoopRefitConfig)})
 
 
 class Mapper(Actor):
@@ -181,7 +162,7 @@ class Mapper(Actor):
         self._links = RelativeMeasurements(self._poses, self.config.measured_keyframes)
         self._publisher = MapPublisher(self._map, self.config.pace())
         self._newest: tuple[int, int] = (0, -1)  # Stamp in ns and id of the newest keyframe.
-        self._repair = LoopRefit(self._map, self.config.repair())
+        self._refit = LoopRefit(self._map, self.config.refit)
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
 
@@ -217,7 +198,7 @@ class Mapper(Actor):
         moving = mask_from_array(message.dynamic_mask)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
         learnt = self._semantics.on_keyframe_mapped(message.keyframe)
-        self._repair.with_keyframe(is_behind=self._waiting() > 0)
+        self._refit.with_keyframe(is_behind=self._waiting() > 0)
         yield from self._refinement()
         yield from self._publisher.on_keyframe(self._message_context())
         yield self._publisher.rendering(
@@ -233,7 +214,7 @@ class Mapper(Actor):
         """
         config = self.config
         return max(
-            config.iterations // (1 + self._waiting()) - self._repair.mending_iterations,
+            config.iterations // (1 + self._waiting()) - self._refit.deduplication_iterations,
             min(config.min_iterations, config.iterations),
         )
 
@@ -241,7 +222,7 @@ class Mapper(Actor):
         return self.situation.backlog.get(KEYFRAME_NEW, 0)
 
     def _refine(self, message: RefineMap) -> Iterator[Output]:
-        self._repair.refine(message.iterations, (message.initial_rate, message.final_rate))
+        self._refit.refine(message.iterations, (message.initial_rate, message.final_rate))
         self._semantics.refresh()
         self._checkpoint = {}  # Saves the work, up to half a minute; no keyframe may follow.
         yield from self._refinement()
@@ -289,7 +270,7 @@ class Mapper(Actor):
         self._poses.correct(
             message.graph_version, keyframe_poses_from_correction(message), held=held
         )
-        self._repair.mark_moved(self._poses)
+        self._refit.mark_moved(self._poses)
         motions = tuple(self._motion(keyframe) for keyframe in self._moved_keyframes())
         if motions:
             T_new_old = {m.keyframe: pose_from_message(m.T_new_old) for m in motions}
@@ -326,7 +307,7 @@ class Mapper(Actor):
     def on_stop(self) -> Iterator[Output]:
         """Publish the final map after removing duplicate Gaussians of the newest keyframes."""
         if self._map.size():
-            self._repair.at_end()
+            self._refit.at_end()
             self._semantics.refresh()
             yield from self._publisher.publish_snapshot(self._message_context())
             yield from self._objects()
@@ -355,8 +336,8 @@ class Mapper(Actor):
             "semantics": self._semantics.snapshot(),
             "poses": self._poses.snapshot(),
             "links": self._links.snapshot(),
-            "told": self._publisher.snapshot(),
-            **self._repair.snapshot(),
+            "publisher": self._publisher.snapshot(),
+            "refit": self._refit.snapshot(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
@@ -367,14 +348,14 @@ class Mapper(Actor):
         self._semantics.restore(saved["semantics"])
         self._poses.restore(saved["poses"])
         self._links.restore(saved["links"])
-        self._publisher.restore(saved["told"])
-        self._repair.restore(saved)
+        self._publisher.restore(saved["publisher"])
+        self._refit.restore(saved["refit"])
 
     def metrics(self) -> dict[str, float]:
         return {
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
-            **self._repair.metrics(),
+            **self._refit.metrics(),
             **self._map.metrics(),
             **self._semantics.metrics(),
         }

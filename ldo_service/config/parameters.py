@@ -14,6 +14,7 @@ from ldo_service.detection.dynamic_classes import DynamicClassConfig
 from ldo_service.gaussians.adam import AdamConfig
 from ldo_service.gaussians.densification import DensificationConfig
 from ldo_service.gaussians.keyframe_store import KeyframeStoreConfig
+from ldo_service.gaussians.loop_refit import LoopRefitConfig
 from ldo_service.gaussians.loss import LossWeights
 from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.gaussians.optimizer import GaussianOptimizerConfig
@@ -194,8 +195,10 @@ def _mapper(config: Config) -> MapperConfig:
         part_gaussians=mapper.publish.max_gaussians_per_message,
         changed_keyframes=mapper.publish.update_interval_keyframes,
         checkpoint_keyframes=mapper.checkpoint_interval_keyframes,
-        due_iterations=mapper.refit.iterations,
-        paid_iterations=mapper.refit.iterations_per_keyframe,
+        refit=LoopRefitConfig(
+            iterations=mapper.refit.iterations,
+            iterations_per_keyframe=mapper.refit.iterations_per_keyframe,
+        ),
     )
 
 

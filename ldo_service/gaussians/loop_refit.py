@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 
@@ -16,15 +17,26 @@ from .map_builder import MapBuilder
 
 @dataclass(frozen=True, slots=True)
 class LoopRefitConfig:
-    """Settings of the refit; see the fields of these names in `MapperConfig`."""
+    """Settings of the deduplication and the refit after pose corrections."""
 
-    mending_min_m: float
-    mending_min_rad: float
-    mended_keyframes: int
-    mended_at_end: int
-    mending_iterations: int
-    due_iterations: int
-    paid_iterations: int
+    # A keyframe that moves farther is deduplicated: it may overlap surface that the map holds.
+    min_motion_m: float = 0.01
+    min_motion_rad: float = 0.01  # Normal iterations correct smaller motions.
+    # Keyframes deduplicated with each new keyframe; 100 moved ones take 50 keyframes.
+    deduplicated_per_keyframe: int = 2
+    deduplicated_at_end: int = 200  # Newest keyframes deduplicated at the end; takes some seconds.
+    # Iterations after the deduplication of each, as for a new keyframe when many wait.
+    deduplication_iterations: int = 3
+    # Refit iterations for a keyframe that a correction moves against the first one, half of them on
+    # other keyframes; as many as for a new keyframe.
+    iterations: int = 12
+    # Pending refit iterations that run with each new keyframe while no other waits; mapping then
+    # takes 50 % longer. Offline runs do the rest at the end, `map/refine` does it on request.
+    iterations_per_keyframe: int = 6
+
+    def __post_init__(self) -> None:
+        if min(getattr(self, name) for name in self.__slots__) < 0:
+            raise ConfigError(named(self, *self.__slots__) + " must not be negative.")
 
 
 class LoopRefit:
@@ -41,12 +53,12 @@ class LoopRefit:
     The work is spread over the following keyframes, to keep the latency of new keyframes low.
     """
 
-    def __init__(self, map_: MapBuilder, config: LoopRefitConfig) -> None:
-        self.config = config
+    def __init__(self, map_: MapBuilder, config: LoopRefitConfig | None = None) -> None:
+        self.config = config or LoopRefitConfig()
         self._map = map_
-        self._mended = 0  # Duplicate Gaussians removed.
-        self._to_mend: list[int] = []  # Keyframes to deduplicate, ascending.
-        self._due: dict[int, int] = {}  # Pending refit iterations by keyframe.
+        self._deduplicated = 0  # Duplicate Gaussians removed.
+        self._to_deduplicate: list[int] = []  # Keyframes to deduplicate, ascending.
+        self._pending: dict[int, int] = {}  # Pending refit iterations by keyframe.
 
     def mark_moved(self, T_map: KeyframePoses) -> None:
         """Schedule work for the keyframes that a correction moves far.
@@ -59,34 +71,36 @@ class LoopRefit:
         placed, config = self._map.views.poses, self.config
         keyframes = np.fromiter(placed, np.int64)
         T_now, T_before = T_map.of(placed), placed.of(placed)
-        least = config.mending_min_m, config.mending_min_rad
-        far = keyframes[se3.transforms_differ(T_now, T_before, *least)]
+        limits = config.min_motion_m, config.min_motion_rad
+        far = keyframes[se3.transforms_differ(T_now, T_before, *limits)]
         if not len(far):
             return
-        self._to_mend = sorted({*self._to_mend, *far.tolist()})
+        self._to_deduplicate = sorted({*self._to_deduplicate, *far.tolist()})
         T_as_a_whole = T_now[0] @ se3.inverse(T_before[0])
-        torn = keyframes[se3.transforms_differ(T_now, T_as_a_whole @ T_before, *least)]
-        self._due |= dict.fromkeys(torn.tolist(), config.due_iterations)
+        displaced = keyframes[se3.transforms_differ(T_now, T_as_a_whole @ T_before, *limits)]
+        self._pending |= dict.fromkeys(displaced.tolist(), config.iterations)
         self._forget()
 
     def _forget(self) -> None:
         """Drop keyframes without pending iterations or without images."""
         known = self._map.views.cameras
-        self._due = {k: left for k, left in self._due.items() if left > 0 and k in known}
+        self._pending = {k: left for k, left in self._pending.items() if left > 0 and k in known}
 
     @property
     def pending_iterations(self) -> int:
         """Number of pending refit iterations.
 
-        It is at most `due_iterations` for each keyframe with images.
+        It is at most `iterations` for each keyframe with images.
         """
-        return sum(self._due.values())
+        return sum(self._pending.values())
 
     @property
-    def mending_iterations(self) -> int:
+    def deduplication_iterations(self) -> int:
         """Number of iterations after deduplication that run with the next keyframe."""
         config = self.config
-        return config.mending_iterations * min(config.mended_keyframes, len(self._to_mend))
+        return config.deduplication_iterations * min(
+            config.deduplicated_per_keyframe, len(self._to_deduplicate)
+        )
 
     def with_keyframe(self, *, is_behind: bool) -> None:
         """Do the part of the work that belongs to one new keyframe.
@@ -94,25 +108,28 @@ class LoopRefit:
         Args:
             is_behind: More keyframes are queued; pending refit iterations then wait.
         """
-        self._deduplicate(self.config.mended_keyframes, self.config.mending_iterations)
-        if not self._due or is_behind:
+        config = self.config
+        self._deduplicate(config.deduplicated_per_keyframe, config.deduplication_iterations)
+        if not self._pending or is_behind:
             return
-        most = self.config.paid_iterations
-        payable = sum(self._due[k] for k in self._resident_keyframes())
-        if payable:
-            self.refine(min(most, payable), effort=most)
+        limit = config.iterations_per_keyframe
+        runnable = sum(self._pending[k] for k in self._resident_keyframes())
+        if runnable:
+            self.refine(min(limit, runnable), effort=limit)
 
     def at_end(self) -> None:
         """Deduplicate at the end of the run, without iterations.
 
         Iterations could move keyframes, and no more refinements are published then.
         """
-        self._deduplicate(self.config.mended_at_end, iterations=0)
+        self._deduplicate(self.config.deduplicated_at_end, iterations=0)
 
-    def _deduplicate(self, most: int, iterations: int) -> None:
-        """Deduplicate at most `most` keyframes, the newest first."""
-        for _ in range(min(most, len(self._to_mend))):
-            self._mended += self._map.deduplicate_keyframe(self._to_mend.pop(), iterations)
+    def _deduplicate(self, limit: int, iterations: int) -> None:
+        """Deduplicate at most `limit` keyframes, the newest first."""
+        for _ in range(min(limit, len(self._to_deduplicate))):
+            self._deduplicated += self._map.deduplicate_keyframe(
+                self._to_deduplicate.pop(), iterations
+            )
 
     def refine(
         self, iterations: int, rates: tuple[float, float] = (1.0, 1.0), effort: float = inf
@@ -121,13 +138,13 @@ class LoopRefit:
 
         See `MapBuilder.refine` for the arguments.
         """
-        awake = self._resident_keyframes()
-        visits = np.repeat(awake, [-(-self._due[k] // 2) for k in awake]).astype(np.int64)
+        resident = self._resident_keyframes()
+        visits = np.repeat(resident, [-(-self._pending[k] // 2) for k in resident]).astype(np.int64)
         order = np.random.default_rng(self.pending_iterations).permutation(visits)
-        torn = order[: -(-iterations // 2)].tolist()
-        done = self._map.refine(iterations, rates, first=torn, effort=effort)
-        for keyframe, visited in Counter(torn[: -(-done // 2)]).items():
-            self._due[keyframe] -= 2 * visited
+        displaced = order[: -(-iterations // 2)].tolist()
+        done = self._map.refine(iterations, rates, first=displaced, effort=effort)
+        for keyframe, visited in Counter(displaced[: -(-done // 2)]).items():
+            self._pending[keyframe] -= 2 * visited
         self._forget()
 
     def _resident_keyframes(self) -> list[int]:
@@ -136,20 +153,20 @@ class LoopRefit:
         The optimizer cannot fit to the other keyframes.
         """
         self._forget()
-        return [k for k in self._due if self._map.is_resident(k)]
+        return [k for k in self._pending if self._map.is_resident(k)]
 
     def snapshot(self) -> dict[str, Any]:
-        return {"to_mend": list(self._to_mend), "due": dict(self._due)}
+        return {"to_deduplicate": list(self._to_deduplicate), "pending": dict(self._pending)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        self._to_mend = list(state["to_mend"])
-        self._due = dict(state.get("due", {}))  # Missing in old checkpoints.
+        self._to_deduplicate = list(state["to_deduplicate"])
+        self._pending = dict(state["pending"])
 
     def metrics(self) -> dict[str, float]:
         return {
-            "keyframes_to_deduplicate": len(self._to_mend),
+            "keyframes_to_deduplicate": len(self._to_deduplicate),
             # Gaussians held twice after a correction, and removed.
-            "gaussians_deduplicated": self._mended,
+            "gaussians_deduplicated": self._deduplicated,
             # Iterations to refit the map to keyframes that corrections moved.
             "iterations_pending": self.pending_iterations,
         }

@@ -357,7 +357,7 @@ class MapBuilder:
             "sleeping": self.sleeping.snapshot(),
             "optimizer": self._fitting.snapshot(),
             "views": self.views.snapshot(),
-            "told": self._published.snapshot(),
+            "published": self._published.snapshot(),
             "newest": self._newest,
             "iterations": self._fitting.iterations,
         }
@@ -372,7 +372,7 @@ class MapBuilder:
         self._fitting.restore(state["optimizer"], state["iterations"])
         self.views.restore(state["views"])
         self.sleeping.restore(state["sleeping"])
-        self._published.restore(self.views.cameras, state["told"])
+        self._published.restore(self.views.cameras, state["published"])
         self._newest = state["newest"]
         self._renderer.forget()
         self._log.mark_all_published(self.gaussians)

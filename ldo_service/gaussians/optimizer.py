@@ -50,7 +50,7 @@ class PoseAdam:
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         keyframes = state["keyframes"].tolist()
-        moments = state["keyframe_moments"][..., -WIDTH:]  # Old checkpoints hold exposures first.
+        moments = state["keyframe_moments"]
         self._moments = dict(zip(keyframes, moments.copy(), strict=True))
 
 

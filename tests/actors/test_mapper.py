@@ -25,6 +25,7 @@ from ldo_service.gaussians import (
     PruningConfig,
     render,
 )
+from ldo_service.gaussians.loop_refit import LoopRefitConfig
 from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.gaussians.visibility import OffloadConfig
 from ldo_service.geometry import RgbdFrame, se3
@@ -124,7 +125,10 @@ def test_replica_equals_the_map_while_gaussians_are_offloaded_and_loaded(keyfram
     offload = OffloadConfig(max_active=500, reach_m=3.0, clump_m=0.5)
     builder = MapBuilderConfig(sleep=offload, recent_cameras=1)
     config = replace(CONFIG, builder=builder, changed_keyframes=1, iterations=1, min_iterations=1)
-    mapper, replica = Mapper(replace(config, mended_at_end=0)), MapReplica()
+    mapper, replica = (
+        Mapper(replace(config, refit=LoopRefitConfig(deduplicated_at_end=0))),
+        MapReplica(),
+    )
     for version, keyframe in enumerate(keyframes, 1):
         poses = {
             0: se3.exp(0.01 * version * np.ones(6))
@@ -309,7 +313,7 @@ def test_surface_mapped_twice_is_deduplicated_after_loop_closure(keyframes) -> N
     frame, T_map_camera = frame_from_message(keyframes[0]), poses[keyframes[0].keyframe]
     added, quality = {}, {}
     for at_end in (0, 10):
-        mapper = Mapper(replace(CONFIG, mended_at_end=at_end))
+        mapper = Mapper(replace(CONFIG, refit=LoopRefitConfig(deduplicated_at_end=at_end)))
         messages = handle_all(mapper, keyframes[:3])
         once = mapper.metrics()["gaussians"]
         messages += handle_all(mapper, [*second, loop_correction])
@@ -349,7 +353,7 @@ def test_pending_iterations_restore_quality_after_loop_closure(
     handle_all(undisturbed, keyframes[:3])
     mapper = mapper_after_loop_closure(keyframes, CONFIG)
     facts = mapper.metrics()
-    assert facts["iterations_pending"] == 3 * CONFIG.due_iterations
+    assert facts["iterations_pending"] == 3 * CONFIG.refit.iterations
     assert psnr_of(mapper, keyframes[1]) < psnr_of(undisturbed, keyframes[1]) - 1
     handle_all(mapper, [RefineMap(stamp_ns=0, iterations=30)])
     assert mapper.metrics()["iterations_pending"] == 6
@@ -367,7 +371,7 @@ def test_repeated_corrections_do_not_add_pending_iterations(keyframes) -> None:
         T_turned = se3.exp(np.array([0, 0.02 * version, 0, 0, 0, 0]))
         moved = {k: T if k < 2 else T_turned @ T for k, T in poses.items()}
         handle_all(mapper, [correction_to_message(0, version, moved)])
-        assert mapper.metrics()["iterations_pending"] == 2 * CONFIG.due_iterations
+        assert mapper.metrics()["iterations_pending"] == 2 * CONFIG.refit.iterations
 
 
 def test_rigid_motion_of_the_whole_map_needs_no_refit(keyframes) -> None:
@@ -380,10 +384,11 @@ def test_rigid_motion_of_the_whole_map_needs_no_refit(keyframes) -> None:
 
 
 def test_pending_iterations_run_only_without_backlog(keyframes, tmp_path) -> None:
-    config = replace(CONFIG, due_iterations=4, paid_iterations=6, folder=str(tmp_path))
+    config = replace(CONFIG, refit=LoopRefitConfig(iterations=4), folder=str(tmp_path))
     mapper = mapper_after_loop_closure(keyframes, config)
     without_refit = mapper_after_loop_closure(
-        keyframes, replace(config, paid_iterations=0, folder="")
+        keyframes,
+        replace(config, refit=replace(config.refit, iterations_per_keyframe=0), folder=""),
     )
     pending, extra = [], []
     for i, k in enumerate(second_round(keyframes[3:7], np.eye(4), first=200)):
@@ -407,7 +412,7 @@ def test_pending_iterations_run_only_without_backlog(keyframes, tmp_path) -> Non
 
 def test_state_without_pending_iterations_is_restored(keyframes) -> None:
     state = mapper_after_loop_closure(keyframes, CONFIG).checkpoint()
-    del state["map"]["due"]
+    state["map"]["refit"]["pending"] = {}
     mapper = Mapper(CONFIG)
     mapper.restore(state)
     assert mapper.metrics()["iterations_pending"] == 0
@@ -483,7 +488,7 @@ def test_logged_inputs_since_the_checkpoint_give_bitwise_equal_state(
     restored_state = RestoredState(state, taken=tuple(map(logged, inputs[1:])))
     second = restore_actor(Mapper(config), restored_state, lambda: Mapper(config))
     one, other = first.checkpoint()["map"], second.checkpoint()["map"]
-    for part in ("map", "semantics", "poses", "links", "to_mend", "due"):
+    for part in ("map", "semantics", "poses", "links", "refit"):
         assert encode_state(one[part]) == encode_state(other[part]), part
     version = max(delta.version for delta in deltas_of(published))
     assert all(delta.version > version for delta in deltas_of(second.on_restored()))

@@ -385,7 +385,7 @@ class Batch:
         if not answer.ok:
             self.recorder.violations.append(answer.message)
         saved = service.saved_map()
-        version = saved["told"]["version"]
+        version = saved["publisher"]["version"]
         service.wait(
             "the last delta",
             lambda: self.recorder.map_version >= version or self.recorder.has_missed_deltas(),

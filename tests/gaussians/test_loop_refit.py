@@ -11,13 +11,13 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.geometry.point_records import PoseTable
 
 CONFIG = LoopRefitConfig(
-    mending_min_m=0.01,
-    mending_min_rad=0.01,
-    mended_keyframes=0,
-    mended_at_end=0,
-    mending_iterations=0,
-    due_iterations=4,
-    paid_iterations=6,
+    min_motion_m=0.01,
+    min_motion_rad=0.01,
+    deduplicated_per_keyframe=0,
+    deduplicated_at_end=0,
+    deduplication_iterations=0,
+    iterations=4,
+    iterations_per_keyframe=6,
 )
 
 
