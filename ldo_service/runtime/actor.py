@@ -1,7 +1,7 @@
 """Actors and their ports.
 
-An actor has input and output ports, a handler, and state that can be saved and restored. The
-delivery policy belongs to the input: only the consumer knows whether a late message is still
+An actor has input and output ports, a handler, and state that can be saved and restored. Each input
+declares its delivery policy, because only the consumer knows whether a late message is still
 useful.
 """
 
@@ -19,9 +19,12 @@ UNLIMITED = 1 << 30
 
 @dataclass(frozen=True, slots=True)
 class Lossless:
-    """Policy of an input that receives every message, in order; the producer waits for credit."""
+    """Policy of an input that receives every message in order.
 
-    window: int = 8  # Maximum number of unhandled messages; bounds memory at both ends.
+    The producer waits while `window` messages are not handled.
+    """
+
+    window: int = 8  # Maximum number of messages sent but not handled; it bounds memory.
 
     def __post_init__(self) -> None:
         if self.window < 1:
@@ -37,7 +40,7 @@ class Latest:
 
     depth: int = 1  # Maximum number of queued messages; with `per_key`, for each key.
     per_key: bool = False  # Keep one queue for each value of the topic's key.
-    max_keys: int = 32  # Maximum number of keys; a new key displaces the oldest one.
+    max_keys: int = 32  # Maximum number of queues; a new key drops the oldest one.
 
     def __post_init__(self) -> None:
         if self.depth < 1 or self.max_keys < 1:
@@ -79,12 +82,12 @@ class Out:
 
 @dataclass(frozen=True, slots=True)
 class FlowStatus:
-    """State of an actor's links before a step.
+    """Credit of an actor's outputs and backlog of its inputs, measured before a step.
 
-    A step depends on the actor's state, the message and this status, and on nothing else.
+    The outputs of a step depend only on the actor's state, the message and this status.
 
     Attributes:
-        credits: Number of messages that may be sent now, for each nonblocking output.
+        credits: Number of messages that may be sent without waiting, for each nonblocking output.
         backlog: Number of messages queued behind the current one, for each lossless input.
     """
 
@@ -98,13 +101,15 @@ class Actor:
     name: ClassVar[str]
     inputs: ClassVar[tuple[In, ...]] = ()
     outputs: ClassVar[tuple[Out, ...]] = ()
-    # Snapshots may be of an earlier step; the stage logs the inputs handled since.
+    # `snapshot` may return the state of an earlier step. The stage then also saves the inputs that
+    # the actor has handled since that step.
     lags = False
-    finishes_last = False  # The final messages depend on those of other actors.
-    # The actor queries a source that no journal records. A replay skips the actor and feeds its
-    # consumers from their own recorded inputs.
+    # Call `on_stop` after that of all other actors, because its messages depend on theirs.
+    finishes_last = False
+    # The actor queries an external server, whose answers no journal records. A replay skips the
+    # actor and feeds its consumers from their own recorded inputs.
     talks_outside = False
-    # A robot waits for the outputs, so the thread has priority over those of other actors.
+    # A robot waits for the outputs, so this actor's thread has priority over other actors' threads.
     is_prompt = False
 
     def __init__(self) -> None:
@@ -119,17 +124,18 @@ class Actor:
         raise NotImplementedError
 
     def on_restored(self) -> Iterator[Message]:
-        """Yield the restored messages.
+        """Yield the messages that a restored actor publishes before its first input.
 
-        Called on an actor restored from a saved state. The previous process may have stopped before
-        it published them.
+        The stage calls it after it has restored the actor from a saved state. The previous process
+        may have stopped before it published its last messages.
         """
         return iter(())
 
     def on_stop(self) -> Iterator[Message]:
-        """Yield the final messages before a soft stop.
+        """Yield the final messages of the actor.
 
-        Actors with `finishes_last` publish theirs after all other actors.
+        The stage calls it on a soft stop, after the actor has handled all queued messages. Actors
+        with `finishes_last` come after all other actors.
         """
         return iter(())
 
@@ -141,9 +147,10 @@ class Actor:
         return {}
 
     def checkpoint(self) -> State:
-        """Return the complete state, including all that `snapshot` may defer.
+        """Return the complete state, including changes that `snapshot` may omit.
 
-        It may take long; the stage calls it on request.
+        It may take seconds. The stage calls it for the command `save`, when its write-ahead log is
+        full, and with the messages of `on_restored` and `on_stop`.
         """
         return self.snapshot()
 
@@ -151,7 +158,7 @@ class Actor:
         """Handle the notification that the last snapshot or checkpoint was written."""
 
     def restore(self, state: State) -> None:
-        """Continue from a snapshot of an earlier actor."""
+        """Set the state of this new actor from the snapshot or checkpoint of an earlier one."""
 
     def metrics(self) -> dict[str, float]:
         """Return the actor's own metrics for its health message, by name."""

@@ -1,4 +1,4 @@
-"""Graph of actors: the producer of each topic, and cycles of lossless inputs."""
+"""Checks of the graph of actors: one producer for each topic, no cycle of lossless inputs."""
 
 from collections.abc import Iterable, Sequence
 from typing import Protocol

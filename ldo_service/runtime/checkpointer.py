@@ -25,7 +25,7 @@ class Checkpointer:
         self._failed = 0
 
     def restore_actor(self, make: Callable[[], Actor]) -> Actor:
-        """Return an actor restored from the state that was saved last."""
+        """Create an actor and restore the state that was saved last."""
         fresh = make()
         self.past = RestoredState.of(self._store.load(fresh.name))
         if self.past.of_actor:
@@ -40,7 +40,7 @@ class Checkpointer:
     def links(
         self, inputs: Mapping[str, InletPosition], outputs: Mapping[str, OutletPosition | None]
     ) -> State:
-        """Return the positions of the stage on its topics.
+        """Return the offsets and the unhandled outputs of the stage, as parts to save.
 
         Args:
             inputs: Position on each lossless input, by topic name.
@@ -57,7 +57,7 @@ class Checkpointer:
 
         Args:
             actor: The actor of the stage.
-            links: Positions on its topics, as `links` returns them.
+            links: Offsets and unhandled outputs of the stage, as `links` returns them.
             taken: Input of the last step, for the write-ahead log; None unless `Actor.lags`.
             whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`.
         """
@@ -81,14 +81,15 @@ class Checkpointer:
         """Count a failed save, and log the first one after a success.
 
         Returns:
-            Whether it is the first failure since a save succeeded.
+            True if this is the first failure since the last successful save.
         """
         self._failed += 1
         is_first, self.is_unsaved = not self.is_unsaved, True
         if is_first:
             log.error(
-                "%s: saving the last step failed: %r. It retries, and maps nothing that a kill "
-                "would lose. Free some disk space, or choose another folder with --state.",
+                "%s: saving the state after the last step failed: %r. The stage retries. Until a "
+                "save succeeds, it sends no message that a killed process would lose. Free some "
+                "disk space, or choose another folder with --state.",
                 name, error,
             )  # fmt: skip
         return is_first

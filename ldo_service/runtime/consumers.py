@@ -10,23 +10,23 @@ from .actor import UNLIMITED
 
 @dataclass
 class Consumer:
-    """State of one consumer; offsets are those of the next message."""
+    """State of one consumer of a topic, as its producer knows it."""
 
     alive: bool = False
     handled: int = 0  # Offset of the first message that it has not handled.
     arrived: int = 0  # Offset of the first message that it has not received.
     limit: int = 0  # Offset of the first message that exceeds its window.
     repeated_from: int = -1  # Offset at which the last retransmission began; -1: none.
-    repeated_at_s: float = 0.0  # Time of the last retransmission.
-    shut_since_s: float | None = None  # Time at which its window was first found full.
+    repeated_at_s: float = 0.0  # Event-loop time of the last retransmission.
+    shut_since_s: float | None = None  # Event-loop time at which its window became full.
 
 
 class Consumers:
-    """Connected and required consumers of a topic, and the credit that they leave.
+    """Connected and required consumers of a topic, and the credit that they grant together.
 
-    Consumers in `expected` are required: they must not miss a message, so there is no credit while
-    one of them is absent. Other consumers count only while they are alive. `seq` is always the
-    offset of the next message.
+    Consumers in `expected` are required: they must not miss a message. The producer therefore has
+    no credit while one of them is disconnected. Other consumers limit the credit only while they
+    are connected. The argument `seq` of all methods is the offset of the producer's next message.
     """
 
     def __init__(self, expected: Iterable[str], handled: int = 0) -> None:
@@ -34,7 +34,7 @@ class Consumers:
 
         Args:
             expected: Names of the required consumers.
-            handled: Offset before which each of them has handled every message.
+            handled: Each required consumer has handled every message before this offset.
         """
         self._known = {name: Consumer(handled=handled) for name in expected}
         self.expected = frozenset(self._known)
@@ -52,7 +52,7 @@ class Consumers:
         return max(0, min(limits, default=UNLIMITED))
 
     def handled(self, seq: int) -> int:
-        """Return the offset before which all consumers have handled every message."""
+        """Return the offset of the first message that some consumer has not handled."""
         return min((c.handled for c in self._known.values()), default=seq)
 
     def all_received(self, seq: int) -> bool:
@@ -64,7 +64,10 @@ class Consumers:
         return {name: consumer.handled for name, consumer in self._known.items()}
 
     def join(self, name: str, seq: int) -> None:
-        """Add a consumer that sent a hello; it receives all that it has not handled."""
+        """Connect a consumer that sent a hello.
+
+        A new consumer starts at `seq`. A known one receives again what it has not handled.
+        """
         self._evicted.pop(name, None)
         consumer = self._known.setdefault(name, Consumer(handled=seq))
         consumer.alive, consumer.shut_since_s, consumer.repeated_from = True, None, -1
@@ -82,14 +85,18 @@ class Consumers:
         return consumer
 
     def leave(self, name: str) -> None:
-        """Mark a consumer as gone; only a required one still blocks the producer."""
+        """Mark a consumer as disconnected.
+
+        The producer forgets it, unless it is required. A required consumer then blocks the producer
+        until it connects again.
+        """
         consumer = self._known[name]
         consumer.alive, consumer.shut_since_s = False, None
         if name not in self.expected:
             del self._known[name]
 
     def stalled(self, now_s: float, patience_s: float, seq: int) -> list[str]:
-        """Return the live consumers with a window that was full for longer than `patience_s`."""
+        """Return the connected consumers whose window has been full for over `patience_s`."""
         names: list[str] = []
         for name, consumer in self._known.items():
             if consumer.alive and consumer.limit <= seq:
@@ -100,13 +107,13 @@ class Consumers:
         return names
 
     def evict(self, name: str) -> None:
-        """Mark a stalled consumer as gone until it makes progress."""
+        """Treat a stalled consumer as disconnected until it handles another message."""
         self._evicted[name] = self._known[name].handled
         self.leave(name)
 
     def is_still_stuck(self, grant: Credit) -> bool:
-        """Return whether the consumer was evicted and has handled nothing since.
+        """Return whether the consumer was evicted and has handled no message since.
 
-        Its heartbeats alone are no progress.
+        Credit messages alone are no progress, because a consumer repeats them with each heartbeat.
         """
         return grant.handled <= self._evicted.get(grant.consumer, -1)

@@ -1,11 +1,15 @@
-"""Delivery state of a stage, saved in one write with its actor's state.
+"""Delivery state of a stage: offsets, unhandled outputs and logged inputs.
+
+The stage saves these parts in one write with the actor's state:
 
 - `stage.offsets`: Offset of the next message on each lossless topic.
 - `stage.outbox T N`: Message N of topic T, which a required consumer has not handled.
-- `stage.wal N`: Input N since the saved state of an actor that lags (write-ahead log).
+- `stage.wal N`: Input N (write-ahead log). An actor with `Actor.lags` has handled it after the step
+  of its saved state.
 
-A restored stage therefore continues after the last finished step. It does not take that input
-again, it sends the outputs of that step again until they are handled, and it sent nothing else.
+A restored stage therefore continues after the last saved step. It does not take the input of that
+step again. It sends the outputs of that step again until all required consumers have handled them.
+Outputs of an unsaved step were never sent to them.
 """
 
 import logging
@@ -58,12 +62,12 @@ class RestoredState:
     own: State = field(default_factory=dict)  # State of the actor.
     inputs: Mapping[str, InletPosition] = field(default_factory=dict)  # Position by topic name.
     outputs: Mapping[str, OutletPosition] = field(default_factory=dict)  # Position by topic name.
-    taken: tuple[LoggedInput, ...] = ()  # Write-ahead log: inputs since the state.
+    taken: tuple[LoggedInput, ...] = ()  # Write-ahead log: inputs after `own`.
     is_none: bool = False  # The store had no state.
 
     @classmethod
     def of(cls, state: State | None) -> "RestoredState":
-        """Split a state as the store loaded it."""
+        """Split a state that the store has loaded; None or an empty state: nothing was saved."""
         if not state:
             return cls(is_none=True)
         links = state.get(OFFSETS, {"in": {}, "out": {}})  # Absent without lossless neighbors.
@@ -90,7 +94,10 @@ class RestoredState:
 
 
 class DeliveryState:
-    """Builder of the saved parts; unchanged parts stay the same objects."""
+    """Builder of the parts to save.
+
+    An unchanged part stays the same object, so that the store does not write it again.
+    """
 
     def __init__(self) -> None:
         self._links: dict[str, Any] = {}
@@ -104,12 +111,12 @@ class DeliveryState:
         return len(self._taken) >= MAX_WAL_ENTRIES
 
     def own(self, own: State, taken: LoggedInput | None, whole: bool) -> dict[str, Any]:
-        """Return the actor's state and the inputs that it handled since.
+        """Return the actor's state and the write-ahead log, as parts to save.
 
         Args:
             own: State of the actor, by part.
-            taken: Input of the last step if the actor lags.
-            whole: The state is a checkpoint, so no inputs are logged with it.
+            taken: Input of the last step; None unless `Actor.lags`.
+            whole: True if `own` is a checkpoint: it includes the last step and needs no log.
 
         Returns:
             Parts to save. A new state clears the write-ahead log.
@@ -145,9 +152,9 @@ class DeliveryState:
 def restore_actor(actor: Actor, past: RestoredState, make: Callable[[], Actor]) -> Actor:
     """Restore a new actor to the end of the last saved step.
 
-    The actor handles the logged inputs again to rebuild its state. Their outputs are discarded,
-    because the outbox has them already. If an input fails now, it is skipped, and another new actor
-    handles the remaining ones.
+    The actor handles the logged inputs again to rebuild its state. The resulting outputs are
+    discarded, because the outbox has them already. If an input fails now, the function starts again
+    with another new actor and without this input.
 
     Args:
         actor: A new actor.

@@ -77,7 +77,7 @@ class Inlet:
         self.rejected += rejected
 
     def discard_backlog(self) -> None:
-        """Drop the queue, because the stage is paused, and count it as paused."""
+        """Drop the queued messages of a paused stage, and count them in `paused`."""
         self.paused += len(self.waiting)
         self.waiting.clear()
 
@@ -124,7 +124,7 @@ class LosslessInlet(Inlet):
             start: Offset of the first message that the producer can send.
 
         Returns:
-            Number of messages that are lost: sent by this producer, but no longer in its outbox.
+            Number of lost messages. The producer has sent them, and its outbox no longer has them.
         """
         known, joins = epoch == self.epoch, not self.is_connected
         self.is_connected = True
@@ -151,7 +151,7 @@ class LosslessInlet(Inlet):
         return True
 
     def discard_backlog(self) -> None:
-        """Keep the queue: the producer waits while the window is full."""
+        """Keep the queued messages of a paused stage; a full window makes the producer wait."""
 
     def reset(self) -> None:
         """Clear the queue and the connection; the producer must send its hello again."""

@@ -1,4 +1,4 @@
-"""Journal of an actor: everything that determined each step, and the result of the step.
+"""Journal of an actor: the input, the flow status and the result of each step.
 
 | channel         | entry        | meaning                                                         |
 |-----------------|--------------|-----------------------------------------------------------------|
@@ -6,8 +6,9 @@
 | `journal/step`  | `StepRecord` | The actor handled the last input under the given flow status.   |
 | `journal/gap`   | `Gap`        | Entries are missing from here on.                               |
 
-The inputs lie between these entries, each on the channel of its topic, as they were decoded. Steps
-count from 0 in each file. Nothing else can change the outputs of an actor; see `replay`.
+Inputs are recorded between these entries, each on the channel of its topic, with its encoded bytes.
+Steps are numbered from 0 in each file. The outputs of an actor depend on nothing else, so
+`ldo_service.recordings.replay` can repeat and verify every step.
 """
 
 import hashlib
@@ -91,7 +92,10 @@ def digest(*bodies: bytes | memoryview) -> str:
 
 
 def checksum(body: bytes | memoryview) -> str:
-    """Compute the CRC-32 in hexadecimal: it detects damage at a fifth of the digest's cost."""
+    """Compute the CRC-32 in hexadecimal.
+
+    It detects damaged bytes in a fifth of the time that `digest` takes.
+    """
     return f"{zlib.crc32(body):08x}"
 
 
@@ -109,10 +113,13 @@ class Journal:
     """Receiver of journal entries that discards them; `Recorder` writes them to a file."""
 
     def record_start(self, state: State | None) -> None:
-        """Record the start of an actor; None: a new actor without a saved state."""
+        """Record the start of an actor, with its saved state; None: it has no saved state."""
 
     def record_input(self, delivery: Delivery, stamp_ns: int) -> None:
-        """Record the input of the following steps and the stamp of the message, ns."""
+        """Record the input of the next step, and the stamp of its message in ns.
+
+        If the step fails, the repeated step has the same input.
+        """
 
     def record_step(
         self,

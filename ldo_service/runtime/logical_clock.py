@@ -1,12 +1,11 @@
 """Offline run of the whole actor graph, on a logical clock that ticks once per frame.
 
-Messages that belong to a frame, such as poses of another odometry, arrive in the same tick, before
-the frame.
+Odometry priors up to a frame are delivered in the tick of that frame, before the frame.
 
-The outputs of a step become visible a declared number of ticks after the actor took the input,
-independent of the real duration. Actors compute in parallel, each in its own thread. The clock
-waits for a thread only at the tick of its output. The result therefore depends only on the input
-and the latencies, not on the machine or its load, and no message is dropped.
+Each actor has a configured latency in ticks. Consumers receive the outputs of a step that many
+ticks after its input, however long the step really takes. Actors compute in parallel, each in its
+own thread. The clock waits for a thread only at the tick of its output. The result therefore
+depends only on the input and the latencies, not on the machine or its load. No message is dropped.
 """
 
 import heapq
@@ -36,7 +35,8 @@ class StepOutput:
 class PendingOutput:
     """Outputs of a step that is still running.
 
-    Outputs with equal ticks are delivered in the order of the graph, then of starting.
+    Outputs of one tick are delivered in the order of the actors in the graph. Those of one actor
+    are delivered in the order in which the steps started.
     """
 
     tick: int  # Tick at which the outputs become visible.
@@ -124,10 +124,12 @@ class LogicalClock:
             thread.thread.shutdown(cancel_futures=True)
 
     def run(self, source: Iterable[Message | tuple[Message, ...]]) -> Iterator[int]:
-        """Yield the tick after each item of the source, then wait for all running steps.
+        """Deliver each item of the source in a tick of its own, and yield the number of the tick.
+
+        After the last item, wait for all running steps.
 
         Args:
-            source: Messages; the messages of a tuple share a tick.
+            source: Messages; the messages of a tuple are delivered in one tick.
 
         Raises:
             StageError: A handler raised; the error names the actor.
@@ -143,7 +145,7 @@ class LogicalClock:
     def finish(self) -> None:
         """Deliver the final messages of each actor, producers first.
 
-        Actors with `finishes_last` come after all others. Another run may follow.
+        Actors with `finishes_last` come after all other actors. `run` may be called again.
         """
         for thread in sorted(self._threads, key=lambda thread: thread.actor.finishes_last):
             self._expect(thread, self._tick, thread.finish())

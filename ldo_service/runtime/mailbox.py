@@ -1,6 +1,6 @@
-"""Mailbox: all inputs of one actor, merged in order of arrival and bounded.
+"""Mailbox: bounded queue of all inputs of one actor, in order of arrival.
 
-Inputs with priority come first. Every drop is counted.
+Messages of inputs with priority are taken first. Each dropped message is counted.
 """
 
 import asyncio
@@ -34,10 +34,10 @@ log = logging.getLogger(__name__)
 
 
 class Mailbox:
-    """Queue of all inputs of an actor; any thread may add, only the event loop takes.
+    """Queue of all inputs of an actor.
 
-    A delivery counts as handled when `done` is called. A consumer that is killed before that
-    receives it again.
+    Any thread may add messages; only the event loop takes them. A delivery counts as handled when
+    `done` is called. If the actor is killed before, it receives a lossless message again.
     """
 
     def __init__(
@@ -52,10 +52,10 @@ class Mailbox:
 
         Args:
             consumer: Name of the actor.
-            ports: Its inputs.
+            ports: Inputs of the actor.
             transport: The network.
-            max_bytes: Largest message of a Latest input. Lossless inputs have no limit: their
-                messages come from actors of the service.
+            max_bytes: Maximum size of a message of a Latest input, bytes. Lossless inputs have no
+                limit, because their messages come from actors of the service.
             past: Position of the previous process on each lossless topic.
         """
         self._consumer, self._max_bytes = consumer, max_bytes
@@ -114,7 +114,10 @@ class Mailbox:
                 self._ask_for_grants()
 
     def _reject(self, inlet: Inlet, why: str) -> None:
-        """Count and log a message that is rejected before it is decoded; needs the lock."""
+        """Count and log a message that is rejected before it is decoded.
+
+        The caller holds the lock.
+        """
         if inlet.rejected == 0:
             log.warning("%s: message of %s rejected: %s. Later rejections are only counted.",
                         self._consumer, inlet.port.topic.name, why)  # fmt: skip
@@ -144,13 +147,13 @@ class Mailbox:
             self._ask_for_grants()
         if lost:
             log.error(
-                "%s: lost %d messages of %s after its eviction as a slow consumer "
-                "(supervision.evict_after_s). The map has a gap here.",
+                "%s: lost %d messages of %s after its eviction as a slow consumer, so the map "
+                "lacks them. Reduce its load, or raise supervision.evict_after_s.",
                 self._consumer, lost, inlet.port.topic.name,
             )  # fmt: skip
 
     def _ask_for_grants(self) -> None:
-        """Schedule `send_credits` on the event loop; needs the lock."""
+        """Schedule `send_credits` on the event loop; the caller holds the lock."""
         if not self._grant_pending:
             self._grant_pending = True
             call_soon(self._loop, self.send_credits)
@@ -202,12 +205,15 @@ class Mailbox:
             }
 
     def put_command(self, order: StageCommand) -> None:
-        """Queue a command before all deliveries."""
+        """Queue a command; `take` returns it before all deliveries."""
         self._orders.append(order)
         self._ready.set()
 
     def pause(self) -> None:
-        """Hold back all deliveries until `resume`; Latest inputs drop their messages."""
+        """Let `take` return only commands until `resume`.
+
+        Latest inputs drop their messages and count them. Lossless inputs keep theirs.
+        """
         with self._lock:
             self._held = True
             for inlet in self._inlets.values():
@@ -215,7 +221,7 @@ class Mailbox:
             self._keep_only_waiting()
 
     def resume(self) -> None:
-        """Release deliveries again."""
+        """Let `take` return deliveries again, after `pause`."""
         with self._lock:
             self._held = False
         self._ready.set()
@@ -234,14 +240,15 @@ class Mailbox:
         self.send_credits()
 
     def _keep_only_waiting(self) -> None:
-        """Remove deliveries from the order that their inlet has dropped; needs the lock."""
+        """Remove the deliveries that their inlet has dropped; the caller holds the lock."""
         waiting = {id(d) for inlet in self._inlets.values() for d in inlet.waiting}
         self._order = deque(d for d in self._order if id(d) in waiting)
 
     def send_credits(self) -> None:
-        """Send the credit of every lossless input again.
+        """Send the current credit of every lossless input to its producer.
 
-        Repetition replaces lost credit messages and announces this consumer to new producers.
+        The stage repeats this with each heartbeat, because a credit message may be lost. Before a
+        producer has sent its hello, this sends the hello of the consumer instead.
         """
         with self._lock:
             self._grant_pending = False

@@ -36,10 +36,10 @@ class Outlet:
     """Sending half of a topic, with credit-based flow control for lossless consumers.
 
     The outlet numbers messages, waits for credit from every lossless consumer, and retransmits lost
-    messages. The consumers in `expected` are required: they must not miss a message. There is no
-    credit until each of them has connected, nor after one has stopped. Other consumers hold the
-    producer back only while they are alive. A nonblocking port sends at once, because its actor has
-    checked the credits before.
+    messages. The consumers in `expected` are required: they must not miss a message. The outlet has
+    no credit while one of them is disconnected. Other consumers limit the credit only while they
+    are connected. A nonblocking port sends without waiting, because its actor has checked the
+    credits before.
     """
 
     # Half a credit period; a shorter time would retransmit messages that are still on their way.
@@ -64,10 +64,10 @@ class Outlet:
             epoch: Number of this run of the actor; a restored outlet continues the epoch of `past`.
             transport: The network.
             expected: Names of the required consumers.
-            evict_after_s: Time without progress after which a consumer is evicted.
+            evict_after_s: Time after which a consumer with a full window is evicted, seconds.
             on_evicted: Called with the name of an evicted consumer.
-            past: Position of the previous process. The outlet continues its numbering and sends
-                again all that a required consumer has not handled.
+            past: Position of the previous process. The outlet continues its numbering, and sends
+                again the messages that a required consumer has not handled.
         """
         self.port, self.topic = port, port.topic
         past = past or OutletPosition(epoch, 0)
@@ -101,7 +101,10 @@ class Outlet:
 
     # --- sending ----------------------------------------------------------------------------
     def credits(self) -> int:
-        """Return how many messages may be sent now without waiting; 0 while one is staged."""
+        """Return how many messages may be sent now without waiting.
+
+        It is 0 while staged messages are not sent.
+        """
         return 0 if self._unsent else self._consumers.room(self._seq)
 
     async def send(self, message: Message, body: bytes) -> None:
@@ -240,7 +243,11 @@ class Outlet:
             self._unhandled.popleft()
 
     def _retransmit(self, consumer: Consumer, gap: bool) -> None:
-        """Retransmit lost messages: after a gap at once, at the end of the stream after a delay."""
+        """Retransmit the messages that a consumer has not received.
+
+        If the consumer reports a gap, this happens at once. Otherwise the newest messages may still
+        be on their way, so the outlet first waits for `REPEAT_AFTER_S`.
+        """
         now = self._loop.time()
         recently = now - consumer.repeated_at_s < self.REPEAT_AFTER_S
         if gap:
@@ -270,13 +277,16 @@ class Outlet:
             self._changed.set()
 
     def evict_stalled(self) -> None:
-        """Evict consumers that are alive but make no progress; called with every heartbeat."""
+        """Evict connected consumers whose window has been full for too long.
+
+        The stage calls it with every heartbeat.
+        """
         overdue = self._consumers.stalled(self._loop.time(), self._evict_after_s, self._next)
         for name in overdue:
             log.error(
                 "%s: consumer %s evicted: it took no message for %.0f s "
                 "(supervision.evict_after_s). A child process of the service is restarted; any "
-                "other consumer is ignored until it makes progress.",
+                "other consumer is ignored until it handles a message.",
                 self.topic.name, name, self._evict_after_s,
             )  # fmt: skip
             self.evicted += 1
@@ -308,7 +318,8 @@ class Outlet:
 class Outlets:
     """Set of all outlets of an actor.
 
-    They stage the outputs of a step, and send them when the step is saved or discard them.
+    They stage the outputs of a step. They send these outputs after the step is saved, and discard
+    them if the step fails.
     """
 
     def __init__(self, outlets: Iterable[Outlet] = ()) -> None:
@@ -324,7 +335,7 @@ class Outlets:
 
     @property
     def has_required_consumers(self) -> bool:
-        """True if some consumer must not miss a message."""
+        """True if a topic has a required consumer, which must not miss a message."""
         return any(outlet.position() for outlet in self._all.values())
 
     def room(self) -> dict[Topic, int]:
@@ -345,7 +356,10 @@ class Outlets:
             self._all[type(out.message)].stage_message(out.message, out.body)
 
     async def release(self, *, is_saved: bool = True) -> None:
-        """Send the staged outputs; those of an unsaved step only without required consumers."""
+        """Send the staged outputs of a step.
+
+        If the step is not saved, topics with required consumers keep theirs staged.
+        """
         for outlet in self._all.values():
             if is_saved or outlet.position() is None:
                 await outlet.commit()

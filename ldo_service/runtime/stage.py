@@ -183,7 +183,8 @@ class Stage:
         if not done:
             written.cancel()
             log.error(
-                "%s: the end of its recording was not written in time; a replay stops earlier.",
+                "%s: the end of its recording was not written in time, so a replay stops before "
+                "the last steps. Record to a faster disk.",
                 self.name,
             )
 
@@ -202,8 +203,8 @@ class Stage:
             await self._outlets.flush()
         except UnsavedStateError:
             log.error(
-                "%s: stopped with one unsaved step; it is repeated after the restart, nothing is "
-                "lost. Free some disk space.",
+                "%s: stopped before its last step was saved. The step is repeated after the "
+                "restart, so nothing is lost. Free some disk space before the restart.",
                 self.name,
             )
 
@@ -295,7 +296,8 @@ class Stage:
         except Exception:
             self._metrics.failures += 1
             log.exception(
-                "%s: producing the messages of %r failed; subscribers may miss the last state.",
+                "%s: producing the messages of step %r failed; subscribers may miss the last "
+                "state.",
                 self.name, kind,
             )  # fmt: skip
             return
@@ -325,7 +327,10 @@ class Stage:
             self._orders.report(order, "")
 
     async def _renew(self, mailbox: Mailbox) -> None:
-        """Reset to an empty state; other actors observe it like a restarted process."""
+        """Replace the actor by a new one with an empty state, under a new epoch.
+
+        Other actors connect to it again, as after a restart of its process.
+        """
         self._checkpointer.forget(self.name)
         self._actor = await self._worker.run(self._restored_actor)
         self._epoch = new_epoch()
@@ -344,7 +349,10 @@ class Stage:
         return actor
 
     async def _restart(self) -> None:
-        """Wait, longer with each failure, and restore the actor from its last state."""
+        """Restore the actor from its last saved state, after a delay.
+
+        The delay doubles with each failure.
+        """
         while True:
             self._metrics.failures += 1
             await asyncio.sleep(self._budget.record_failure(asyncio.get_running_loop().time()))
@@ -353,7 +361,7 @@ class Stage:
             except Exception:
                 log.exception(
                     "%s: restoring its last state failed; retrying within the restart budget. If "
-                    "it ends the service, start with an empty map by another --state folder.",
+                    "the service ends, start with an empty map in another folder (--state).",
                     self.name,
                 )
                 continue

@@ -15,8 +15,9 @@ Commands:
 - `save`: Write the whole state now.
 
 `Control` replies once for the whole service, when all its actors have replied. `reset` first pauses
-every actor, producers first, so that no message of the old run is in flight when they restart. A
-late correction of 50 keyframes would otherwise supersede the first correction of the new run.
+every actor, producers first, so that no message of the old run is in flight when they restart.
+Otherwise a late correction after 50 keyframes could arrive in the new run. Its higher version would
+supersede the first correction of the new run.
 """
 
 import asyncio
@@ -63,7 +64,11 @@ class StageReply(msgspec.Struct, frozen=True, array_like=True):
 
 
 class CommandReceiver:
-    """Stage end of the protocol: passes each command on once and repeats lost replies."""
+    """Receiver of commands in a stage.
+
+    It passes each command to the stage once. If a finished command arrives again, it repeats the
+    reply, which was lost.
+    """
 
     def __init__(
         self, stage: str, transport: Transport, take: Callable[[StageCommand], None]
@@ -100,7 +105,7 @@ class CommandReceiver:
 
 
 class CommandSender:
-    """Service end of the protocol."""
+    """Sender of commands in the service."""
 
     def __init__(self, transport: Transport) -> None:
         self._loop = asyncio.get_running_loop()
@@ -229,14 +234,15 @@ class Control:
         return f"{', '.join(self._actors)} restarted with an empty state.{still}"
 
     async def _each(self, what: What, actors: Sequence[str]) -> None:
-        """Send a command to the actors in sequence.
+        """Send a command to the actors, one after the other, and wait for each reply.
 
-        A producer may have to wait for a consumer that is not paused yet. The actors share
-        `timeout_s`; each has at least `MIN_S`, also after an actor that does not reply.
+        The order matters for `pause`: a producer that waits for credit can finish its step only
+        while its consumer is not paused. All actors together have `timeout_s`. Each one has at
+        least `MIN_S`, even if an earlier actor does not reply.
 
         Raises:
-            ControlError: Some actors did not execute the command. It is raised after all actors
-                have received the command, and names these actors.
+            ControlError: Some actors did not execute the command. It is raised after the command
+                was sent to all actors, and names those that failed.
         """
         failures, until_s = [], time.monotonic() + self._timeout_s
         for actor in actors:
@@ -249,7 +255,7 @@ class Control:
 
     # --- actors that were restarted ---------------------------------------------------------------
     def _presence(self, name: str, alive: bool) -> None:
-        """Pause a restarted source again, because the pause is not part of its saved state."""
+        """Pause a restarted source actor again; its saved state does not include the pause."""
         if alive and self._is_paused and name in self._sources:
             task = asyncio.ensure_future(self._commander.order("pause", name, self._timeout_s))
             self._tasks.add(task)

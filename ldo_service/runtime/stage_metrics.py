@@ -49,8 +49,8 @@ class StageMetrics:
 
         Args:
             message: Input of the step.
-            is_timed: Whether its duration enters `step_ms`. Steps that only store their input are
-                excluded, because they would bias the duration of a frame.
+            is_timed: Whether `step_ms` includes its duration. Steps that only store their input are
+                excluded, because they would lower the percentiles.
         """
         self.steps += 1
         if is_timed:
@@ -65,7 +65,7 @@ class StageMetrics:
         return 0.0 if started_s is None else time.monotonic() - started_s
 
     def health(self, **of_the_stage: Any) -> Health:
-        """Return the health message; the stage passes the remaining fields."""
+        """Return the health message; `of_the_stage` has the fields that are not stored here."""
         step_ms = np.array(self.step_ms or [0.0])
         is_busy = self.started_at_s is not None and self.state == "ready"
         return Health(

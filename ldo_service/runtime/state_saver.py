@@ -1,4 +1,4 @@
-"""Saving of a stage's state after each step, also while the disk is full."""
+"""Saving of a stage's state after each step, with retries while the disk is full."""
 
 import asyncio
 from collections.abc import Callable
@@ -26,7 +26,7 @@ class UnsavedStateError(Exception):
 class StateSaver:
     """Saver of the state of one stage.
 
-    While the disk is full, it retries and the stage waits, with two exceptions:
+    While the disk is full, the saver retries and the stage takes no messages, with two exceptions:
 
     - A stage with nonblocking outputs continues. Its credit is 0 until the staged outputs are saved
       and sent.
@@ -67,8 +67,8 @@ class StateSaver:
     def save_initial(self, actor: Actor) -> None:
         """Save the initial state before other actors connect.
 
-        The state is small, so the event loop saves it itself. If that fails, the stage retries
-        before the first step.
+        The initial state is small, so this blocks the event loop only briefly. If saving fails, the
+        stage retries before the first step.
         """
         try:
             self._write(
@@ -90,7 +90,7 @@ class StateSaver:
         Args:
             actor: The actor of the stage.
             delivery: The delivery of the current step, which counts as handled.
-            taken: Its entry of the write-ahead log; None unless `Actor.lags`.
+            taken: The delivery's entry of the write-ahead log; None unless `Actor.lags`.
             whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`.
 
         Returns:

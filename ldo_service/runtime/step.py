@@ -45,7 +45,8 @@ def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
         topic = topics.get(type(message))
         if topic is None:
             raise TypeError(
-                f"{actor.name} produced a {type(message).__name__}, which is not in its outputs."
+                f"{actor.name} produced a {type(message).__name__}, which is not in its outputs. "
+                "Yield only messages of the actor's `outputs`."
             )
         if topic in room:
             room[topic] -= 1
@@ -59,7 +60,10 @@ def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
 
 
 class MessageDecoder:
-    """Decoder of inputs that logs a series of malformed messages of a topic once."""
+    """Decoder of inputs.
+
+    Of consecutive malformed messages of a topic, it logs only the first one.
+    """
 
     def __init__(self, actor: str) -> None:
         self._actor = actor

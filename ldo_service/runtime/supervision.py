@@ -1,8 +1,8 @@
 """Supervision of all stages of a process in one task group, and the watchdog of systemd.
 
 An error that a stage cannot recover from ends all stages. The watchdog uses the protocol of
-sd_notify(3). It sends a datagram with one word to the socket that the environment names. The
-systemd manager restarts a unit with `WatchdogSec=` if the event loop is blocked for that time.
+sd_notify(3): it sends datagrams with one word to the socket in NOTIFY_SOCKET. If a unit sets
+`WatchdogSec=`, systemd restarts it when the event loop is blocked for that time.
 """
 
 import asyncio
@@ -62,11 +62,11 @@ async def supervise(runners: Sequence[Runner], stop: StopRequest, drain_s: float
     Args:
         runners: Stages and child processes, producers first.
         stop: The stop request.
-        drain_s: Time that each runner has for a soft stop before it is cancelled.
+        drain_s: Time that each runner has for a soft stop before it is cancelled, seconds.
 
     Raises:
-        RestartsExhausted: A restart budget is used up.
-        StageStalled: A step took too long.
+        RestartsExhausted: An actor has used up its restart budget.
+        StageStalled: A step took longer than `SupervisionConfig.stall_after_s`.
     """
     try:
         async with asyncio.TaskGroup() as group:
@@ -94,7 +94,7 @@ async def _end(
 
 
 def _first(errors: BaseExceptionGroup) -> BaseException:
-    """Return the error that ended the group; the others are its consequences."""
+    """Return the first error of the group; the other errors are its consequences."""
     error: BaseException = errors
     while isinstance(error, BaseExceptionGroup):
         error = error.exceptions[0]
