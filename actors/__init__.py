@@ -1,1 +1,1 @@
-"""Actors of the design; each one connects messages (`schemas`) to algorithms (`ldo_service`)."""
+"""Actors of the service; each one converts messages (`schemas`) and calls the algorithms."""

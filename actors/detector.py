@@ -3,8 +3,8 @@
 in   keyframe/new      Keyframe         Lossless(8)   a lost keyframe would get no detections
 out  detection/boxes   DetectionBoxes                 one for every keyframe, possibly empty
 
-A network that cannot be used never ends the service. The detector then publishes messages without
-boxes, and its metrics report the failure.
+The service continues if the network cannot be loaded or fails. The detector then publishes messages
+without boxes, and its metrics report the failure.
 """
 
 import logging
@@ -26,14 +26,17 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class DetectorConfig:
-    """Network of the detector, and how it runs."""
+    """Choice and parameters of the detector's network."""
 
     model: str = ""  # A name of `ldo models list`, or an ONNX file; empty: no detections.
     network: NetworkConfig = field(default_factory=NetworkConfig)
 
 
 class Detector(Actor):
-    """Stateless actor: a keyframe that is sent again gets the same boxes."""
+    """Actor that detects objects in keyframes.
+
+    It has no state, so it finds the same boxes if a keyframe is sent again.
+    """
 
     name = "detector"
     inputs = (In(KEYFRAME_NEW, Lossless(8)),)
@@ -49,10 +52,13 @@ class Detector(Actor):
             if self.config.model:
                 self._network = open_detector(self.config.model, self.config.network)
         except ConfigError as error:
-            log.error('detector disabled: %s. Check detector.model with "ldo models list".', error)
+            log.error('detector disabled: %s Check detector.model with "ldo models list".', error)
 
     def handle(self, message: Keyframe) -> Iterator[DetectionBoxes]:
-        """Yield one message for the keyframe; it has no `network` if no network could be used."""
+        """Yield the detections of the keyframe in one message.
+
+        If no network could be used, the field `network` of the message is empty.
+        """
         if self._network is None:
             yield detections_to_message(message, None, (), "")
             return

@@ -1,8 +1,8 @@
 """Check and rectification of camera frames.
 
-in   camera/rgbd    CameraRgbd    Latest(4)   buffers a burst; newer frames count more
-in   camera/color   CameraColor   Latest(4)   as camera/rgbd, for cameras with two topics;
-in   camera/depth   CameraDepth   Latest(4)   color and depth are paired by stamp
+in   camera/rgbd    CameraRgbd    Latest(4)   buffers a burst of four; drops older frames
+in   camera/color   CameraColor   Latest(4)   color image of a camera with two topics
+in   camera/depth   CameraDepth   Latest(4)   depth image of such a camera, paired by stamp
 out  frame/rgbd     FrameRgbd                 a pair has stamp and number of its color image
 """
 
@@ -46,9 +46,9 @@ class FrameSourceConfig:
     max_skew_s: float = 0.015
     # Images per stream that wait for their partner: 0.27 s at 30 Hz, 7 MB for VGA.
     pair_buffer: int = 8
-    # A stamp that is earlier by more than this means that the camera restarted; it is no jitter.
+    # Stamps that go back by more than this mean that the camera restarted; jitter is smaller.
     restart_after_s: float = 1.0
-    # Minimum image side. Smaller images hold too little to track and hint at a wrong header.
+    # Minimum image side. Smaller images lack detail for tracking; usually their header is wrong.
     min_side_px: int = 32
 
     def __post_init__(self) -> None:
@@ -91,7 +91,11 @@ class FrameSource(Actor):
         self._has_warned_of_skew = False
 
     def handle(self, message: Input) -> Iterator[FrameRgbd]:
-        """Yield the rectified frame of a whole message, or of each pair that it completes."""
+        """Yield the rectified frames that the message completes.
+
+        An RGB-D message is a complete frame. A color or depth message completes a pair, or waits
+        for its partner.
+        """
         self._notice_restart(message)
         if isinstance(message, CameraRgbd):
             yield from self._frame(message, partial(raw_frame_from_message, message, message.frame))
@@ -150,7 +154,10 @@ class FrameSource(Actor):
             )
 
     def _notice_restart(self, message: Input) -> None:
-        """Reset stamps and pairing if the stamp went back, as after a restart of the camera."""
+        """Forget the last stamp and all unpaired images if the camera has restarted.
+
+        A restart shows in stamps that go back by more than `restart_after_s`.
+        """
         back_s = (self._last_stamp_ns - message.stamp_ns) * 1e-9
         if back_s > self.config.restart_after_s:
             log.warning(
@@ -181,9 +188,10 @@ class FrameSource(Actor):
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, int]:
-        """Return the last stamp; images that wait for a partner are not saved.
+        """Return the last stamp.
 
-        After a crash at most one pair is lost, which costs less than saving images.
+        Images that wait for their partner are not saved. A crash therefore loses at most one pair,
+        which costs less than saving every image.
         """
         return {"last_stamp_ns": self._last_stamp_ns}
 
@@ -206,7 +214,10 @@ class FrameSource(Actor):
 
 
 def join_halves(color: CameraColor, depth: CameraDepth) -> RawFrame:
-    """Return depth registered to the color image, with the stamp and camera of that image.
+    """Return the raw frame of a color image and a depth image.
+
+    Depth is registered to the color image. The frame has the number, the stamp and the camera of
+    the color image.
 
     Raises:
         DataError: An image cannot be decoded.

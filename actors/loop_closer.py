@@ -1,13 +1,13 @@
 """Detection of loop closures between subgraphs of keyframes.
 
 in   keyframe/new       Keyframe         Lossless(8)   a lost keyframe could never close a loop
-in   detection/boxes    DetectionBoxes   Lossless(8)   semantics of every keyframe
-in   graph/correction   GraphCorrection  Latest(1)     complete and versioned; the newest suffices
+in   detection/boxes    DetectionBoxes   Lossless(8)   object classes in every keyframe
+in   graph/correction   GraphCorrection  Latest(1)     has all poses, so the newest suffices
 out  loop/closure       LoopClosure                    each accepted candidate
-out  loop/candidate     LoopCandidate                  each candidate, with its rejection reason
+out  loop/candidate     LoopCandidate                  each candidate; the reason if it is rejected
 
-A keyframe waits for its detections. The detector publishes them for every keyframe, even without a
-network; the field `network` is then empty.
+The actor processes a keyframe when its detections have arrived. The detector publishes a message
+for every keyframe. If it has no network, the field `network` of the message is empty.
 """
 
 import logging
@@ -47,8 +47,11 @@ from ldo_service.tracking.keyframe_database import KeyframeRecord, make_keyframe
 
 log = logging.getLogger(__name__)
 
-MAX_PENDING_KEYFRAMES = 16  # Two windows of boxes; if more keyframes wait, the boxes were lost.
-# Newest keyframes, which the optimizer may not have placed yet; the tracker keeps as many.
+# Maximum keyframes that wait for detections: two windows of the input. If more wait, their
+# detections were lost.
+MAX_PENDING_KEYFRAMES = 16
+# Number of newest keyframes for which the optimizer may not have published a pose yet; the tracker
+# keeps as many.
 RECENT_KEYFRAMES = 32
 
 
@@ -72,7 +75,10 @@ class PendingKeyframe:
 
     @property
     def facts(self) -> tuple[int, int, int]:
-        """Frame, stamp and image width; the record in `place` is a separate part of the state."""
+        """Frame number, stamp in ns and image width in pixels, for the saved state.
+
+        The record in `place` is saved as a separate part.
+        """
         return self.frame, self.stamp_ns, self.width_px
 
 
@@ -107,7 +113,10 @@ class LoopCloser(Actor):
     def handle(
         self, message: Keyframe | DetectionBoxes | GraphCorrection
     ) -> Iterator[LoopClosure | LoopCandidate]:
-        """Yield candidates and closures of the keyframes whose wait for boxes a message ends."""
+        """Yield the loop candidates and closures of keyframes that can be processed now.
+
+        A keyframe can be processed when its detections have arrived or were lost.
+        """
         if not self.config.is_on:
             return
         self._parts = None
@@ -147,9 +156,11 @@ class LoopCloser(Actor):
         )
 
     def _ready(self) -> list[int]:
-        """Return the keyframes that need not wait any longer.
+        """Return the pending keyframes whose detections have arrived or were lost.
 
-        Detections arrive in order, so those of keyframes before the newest match will not come.
+        Detections arrive in the order of the keyframes. If a keyframe has detections, those of
+        earlier pending keyframes can no longer arrive. If more than `MAX_PENDING_KEYFRAMES` wait,
+        the detections of the oldest ones were lost.
         """
         newest = max(self._boxes.keys() & self._waiting.keys(), default=-1)
         ready = [k for k in self._waiting if k <= newest]
@@ -173,9 +184,9 @@ class LoopCloser(Actor):
     def _masked_keyframe(
         self, waiting: PendingKeyframe, boxes: DetectionBoxes | None
     ) -> tuple[KeyframeRecord, DetectionPoints | None]:
-        """Return the record without dynamic classes, and the 3D points of its static detections.
+        """Return the keyframe record without dynamic objects, and its detections as 3D points.
 
-        The points are None if no network ran.
+        The points are those of static classes; None if no network ran.
         """
         if boxes is None or not boxes.network:
             return waiting.place, None
@@ -215,14 +226,18 @@ class LoopCloser(Actor):
             yield loop_candidate_to_message(finding)
 
     def on_stop(self) -> Iterator[LoopClosure | LoopCandidate]:
-        """Process the pending keyframes and the unfinished subgraph."""
+        """Search loops for the pending keyframes and for the unfinished subgraph."""
         self._parts = None
         for keyframe in list(self._waiting):
             yield from self._recognize(keyframe)
         yield from self._to_messages(self.recognizer.flush(self.poses, self._joined))
 
     def _needed(self) -> list[int]:
-        """Return the keyframes that are stored as views or may not have a pose in the map yet."""
+        """Return the keyframes whose poses must be kept.
+
+        These are the keyframes stored as views of subgraphs, and the newest ones, for which the
+        optimizer may not have published a pose yet.
+        """
         views = {v.keyframe for s in self.recognizer.subgraphs for v in s.views}
         return [k for k in self.poses if k > self._newest - RECENT_KEYFRAMES or k in views]
 
@@ -254,9 +269,10 @@ class LoopCloser(Actor):
         return {**subgraphs, **views, **waiting, **words, **self._poses_part(), "now": now}
 
     def _poses_part(self) -> dict[str, Any]:
-        """Return the part of the poses, cached because detections do not change it.
+        """Return the part of the state with the keyframe poses.
 
-        It is the largest part: 0.4 kB for each stored view.
+        It is the largest part, 0.4 kB for each stored view. It is cached, because detections do not
+        change it.
         """
         if self._saved_poses is None:
             self._saved_poses = self.poses.snapshot()

@@ -1,16 +1,16 @@
-"""Mapping with 3D Gaussians, their labels and the objects.
+"""Mapping with labelled 3D Gaussians and objects.
 
-in   keyframe/new          Keyframe             Lossless(8)        a lost one leaves a hole
+in   keyframe/new          Keyframe             Lossless(8)        a lost keyframe leaves a hole
 in   detection/boxes       DetectionBoxes       Lossless(8)        labels come from detections
-in   label/result          LabelResult          Latest(1 per key)  the newest label counts
-in   graph/correction      GraphCorrection      Latest(1)          the newest is complete
+in   label/result          LabelResult          Latest(1 per key)  newest label of each region
+in   graph/correction      GraphCorrection      Latest(1)          the newest has all poses
 in   map/refine            RefineMap            Latest(1)          only the newest request counts
 out  map/view              MapRendering         the map rendered at the newest keyframe
 out  map/delta             MapDelta             changes since the last version
 out  map/snapshot          MapSnapshot          the whole map, in parts, every few keyframes
 out  label/request         LabelRequest         unlabelled regions, for the labeller
 out  map/objects           MapObjects           all objects, after the first detections
-out  object/observation    ObjectObservation    objects that a keyframe shows or misses
+out  object/observation    ObjectObservation    objects observed or missed in a keyframe
 out  keyframe/refinement   KeyframeRefinement   keyframe poses refined by the renderer
 """
 
@@ -125,7 +125,10 @@ class MapperConfig:
 
 
 class Mapper(Actor):
-    """Actor that maps keyframes at once and moves Gaussians with their anchor keyframes."""
+    """Actor that adds each keyframe to the map when it arrives.
+
+    When a correction changes keyframe poses, the Gaussians move with their anchor keyframes.
+    """
 
     name = "mapper"
     lags = True  # It writes the whole map only every few keyframes.
@@ -208,9 +211,11 @@ class Mapper(Actor):
         yield from self._publish_semantics(learnt, message.stamp_ns)
 
     def _iterations(self) -> int:
-        """Return the iterations for the next keyframe: the more keyframes wait, the fewer.
+        """Return the number of optimization iterations for the next keyframe.
 
-        Later keyframes optimize it again as a neighbor. Deduplication shares the budget.
+        The more keyframes wait, the fewer iterations each one gets. Later keyframes optimize its
+        Gaussians again, because they include it as a neighbor. The iterations of a pending
+        deduplication are subtracted.
         """
         config = self.config
         return max(
@@ -236,7 +241,10 @@ class Mapper(Actor):
 
     # --- labels and objects -----------------------------------------------------------------------
     def _take_boxes(self, message: DetectionBoxes) -> Iterator[Output]:
-        """Add detections; without a network no object is missed. The next delta has the labels."""
+        """Add the detections of a keyframe; the next map delta has the resulting labels.
+
+        If no network ran, the keyframe does not count as a miss of any object.
+        """
         vocabulary = self._semantics.vocabulary
         claims = detections_from_message(message, vocabulary) if message.network else None
         learnt = self._semantics.add_detections(message.keyframe, claims)
@@ -257,7 +265,7 @@ class Mapper(Actor):
             yield from self._objects()
 
     def _objects(self) -> Iterator[MapObjects]:
-        """Yield all objects; nothing before the first detections."""
+        """Yield all objects in one message; yield nothing before the first detections."""
         semantics = self._semantics
         if semantics.is_used:
             now = self._publisher.version, self._poses.version, self._newest[0]
@@ -265,7 +273,10 @@ class Mapper(Actor):
 
     # --- corrections ------------------------------------------------------------------------------
     def _correct(self, message: GraphCorrection) -> Iterator[Output]:
-        """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
+        """Move the Gaussians with their anchor keyframes to the corrected poses.
+
+        The motions are rounded as in the message, so that the maps of subscribers stay equal.
+        """
         held = self._links.acknowledged(message.last_refinement)
         self._poses.correct(
             message.graph_version, keyframe_poses_from_correction(message), held=held
@@ -280,7 +291,11 @@ class Mapper(Actor):
             yield from self._objects()
 
     def _moved_keyframes(self) -> list[int]:
-        """Return keyframes that moved visibly against their Gaussians; small motions add up."""
+        """Return the keyframes whose Gaussians must move.
+
+        Their pose differs visibly from the pose to which their Gaussians were last moved. Smaller
+        differences accumulate until they are visible.
+        """
         config, placed = self.config, self._map.views.poses
         T_now, T_gaussians = self._poses.of(placed), placed.of(placed)
         shows = se3.transforms_differ(
@@ -299,7 +314,10 @@ class Mapper(Actor):
         return MessageContext(self._newest[0], self._poses.version, self._semantics.names)
 
     def on_restored(self) -> Iterator[Output]:
-        """Publish the whole map, as subscribers may have missed deltas and new ones need it."""
+        """Publish the whole map.
+
+        Subscribers may have missed deltas, and new subscribers need the whole map.
+        """
         if self._map.size():
             yield from self._publisher.publish_snapshot(self._message_context())
             yield from self._objects()
@@ -314,7 +332,10 @@ class Mapper(Actor):
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return the last checkpoint, the same object until the next one."""
+        """Return the last checkpoint of the map.
+
+        It stays the same object until the next one, `checkpoint_keyframes` keyframes later.
+        """
         newest = self._newest[1]
         saved = self._checkpoint["newest"][1] if self._checkpoint else None
         is_due = saved is None or newest - saved >= self.config.checkpoint_keyframes

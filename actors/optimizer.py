@@ -1,8 +1,8 @@
 """Optimization of the pose graph of keyframes and objects.
 
-in   keyframe/new          Keyframe             Lossless(8)   a lost one would break the chain
+in   keyframe/new          Keyframe             Lossless(8)   each one links to the one before
 in   keyframe/refinement   KeyframeRefinement   Lossless(8)   better relative-pose measurements
-in   loop/closure          LoopClosure          Lossless(8)   rare, and costly to find
+in   loop/closure          LoopClosure          Lossless(8)   rare, and costly to detect
 in   object/observation    ObjectObservation    Lossless(8)   every observation adds information
 out  graph/correction      GraphCorrection                    all keyframe poses and landmarks
 
@@ -76,7 +76,10 @@ class OptimizerConfig:
 
 
 class Optimizer(Actor):
-    """Actor that owns the keyframe poses in the map and the merging of submaps."""
+    """Actor that optimizes the pose graph.
+
+    It alone decides the poses of keyframes in the map, and which submaps are merged.
+    """
 
     name = "optimizer"
     inputs = (
@@ -134,7 +137,7 @@ class Optimizer(Actor):
         yield self._correction(message.stamp_ns)
 
     def on_restored(self) -> Iterator[GraphCorrection]:
-        """Publish the correction again: the last one may not have been sent."""
+        """Publish the current correction, because the previous process may not have sent it."""
         if len(self._graph):
             yield self._correction(self._stamp_ns)
 
@@ -156,7 +159,7 @@ class Optimizer(Actor):
 
     # --- keyframes --------------------------------------------------------------------------------
     def _take(self, message: Keyframe) -> None:
-        """Add a keyframe to the pose graph, then the messages that waited for it."""
+        """Add a keyframe to the pose graph, then process the messages that waited for it."""
         if self._landmarks.needs_update():
             self._landmarks.update_graph(self._graph)
         self._add(message)
@@ -168,7 +171,10 @@ class Optimizer(Actor):
         self._observe()
 
     def _refine(self, poses: tuple[MeasuredPose, ...]) -> None:
-        """Replace measurements; those of a keyframe that has not arrived wait for it."""
+        """Replace relative-pose measurements in the pose graph.
+
+        Measurements of a keyframe that has not arrived are stored until it arrives.
+        """
         asked = self._early | {(p.reference, p.keyframe): p for p in poses}
         known = {pair: p for pair, p in asked.items() if set(pair) <= self._graph.keyframes}
         newest = max(self._graph.keyframes, default=-1)
@@ -192,7 +198,7 @@ class Optimizer(Actor):
             self._join(pose)
 
     def _add_first_keyframe(self, message: Keyframe, T_odom_keyframe: np.ndarray) -> None:
-        """Add the first keyframe of a submap; its pose among the other submaps is unknown."""
+        """Add the first keyframe of a submap; its pose relative to other submaps is unknown."""
         self._first[message.submap] = message.keyframe
         T_map_keyframe = T_map_submap(message.submap) @ T_odom_keyframe
         self._graph.add_first(message.keyframe, T_map_keyframe)
@@ -200,7 +206,9 @@ class Optimizer(Actor):
     def _add_odometry_fallback(
         self, newest: tuple[int, np.ndarray], keyframe: int, T_odom_keyframe: np.ndarray
     ) -> None:
-        """Measure a keyframe by odometry if none of its reference keyframes was received.
+        """Connect a keyframe to its submap by odometry.
+
+        This replaces its measurements, because none of its reference keyframes was received.
 
         Args:
             newest: Id and T_odom_keyframe of the newest keyframe of the submap.
@@ -220,7 +228,10 @@ class Optimizer(Actor):
         self._graph.add(self._graph.odometry_fallback(known, keyframe, T_known_keyframe))
 
     def _join(self, pose: MeasuredPose) -> None:
-        """Add a submap measurement; if the submaps are merged already, check it as a closure."""
+        """Add the relative pose between keyframes of two submaps, which merges the submaps.
+
+        If they are merged already, the relative pose is checked like a loop closure.
+        """
         if pose.reference not in self._graph:
             log.warning(
                 "optimizer: keyframe %d has a submap measurement to unknown keyframe %d; "
@@ -239,7 +250,7 @@ class Optimizer(Actor):
 
     # --- loops and objects ------------------------------------------------------------------------
     def _close(self) -> bool:
-        """Check the closures between known keyframes; return whether there were any."""
+        """Check the stored loop closures between known keyframes; return whether there were any."""
         known = [c for c in self._early_closures if self._is_known(c.pose)]
         later = [c for c in self._early_closures if not self._is_known(c.pose)]
         self._early_closures = self._keep_newest(later)
@@ -272,7 +283,10 @@ class Optimizer(Actor):
         self._log_merged(before)
 
     def _observe(self) -> None:
-        """Store observations in known keyframes; the pose graph takes them in later."""
+        """Pass the stored observations in known keyframes on to the landmarks.
+
+        A later keyframe adds them to the pose graph.
+        """
         later = []
         for seen in self._early_observations:
             camera = self._cameras.get(seen.keyframe)
@@ -316,16 +330,17 @@ class Optimizer(Actor):
 
     # --- submaps ---------------------------------------------------------------------------------
     def _joined(self) -> dict[int, int]:
-        """Return the merged submaps, each with the older one that it is merged into."""
+        """Return, for each merged submap, the older submap that it was merged into."""
         submaps = {first: submap for submap, first in self._first.items()}
         placed = {s: submaps[self._graph.component_root(first)] for s, first in self._first.items()}
         return {submap: older for submap, older in placed.items() if older < submap}
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return the pose graph at its last rebuild, the changes since, the landmarks and the rest.
+        """Return the state in three parts: `graph`, `landmarks` and `rest`.
 
-        The part of the last rebuild stays the same object for some keyframes.
+        `graph` is the pose graph at its last rebuild. It stays the same object until the next
+        rebuild, some keyframes later. `rest` has the changes since the last rebuild.
         """
         graph = self._graph.snapshot()
         rest = {

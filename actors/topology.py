@@ -1,6 +1,7 @@
 """Graph of actors: every actor with its ports and its factory.
 
-The diagram and the topic table of the pages are generated from here (`ldo topics --markdown`).
+The diagram and the topic table of the documentation are generated from `GRAPH`. `ldo topics` prints
+both, with `--mermaid` and `--markdown`.
 """
 
 from collections.abc import Callable, Iterable
@@ -33,7 +34,7 @@ class ActorParameters:
 
 @dataclass(frozen=True, slots=True)
 class ActorSpec:
-    """An actor of the design, with its ports."""
+    """Name, purpose, ports and factory of an actor."""
 
     name: str
     does: str
@@ -88,7 +89,7 @@ GRAPH: tuple[ActorSpec, ...] = (
 
 
 def actor_spec(name: str) -> ActorSpec:
-    """Return the actor of a name.
+    """Return the specification of an actor by its name.
 
     Raises:
         ConfigError: There is no such actor.
@@ -106,7 +107,10 @@ def make_actors(parameters: ActorParameters) -> list[Actor]:
 
 
 def producer_of(topic: t.Topic) -> str:
-    """Return the name of the actor that publishes a topic, or `outside` or `every stage`."""
+    """Return the name of the actor that publishes a topic.
+
+    The result is `outside` if other programs publish it, and `every stage` if each actor does.
+    """
     for box in GRAPH:
         if any(out.topic is topic for out in box.outputs):
             return box.name
@@ -119,7 +123,7 @@ def producer_of(topic: t.Topic) -> str:
 
 
 def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
-    """Return the name and policy of each consumer."""
+    """Return the name and the delivery policy of each consumer of a topic."""
     if topic is t.CONTROL:
         return [("the service", "one at a time")]
     return [

@@ -1,15 +1,15 @@
 """Tracking of the camera pose in RGB-D frames.
 
 in   frame/rgbd       FrameRgbd        Latest(1)    a late frame is worth less than the next one
-in   graph/correction GraphCorrection  Latest(1)    complete and versioned; the newest suffices
-in   odometry/prior   OdometryPrior    Latest(64)   0.3 s at 200 Hz, the time to track a frame;
-                                                    older poses matter less; producers never wait
+in   graph/correction GraphCorrection  Latest(1)    has all poses, so the newest suffices
+in   odometry/prior   OdometryPrior    Latest(64)   0.3 s at 200 Hz: the time to track a frame;
+                                                    older poses may be dropped
 in   detection/boxes  DetectionBoxes   Latest(1)    dynamic objects are masked for tracking
 out  pose/tracked     TrackedPose                   one for every tracked frame
 out  keyframe/new     Keyframe                      made only when every consumer has credit
 
-The actor converts messages, and keeps the ports, the prior and the counters. `Odometry.process`
-does the tracking of a frame in one call. If `TrackerConfig.localize` names a finished run, a
+The actor converts messages, buffers the odometry prior and counts. `Odometry.process` tracks a
+frame in one call. If `TrackerConfig.localize` names a finished run, a
 `Localizer` replaces the odometry. It makes no keyframes, so the mapper and the optimizer are idle
 and the map does not change. Subscribers of poses see no difference.
 """
@@ -91,7 +91,7 @@ class CameraExtrinsics:
         if abs(norm - 1.0) > UNIT_WITHIN:
             raise ConfigError(
                 f"tracker.T_base_camera.quaternion_wxyz={list(self.quaternion_wxyz)} has norm "
-                f"{norm:.4g}, must have norm 1. The order is w x y z."
+                f"{norm:.4g}, but must have norm 1. The order is w x y z."
             )
 
     def matrix(self) -> np.ndarray:
@@ -111,11 +111,14 @@ class TrackerConfig:
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.hold_out == 1:
-            raise ConfigError(f"tracker.hold_out={self.hold_out} must be 0 or at least 2.")
+            raise ConfigError(f"tracker.hold_out={self.hold_out} must be 0 or at least 2 frames.")
 
 
 class Tracker(Actor):
-    """Actor that tracks frames against the reference keyframe and follows graph corrections."""
+    """Actor that tracks frames against the reference keyframe.
+
+    Graph corrections update the poses of its keyframes in the map.
+    """
 
     name = "tracker"
     inputs = (
@@ -146,7 +149,7 @@ class Tracker(Actor):
     def handle(
         self, message: FrameRgbd | GraphCorrection | OdometryPrior | DetectionBoxes
     ) -> Iterator[TrackedPose | Keyframe]:
-        """Yield the pose of a frame, and its keyframe if it becomes one."""
+        """Yield the pose of a frame, after its keyframe if the frame becomes one."""
         if isinstance(message, OdometryPrior):
             self._take_prior(message)
             return
@@ -160,7 +163,7 @@ class Tracker(Actor):
             yield from self._track(frame_from_message(message))
 
     def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
-        """Track a frame, and publish its pose and its keyframe, if it becomes one."""
+        """Track a frame; yield its keyframe if it becomes one, then its pose."""
         hold_out = self.config.hold_out
         is_held_out = hold_out > 0 and frame.index % hold_out == hold_out - 1
         may_map = not is_held_out and self.has_credit(KEYFRAME_NEW)
@@ -184,7 +187,8 @@ class Tracker(Actor):
         if self._missed == MISSED_PRIOR_WARNING_COUNT:
             log.warning(
                 "tracker: %d frames in a row had no odometry/prior; its newest pose is %.3f s "
-                "older than the last frame. Is it still published, and do both stamp by one clock?",
+                "older than the last frame. Check that it is still published, and that camera and "
+                "odometry use one clock.",
                 self._missed, 1e-9 * (frame.stamp_ns - self._prior.poses[-1].stamp_ns),
             )  # fmt: skip
 
@@ -206,7 +210,10 @@ class Tracker(Actor):
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return one part for each known keyframe, written once, and a few parts that change."""
+        """Return the state in parts, of which only changed ones are written.
+
+        Each known keyframe has a part that never changes.
+        """
         if self._parts is None:
             self._parts = self._tracked_parts()
         return {**self._parts, "prior": self._prior.pack()}
@@ -232,14 +239,14 @@ class Tracker(Actor):
         """Continue from a snapshot.
 
         Raises:
-            ConfigError: The snapshot belongs to another map.
+            ConfigError: The snapshot was saved with another value of `localize`.
         """
         now = state["now"]
         if now["localize"] != self.config.localize:
             raise ConfigError(
-                f"the saved state belongs to --localize {now['localize'] or '(none)'}, but this "
-                f"service runs with {self.config.localize or '(none)'}. Choose another folder "
-                "with --state."
+                f"the saved state is of a service with --localize {now['localize'] or '(none)'}, "
+                f"but this service has --localize {self.config.localize or '(none)'}. Choose "
+                "another folder with --state."
             )
         places = [state[f"place_{number}"] for number in now["odometry"]["order"]]
         own = {name: state[name] for name in (*OWN_PARTS, "fix") if name in state}
@@ -267,10 +274,10 @@ class Tracker(Actor):
 
 
 def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry:
-    """Return odometry that maps, or a localizer in the map of a finished run.
+    """Return odometry that makes keyframes, or a localizer in the map of a finished run.
 
     Raises:
-        DataError: The run left no keyframe database.
+        DataError: The folder of the run has no usable keyframe database.
     """
     if not config.localize:
         return Odometry(config.odometry, T_base_camera)

@@ -1,14 +1,14 @@
 """Labelling of regions that the detector does not know.
 
-in   label/request   LabelRequest   Latest(1 per region)   a newer view of a region shows more
-in   label/add       AddLabel       Latest(32)             a waiting user has priority
+in   label/request   LabelRequest   Latest(1 per region)   newer crops show more of the region
+in   label/add       AddLabel       Latest(32)             has priority, because a user waits
 out  label/result    LabelResult                           one for every request, with delay
 out  label/names     LabelNames                            one for every label/add
 
-The actor labels one region at a time. No other actor waits for it, however long a request takes. A
-labeller that fails or returns invalid answers never ends the service. Regions then stay without a
-label, and the metrics report the failure. Without a labeller, the actor answers every request at
-once with an empty label.
+The actor labels one region at a time. No other actor waits for it, however long a request takes.
+The service continues if the labeller fails or returns invalid answers. Regions then stay without a
+label, and the metrics report the failure. If no labeller is configured, the actor answers every
+request at once with an empty label.
 
 The answers of a labelling server are not reproducible from a journal. A replay therefore skips this
 actor and feeds the recorded results to the mapper.
@@ -84,10 +84,10 @@ class VlmLabeller(Actor):
         try:
             self._labeller = labeller or labeller_from_config(self.config)
         except ConfigError as error:
-            log.error("vlm_labeller disabled: %s. Regions keep no open-vocabulary label.", error)
+            log.error("vlm_labeller disabled: %s Regions get no open-vocabulary label.", error)
 
     def handle(self, message: LabelRequest | AddLabel) -> Iterator[LabelResult | LabelNames]:
-        """Yield the label of a region, or the names after one was added."""
+        """Yield the label of the requested region, or all names after adding one."""
         match message:
             case LabelRequest():
                 yield self._answer(message)
@@ -110,7 +110,7 @@ class VlmLabeller(Actor):
         )
 
     def _label_region(self, request: LabelRequest) -> list[Opinion] | None:
-        """Return the labels of a region, the likeliest first, or None if no labeller answered.
+        """Return the labels of a region, the most likely first, or None if no labeller answered.
 
         The first failure is logged; further ones are logged only after a success.
         """
@@ -121,7 +121,7 @@ class VlmLabeller(Actor):
         except (ModelError, EndpointError, FrameError) as error:
             if not self._is_failing:
                 log.error(
-                    "vlm_labeller: request failed (%s: %s); regions keep no open-vocabulary label. "
+                    "vlm_labeller: request failed (%s: %s); regions get no open-vocabulary label. "
                     "Check vlm_labeller.model, or the server at vlm_labeller.url.",
                     self._labeller.identity,
                     error,
@@ -150,7 +150,7 @@ class VlmLabeller(Actor):
         if self._labeller is None:
             return "there is no labeller: set vlm_labeller.model or vlm_labeller.url."
         if len(self._labeller.names) >= MAX_NAMES:
-            return f"there are {MAX_NAMES} names already."
+            return f"there are {MAX_NAMES} names already, the maximum."
         try:
             self._labeller.add(name)
         except ConfigError as error:
@@ -162,7 +162,10 @@ class VlmLabeller(Actor):
         return self._state
 
     def restore(self, state: State) -> None:
-        """Add the saved names again; one that this labeller rejects stays saved for a later one."""
+        """Add the saved names again.
+
+        A name that this labeller rejects stays saved, because another labeller may accept it.
+        """
         self._state = {"added": tuple(state["added"])}
         for name in self._state["added"]:
             if refused := self._try_to_add(name):
