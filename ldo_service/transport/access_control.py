@@ -2,15 +2,16 @@
 
 | role       | permissions                                            |
 |------------|--------------------------------------------------------|
-| `service`  | Everything of its robot.                               |
-| `camera`   | Publishes frames.                                      |
+| `service`  | Performs all operations on all topics of its robot.    |
+| `camera`   | Publishes camera frames.                               |
 | `odometry` | Publishes odometry priors.                             |
 | `viewer`   | Reads every topic.                                     |
-| `operator` | Reads every topic, controls, refines and adds labels.  |
+| `operator` | Reads every topic; sends commands, refine requests     |
+|            | and label names.                                       |
 
-Clients without an entry may connect, but every message is denied. A request that the rules cover
-only in part is denied too: a viewer that subscribes to `ldo/robot/**` receives nothing. It must
-subscribe to topics by name.
+Clients without an entry may connect, but the router denies all their messages. It also denies a
+request that the rules cover only in part. A viewer that subscribes to `ldo/robot/**` therefore
+receives nothing; it must subscribe to topics by name.
 
 `access.yaml` has an entry for each certificate, by its common name:
 
@@ -81,7 +82,8 @@ def read_access(path: Path) -> dict[str, AccessEntry]:
         ) from error
     except (ValueError, yaml.YAMLError) as error:
         raise ConfigError(
-            f"{path} is no valid access list: {error}. `ldo keys` writes such a file."
+            f"{path} is no valid access list: {error}. Replace it by the file that "
+            "`ldo keys` writes."
         ) from error
 
 
@@ -103,7 +105,10 @@ def access_control(access: Access) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Rule that allows messages: "ingress" from the client to the router, "egress" back."""
+    """Rule that allows some kinds of messages on some keys.
+
+    Messages from the client to the router are "ingress", those from the router "egress".
+    """
 
     says: str  # Name of the rule, part of its id.
     flows: tuple[str, ...]
@@ -124,16 +129,18 @@ class Rule:
 def rules_of(role: Role) -> Iterator[Rule]:
     """Yield the rules of a role."""
     if role == "service":
-        yield Rule("do all", ("ingress", "egress"), EVERYTHING, ("**",))
+        yield Rule("all operations", ("ingress", "egress"), EVERYTHING, ("**",))
     if role in PUTS:
         keys = tuple(topic.name for topic in PUTS[role])
-        yield Rule("put", ("ingress",), ("put",), keys)
-        yield Rule("learn who listens", ("egress",), ("declare_subscriber",), keys)
+        yield Rule("publish", ("ingress",), ("put",), keys)
+        yield Rule("receive subscriptions", ("egress",), ("declare_subscriber",), keys)
     if role in READERS:
         yield from _rules_of_readers()
     if role in CONTROLLERS:
-        yield Rule("control", ("ingress",), ("query",), (CONTROL.name,))
-        yield Rule("be answered", ("egress",), ("reply", "declare_queryable"), (CONTROL.name,))
+        yield Rule("send commands", ("ingress",), ("query",), (CONTROL.name,))
+        yield Rule(
+            "receive command replies", ("egress",), ("reply", "declare_queryable"), (CONTROL.name,)
+        )
 
 
 def _rules_of_readers() -> Iterator[Rule]:
@@ -141,9 +148,9 @@ def _rules_of_readers() -> Iterator[Rule]:
     states = tuple(topic.name for topic in READABLE if topic.is_state)
     tokens = (f"{ALIVE}/*",)
     yield Rule("subscribe", ("ingress",), ("declare_subscriber",), topics)
-    yield Rule("hear", ("egress",), ("put",), topics)
-    yield Rule("ask", ("ingress",), ("query",), states)
-    yield Rule("hear answers", ("egress",), ("reply", "declare_queryable"), states)
+    yield Rule("receive messages", ("egress",), ("put",), topics)
+    yield Rule("query", ("ingress",), ("query",), states)
+    yield Rule("receive query replies", ("egress",), ("reply", "declare_queryable"), states)
     asks_who = ("liveliness_query", "declare_liveliness_subscriber")
-    yield Rule("ask who is alive", ("ingress",), asks_who, tokens)
-    yield Rule("hear who is alive", ("egress",), ("liveliness_token",), tokens)
+    yield Rule("query liveliness", ("ingress",), asks_who, tokens)
+    yield Rule("receive liveliness", ("egress",), ("liveliness_token",), tokens)

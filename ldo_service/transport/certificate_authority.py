@@ -59,7 +59,7 @@ class CertificateAuthority:
         """Open the folder.
 
         Raises:
-            ConfigError: The folder holds no authority.
+            ConfigError: The folder contains no authority.
         """
         self.folder = folder
         try:
@@ -68,8 +68,8 @@ class CertificateAuthority:
         except (OSError, ValueError) as error:
             why = error.strerror if isinstance(error, OSError) else error
             raise ConfigError(
-                f"{folder} holds no certificate authority ({why}). Create one in a new folder by "
-                "`ldo keys init`."
+                f"{folder} contains no certificate authority ({why}). Create one in a new "
+                "folder by `ldo keys init`."
             ) from error
         self._access = read_access(folder / ACCESS)
 
@@ -79,10 +79,10 @@ class CertificateAuthority:
 
         Args:
             folder: The folder to create.
-            days: Validity of its certificate.
+            days: Validity of its certificate, days.
 
         Raises:
-            ConfigError: The folder exists already, which stays unchanged, or cannot be written.
+            ConfigError: The folder cannot be written, or exists already and stays unchanged.
         """
         if folder.exists():
             raise ConfigError(
@@ -96,7 +96,9 @@ class CertificateAuthority:
             (folder / CA).write_bytes(certificate_pem(certificate))
             write_atomically(folder / ACCESS, (HEAD + "{}\n").encode())
         except OSError as error:
-            raise ConfigError(f"{folder} cannot be written: {error}.") from error
+            raise ConfigError(
+                f"{folder} cannot be written: {error}. Choose another folder."
+            ) from error
         return cls(folder)
 
     @property
@@ -120,15 +122,16 @@ class CertificateAuthority:
             name: Name of the keys, for example of the machine.
             role: Role of the certificate.
             robot: Name of the robot, or EVERY_ROBOT.
-            days: Validity of the certificate.
-            hosts: Host names and addresses of a service.
+            days: Validity of the certificate, days.
+            hosts: Host names and IP addresses at which clients reach a service.
             now: Start of the validity; the current time by default.
 
         Returns:
             Folder with the keys, to copy to the machine.
 
         Raises:
-            ConfigError: A name is invalid or taken; nothing changes then.
+            ConfigError: A name is invalid or taken, or the folder cannot be written. No file
+                changes in these cases.
         """
         _require_name(name)
         if robot != EVERY_ROBOT:
@@ -173,7 +176,10 @@ class CertificateAuthority:
                 (made / CERTIFICATE).write_bytes(certificate_pem(certificate))
                 shutil.copyfile(self.folder / CA, made / CA)
         except OSError as error:
-            raise ConfigError(f"{self.folder} cannot be written: {error}.") from error
+            raise ConfigError(
+                f"{self.folder} cannot be written: {error}. Check its permissions and the free "
+                "disk space."
+            ) from error
         return certificate
 
     def _grant(self, access: dict[str, AccessEntry]) -> None:
@@ -203,7 +209,7 @@ def _require_absent(path: Path) -> None:
 
 
 def _write_secret(path: Path, body: bytes) -> None:
-    """Write a new file that only its owner may read, from the first byte on."""
+    """Create a file that only its owner can read, and write the body to it."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "wb") as file:
         file.write(body)

@@ -36,7 +36,7 @@ def of_authority(key: PrivateKey, days: int, now: datetime) -> Certificate:
 
     Args:
         key: Private key of the authority.
-        days: Validity.
+        days: Validity, days.
         now: Current time.
 
     Raises:
@@ -62,16 +62,18 @@ def of_member(
     now: datetime,
     hosts: Sequence[str] = (),
 ) -> Certificate:
-    """Create the certificate of a client, or of a client and server if it has hosts.
+    """Create the certificate of a member of the network.
+
+    Every member is a client. A member with hosts is also a server.
 
     Args:
         authority: Certificate of the authority.
         signing: Private key of the authority.
         common_name: Common name of the member.
         public: Public key of the member.
-        days: Validity.
+        days: Validity, days.
         now: Current time.
-        hosts: Host names and addresses of a server.
+        hosts: Host names and IP addresses of a server; empty for a client.
 
     Raises:
         ConfigError: A host or the number of days is invalid.

@@ -41,16 +41,17 @@ class Endpoint:
             )
         if self.keys is not None and not is_tls:
             raise ConfigError(
-                f"keys need a TLS endpoint, and {self.endpoint} is none: write tls/ADDRESS:PORT."
+                f"keys need a TLS endpoint, but the endpoint is {self.endpoint}. Write it as "
+                "tls/ADDRESS:PORT."
             )
 
     def expression(self, key: str) -> str:
-        """Return the Zenoh key expression of a key of this robot."""
+        """Return the Zenoh key expression of a topic or other key of this robot."""
         return f"{ROBOT_PREFIX}/{self.robot}/{key}"
 
     @property
     def address(self) -> tuple[str, str]:
-        """Host and port; empty where the endpoint has none."""
+        """Host and port of the endpoint; empty strings if it has none."""
         host, _, port = self.endpoint.partition("/")[2].rpartition(":")
         return host.strip("[]"), port
 
@@ -66,13 +67,14 @@ class Endpoint:
         """Check that the endpoint is on loopback or protected by TLS.
 
         Raises:
-            ConfigError: Every machine on the network could read topics, publish and control.
+            ConfigError: The endpoint is neither. Every machine on the network could then read
+                topics, publish messages and send commands.
         """
         if self.keys is None and not _is_loopback(self.address[0]):
             raise ConfigError(
-                f"endpoint {self.endpoint} would let everybody on the network read the map and "
-                "control the robot. Use tls/ADDRESS:PORT with --keys (created by `ldo keys`), or "
-                "--insecure on a private network."
+                f"endpoint {self.endpoint} would let every machine on the network read the map "
+                "and control the robot. Use tls/ADDRESS:PORT with --keys (created by `ldo keys`), "
+                "or --insecure on a private network."
             )
 
 

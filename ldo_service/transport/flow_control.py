@@ -7,13 +7,14 @@
 - `Credit` (consumer to producer): Offsets of the first message that is not handled, that has not
   arrived, and that may not be sent yet. It is sent after each step and twice a second.
 
-All three carry a state, not a change. They may be lost, repeated or replaced by newer ones.
+Each of the three has the complete state of its sender, not a change. It may therefore be lost,
+repeated or replaced by a newer one.
 
-The producer keeps the unhandled messages, at most one window. It retransmits them from `arrived`
-when a credit message reports a gap. A restarted consumer receives the messages that it had not
-handled. Both ends save their position in one write with the actor's state
-(`runtime.delivery_state`). Each message therefore takes effect once, no matter which process is
-killed and when. `SequenceTracker` counts lost messages by their sequence numbers.
+The producer keeps the messages that are not handled, at most one window. It retransmits them from
+`arrived` when a credit message reports a gap. A restarted consumer receives the messages that it
+had not handled. Producer and consumer each save their position in one write with the actor's state
+(`runtime.delivery_state`). Each message therefore takes effect exactly once, even if either process
+is killed at any time. `SequenceTracker` counts lost messages by their sequence numbers.
 """
 
 import secrets
@@ -103,7 +104,7 @@ class OutletPosition(NamedTuple):
 
     @property
     def handled(self) -> int:
-        """Offset before which every message has been handled."""
+        """Offset of the first message that some consumer has not handled."""
         return self.unhandled[0].seq if self.unhandled else self.seq
 
 
@@ -115,7 +116,7 @@ class InletPosition(NamedTuple):
 
 
 def new_epoch() -> int:
-    """Return a number that no earlier run of a producer had."""
+    """Return a new random number that identifies one numbering of a producer's messages."""
     return 1 + secrets.randbits(62)
 
 
@@ -123,7 +124,7 @@ encode_link = msgspec.msgpack.Encoder().encode
 
 
 def decode_request(body: memoryview) -> ConsumerHello | Credit:
-    """Decode a message of a consumer."""
+    """Decode the hello or the credit of a consumer."""
     return decode(body, ConsumerHello | Credit)  # type: ignore[arg-type]
 
 
@@ -153,8 +154,8 @@ def producer_hello_key(topic: str) -> str:
 class SequenceTracker:
     """Counter of lost messages of a topic.
 
-    A message that arrives late is not lost. A message that arrives twice counts once, because a
-    restarted producer repeats messages that some consumer may not have received.
+    A message that arrives late does not count as lost. A message that arrives twice counts once,
+    because a restarted producer repeats messages that some consumer may not have received.
     """
 
     def __init__(self) -> None:

@@ -15,11 +15,17 @@ class Publisher(Protocol):
     """Publisher on one key; its methods do not block the event loop."""
 
     def send(self, header: bytes, body: bytes) -> Awaitable[None]:
-        """Send a message; done when it has left or was dropped because of congestion."""
+        """Send a message.
+
+        The result is done when the message was sent, or was dropped because of congestion.
+        """
         ...
 
     def post(self, header: bytes, body: bytes) -> None:
-        """Send a message soon; a newer post replaces one that has not left yet."""
+        """Send a message without waiting.
+
+        It replaces an earlier posted message that was not sent yet.
+        """
         ...
 
     def close(self) -> None:
@@ -30,8 +36,9 @@ class Publisher(Protocol):
 class Transport(Protocol):
     """Network between actors; keys are relative to the robot.
 
-    Messages may be lost, and those of one publisher stay in order. Lossless delivery is provided by
-    `ldo_service.transport.flow_control`, which numbers, acknowledges and retransmits messages.
+    Messages may be lost. Messages of one publisher stay in order.
+    `ldo_service.transport.flow_control` adds lossless delivery: it numbers, acknowledges and
+    retransmits messages.
     """
 
     def publisher(self, key: str) -> Publisher:
@@ -75,7 +82,7 @@ class MemoryTransport:
         """Initialize without subscribers.
 
         Args:
-            lose: Function of the key that decides whether a message is lost, for tests.
+            lose: Returns whether a message with a key is lost; tests use it.
         """
         self._subscribers: dict[str, list[OnMessage]] = {}
         self._watchers: list[OnPresence] = []
@@ -104,7 +111,7 @@ class MemoryTransport:
             on_presence(name, True)
 
     def leave(self, name: str) -> None:
-        """Report an actor as gone, as after its process was killed."""
+        """Declare an actor no longer alive, as if its process was killed."""
         self._alive.remove(name)
         for on_presence in self._watchers:
             on_presence(name, False)
@@ -120,7 +127,7 @@ class MemoryTransport:
         self._answers[key] = last_values
 
     def query(self, key: str) -> Sequence[tuple[bytes, bytes]]:
-        """Return the last values of a key; empty without a queryable."""
+        """Return the last values of a key; empty if no actor serves queries on it."""
         return self._answers[key]() if key in self._answers else ()
 
     def close(self) -> None:

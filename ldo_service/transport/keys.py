@@ -51,7 +51,7 @@ class TlsKeys:
         return None if folder is None else cls(Path(folder).expanduser().resolve())
 
     def __post_init__(self) -> None:
-        """Check that the keys are readable, private and match.
+        """Check that the files are readable, the private key is protected, and the keys match.
 
         Raises:
             ConfigError: The folder cannot be used.
@@ -82,12 +82,14 @@ class TlsKeys:
         try:
             context.load_verify_locations(self.folder / CA)
         except ssl.SSLError as error:
-            raise ConfigError(f"{self.folder / CA} holds no certificate. Copy it again.") from error
+            raise ConfigError(
+                f"{self.folder / CA} contains no certificate. Copy it again."
+            ) from error
         try:
             context.load_cert_chain(self.folder / CERTIFICATE, self.folder / KEY)
         except ssl.SSLError as error:
             raise ConfigError(
-                f"{CERTIFICATE} and {KEY} in {self.folder} do not belong together "
+                f"{CERTIFICATE} and {KEY} in {self.folder} do not match "
                 f"({error.reason or error}). Copy the whole folder again."
             ) from error
         return context

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 class MessageReader:
     """Subscribers and queries of one program outside the service.
 
-    A subscriber buffers the newest messages and drops older ones, so that it slows no producer.
+    A subscriber buffers the newest messages and drops older ones. It therefore slows no producer.
     """
 
     def __init__(self, session: zenoh.Session, network: Endpoint) -> None:
@@ -30,7 +30,8 @@ class MessageReader:
     def messages(self, topic: Topic, keep: int) -> Iterator[tuple[Header, Message]]:
         """Yield header and message of each sample on a topic, without end.
 
-        Messages that a restarted producer repeats are skipped.
+        Messages that a restarted producer repeats are skipped. Of the messages that wait, at most
+        the newest `keep` are buffered.
         """
         numbers = SequenceTracker()
         with self._subscriber(topic.subscription_key, keep) as subscriber:
@@ -94,6 +95,6 @@ def _readable(samples: Iterable[Any], kind: type[M]) -> Iterator[M]:
             yield _message_of(sample, kind)
         except msgspec.DecodeError as error:
             log.warning(
-                "client: malformed %s skipped: %s. Does the service run the same version?",
+                "client: malformed %s skipped: %s. Check that the service runs the same version.",
                 kind.__name__, error,
             )  # fmt: skip

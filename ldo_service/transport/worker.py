@@ -32,8 +32,8 @@ class Worker:
 
         Args:
             name: Name of the thread.
-            nice: Increase of its nice value, 0..19, on Linux. Threads that it starts inherit it. A
-                higher value yields to other threads when there are too few cores.
+            nice: Increase of the thread's nice value, 0..19, on Linux. Threads that it starts
+                inherit the value. A larger value gives other threads priority on a busy machine.
         """
         self.name, self._nice = name, nice
         self._jobs: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
@@ -67,8 +67,8 @@ class Worker:
     def join(self, timeout_s: float) -> None:
         """Wait for the thread after `close`.
 
-        Otherwise the end of the interpreter kills a thread inside a library, and some libraries
-        then abort the process.
+        Without this wait, the end of the interpreter may kill the thread inside a library. Some
+        libraries then abort the process.
         """
         self._thread.join(timeout_s)
 

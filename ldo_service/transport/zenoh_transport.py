@@ -38,7 +38,7 @@ LEAVE_WITHIN_S = 2.0  # Time to send pending messages when a transport closes.
 
 
 def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
-    """Open the router of the service or a client of it, for use in a `with` block.
+    """Open a Zenoh session for a `with` block: a router of the service, or a client of one.
 
     Raises:
         ConfigError: The port is taken, no service replies there, or the keys are rejected.
@@ -204,7 +204,10 @@ class ZenohTransport:
         self._declared.append(self._session.declare_queryable(expression, handler))
 
     def close(self) -> None:
-        """End all declarations, and send pending messages within `LEAVE_WITHIN_S`."""
+        """End all subscriptions, queries and tokens.
+
+        Messages that are not sent yet have `LEAVE_WITHIN_S` to be sent.
+        """
         for task in self._responding:
             task.cancel()
         for declared in self._declared:
@@ -219,9 +222,9 @@ class ZenohTransport:
 
 
 class ZenohPublisher:
-    """Publisher on one key with its own thread.
+    """Publisher on one key, with a thread of its own.
 
-    Messages of a key stay in order, and no key waits for another.
+    Messages on the key stay in order. They never wait for messages on other keys.
     """
 
     def __init__(self, session: zenoh.Session, expression: str) -> None:
@@ -233,11 +236,11 @@ class ZenohPublisher:
         self._posted: tuple[bytes, bytes] | None = None
 
     def send(self, header: bytes, body: bytes) -> Awaitable[None]:
-        """Send a message; done when it has left or was dropped because of congestion."""
+        """Send a message; the result is done when it was sent or dropped by congestion."""
         return self._thread.run(self._put, header, body)
 
     def post(self, header: bytes, body: bytes) -> None:
-        """Send a message soon; a newer post replaces one that has not left yet."""
+        """Send a message without waiting; it replaces a posted one that was not sent yet."""
         with self._lock:
             is_under_way, self._posted = self._posted is not None, (header, body)
         if not is_under_way:
@@ -257,7 +260,7 @@ class ZenohPublisher:
                         self._publisher.key_expr, error)  # fmt: skip
 
     def close(self) -> None:
-        """Stop sending; messages sent or posted so far still leave."""
+        """Accept no more messages; those accepted so far are still sent."""
         self._thread.submit(self._undeclare)
         self._thread.close()
 

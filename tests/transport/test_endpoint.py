@@ -52,7 +52,7 @@ def test_loopback_needs_no_keys(endpoint: str) -> None:
     "endpoint", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/mule.local:7447", "udp/10.0.0.7:7447"]
 )
 def test_network_endpoint_without_keys_is_rejected(endpoint: str) -> None:
-    with pytest.raises(ConfigError, match="everybody on the network"):
+    with pytest.raises(ConfigError, match="every machine on the network"):
         Endpoint("mule", endpoint).require_safe()
 
 

@@ -50,10 +50,10 @@ def replace_secret_key(folder: Path, authority: CertificateAuthority) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda folder, _: (folder / "ca.crt").write_text("no"), "ca.crt holds no certificate"),
-        (lambda folder, _: (folder / "tls.crt").write_text("no"), "do not belong together"),
-        (lambda folder, _: (folder / "tls.key").write_text("no"), "do not belong together"),
-        (replace_secret_key, "do not belong together"),
+        (lambda folder, _: (folder / "ca.crt").write_text("no"), "ca.crt contains no certificate"),
+        (lambda folder, _: (folder / "tls.crt").write_text("no"), "do not match"),
+        (lambda folder, _: (folder / "tls.key").write_text("no"), "do not match"),
+        (replace_secret_key, "do not match"),
     ],
     ids=["no authority", "no certificate", "no key", "another key"],
 )
