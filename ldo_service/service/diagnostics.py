@@ -1,8 +1,8 @@
-"""Diagnosis of an actor from its messages: problems, consequences and what to do.
+"""Diagnosis of an actor from its messages: problems, their consequences and actions.
 
-Three signals are checked. The liveliness token is present while the process exists. Heartbeats
-arrive twice a second while the event loop runs. The age of the last step is small while the actor
-handles messages.
+The diagnosis checks three signals. The liveliness token is present while the process exists.
+Heartbeats arrive twice a second while the event loop runs. The age of the last step is small while
+the actor handles messages.
 """
 
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ IDLE_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class ActorStatus:
-    """Observations of an actor."""
+    """Liveliness token and last heartbeat of an actor, as a client has observed them."""
 
     actor: str
     has_token: bool  # The liveliness token is present.
@@ -143,7 +143,7 @@ def _of_models(health: Health) -> Iterator[Problem]:
 
 
 def notes(seen: ActorStatus) -> Iterator[str]:
-    """Yield remarks on an actor that need no repair."""
+    """Yield remarks about an actor that are not problems."""
     health = seen.health
     if health is None:
         return

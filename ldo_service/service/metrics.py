@@ -1,4 +1,4 @@
-"""HTTP endpoint with the health of all actors: `ldo serve --metrics-port PORT`.
+"""HTTP server with the health of all actors: `ldo serve --metrics-port PORT`.
 
 It listens on loopback by default.
 
@@ -90,7 +90,7 @@ class HealthCollector(Collector):
         Args:
             robot: Name of the robot, a label of every metric.
             actors: Names of the actors that must send heartbeats.
-            silent_after_s: Heartbeat timeout of the service.
+            silent_after_s: Heartbeat timeout of the service, seconds.
         """
         self._robot, self._actors = robot, tuple(actors)
         self._silent_after_s = silent_after_s + COMES_BACK_S
@@ -139,7 +139,10 @@ class HealthCollector(Collector):
             yield metric
 
     def silent_actors(self) -> list[str]:
-        """Return the actors without a recent heartbeat; all of them before the first one."""
+        """Return the names of the actors without a recent heartbeat.
+
+        Before the first heartbeat, these are all actors of the service.
+        """
         since_s = time.monotonic() - self._silent_after_s
         with self._lock:
             heard = {actor for actor, (at_s, _) in self._last.items() if at_s > since_s}
@@ -240,8 +243,8 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
         server = make_server(address, port, answer, kind, _Quiet)
     except OSError as error:
         raise ConfigError(
-            f"--metrics-port {port}: cannot listen on {address}:{port} ({error.strerror}). Is "
-            "another service listening there? Choose another port, or service.metrics_address."
+            f"--metrics-port {port}: cannot listen on {address}:{port} ({error.strerror}). "
+            "Choose another port, or another address with service.metrics_address."
         ) from error
     thread = Thread(target=server.serve_forever, name="metrics", daemon=True)
     thread.start()

@@ -92,7 +92,7 @@ class Service:
         """Serve until SIGINT or SIGTERM; a second signal stops at once.
 
         Raises:
-            ConfigError: The configuration is invalid or the port is taken.
+            ConfigError: The configuration or the state is invalid, or a port is in use.
             StageError: An actor cannot be restarted any more.
         """
         check_graph(GRAPH)
@@ -245,11 +245,12 @@ def _is_fed_from_outside(box: ActorSpec) -> bool:
 
 
 def _leave_if_busy(exit_code: int, why: str) -> None:
-    """Exit at once if a step is still running.
+    """Exit the process at once if a step is still running.
 
-    Its thread cannot be stopped, and a normal end of the interpreter would abort the process.
+    The thread of the step cannot be stopped. A normal end of the interpreter would kill it inside a
+    library and abort the process.
     """
     if busy := Worker.busy_workers(LEAVE_WITHIN_S):
-        log.error("%s (left in the middle of a step: %s)", why, ", ".join(busy))
+        log.error("%s (exited during a step of %s)", why, ", ".join(busy))
         logging.shutdown()
         os._exit(exit_code)

@@ -1,4 +1,4 @@
-"""State folder of a service: lock and consistency of its states."""
+"""State folder of a service: its lock, and checks of the actors' saved states."""
 
 import fcntl
 import os
@@ -20,10 +20,13 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
 
     Args:
         folder: The folder; None for a temporary one that is deleted with `stack`.
-        stack: Closed when the service ends.
+        stack: Exit stack that is closed when the service ends.
+
+    Returns:
+        The folder, which exists.
 
     Raises:
-        ConfigError: The folder cannot be written, or holds a run or a recording.
+        ConfigError: The folder cannot be written, or contains a run or a recording.
     """
     if folder is None:
         return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ldo-")))
@@ -39,25 +42,25 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
         ) from error
     if "state" not in found and "frames.csv" in found:
         raise ConfigError(
-            f"{folder} is what `ldo run` wrote, and holds no state of a service. Choose another "
+            f"{folder} contains a run of `ldo run`, not the state of a service. Choose another "
             f"folder with --state. To localize in its map, use --localize {folder}."
         )
     if "state" not in found and any(name.endswith(".mcap") for name in found):
         raise ConfigError(
-            f"{folder} is a recording, and holds no state of a service. Choose another folder with "
-            "--state."
+            f"{folder} contains a recording, not the state of a service. Choose another folder "
+            "with --state."
         )
     return folder
 
 
 def claim_state(folder: Path, stack: ExitStack) -> None:
-    """Lock the folder for this service, and check that its states belong together.
+    """Lock the folder for this service, and check that the states of all actors match.
 
-    All states share keyframe ids and versions. Continuing from some of them would connect keyframes
-    of two different runs.
+    The states of tracker, mapper and optimizer refer to the same keyframe ids and graph versions.
+    If one state was missing or older, the service would connect keyframes of two different runs.
 
     Raises:
-        ConfigError: Another service uses the folder, or its states do not belong together.
+        ConfigError: Another service uses the folder, or the states do not match.
         DataError: A state cannot be read because of the disk.
     """
     lock = stack.enter_context((folder / "lock").open("w"))
@@ -65,15 +68,16 @@ def claim_state(folder: Path, stack: ExitStack) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         raise ConfigError(
-            f"another service keeps its state in {folder}. Choose another folder with --state."
+            f"another service uses the state folder {folder}. Choose another folder with --state."
         ) from error
     store = FolderStore(folder / "state")
     pasts = {name: RestoredState.of(store.load(name)) for name in INTERDEPENDENT_ACTORS}
     missing = [name for name, past in pasts.items() if past.is_none]
     if missing and any(past.has_passed for past in pasts.values()):
         raise ConfigError(
-            f"{folder} has no readable state of {', '.join(missing)}, but of the other actors. "
-            "Choose another folder with --state, or delete this one to start with an empty map."
+            f"{folder} has no readable state of {', '.join(missing)}, but has states of other "
+            "actors. Choose another folder with --state, or delete this one to start with an empty "
+            "map."
         )
     for topic, producer, consumer in _inconsistent_states(pasts):
         raise ConfigError(
@@ -84,7 +88,10 @@ def claim_state(folder: Path, stack: ExitStack) -> None:
 
 
 def _inconsistent_states(pasts: Mapping[str, RestoredState]) -> Iterator[tuple[str, str, str]]:
-    """Yield topic, producer and consumer where the consumer handled more than was produced."""
+    """Yield each topic whose consumer has handled messages that its producer has not produced.
+
+    Each item has the topic, the producer and the consumer.
+    """
     for producer, past in pasts.items():
         for topic, made in past.outputs.items():
             for consumer, other in pasts.items():

@@ -121,7 +121,7 @@ def test_state_folder_is_resumed_and_shared_or_partial_ones_rejected(
         for index in range(30):
             service.pose_of(raw_frame_to_message(room.read(index)))
         state = tmp_path / "s"
-        assert "another service keeps its state" in start_error(state)
+        assert "another service uses the state" in start_error(state)
         wait_until(lambda: service.update_health()["mapper"].metrics["keyframes"] > 2, 10, "a map")
         assert service.stop() == 0
         keyframes = service.health["mapper"].metrics["keyframes"]

@@ -196,4 +196,4 @@ def test_service_stopped_during_a_long_step_exits_with_code_0(
         service.process.send_signal(signal.SIGINT)
         wait_until(lambda: service.update_health()["mapper"].state == "draining", 20, "draining")
         assert service.stop() == 0
-        assert "left in the middle of a step: mapper" in service.log
+        assert "exited during a step of mapper" in service.log
