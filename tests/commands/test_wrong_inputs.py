@@ -76,7 +76,7 @@ def example_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("serve --localize nowhere", 3, "no keyframe_database.msgpack"),
         ("serve --state suite.yaml", 2, "cannot be used for state"),
         ("serve --resume ran", 2, "ran contains a run of `ldo run`"),
-        ("serve --state junk", 2, "junk is a recording"),
+        ("serve --state junk", 2, "junk contains a recording"),
         ("serve --set tracker.nothing=1", 2, "no setting tracker.nothing"),
         ("serve --keys empty --endpoint tls/127.0.0.1:1", 2, "ca.crt cannot be read"),
         ("replay junk --verify", 3, "not an MCAP file"),
