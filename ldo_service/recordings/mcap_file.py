@@ -1,8 +1,9 @@
 """MCAP files of a recording: written message by message, and indexed for reading.
 
-Records are not chunked, so writing has a fifth of the cost. A file that was cut off by a kill or a
-full disk is readable up to its last whole record. Unlike the readers of the library, the index
-accepts such a file. It needs no summary, and it reads bodies from the disk only on request.
+Records are not chunked, because chunks make writing cost five times as much. A killed process or a
+full disk may cut off a file. It is then readable up to its last whole record. `McapIndex` accepts
+such a file, unlike the readers of the library `mcap`. The index needs no summary, and reads bodies
+from the disk only on request.
 Format: https://mcap.dev/spec
 """
 
@@ -82,7 +83,10 @@ class McapIndex:
             with self.path.open("rb") as file:
                 self._read_index(file, self.path.stat().st_size)
         except UNREADABLE as error:
-            raise DataError(f"{self.path} cannot be read as a recording: {error}.") from error
+            raise DataError(
+                f"{self.path} cannot be read as a recording: {error}. Give an MCAP file that "
+                "`ldo record` wrote."
+            ) from error
 
     def body(self, place: MessageLocation) -> bytes:
         """Read the body of a message."""
@@ -127,18 +131,25 @@ class McapIndex:
 
 
 def require_version(index: McapIndex) -> None:
-    """Raise DataError if a recording has another version than this service replays."""
+    """Check that a recording has the version that this service replays.
+
+    Raises:
+        DataError: Another version of the service wrote the recording.
+    """
     version = index.metadata.get(ABOUT, {}).get("version", "1")
     if version != str(RECORDING_VERSION):
         raise DataError(
-            f"{index.path} has version={version}, and this service replays {RECORDING_VERSION}: "
-            "another version of the service recorded it. Replay it with that version; its camera "
-            "frames remain a SOURCE of `ldo run`."
+            f"{index.path} has version={version}, but must have version={RECORDING_VERSION} to be "
+            "replayed. Another version of the service recorded it. Replay it with that version, or "
+            "give it to `ldo run` as SOURCE, which reads its camera frames."
         )
 
 
 def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, offset and length of each whole record, with the stream at its content."""
+    """Yield opcode, content offset and content length of each whole record.
+
+    The stream is at the content of the yielded record.
+    """
     while size - stream.tell() >= RECORD.size:
         opcode, length = RECORD.unpack(stream.read(RECORD.size))
         start = stream.tell()
@@ -176,7 +187,10 @@ class RecordConfig:
 
 
 class RecordingFile:
-    """New MCAP file, written by one thread; it ignores messages after an error or a limit."""
+    """New MCAP file, written by one thread.
+
+    After an error or a limit, the file is closed and further messages are ignored.
+    """
 
     def __init__(self, path: Path, about: Mapping[str, str], config: RecordConfig) -> None:
         """Create the file.
@@ -208,7 +222,7 @@ class RecordingFile:
     def add(
         self, topic: str, kind: type, body: bytes | memoryview, number: int, stamp_ns: int
     ) -> None:
-        """Append a message of type `kind`; its publish time is `stamp_ns`."""
+        """Append an encoded message of type `kind`; its publish time is `stamp_ns`."""
         if not self.is_open:
             return
         data = cast(bytes, body)  # A view is written without a copy.
@@ -230,7 +244,10 @@ class RecordingFile:
         return self._channels[topic]
 
     def is_over_limit(self) -> bool:
-        """Return whether the folder is too large or the disk too full."""
+        """Return whether the folder exceeds `max_gb` or the disk has less than `min_free_gb`.
+
+        The sizes are checked after every `CHECK_EVERY_BYTES`; between checks the result is False.
+        """
         if self._unchecked < CHECK_EVERY_BYTES:
             return False
         self._unchecked = 0
@@ -240,7 +257,10 @@ class RecordingFile:
         return used > self._config.max_gb * 1e9 or free < self._config.min_free_gb * 1e9
 
     def close(self) -> None:
-        """Write the summary, which lets tools open the file at once."""
+        """Write the summary and close the file.
+
+        With the summary, tools open the file without reading all of it.
+        """
         if not self.is_open:
             return
         try:

@@ -1,4 +1,4 @@
-"""Journal that is written to a file, in a thread of its own so that no step waits for the disk."""
+"""Journal that a thread of its own writes to a file, so that no step waits for the disk."""
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
@@ -36,7 +36,7 @@ ENTRY_BYTES = 1000  # Memory of an entry in addition to its body.
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """Recorded input of the following steps."""
+    """Recorded input of the next step, and of its repetition if the step fails."""
 
     number: int
     stamp_ns: int
@@ -46,8 +46,8 @@ class Taken:
 class Recorder(Journal):
     """Journal of one actor that is written to a file.
 
-    The queue to the writer is limited to `queue_mb`. If it is full, an input and its steps are
-    dropped. The gap is recorded and logged once; the robot is not affected.
+    The queue to the writing thread is limited to `queue_mb`. While it is full, inputs and their
+    steps are not recorded. The gap is recorded and logged once; the actor is not affected.
     """
 
     def __init__(self, path: Path, about: Mapping[str, str], config: RecordConfig) -> None:
@@ -55,7 +55,7 @@ class Recorder(Journal):
 
         Args:
             path: The new file.
-            about: Fields of its metadata record.
+            about: Fields of the file's metadata record.
             config: Limits of the recording.
 
         Raises:
@@ -86,7 +86,7 @@ class Recorder(Journal):
         self._submit(size, self._file.add_entry, Started(step=self._steps, state=parts))
 
     def record_input(self, delivery: Delivery, stamp_ns: int) -> None:
-        """Record the input of the following steps, or drop it if the queue is full."""
+        """Record the input of the next step, or drop it if the queue is full."""
         size = len(delivery.body)
         with self._lock:
             has_place = self._waiting + size <= self._max_waiting
@@ -206,8 +206,9 @@ class Recorder(Journal):
         self._file.add_entry(Gap(step=step, reason="limit"))
         self._file.close()
         log.error(
-            "%s: the recording has reached recording.max_gb, or the disk recording.min_free_gb. It "
-            "ends here; the robot continues.",
+            "%s: the folder of the recording has reached recording.max_gb, or less than "
+            "recording.min_free_gb is free on the disk. This recording ends here; the robot "
+            "continues.",
             self._file.path,
         )
 

@@ -66,7 +66,8 @@ class JournalFile:
                 yield decode(self._index.body(place), ENTRIES[place.topic])
             except msgspec.DecodeError as error:
                 raise DataError(
-                    f"{self.path}: entry {place.number} of {place.topic} is damaged: {error}."
+                    f"{self.path}: entry {place.number} of {place.topic} is damaged: {error}. Copy "
+                    "the recording again, or make a new one."
                 ) from error
 
     def body(self, message: MessageLocation) -> bytes:
@@ -80,12 +81,15 @@ class JournalFile:
             DataError: The message is missing.
         """
         if step.taken not in self._by_number:
-            raise DataError(f"{self.path}: the message of step {step.step} is missing.")
+            raise DataError(
+                f"{self.path}: the message of step {step.step} is missing. Copy the recording "
+                "again, or make a new one."
+            )
         return self.body(self._by_number[step.taken])
 
 
 def recorded_actors(folder: Path) -> dict[str, list[Path]]:
-    """Return the files of each actor, in the order of its processes."""
+    """Return the files of each actor by name, in the order in which its processes started."""
     return {actor: list(lives.values()) for actor, lives in sorted(_lives(folder).items())}
 
 
@@ -96,7 +100,10 @@ def new_path(folder: Path, actor: str) -> Path:
 
 
 def _lives(folder: Path) -> dict[str, dict[int, Path]]:
-    """Return the files by actor and then by process number, which starts at 1, ascending."""
+    """Return the files by actor, and for each actor by the number of its process.
+
+    The numbers start at 1 and are in ascending order.
+    """
     matches = [(NAME.fullmatch(path.name), path) for path in folder.glob("*.mcap")]
     numbered = sorted((int(m["number"] or 1), m["actor"], path) for m, path in matches if m)
     lives: dict[str, dict[int, Path]] = {}
@@ -116,4 +123,7 @@ def prepare_recording(folder: Path) -> None:
         if any(folder.iterdir()):
             raise ConfigError(f"{folder} is not empty. Choose another folder for the recording.")
     except OSError as error:
-        raise ConfigError(f"{folder} cannot be written: {error.strerror}.") from error
+        raise ConfigError(
+            f"{folder} cannot be written: {error.strerror}. Choose another folder for the "
+            "recording."
+        ) from error

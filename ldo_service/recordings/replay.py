@@ -1,7 +1,8 @@
 """Replay of a recorded actor with the same inputs, flow status and restarts.
 
-The outputs must have the digests of the recording. A failed step has no effect on the state, so the
-replay counts whether it fails again but accepts either result.
+The outputs must have the digests of the recording. A step that failed when recorded had no effect
+on the actor's state. The replay therefore accepts that such a step succeeds now, and counts those
+that fail again.
 """
 
 from collections import Counter
@@ -33,7 +34,7 @@ Make = Callable[[Mapping[str, str]], Actor]  # Creates an actor from the metadat
 
 @dataclass
 class ReplayReport:
-    """Result of a replay, which ends at the first difference."""
+    """Result of a replay; the replay ends at the first difference to the recording."""
 
     actor: str
     starts: int = 0  # Starts of the actor, new or restored.
@@ -74,7 +75,7 @@ def replay(
 
     Args:
         actor: Name of the actor.
-        files: Its files in order.
+        files: Recorded files of the actor, in the order of its processes.
         make: Function that creates a new actor.
         advance: Called after each step.
 
@@ -121,7 +122,10 @@ class ReplaySession:
             self._note(f"was cut off{self._under_way()}; it is replayed up to that point.")
 
     def _under_way(self) -> str:
-        """Describe the input without a finished step, which may have killed the process."""
+        """Describe the last input if its step was not recorded; else return an empty string.
+
+        The step may have killed the process.
+        """
         taken = self._file.messages
         if not taken or (self._last and self._last.taken == taken[-1].number):
             return ""
