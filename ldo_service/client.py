@@ -6,8 +6,8 @@
         for pose in service.poses():
             print(pose.status, pose.T_odom_camera.translation)
 
-The module imports no numerical code of the service. A slow subscriber does not slow the robot: the
-client buffers the newest messages and drops older ones.
+The module imports no numerical code of the service. The client buffers the newest messages and
+drops older ones, so a slow program does not slow the robot.
 """
 
 import time
@@ -103,7 +103,7 @@ class Client:
     def publish_color(
         self, color: np.ndarray, camera: CameraModel, stamp_ns: int | None = None
     ) -> None:
-        """Send a color image without depth; `publish_depth` sends the depth.
+        """Send a color image of a camera whose depth images `publish_depth` sends.
 
         The arguments are those of `publish`.
         """
@@ -128,7 +128,7 @@ class Client:
             depth: Depth image, [H, W], uint16 or float32; 0 or NaN where unknown.
             camera: Intrinsics of the depth camera.
             depth_scale: Units of `depth` per meter.
-            T_color_depth: Transform from the depth camera to the color camera.
+            T_color_depth: Transform from the depth camera to the color camera, meters.
             stamp_ns: Time of the exposure, ns; the current time by default.
         """
         message = CameraDepth(
@@ -145,9 +145,9 @@ class Client:
         """Send an odometry prior: a pose from another odometry of the robot.
 
         Args:
-            T_prior_base: Pose of the robot's base in the frame of that odometry.
-            stamp_ns: Time of the measurement, ns, by the clock of the frames; the current time by
-                default.
+            T_prior_base: Pose of the robot's base in the frame of that odometry, meters.
+            stamp_ns: Time of the measurement, ns; the current time by default. It must be of the
+                same clock as the stamps of the camera frames.
         """
         message = OdometryPrior(stamp_ns=_stamp(stamp_ns), T_prior_base=T_prior_base)
         self._sender.send(message, "odometry", self._priors)
@@ -219,18 +219,20 @@ class Client:
 
         Args:
             topic: The topic or its name.
-            timeout_s: Maximum time to wait.
+            timeout_s: Maximum time to wait, seconds.
 
         Returns:
             All parts of the value; empty if there is no value yet.
 
         Raises:
-            ConfigError: No topic has this name, or the topic keeps no last value.
+            ConfigError: No topic has this name, or the topic is not a state topic.
         """
         topic = _topic(topic)
         if not topic.is_state:
             keeping = ", ".join(other.name for other in TOPICS if other.is_state)
-            raise ConfigError(f"{topic.name} keeps no last value. Topics that do: {keeping}.")
+            raise ConfigError(
+                f"{topic.name} has no last value to request. Topics with a last value: {keeping}."
+            )
         return self._reader.last_values(topic, timeout_s)
 
     def objects(self, timeout_s: float = 3.0) -> MapObjects:
@@ -247,7 +249,7 @@ class Client:
             raise ConfigError(
                 "the map has no objects yet. They need a keyframe, also after a restart, and a "
                 "detector: `ldo serve --set detector.model=...`; `ldo models` shows how. A service "
-                "that only localizes adds no objects; the folder of its map has them."
+                "that only localizes publishes no objects; the folder of its map has them."
             )
         raise self._nobody("replies", MAP_OBJECTS)
 
@@ -259,8 +261,8 @@ class Client:
         """Request the service to pause, resume, save or reset, and wait for all actors.
 
         Args:
-            verb: The command.
-            timeout_s: Maximum time to wait.
+            verb: The command: pause, resume, save or reset.
+            timeout_s: Maximum time to wait, seconds.
 
         Returns:
             The reply. `ok` is False if an actor failed or the command is unknown; `message` has the
@@ -290,7 +292,7 @@ class Client:
             iterations: Number of iterations, at most 500.
             first_rate: Factor of the step size in the first iteration, in (0, 1].
             last_rate: Factor of the step size in the last iteration, in (0, 1].
-            timeout_s: Maximum time to wait for a subscriber.
+            timeout_s: Maximum time to wait for the mapper to be connected, seconds.
 
         Raises:
             ValueError: An argument is out of range.
@@ -312,7 +314,7 @@ class Client:
 
         Args:
             name: The new name.
-            timeout_s: Maximum time to wait.
+            timeout_s: Maximum time to wait, seconds.
 
         Returns:
             All names of the vocabulary.
@@ -338,7 +340,7 @@ class Client:
         """Publish a request once it has a subscriber.
 
         Raises:
-            ConfigError: There is no subscriber within `timeout_s`.
+            ConfigError: No actor subscribes to the request within `timeout_s` seconds.
         """
         if not self._sender.wait_for_subscriber(type(message), timeout_s):
             raise self._nobody("listens", topic)

@@ -30,7 +30,7 @@ def replay_recording(folder: Path | str, *actors: str) -> dict[str, ReplayReport
         actors: Names of the actors; all recorded actors by default.
 
     Returns:
-        The counters of each replay, by actor.
+        The report of each replay, by the name of the actor.
 
     Raises:
         ReplayDiverged: A step differs from the recording.
@@ -40,7 +40,10 @@ def replay_recording(folder: Path | str, *actors: str) -> dict[str, ReplayReport
 
 
 def recorded(folder: Path | str) -> Callable[..., Any]:
-    """Create a fixture with one case per recorded actor; skipped without a recording."""
+    """Create a fixture with one case per recorded actor.
+
+    Tests with the fixture are skipped if the folder has no recording.
+    """
     absent = pytest.param(
         None, marks=pytest.mark.skip(f"no recording in {folder}: create it by `ldo record`")
     )
