@@ -87,7 +87,10 @@ def _prints_self(node: ast.Raise) -> bool:
 
 
 def _python_comments(source: str) -> Iterator[Finding]:
-    """Yield line number and text of each comment; lines that continue one another are joined."""
+    """Yield line number and text of each comment.
+
+    Comment lines that follow each other at the same column are joined to one comment.
+    """
     first_line = last_line = 0
     last_column, text = -1, ""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):

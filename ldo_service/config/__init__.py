@@ -1,4 +1,4 @@
-"""Configuration: settings with defaults, units and reasons, and the actors' parameters from them.
+"""Configuration: settings with defaults, units and reasons, converted to the actors' parameters.
 
 A configuration file lists only the settings that differ from their defaults:
 

@@ -17,19 +17,19 @@ from .values import (
 
 @dataclass(frozen=True, slots=True)
 class RetrievalSettings:
-    """Search for places that look like the current one."""
+    """Search for subgraphs of keyframes that look like the newest one."""
 
-    # Comparison of places: by labels and images (two_stage), by labels alone (semantic), or by
+    # Comparison of subgraphs: by labels and images (two_stage), by labels alone (semantic), or by
     # images alone (geometric). The latter two serve for evaluation.
     mode: Literal["two_stage", "semantic", "geometric"] = "two_stage"
-    # Minimum number of camera frames between two places of a loop (III.C).
+    # Minimum number of camera frames between the two subgraphs of a loop closure (III.C).
     min_gap_frames: NonNegativeInt = 100
-    # Maximum number of subgraphs, of up to 5 keyframes each, in the place database. Beyond it, the
-    # path is thinned.
+    # Maximum number of subgraphs, of up to 5 keyframes each, in the place database. Beyond it,
+    # subgraphs are removed evenly along the path.
     max_subgraphs: Annotated[int, Meta(ge=3)] = 1000
-    # Maximum number of most similar subgraphs that are verified. This is K (III.C).
+    # Maximum number of subgraphs that are verified, the most similar ones. This is K (III.C).
     max_candidates: PositiveInt = advanced(5)
-    # Minimum similarity of the labels of two places. This is theta_loop (III.C).
+    # Minimum similarity of the labels of two subgraphs. This is theta_loop (III.C).
     min_similarity: Ratio = advanced(0.75)
 
 
@@ -50,7 +50,7 @@ class VerificationSettings:
 class DriftGateSettings:
     """Maximum odometry drift that a loop closure may correct."""
 
-    # Maximum drift that a loop closure may correct on a path of any length, meters.
+    # Drift that a loop closure may correct on a path of any length, meters.
     max_drift_m: NonNegativeFloat = advanced(0.5)
     # Additional drift that a loop closure may correct, as a fraction of the path length. The
     # default is ten times the drift of depth cameras.
@@ -59,7 +59,7 @@ class DriftGateSettings:
 
 @dataclass(frozen=True, slots=True)
 class LoopCloserSettings:
-    """Loop closing."""
+    """Detection of loop closures."""
 
     # True closes loops. False disables loop closing, to measure its contribution.
     enabled: bool = True
@@ -72,8 +72,8 @@ class LoopCloserSettings:
 class NoiseSettings:
     """Noise of measurements in the pose graph."""
 
-    # Random walk of odometry rotations, in radians per square root of a meter. Without it, a loop
-    # closure cannot bend the odometry chain.
+    # Random walk of odometry rotations, in radians per square root of a meter. With 0, a loop
+    # closure cannot spread its correction over the odometry.
     drift_rad_per_sqrt_m: NonNegativeFloat = advanced(0.02)
     # Random walk of odometry translations, in meters per square root of a meter: about 1 % after
     # some meters.
@@ -100,7 +100,7 @@ class LoopClosureSettings:
 class LandmarkSettings:
     """Objects as landmarks of the pose graph."""
 
-    # True adds objects to the pose graph. False keeps them out, to measure their contribution.
+    # True adds objects to the pose graph. False omits them, to measure their contribution.
     enabled: bool = True
     # Maximum number of landmarks in the pose graph. Beyond it, those not observed for the longest
     # time are removed.

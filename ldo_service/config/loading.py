@@ -74,9 +74,13 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         tree = load_yaml(path.read_text())
     except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror}.") from error
+        raise ConfigError(
+            f"{path} cannot be read: {error.strerror}. Give an existing YAML file."
+        ) from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not a text file in UTF-8.") from error
+        raise ConfigError(
+            f"{path} is not a text file in UTF-8. Give a YAML file in this encoding."
+        ) from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(tree or {}, dict):

@@ -24,10 +24,11 @@ from .values import (
 class DensifySettings:
     """Addition of new Gaussians."""
 
-    # Side of the largest cell of a flat surface that gets one Gaussian, pixels. 2 gains 0.4 dB with
-    # twice as many Gaussians.
+    # Maximum side of an image cell that gets one Gaussian, pixels. Flat surfaces have cells of this
+    # size. 2 gains 0.4 dB with twice as many Gaussians.
     max_cell_px: PositiveInt = 4
-    # Maximum transmittance of a pixel that gets no new Gaussian. 0.5 costs 0.5 dB and saves 4 %.
+    # Transmittance above which a pixel gets a new Gaussian. 0.5 costs 0.5 dB and saves 4 % of the
+    # Gaussians.
     max_transmittance: OpenRatio = advanced(0.3)
 
     def __post_init__(self) -> None:
@@ -134,7 +135,7 @@ class ObjectSettings:
 
 @dataclass(frozen=True, slots=True)
 class OpenVocabularySettings:
-    """Regions for which a label is requested from the labeller."""
+    """Requests to the labeller for labels of image regions."""
 
     # Minimum score of a detection that needs no label from the labeller (III.B).
     confident_score: Ratio = advanced(0.6)
@@ -150,7 +151,7 @@ class OpenVocabularySettings:
 
 @dataclass(frozen=True, slots=True)
 class PublishSettings:
-    """Messages that carry the map."""
+    """Publication of the map in messages."""
 
     # Minimum number of keyframes between two snapshots of the map, which limits the bandwidth.
     snapshot_interval_keyframes: PositiveInt = advanced(10)
@@ -166,7 +167,8 @@ class PublishSettings:
 class RefitSettings:
     """Refit of the map to keyframes that a correction has moved."""
 
-    # Refit iterations for each keyframe that moves over 1 cm against the first one.
+    # Refit iterations for each keyframe that a correction moves by more than 1 cm relative to the
+    # first keyframe.
     iterations: NonNegativeInt = advanced(12)
     # Pending refit iterations that run with each new keyframe if no other keyframe is queued.
     iterations_per_keyframe: NonNegativeInt = advanced(6)

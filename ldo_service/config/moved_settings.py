@@ -1,4 +1,4 @@
-"""Settings of earlier versions, and their current names."""
+"""Check for settings of earlier versions, with their current names."""
 
 import functools
 from importlib.resources import files
@@ -31,7 +31,11 @@ def refuse_moved(tree: dict[str, Any]) -> None:
 
 
 def moved(path: str) -> str:
-    """Return a sentence with the new name of a setting; empty if it has not moved."""
+    """Return a sentence with the new name of a setting.
+
+    The sentence of a setting that is now a constant has its value. The result is empty if the
+    setting has not moved.
+    """
     kind, new = _table().get(path, ("", ""))
     if kind == "setting":
         return f"{path} is now {new}."

@@ -1,4 +1,4 @@
-"""Parameters of the detector and the labeller, from the configuration."""
+"""Conversion of the configuration to the parameters of the detector and the labeller."""
 
 from ldo_service.actors.detector import DetectorConfig
 from ldo_service.actors.vlm_labeller import VlmLabellerConfig

@@ -1,4 +1,4 @@
-"""Settings of the detector, of the labeller and of their inference."""
+"""Settings of the detector, the labeller and the inference of their networks."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -27,8 +27,8 @@ class DetectorSettings:
     class_names: str = ""
     # Minimum score of a detection. The default is that of YOLOv5 and YOLOX.
     min_score: Ratio = 0.25
-    # COCO classes of objects that may move by themselves. Poses and loop closures do not
-    # rely on their pixels.
+    # COCO classes of objects that may move by themselves. Tracking and loop closing ignore their
+    # pixels.
     dynamic_classes: tuple[str, ...] = DynamicClassConfig().classes
     # Output layout of the network. Empty recognizes it by the shape of the output.
     layout: Literal["", "yolov5", "yolox", "yolov8"] = advanced("")
@@ -42,7 +42,7 @@ class DetectorSettings:
 
 @dataclass(frozen=True, slots=True)
 class InferenceSettings:
-    """Inference of the detector and of the encoder pair."""
+    """Inference of the detector's network and of the labeller's encoders."""
 
     # Execution providers of onnxruntime in order of preference, such as cuda or tensorrt.
     providers: tuple[str, ...] = ("cpu",)
@@ -52,7 +52,7 @@ class InferenceSettings:
 
 @dataclass(frozen=True, slots=True)
 class EncoderSettings:
-    """Pair of image and text encoders."""
+    """Pair of an image encoder and a text encoder, with which the labeller names regions."""
 
     # Prompts whose embeddings are averaged for each name; the name replaces {}.
     prompts: Annotated[tuple[str, ...], Meta(min_length=1)] = advanced(
@@ -86,7 +86,7 @@ class EncoderSettings:
 
 @dataclass(frozen=True, slots=True)
 class HttpSettings:
-    """Vision-language model behind an OpenAI-compatible server."""
+    """Vision-language model on an OpenAI-compatible server."""
 
     # Name of the model on the server. Empty uses the only one.
     model: str = ""
@@ -94,12 +94,12 @@ class HttpSettings:
     default_confidence: Ratio = 0.3
     # Timeout of one attempt of a request to the server, seconds.
     timeout_s: PositiveFloat = 10.0
-    # Timeout of one region with all its views, attempts and waits, seconds. It must stay below
-    # supervision.step_timeout_s.
+    # Timeout of the label of one region, with all views, attempts and waits, seconds. Together with
+    # timeout_s it must be below supervision.step_timeout_s and service.control_timeout_s.
     deadline_s: PositiveFloat = 40.0
     # Environment variable with the API key. Empty sends no key.
     api_key_variable: str = ""
-    # Maximum number of views of a region, with one request each.
+    # Maximum number of image crops of a region. Each one takes one request.
     max_views: PositiveInt = advanced(2)
     # Maximum number of attempts of a request.
     max_attempts: PositiveInt = advanced(3)
@@ -116,7 +116,7 @@ class HttpSettings:
 
 @dataclass(frozen=True, slots=True)
 class VlmLabellerSettings:
-    """Labels of regions that the detector does not know."""
+    """Labeller of regions that the detector does not know."""
 
     # Encoder pair: a name from `ldo models list`, or a folder with its files. Empty uses none.
     model: str = ""

@@ -1,4 +1,4 @@
-"""Constants of the paper, and switches to its literal rules."""
+"""Settings that are constants of the paper, or switch to the rules of the paper."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -18,9 +18,9 @@ from .values import (
 
 @dataclass(frozen=True, slots=True)
 class PaperSettings:
-    """Constants of the paper, and switches to its literal rules where the defaults differ.
+    """Constants of the paper, and switches to rules of the paper that the defaults replace.
 
-    These settings reproduce the paper and are not tuned, so they are counted separately.
+    These settings reproduce the results of the paper. A user need not tune them.
     """
 
     # Rule that labels a Gaussian: the fraction of its splat that a region covers, or the paper's
@@ -50,7 +50,8 @@ class PaperSettings:
     fusion_epsilon: PositiveFloat = advanced(1e-6)
     # Weight of the fixed fusion, an ablation (IV.C).
     fusion_fixed_weight: Ratio = advanced(0.5)
-    # Distance scale within which neighbors share their labels, meters. This is sigma_cons (III.A).
+    # Distance scale of the weights with which neighbors average their labels, meters. This is
+    # sigma_cons (III.A).
     consistency_sigma_m: PositiveFloat = advanced(0.05)
     # Maximum distance of neighbors, meters: three sigma, where a weight is below 2e-4.
     consistency_radius_m: PositiveFloat = advanced(0.15)

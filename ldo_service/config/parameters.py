@@ -1,7 +1,8 @@
-"""Parameters of the actors and of the runtime, from the configuration.
+"""Conversion of the configuration to the parameters of the actors and of the runtime.
 
-Only this module knows where a setting is used. It passes one value to several actors if they share
-it. A parameter without a setting keeps the default of its class, where a comment gives the reason.
+Only this module knows which parameters a setting determines. Some settings determine parameters of
+several actors. A parameter without a setting keeps the default of its class, where a comment gives
+the reason.
 """
 
 from ldo_service.actors.frame_source import FrameSourceConfig
@@ -96,7 +97,7 @@ def recording_parameters(config: Config) -> RecordConfig:
 
 
 def latency_frames(config: Config) -> dict[str, int]:
-    """Return the latency of each actor on the logical clock, in frames, by its name."""
+    """Return the latency of actors on the logical clock, in frames, by the actor's name."""
     latency = config.offline.latency_frames
     return {
         "detector": latency.detector,

@@ -35,8 +35,8 @@ def config_yaml(config: Config) -> str:
 def explained_yaml(config: Config, *, with_advanced: bool = False) -> str:
     """Return the configuration as YAML with comments.
 
-    Without `with_advanced`, the text has the public settings and the advanced ones that differ from
-    their defaults, so that it loads as the same configuration.
+    Without `with_advanced`, the text has the public settings, and the advanced settings that differ
+    from their defaults. Loading the text therefore gives the same configuration.
 
     Args:
         config: The configuration.

@@ -24,7 +24,7 @@ from .tracker_settings import TrackerSettings
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """Root of the configuration, which `parameters` converts to the parameters of the actors."""
+    """Root of the configuration; `config.parameters` converts it to parameters of the actors."""
 
     frame_source: FrameSourceSettings = field(default_factory=FrameSourceSettings)
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
@@ -46,7 +46,7 @@ class Config:
         """Check that the service waits long enough for the server of the labeller.
 
         Raises:
-            ConfigError: A request may take longer than a timeout of the service.
+            ConfigError: A label request may take longer than a timeout of the service.
         """
         http = self.vlm_labeller.http
         max_s = http.deadline_s + http.timeout_s  # The time to connect counts separately.
@@ -65,10 +65,11 @@ class Config:
     def with_map_folder(self, folder: Path) -> "Config":
         """Return the configuration with a folder for images and offloaded Gaussians.
 
-        A folder that is already set is kept. A restored mapper finds its files there.
+        The setting `mapper.image_folder` has priority over the argument. A restored mapper finds
+        its files in the folder.
 
         Args:
-            folder: The folder within the state or the run.
+            folder: Folder within the state folder or the run folder.
         """
         image_folder = self.mapper.image_folder or str(folder)
         return dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Settings of input, offline runs, the service, recordings, supervision and the viewer."""
+"""Settings of frame input, data sets, offline runs, service, recordings and viewer."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -22,10 +22,10 @@ from .values import (
 
 @dataclass(frozen=True, slots=True)
 class FrameSourceSettings:
-    """Input of camera frames."""
+    """Pairing of color and depth images of a camera."""
 
-    # Maximum difference of the stamps of a color and a depth image, seconds. Less than half a
-    # period at 30 Hz finds the nearest depth.
+    # Maximum difference of the stamps of a paired color and depth image, seconds. The default is
+    # below half a frame period at 30 Hz, so that the nearest depth image is paired.
     max_skew_s: Annotated[float, Meta(ge=0, lt=10)] = 0.015
 
 
@@ -64,17 +64,18 @@ class DatasetSettings:
 
 @dataclass(frozen=True, slots=True)
 class LatencySettings:
-    """Latency of each actor on the logical clock of `ldo run`; other actors have none."""
+    """Latency of actors on the logical clock of `ldo run`; the other actors have none."""
 
-    # Frames between a keyframe and its detections, the same on any machine.
+    # Frames between a keyframe and its detections.
     detector: NonNegativeInt = advanced(3)
-    # Frames between a keyframe and its loop closure. Five places are verified at a time.
+    # Frames between a keyframe and its loop closure, for the verification of five loop candidates.
     loop_closer: NonNegativeInt = advanced(10)
     # Frames between a keyframe and its addition to the map.
     mapper: NonNegativeInt = advanced(3)
     # Frames between a keyframe and a correction of the pose graph.
     optimizer: NonNegativeInt = advanced(3)
-    # Frames between a label request and its result: a second, because the labeller is asynchronous.
+    # Frames between a label request and its result. The default is one second at 30 Hz, because a
+    # labeller is slow.
     vlm_labeller: NonNegativeInt = advanced(30)
 
 
@@ -91,15 +92,15 @@ class OfflineSettings:
 class ServiceSettings:
     """Live service (`ldo serve`)."""
 
-    # Actors that run in their own processes. The default isolates gtsam, which holds the GIL of its
-    # process.
+    # Actors that run in processes of their own. The default is the actor that uses gtsam, which
+    # holds the GIL during every call.
     process_actors: tuple[str, ...] = ("optimizer",)
-    # Maximum time for each stage to finish its work at a soft stop, seconds.
+    # Maximum time for each actor to handle its queued messages when the service stops, seconds.
     shutdown_timeout_s: PositiveFloat = 10.0
     # Seconds without a heartbeat after which a process is killed and started again.
     heartbeat_timeout_s: PositiveFloat = 10.0
-    # True writes each step to disk before its outputs are published, 12 ms per step. False may lose
-    # the state in a power cut.
+    # True calls fsync after each step, before its outputs are published, which takes 12 ms. False
+    # may lose the state in a power cut.
     fsync: bool = False
     # Folder with the TLS keys that `ldo keys add` made. The option --keys overrides it.
     keys: str = ""
@@ -130,8 +131,8 @@ class RecordingSettings:
 class SupervisionSettings:
     """Supervision of actors."""
 
-    # Maximum number of failures of an actor within a minute. More of them are not cured by a
-    # restart, and the actor is stopped.
+    # Maximum number of restarts of an actor within a minute. A further failure ends the service,
+    # because a restart does not help.
     max_restarts: NonNegativeInt = 5
     # Maximum duration of one step of an actor, seconds. The default is 100 times the slowest step
     # measured.
@@ -139,10 +140,10 @@ class SupervisionSettings:
     # Niceness of threads that may run late (Linux). The default gives them a tenth of the CPU
     # weight of the tracker.
     background_nice: Annotated[int, Meta(ge=0, le=19)] = 10
-    # Interval of heartbeats, seconds. A stopped process is noticed within two of them.
+    # Interval of heartbeats, seconds. A missing heartbeat shows within two intervals.
     heartbeat_s: PositiveFloat = advanced(0.5)
-    # Seconds without taking a message after which a consumer is evicted, because it blocks the
-    # robot.
+    # Time without handling a message after which a consumer with a full queue is evicted, seconds.
+    # Such a consumer blocks its producers.
     evict_after_s: PositiveFloat = advanced(30.0)
 
 
@@ -153,9 +154,11 @@ class ViewerSettings:
     # Address on which the window is served. It needs no keys: anyone who reaches it can see the
     # map.
     address: str = LOOPBACK
-    # Port on which the window is served, or the next free one. 0 uses any free port.
+    # Port on which the window is served. If it is in use, the next free port is taken. 0 uses any
+    # free port.
     port: Annotated[int, Meta(ge=0, le=65535)] = 8080
-    # Maximum number of Gaussians in the browser, those of the largest weight, at 32 bytes each.
+    # Maximum number of Gaussians in the browser, at 32 bytes each. Those of the largest weight are
+    # sent.
     max_gaussians: PositiveInt = 300_000
-    # Interval of updates of the window, seconds: poses move at 5 Hz.
+    # Interval of updates of the window, seconds. The default shows poses at 5 Hz.
     update_interval_s: PositiveFloat = advanced(0.2)

@@ -52,11 +52,11 @@ class ImageSettings:
     # Working width in pixels. An image is halved until it is narrower than 1.5 times this width. A
     # larger width is more accurate and slower.
     width_px: PositiveInt = 320
-    # More levels let the alignment converge over larger motions. Four levels of 320 pixels end at
-    # 40 pixels.
+    # Number of pyramid levels. More levels let the alignment converge over larger motions. With
+    # four levels, an image 320 pixels wide ends at 40 pixels.
     pyramid_levels: PositiveInt = advanced(4)
-    # Maximum depth that is used, meters. No depth camera measures farther, and a stray 65 m
-    # must not count.
+    # Maximum depth that is used, meters. No depth camera measures farther. Larger values, such as
+    # 65 m, are errors of the camera.
     max_depth_m: PositiveFloat = 30.0
 
 
@@ -105,11 +105,11 @@ class KeyframeSettings:
     min_interval_frames: PositiveInt = advanced(2)
     # Maximum number of frames between keyframes, if the camera moved at all.
     max_interval_frames: PositiveInt = advanced(30)
-    # Fraction of the two motion limits after which a mapping keyframe is made. Above 1 there
-    # are none. On the kitchen they gain 0.4 dB.
+    # Fraction of the rotation and translation limits after which a mapping keyframe is made. With a
+    # value above 1 there are none. Mapping keyframes gain 0.4 dB on the sequence kitchen.
     mapping_only_ratio: PositiveFloat = advanced(0.33)
-    # Number of keyframes from which the tracker searches for a known keyframe before it makes a new
-    # one. 0 never searches. Until then new views improve the map.
+    # Number of keyframes after which the tracker searches for a known keyframe before it makes a
+    # new one. Before that, every new keyframe improves the map. 0 never searches.
     reuse_after: NonNegativeInt = 1500
 
     def __post_init__(self) -> None:
@@ -122,10 +122,10 @@ class KeyframeSettings:
 
 @dataclass(frozen=True, slots=True)
 class WindowSettings:
-    """Measurements between a keyframe and earlier keyframes."""
+    """Relative-pose measurements between a new keyframe and earlier keyframes."""
 
-    # Maximum number of earlier keyframes that a keyframe is measured against, at 4 ms each. More
-    # change little; 0 uses none.
+    # Maximum number of earlier keyframes to which a new keyframe is aligned, at 4 ms each. More of
+    # them change little. 0 uses none.
     max_measurements: NonNegativeInt = advanced(3)
 
 
@@ -133,8 +133,8 @@ class WindowSettings:
 class RelocalizationSettings:
     """Relocalization after tracking was lost."""
 
-    # Maximum number of keyframes in the keyframe database, 0.13 MB each at 640x480. Beyond it, the
-    # path is thinned.
+    # Maximum number of keyframes in the keyframe database, 0.13 MB each at 640x480. Beyond it,
+    # keyframes are removed evenly along the path.
     max_keyframes: Annotated[int, Meta(ge=3)] = 1000
     # Number of keyframes of similar appearance that a lost frame is compared with.
     appearance_candidates: NonNegativeInt = advanced(5)
@@ -147,8 +147,8 @@ class RelocalizationSettings:
 class SubmapSettings:
     """Submaps that the tracker starts after it was lost."""
 
-    # Seconds without a pose after which the tracker starts a new submap, as ORB-SLAM3 does. 0 never
-    # starts one.
+    # Time without a pose after which the tracker starts a new submap, seconds, as in ORB-SLAM3. 0
+    # never starts one.
     start_after_lost_s: NonNegativeFloat = 3.0
 
 
@@ -189,18 +189,19 @@ class DynamicsSettings:
 
 @dataclass(frozen=True, slots=True)
 class OdometryPriorSettings:
-    """Use of an external odometry as prior."""
+    """Use of poses of another odometry as initial guesses."""
 
-    # Maximum time between two poses that are interpolated, seconds, because the path between
-    # them is not straight.
+    # Maximum time between two poses of the other odometry that are interpolated, seconds. The path
+    # between more distant poses is not straight.
     max_gap_s: PositiveFloat = advanced(0.25)
-    # Maximum duration of dead reckoning while LOST, seconds: 2 % drift at 0.5 m/s is then 30 cm.
+    # Maximum duration of dead reckoning by the other odometry while LOST, seconds. At 0.5 m/s, a
+    # drift of 2 % is then 30 cm.
     max_dead_reckoning_s: PositiveFloat = advanced(30.0)
 
 
 @dataclass(frozen=True, slots=True)
 class TrackerSettings:
-    """Camera pose of each frame."""
+    """Tracking of the camera pose in each frame."""
 
     T_base_camera: MountingSettings = field(default_factory=MountingSettings)
     image: ImageSettings = field(default_factory=ImageSettings)
@@ -223,4 +224,6 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         if self.hold_out == 1:
-            raise ConfigError(f"tracker.hold_out={self.hold_out} must be 0, or 2 and more.")
+            raise ConfigError(
+                f"tracker.hold_out={self.hold_out} must be 0 (maps every frame) or at least 2."
+            )

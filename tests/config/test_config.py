@@ -90,7 +90,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
             "no setting tracker.holdout. Did you mean tracker.hold_out?",
         ),
         ("traker.hold_out=5", "Did you mean tracker?"),
-        ("tracker.hold_out=1", "tracker.hold_out=1 must be 0, or 2 and more."),
+        ("tracker.hold_out=1", "tracker.hold_out=1 must be 0 (maps every frame) or at least 2."),
         ("tracker.hold_out=many", "tracker.hold_out=many must be a whole number."),
         ("tracker.image.pyramid_levels=[", "not valid YAML"),
         ("hold_out=5", "section.field=value"),
