@@ -3,9 +3,10 @@
 Transforms  `T_a_b` maps coordinates in b to coordinates in a: `p_a = T_a_b @ p_b`. Adjacent names
             cancel in a chain: `T_map_camera = T_map_keyframe @ T_keyframe_camera`. Code uses 4x4
             float64 arrays; messages use a translation and a quaternion wxyz.
-Frames      `camera`: x right, y down, z forward (optical). `odom`: continuous except after a
-            loss. `map`: globally consistent; changes with corrections. `map` and `odom` initially
-            equal the first camera frame. (REP-105)
+Frames      `camera`: x right, y down, z forward (optical). `odom`: the odometry's frame, in which
+            poses are continuous until tracking is lost. `map`: globally consistent; its poses
+            change when the pose graph is optimized. `map` and `odom` initially equal the first
+            camera frame. (REP-105)
 Units       Meters, radians, seconds. Stamps are integer nanoseconds. Depth is z, not range;
             0 means "not measured".
 Pixels      Centers are at integer coordinates: pixel (0, 0) covers [-0.5, 0.5]. Halving an image

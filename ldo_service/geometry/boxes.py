@@ -10,7 +10,7 @@ def areas(boxes: np.ndarray) -> np.ndarray:
 
 
 def intersections(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the areas [K, R] that boxes [K, 4] and [R, 4] have in common, in square pixels."""
+    """Return the intersection areas [K, R] of boxes [K, 4] and [R, 4], in square pixels."""
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     return np.prod(np.maximum(high - low, 0), axis=-1)
@@ -30,13 +30,14 @@ def ious(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 def non_maximum_suppression(
     boxes: np.ndarray, scores: np.ndarray, class_ids: np.ndarray, max_iou: float
 ) -> np.ndarray:
-    """Return which boxes to keep, highest score first.
+    """Return the indices of the boxes to keep, highest score first.
 
     The search is greedy: a box is dropped if its intersection over union with a kept box of its
     class exceeds `max_iou`. Boxes of equal scores are processed in the order of the arguments.
 
     Args:
-        boxes: Boxes, [M, 4]; with several classes, coordinates must be above -1.
+        boxes: Boxes, [M, 4]. If there are several classes, coordinates must be above -1, because
+            OpenCV separates the classes by shifting their boxes.
         scores: Scores, [M]; at least 0.
         class_ids: Classes, [M]; at least 0. Boxes of different classes never suppress each other.
         max_iou: Largest overlap that two kept boxes may have, 0..1; compared in single precision.

@@ -54,11 +54,13 @@ class Camera:
                 )
         if not (-self.width < self.cx < 2 * self.width):
             raise DataError(
-                f"cx={self.cx:g} px is far outside the image, which is {self.width} px wide."
+                f"cx={self.cx:g} px is far outside the image, which is {self.width} px wide. "
+                "Check that the intrinsics are for this resolution."
             )
         if not (-self.height < self.cy < 2 * self.height):
             raise DataError(
-                f"cy={self.cy:g} px is far outside the image, which is {self.height} px high."
+                f"cy={self.cy:g} px is far outside the image, which is {self.height} px high. "
+                "Check that the intrinsics are for this resolution."
             )
         if len(self.distortion) not in (0, 4, 5, 8):
             raise DataError(
@@ -68,7 +70,7 @@ class Camera:
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> "Camera":
-        """Return the camera from the result of `dataclasses.asdict`; `distortion` may be a list."""
+        """Restore a camera from its fields by name; `distortion` may be a list."""
         return Camera(**{**values, "distortion": tuple(values["distortion"])})
 
     @property
@@ -77,7 +79,7 @@ class Camera:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def halved(self) -> "Camera":
-        """Return the camera of the image halved by averaging 2x2 blocks.
+        """Return the camera of the half-size image in which each pixel averages a 2x2 block.
 
         The distortion coefficients do not change, as they act on normalized coordinates.
         """
@@ -145,7 +147,7 @@ class Camera:
 
 @lru_cache(maxsize=4)
 def rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normalized coordinates x, y [H, W] float32 of all pixels, undistorted."""
+    """Return the normalized coordinates x, y [H, W] float32 of all pixels, without distortion."""
     if any(camera.distortion):
         u, v = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
         pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
@@ -167,8 +169,8 @@ def project(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, n
         camera: The camera, with its lens distortion.
 
     Returns:
-        Pixels u, v, [...] float32; NaN beyond the radius at which the distortion polynomial turns
-        and would map far points back into the image.
+        Pixels u, v, [...] float32. Points beyond the radius where the distortion polynomial starts
+        to decrease are NaN, because the polynomial would map them back into the image.
     """
     if any(camera.distortion):
         x, y = _distorted(x, y, camera)
@@ -191,7 +193,10 @@ def _distorted(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray
 
 @lru_cache(maxsize=4)
 def _turning_r2(camera: Camera) -> float:
-    """Return the squared radius where the distortion polynomial turns, or the maximum radius."""
+    """Return the squared radius where the distorted radius starts to decrease.
+
+    If it increases up to FARTHEST_RADIUS, return the square of FARTHEST_RADIUS.
+    """
     k1, k2, _, _, k3, k4, k5, k6 = _coefficients(camera)
     r = np.linspace(0.0, FARTHEST_RADIUS, 4001)
     r2 = r * r

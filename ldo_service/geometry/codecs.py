@@ -1,9 +1,9 @@
 """Encoding and decoding of images: raw, JPEG, PNG, and depth compressed with zstd.
 
-The header of a PNG or JPEG is checked before decompression, which limits the memory that a small
-message can allocate. A kilobyte of JPEG may declare 20000x20000 pixels, for which a decoder
-allocates 2.3 GB. A PNG of 300 bytes may declare a chunk of 4 GB, which OpenCV 5 allocates before it
-reads the chunk (both measured).
+The header of a PNG or JPEG is checked before decompression. This limits the memory that a small
+message can allocate. A JPEG of one kilobyte may declare 20000x20000 pixels, for which a decoder
+allocates 2.3 GB. A PNG of 300 bytes may declare a chunk of 4 GB, and OpenCV 5 allocates this memory
+before it reads the chunk. Both sizes were measured.
 """
 
 import struct

@@ -34,17 +34,18 @@ class RgbdFrame:
         if self.color.shape != (*size, 3) or self.color.dtype != np.uint8:
             raise FrameError(
                 f"frame {self.index}: color is {self.color.dtype}{self.color.shape}, "
-                f"expected uint8{(*size, 3)} by the camera."
+                f"expected uint8{(*size, 3)}, the size of its camera."
             )
         if self.depth_m.shape != size or self.depth_m.dtype != np.float32:
             raise FrameError(
                 f"frame {self.index}: depth is {self.depth_m.dtype}{self.depth_m.shape}, "
-                f"expected float32{size} by the camera."
+                f"expected float32{size}, the size of its camera."
             )
         lowest, highest = float(self.depth_m.min()), float(self.depth_m.max())
         if not (lowest >= 0.0 and highest < np.inf):  # NaN fails each comparison.
             raise FrameError(
-                f"frame {self.index}: depth must be finite and at least 0 (0 = not measured)."
+                f"frame {self.index}: depth of {lowest:g} to {highest:g} m must be finite and at "
+                "least 0. Set pixels without a measurement to 0."
             )
 
 
@@ -122,7 +123,7 @@ def _size(image: np.ndarray) -> str:
 
 
 def undistortion_maps(camera: Camera) -> Maps | None:
-    """Return the pixels u, v [H, W] of the distorted image at each rectified pixel.
+    """Return where each pixel of the rectified image lies in the distorted one: u, v [H, W].
 
     Return None if the camera has no distortion.
     """
@@ -137,9 +138,10 @@ def undistortion_maps(camera: Camera) -> Maps | None:
 def rectify(raw: RawFrame, maps: Maps | None) -> RgbdFrame:
     """Remove the lens distortion of a frame and convert its depth to meters.
 
-    The intrinsic matrix does not change. Color is interpolated bilinearly. Depth takes the nearest
-    pixel, since a mean across an edge is a surface that does not exist. Pixels outside the
-    distorted image are black with depth 0. Without distortion, the color array is shared.
+    The intrinsic matrix does not change. Color is interpolated bilinearly. Depth is taken from the
+    nearest pixel, because a mean of depths across an edge lies on no surface. Pixels outside the
+    distorted image are black with depth 0. Without distortion, the result refers to the color
+    array of `raw`.
 
     Args:
         raw: The frame.
@@ -153,7 +155,7 @@ def rectify(raw: RawFrame, maps: Maps | None) -> RgbdFrame:
 
 
 class Rectifier:
-    """Rectification of frames that caches the undistortion maps of the last camera."""
+    """Function object for `rectify` that caches the undistortion maps of the last camera."""
 
     def __init__(self) -> None:
         self._camera: Camera | None = None

@@ -30,8 +30,9 @@ KEYFRAME = np.dtype(
 def T_map_submap(submap: int) -> np.ndarray:
     """Return the provisional pose [4, 4] of a submap that is not merged with an older one.
 
-    Unmerged submaps are placed below each other, as buildings extend sideways. They are far enough
-    apart that their surfaces do not touch; float32 still resolves 0.1 mm in the tenth of them.
+    Unmerged submaps are placed 100 m below each other, because buildings extend mostly sideways.
+    At this distance, their surfaces do not touch. In the tenth submap, float32 coordinates still
+    resolve 0.1 mm.
     """
     T = np.eye(4)
     T[1, 3] = submap * APART_M
@@ -41,8 +42,9 @@ def T_map_submap(submap: int) -> np.ndarray:
 class KeyframePoses:
     """Keyframe poses in the map by id, from relative poses and corrections of the pose graph.
 
-    Each receiver of keyframes has one. Receivers with the same keyframes and the same correction
-    agree, whatever the order of their arrival. It grows by 0.4 kB per keyframe.
+    Each component that receives keyframes has its own instance. Instances with the same keyframes
+    and the same last correction have equal poses, in whatever order these arrived. An instance
+    needs 0.4 kB of memory per keyframe.
     """
 
     def __init__(self) -> None:
@@ -81,14 +83,14 @@ class KeyframePoses:
     ) -> np.ndarray:
         """Add a keyframe, and return its T_map_keyframe [4, 4].
 
-        If the reference is unknown because its message was missed, the pose comes from odometry
+        The reference is unknown if its message was missed. The pose then comes from odometry
         relative to the newest known keyframe of the submap.
 
         Args:
             keyframe: Id of the keyframe.
-            reference: Keyframe that it was measured from, if any.
+            reference: Keyframe that the relative pose refers to; None without one.
             T_reference_keyframe: Relative pose, [4, 4].
-            T_odom_keyframe: Pose in odometry, [4, 4].
+            T_odom_keyframe: Pose in the odometry frame, [4, 4].
             submap: Submap of the keyframe.
         """
         measured_from = NO_REFERENCE if reference is None else reference
@@ -117,15 +119,16 @@ class KeyframePoses:
     def correct(
         self, version: int, T_map: Mapping[int, np.ndarray], held: Collection[int] = ()
     ) -> None:
-        """Apply a correction of the pose graph; one older than the last changes nothing.
+        """Apply optimized poses of the pose graph; ignore them if the version is not newer.
 
         The poses of keyframes newer than the correction are computed again from their references.
 
         Args:
             version: Version of the pose graph.
             T_map: Corrected T_map_keyframe [4, 4] by id.
-            held: Keyframes with relative poses better than those that the correction was computed
-                from. Their poses are also computed again from their references, if these are known.
+            held: Keyframes whose relative pose here is more accurate than the one that the pose
+                graph used. Their poses are also computed again from their references, if these are
+                known.
         """
         if version <= self.version or not T_map:
             return
@@ -157,8 +160,9 @@ class KeyframePoses:
     def _placed(self, record: np.void, newest: int | None) -> np.ndarray:
         """Compute T_map_keyframe [4, 4] of a record.
 
-        It follows from the reference if that is known, else from odometry relative to `newest`,
-        else from the provisional pose of the submap.
+        The pose is relative to the reference keyframe if that is known. Otherwise it comes from
+        odometry, relative to the keyframe `newest`. If `newest` is None, it comes from odometry in
+        the provisional pose of the submap.
         """
         reference = int(record["reference"])
         if reference in self:
@@ -176,11 +180,11 @@ class KeyframePoses:
         return int(known[-1]) if len(known) else None
 
     def keep_only(self, keyframes: Iterable[int]) -> None:
-        """Remove all other keyframes, for a receiver that needs only a few."""
+        """Remove all keyframes except the given ones, for a component that needs only a few."""
         self._known.keep_only(keyframes)
 
     def T_map_odom(self, keyframe: int) -> np.ndarray:
-        """Return the odometry frame in the map [4, 4] at a keyframe."""
+        """Return T_map_odom [4, 4] as given by the two poses of a keyframe, in map and odometry."""
         record = self._record(keyframe)
         return record["T_map"] @ se3.inverse(record["T_odom"])
 
@@ -189,7 +193,7 @@ class KeyframePoses:
         return {"version": self.version, **self._known.columns()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a snapshot."""
+        """Replace the version and the records by those of a snapshot."""
         self.version = state["version"]
         self._known.restore(state)
 

@@ -19,25 +19,27 @@ def register_depth(
 ) -> np.ndarray:
     """Register a depth image to the color camera, including the lens distortion of that camera.
 
-    Each measured pixel is a cell that is `fx_color / fx_depth * z_depth / z_color` pixels wide. Its
-    center is
+    Each measured depth pixel becomes a rectangle in the color image, called its cell. The cell is
+    `fx_color / fx_depth * z_depth / z_color` pixels wide, and its center is
 
         project_color(T_color_depth @ (ray_depth * depth_m)).
 
-    A cell is stretched halfway to its neighbors on the same surface, so that neither a finer color
-    image nor a slanted surface has holes. A pixel takes the depth of the nearest cell that covers
-    it; depth is not interpolated. The result is deterministic, as a minimum does not depend on the
-    order of the pixels.
+    A cell is stretched halfway to its neighbors on the same surface. This avoids holes where the
+    color image is finer than the depth image or the surface is slanted. A color pixel gets the
+    depth of the nearest cell that covers it; depth is not interpolated. The result is
+    deterministic, because a minimum does not depend on the order of the pixels.
 
     Args:
-        depth_m: Depth, [Hd, Wd], z in meters; 0 where not measured. Distorted as `depth_camera`.
+        depth_m: Depth, [Hd, Wd], z in meters; 0 where not measured. It has the lens distortion of
+            `depth_camera`.
         depth_camera: Intrinsics of the depth image.
         color_camera: Intrinsics of the color image.
         T_color_depth: Transform from depth to color coordinates, [4, 4].
 
     Returns:
-        [Hc, Wc] float32, z in meters in the color camera; 0 where no cell lands, as on surfaces
-        that only the color camera sees. Rectify it together with the color image.
+        [Hc, Wc] float32, z in meters in the color camera. Pixels that no cell covers are 0, such as
+        surfaces that only the color camera sees. The result has the lens distortion of the color
+        camera, so rectify it together with the color image.
 
     Raises:
         FrameError: The depth image has another size than its camera.
@@ -76,13 +78,16 @@ def _points(
 
 
 def _same_surface(z: np.ndarray, is_seen: np.ndarray, axis: int) -> np.ndarray:
-    """Return which pixels and their next ones along `axis` are both seen and on one surface."""
+    """Return for each pixel whether it and the next one along `axis` lie on one surface.
+
+    Both must be measured (`is_seen`), and their depths must differ by less than SAME_SURFACE.
+    """
     (first, second), (a, b) = _neighbors(z, axis), _neighbors(is_seen, axis)
     return a & b & (np.abs(second - first) < SAME_SURFACE * first)
 
 
 def _neighbors(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return views of the pixels with a next one along `axis`, and of these next ones."""
+    """Return two array views: all pixels but the last along `axis`, and all but the first."""
     return (image[:, :-1], image[:, 1:]) if axis == 1 else (image[:-1], image[1:])
 
 
@@ -93,10 +98,11 @@ def _covered(
     axis: int,
     size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the range of pixels that each cell covers in one direction.
+    """Compute the range of color pixels that each cell covers along one image axis.
 
-    A cell reaches halfway to its neighbors along `axis`. As a surface may be sheared, it also
-    extends by half the difference of its center to those of its neighbors across `axis`.
+    A cell reaches halfway to its neighbors along `axis`. The projection may be sheared: neighbors
+    along the other axis are then displaced along this one. The cell therefore also extends by half
+    of that displacement.
 
     Args:
         center: Centers of the cells in this direction, [Hd, Wd] pixels.
@@ -138,7 +144,7 @@ def _nearest(
     rows: tuple[np.ndarray, np.ndarray],
     shape: tuple[int, int],
 ) -> np.ndarray:
-    """Return the smallest z of the cells that cover each pixel; 0 without any."""
+    """Return the smallest z of the cells that cover each pixel; 0 where no cell does."""
     is_inside = is_seen & (columns[0] <= columns[1]) & (rows[0] <= rows[1])
     z, u, last_u, v, last_v = (a[is_inside] for a in (z, *columns, *rows))
     nearest = np.full(shape[0] * shape[1], np.inf, np.float32)
@@ -151,7 +157,7 @@ def _nearest(
 
 
 def _cover_row(nearest: np.ndarray, z: np.ndarray, pixel: np.ndarray, more: np.ndarray) -> None:
-    """Reduce `nearest` to z, where that is smaller, at `pixel` and `more` pixels to its right."""
+    """Set `nearest` to z at `pixel` and the `more` pixels to its right where z is smaller."""
     while len(z):
         np.minimum.at(nearest, pixel, z)
         wider = more > 0
@@ -163,8 +169,8 @@ def resample_color(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Resample a color image to the depth camera, for cameras of equal center and orientation.
 
-    The image is halved while it is more than 1.5 times finer and then interpolated bilinearly,
-    which avoids aliasing.
+    The color image is halved as long as it is more than 1.5 times finer than the depth image. This
+    avoids aliasing. It is then interpolated bilinearly.
 
     Args:
         color: Color image, [Hc, Wc, 3] uint8.

@@ -1,7 +1,8 @@
 """Rigid transforms as 4x4 float64 arrays. Conventions: `ldo_service.geometry`.
 
-It contains the maps of the group SE(3) and conversions of rotations. It also interpolates many
-transforms at once and fits a transform to corresponding points (Umeyama, PAMI 1991).
+The module contains the exponential and the logarithm of SE(3) and conversions of rotations. It also
+interpolates many transforms at once and fits a transform to corresponding points (Umeyama, PAMI
+1991).
 """
 
 import numpy as np
@@ -56,7 +57,10 @@ def inverse(T: Array) -> Array:
 
 
 def orthonormalize(T: Array) -> Array:
-    """Return T [4, 4] with the nearest rotation, since rounding errors of products accumulate."""
+    """Return T [4, 4] with its rotation replaced by the nearest exact one.
+
+    Products of transforms accumulate rounding errors, which this removes.
+    """
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)
     out[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
@@ -143,8 +147,8 @@ def transforms_differ(
     Args:
         T_a: Transforms, [K, 4, 4].
         T_b: Transforms, [K, 4, 4].
-        distance_m: Maximum distance.
-        angle_rad: Maximum angle.
+        distance_m: Maximum distance of the positions, meters.
+        angle_rad: Maximum angle between the rotations, radians.
 
     Returns:
         [K] bool.
@@ -162,8 +166,8 @@ def interpolate(T_a: np.ndarray, T_b: np.ndarray, share: np.ndarray) -> np.ndarr
 
         T = T_a (exp(s omega), s t),   (exp(omega), t) = T_a^-1 T_b
 
-    The rotation is about one axis at a constant rate; the translation is on a straight line. Each
-    result is bitwise independent of the other pairs.
+    The rotation is about one axis at a constant rate; the translation is on a straight line. The
+    result of a pair is bitwise the same, whatever other pairs are given.
 
     Args:
         T_a: Transforms at s = 0, [N, 4, 4].
@@ -187,7 +191,8 @@ def fit_rigid_transform(points: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Fit a rigid transform between corresponding points, without scale.
 
     It minimizes sum |T p_k - q_k|^2 (Umeyama, PAMI 1991, eq. 40-42) and excludes reflections. If
-    the points are on one line, the rotation about it is arbitrary; the residuals are minimal too.
+    all points lie on one line, the residuals are minimal, but the rotation about the line is
+    arbitrary.
 
     Args:
         points: Points p, [M, 3].

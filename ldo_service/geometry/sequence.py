@@ -30,12 +30,12 @@ class TrueLabels:
 class Sequence(ABC):
     """RGB-D frames of one camera in the order of their stamps.
 
-    `read(i)` returns the frame as the camera delivered it, for a publisher. `sequence[i]` returns
-    the rectified frame, for tracking and mapping. Both raise FrameError for a frame that cannot be
-    read; callers skip and count it.
+    `read(i)` returns the frame as the camera delivered it, for a publisher of frames. `sequence[i]`
+    returns the rectified frame, for tracking and mapping. Both raise FrameError for a frame that
+    cannot be read. Callers skip and count such frames.
 
     Attributes:
-        name: Name of the sequence in tables.
+        name: Name of the sequence in tables of results.
         raw_camera: Intrinsics with lens distortion.
         stamps_ns: Stamps, [len] int64, ascending.
     """
@@ -79,7 +79,7 @@ class Sequence(ABC):
 
     def __getitem__(self, index: int) -> RgbdFrame:
         if not 0 <= index < len(self):
-            raise IndexError(f"frame {index} of {len(self)} in {self.name}")
+            raise IndexError(f"{self.name} has no frame {index}, only frames 0 to {len(self) - 1}.")
         return self._rectifier(self.read(index))
 
     def __iter__(self) -> Iterator[RgbdFrame]:

@@ -1,4 +1,4 @@
-"""Association of measurements by their time stamps, online and for complete lists.
+"""Association of measurements by their time stamps, for live streams and for complete lists.
 
 Conventions: `ldo_service.geometry`.
 """
@@ -69,7 +69,7 @@ B = TypeVar("B", bound=Stamped)
 
 @dataclass
 class StreamBuffer:
-    """Buffer of the unpaired measurements of one stream."""
+    """Buffer of the measurements of one stream that have no partner yet."""
 
     waiting: deque[Stamped] = field(default_factory=deque)  # The oldest first.
     # The newest stamps that were received.
@@ -102,16 +102,19 @@ class StreamBuffer:
 
 
 class StreamPairer(Generic[A, B]):
-    """Online pairing of the measurements ("halves") of two streams by nearest stamp.
+    """Pairing of the measurements of two live streams by nearest stamp.
 
-    The stamps of a pair differ by at most `max_skew_ns`. Pairs keep the order of both streams, and
-    each half is used at most once. The pairer returns a pair as soon as no nearer half can arrive.
-    It returns the pair at once if the stamps differ by at most half the period of the stream that
-    is behind. Otherwise it waits for the next half of that stream. While the period is unknown, it
-    takes the first half within `max_skew_ns`.
+    A measurement is called a half of its pair. The stamps of a pair differ by at most
+    `max_skew_ns`. Pairs keep the order of both streams, and each half is used at most once.
 
-    At most `buffer` halves of a stream wait; beyond that, the oldest one is paired with the best
-    available half or dropped. Equal input gives equal pairs, as no clock is read.
+    The pairer compares the oldest waiting halves of the two streams. The stream of the earlier half
+    may still deliver one that is nearer to the later half. If the stamps differ by at most half
+    the period of that stream, none can be nearer, and the pair is returned at once. Otherwise the
+    pairer waits for the next half of that stream. While the period is unknown, the pairer accepts
+    any difference up to `max_skew_ns`.
+
+    At most `buffer` halves of a stream wait. If there are more, the oldest one is paired with the
+    best available half or dropped. Equal input gives equal pairs, because no clock is read.
     """
 
     def __init__(self, max_skew_ns: int, buffer: int) -> None:
@@ -176,12 +179,15 @@ class StreamPairer(Generic[A, B]):
 
     @staticmethod
     def _has_nearer(earlier: StreamBuffer, later: StreamBuffer, skew: int) -> bool:
-        """Return whether the second half of the earlier stream is nearer to the later half."""
+        """Return whether the second half of `earlier` is nearer to the first half of `later`.
+
+        It is compared with the first half of `earlier`, which differs by `skew`.
+        """
         target = later.waiting[0].stamp_ns
         return len(earlier.waiting) > 1 and abs(earlier.waiting[1].stamp_ns - target) < skew
 
     @staticmethod
     def _may_get_nearer(earlier: StreamBuffer, skew: int) -> bool:
-        """Return whether the next half of the earlier stream may be nearer than its first one."""
+        """Return whether a half that `earlier` has yet to receive may be nearer than its first."""
         period = earlier.period_ns()
         return len(earlier.waiting) == 1 and period is not None and 2 * skew > period
