@@ -23,7 +23,7 @@ def read_arrays(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
         max_bytes: Maximum size of all arrays, checked before any memory is allocated.
 
     Raises:
-        Exception: One of UNREADABLE.
+        Exception: The file is damaged, too large or not readable; the type is one of UNREADABLE.
     """
     with zipfile.ZipFile(path) as archive:
         packed = sum(entry.file_size for entry in archive.infolist())
@@ -37,7 +37,10 @@ def read_arrays(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
 
 
 def _announced_bytes(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
-    """Return the size of an array according to its header, which NumPy does not check."""
+    """Return the size in bytes that the header of an array declares.
+
+    NumPy allocates this size without checking it.
+    """
     with archive.open(entry) as file:
         if npy.read_magic(file) == (1, 0):
             shape, _, dtype = npy.read_array_header_1_0(file)

@@ -1,8 +1,9 @@
 """Files and folders that appear whole or not at all.
 
-The content goes to a temporary neighbor first, which is renamed when it is complete. A reader sees
-the old content or the new one, never a part, and a failed write leaves no temporary file behind. A
-killed process may leave one; its name ends in `UNFINISHED`.
+The content is first written to a temporary file or folder next to the target. This is renamed when
+it is complete, so a reader sees the old content or the new content, never an incomplete one. A
+failed write removes the temporary file. A killed process may leave a temporary file, whose name
+ends in `UNFINISHED`.
 """
 
 import os
@@ -21,8 +22,8 @@ def write_atomically(path: Path, *parts: bytes, syncs: bool = False, unique: boo
         path: The file; its folder must exist.
         parts: The content, concatenated in order.
         syncs: Wait until the content and the name are on the disk, so a power cut loses nothing.
-        unique: Use a temporary name of its own, for a file that several processes may write at
-            the same time.
+        unique: Use a temporary name that no other process uses. It is needed if several processes
+            may write the file at the same time.
 
     Returns:
         The size of the file in bytes.
@@ -62,7 +63,7 @@ def folder_made_atomically(path: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk."""
+    """Wait until the content of a file, or the list of file names of a folder, is on the disk."""
     number = os.open(path, os.O_RDONLY)
     try:
         os.fsync(number)

@@ -1,8 +1,8 @@
 """Folder of numbered files with checksums.
 
-A file begins with a checksum of its content, and gets its name when it is completely written. A
-reader gets the written content or an error. Files are not synced to the disk, so a power cut may
-damage the last ones.
+A file begins with a checksum of its content. It gets its final name when it is completely written.
+A reader gets exactly the written content or an error. Files are not synced to the disk, so a power
+cut may damage the files written last.
 """
 
 import errno
@@ -39,7 +39,7 @@ class ChecksummedFolder:
         Args:
             folder: The folder; None for a temporary one that is deleted with this object.
             suffix: Suffix of the files.
-            consequence: Sentence for the log about the consequence of a full disk.
+            consequence: Sentence that the log adds to a failed write, about its consequence.
 
         Raises:
             ConfigError: The folder cannot be used.
@@ -68,7 +68,8 @@ class ChecksummedFolder:
         """Write or replace a file.
 
         Returns:
-            False if the write failed. Failures are counted, and a series of them is logged once.
+            False if the write failed. Failures are counted. Of consecutive failures, only the
+            first is logged.
         """
         try:
             header = _HEADER.pack(_MAGIC, zlib.crc32(body))

@@ -1,7 +1,7 @@
 """Stores of the last state of each actor, from which a restored actor continues.
 
-A state consists of a few named parts. A store writes only the parts that are new objects, so
-callers must not modify parts after saving them.
+A state consists of a few named parts. A store skips a part that is the same Python object as in the
+last save. Callers must therefore never modify a part that was saved; they replace it.
 """
 
 import logging
@@ -31,7 +31,7 @@ STATE_VERSION = 2
 
 
 class _Contents(msgspec.Struct, frozen=True):
-    """File of each part of an actor's state, and the version of their content."""
+    """Content of `contents.msgpack`: file name of each part, and version of the state's format."""
 
     files: dict[str, str]
     version: int = STATE_VERSION
@@ -54,7 +54,7 @@ class StateStore(Protocol):
 
 
 class MemoryStore:
-    """Store in memory: it survives a failed actor, but not its process."""
+    """Store in memory; it is lost when its process ends, but not when an actor fails."""
 
     def __init__(self) -> None:
         self._states: dict[str, State] = {}
@@ -74,15 +74,15 @@ class MemoryStore:
 
 
 class FolderStore:
-    """Store in a folder `<folder>/<actor>/` that survives a killed process.
+    """Store in files of a folder `<folder>/<actor>/`, which survive a killed process.
 
-    Each part has a file, and `contents.msgpack` lists the files of one state. A new part is written
-    to a new file, and the list changes last, by one rename. A reader therefore finds the whole old
-    state or the whole new state.
+    Each part has a file, and `contents.msgpack` lists the files of the current state. A changed
+    part is written to a new file. The list is replaced last, by one rename. A reader therefore
+    finds the whole old state or the whole new state.
     """
 
     def __init__(self, folder: Path, *, syncs: bool = False) -> None:
-        """Initialize without reading.
+        """Initialize the store without reading any file.
 
         Args:
             folder: Folder of all states.
@@ -130,15 +130,15 @@ class FolderStore:
     def load(self, actor: str) -> State | None:
         """Load the last state of an actor.
 
-        A damaged state is logged and moved to `<actor>.unreadable`, where it replaces an earlier
-        one.
+        A damaged state is logged and its folder renamed to `<actor>.unreadable`. An earlier folder
+        of that name is deleted.
 
         Returns:
             The state; None if there is none or it is damaged.
 
         Raises:
-            DataError: The state exists but cannot be read because of the disk or a limit, or
-                another version of the service wrote it.
+            DataError: The state exists, but the disk or a limit of the process prevents reading
+                it, or another version of the service wrote it.
         """
         folder = self._folder / actor
         try:
@@ -184,20 +184,23 @@ def _set_aside(folder: Path) -> None:
 
 
 def _remove_unreferenced(folder: Path, files: Mapping[str, str]) -> None:
-    """Remove files that a killed process wrote and the list does not contain."""
+    """Remove the files that are not in `files`; a process that was killed left them."""
     for file in folder.glob("*"):
         if file.name not in (CONTENTS, *files.values()):
             _remove(file)
 
 
 def _remove(file: Path) -> None:
-    """Remove an unlisted file; if that fails, the next process removes it."""
+    """Remove a file that `contents.msgpack` does not list.
+
+    If that fails, the next process removes it.
+    """
     with suppress(OSError):
         file.unlink()
 
 
 def _read_contents(folder: Path) -> dict[str, str]:
-    """Return the files of a state, by part; empty if no state was saved.
+    """Return the file name of each part of a state; empty if no state was saved.
 
     Raises:
         DataError: Another version of the service wrote the state.

@@ -1,4 +1,4 @@
-"""Plain values from YAML that a user wrote, and back.
+"""Reading and writing of plain values as YAML, for files that users write.
 
 Numbers with an exponent follow YAML 1.2. PyYAML reads YAML 1.1, where `2e-4` is text because it has
 no decimal point.
@@ -54,7 +54,8 @@ def dump_yaml(values: Any, *, flow: bool | None = False, width: float = 80) -> s
 
     Args:
         values: Plain values.
-        flow: Write all values on one line; None: only the innermost lists and dictionaries.
+        flow: True: all values on one line. None: one line per innermost list or dictionary. False:
+            one line per value.
         width: Maximum line width in columns.
     """
     form = {"default_flow_style": flow, "width": width, "sort_keys": False}
