@@ -102,11 +102,11 @@ def messages(rs: Any, source: Any, camera: CameraModel) -> Iterator[CameraRgbd]:
 def camera_model(rs: Any, intrinsics: Any) -> CameraModel:
     """Return the camera model with OpenCV's distortion, fitted to the model of the device.
 
-    A point of the undistorted image at (x, y), r^2 = x^2 + y^2, is imaged at
+    OpenCV's model maps an undistorted point (x, y), with r^2 = x^2 + y^2, to the distorted x
 
-        x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and y likewise,
+        x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2),
 
-    which is linear in the coefficients.
+    and y likewise. This is linear in the coefficients, so that least squares can fit them.
 
     Args:
         rs: The module pyrealsense2.
@@ -138,7 +138,10 @@ def camera_model(rs: Any, intrinsics: Any) -> CameraModel:
 
 
 def _require_device(rs: Any, serial: str) -> None:
-    """Raise ConfigError if the device is not connected; a pipeline would wait 15 s for it."""
+    """Raise ConfigError at once if the device is not connected.
+
+    Without this check, a pipeline waits 15 s for the device.
+    """
     devices = rs.context().query_devices()
     found = [device.get_info(rs.camera_info.serial_number) for device in devices]
     if not found or (serial and serial not in found):
@@ -161,10 +164,12 @@ def _config(rs: Any, stream: RealSenseStream) -> Any:
 def _seen_through(rs: Any, intrinsics: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sample the distortion model of the device on a grid of points.
 
-    A model is evaluated in the direction in which it is defined.
+    The inverse Brown-Conrady model is defined from distorted to undistorted points, so the grid
+    consists of distorted points. For all other models, it consists of undistorted points.
 
     Returns:
-        Distorted coordinates [N, 2] in focal lengths, and undistorted coordinates x and y [N].
+        Distorted coordinates [N, 2], and undistorted coordinates x and y [N]; all are normalized by
+        the focal length.
     """
     columns = np.linspace(0, intrinsics.width - 1, GRID[0])
     rows = np.linspace(0, intrinsics.height - 1, GRID[1])
@@ -185,9 +190,9 @@ def _fitted(
     """Fit OpenCV's distortion coefficients to samples.
 
     Args:
-        seen: Distorted coordinates, [N, 2] in focal lengths.
-        x: Undistorted coordinates, [N].
-        y: Undistorted coordinates, [N].
+        seen: Distorted coordinates, [N, 2], normalized by the focal length.
+        x: Undistorted coordinates, [N], normalized likewise.
+        y: Undistorted coordinates, [N], normalized likewise.
         focal_px: Focal length in pixels.
 
     Returns:

@@ -1,7 +1,7 @@
 """RGB-D camera of ROS 2, whose topics a Zenoh bridge forwards.
 
-zenoh-bridge-ros2dds publishes the CDR of the topic `/a/b` on the key `a/b` while that key has a
-subscriber.
+The bridge, zenoh-bridge-ros2dds, publishes each message of a topic `/a/b` on the Zenoh key `a/b`,
+encoded as CDR. It does so only while that key has a subscriber.
 """
 
 import time
@@ -128,7 +128,7 @@ class RosCamera:
 
     @property
     def statistics(self) -> str:
-        """Summary of frames made, and of images rejected, unpaired and dropped."""
+        """Text with the numbers of frames, and of rejected, unpaired and dropped images."""
         return (
             f"{self.frames_made} frames, {self.rejected} images rejected, {self._pairing.lost_a} "
             f"color and {self._pairing.lost_b} depth images unpaired, {self._inbox.dropped} dropped"
@@ -147,7 +147,7 @@ class RosCamera:
                 self._notice_silence()
 
     def take(self, topic: str, body: bytes) -> Iterator[CameraRgbd]:
-        """Process a sample, and iterate over the frames that it completes."""
+        """Process a message of a topic, and iterate over the frames that it completes."""
         self._last_s[topic] = time.monotonic()
         try:
             for color, depth in self._pairs(topic, body):
@@ -170,9 +170,10 @@ class RosCamera:
             yield from self._pairing_at(depth.stamp_ns).add_b(depth)
 
     def _pairing_at(self, stamp_ns: int) -> StreamPairer[RosImage, RosImage]:
-        """Return the pairer; after a restart of the driver or bag, a new one.
+        """Return the pairer of color and depth, or a new one if the stamps were set back.
 
-        A stamp that is much earlier than the newest one indicates the restart.
+        A stamp more than RESTARTED_AFTER_NS before the newest one means that the camera driver or
+        the bag was restarted.
         """
         if stamp_ns < self._newest_ns - RESTARTED_AFTER_NS:
             self._say("The stamps went back: the camera has restarted. No action needed.")

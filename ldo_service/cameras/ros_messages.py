@@ -44,7 +44,7 @@ class RosImage:
 
 
 def is_compressed(topic: str) -> bool:
-    """Return whether a topic has compressed images, by the naming of image_transport."""
+    """Return whether the name of a topic is that of compressed images in image_transport."""
     return topic.endswith(("/compressed", "/compressedDepth"))
 
 
@@ -139,7 +139,7 @@ def joined(
         depth: Depth image.
         camera: The color camera.
         frame: Number of the frame.
-        is_registered: Assume that depth is on the pixels of color, whatever its frame_id.
+        is_registered: Assume that depth is registered to color even if the frame_ids differ.
 
     Raises:
         FrameError: The images and the camera do not fit together.
@@ -223,7 +223,7 @@ def _pixels(message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
 
 
 def _compressed(message: Any, start: int, depth_scale: float = 1.0) -> RosImage:
-    """Return a compressed image without decoding it; the service decodes it."""
+    """Wrap a compressed image without decoding it; the receiving service decodes it."""
     data = memoryview(message.data.tobytes())[start:]
     size = read_image_size(data)
     if size is None:
