@@ -7,8 +7,8 @@
 
 Optional labels, as Habitat renders them:
 
-    semantic_class/*.png                     8 bits per pixel: the class; by number of the frame
-    instance/*.png                           16 bits per pixel: the object
+    semantic_class/*.png                     8 bits per pixel: the class; named by frame number
+    instance/*.png                           16 bits per pixel: the object; named likewise
     labels.json                              {"classes": {"<class>": name}}
 """
 
@@ -142,7 +142,7 @@ def _calibration(folder: Path) -> Calibration:
 
 
 def _poses(path: Path) -> np.ndarray:
-    """Read T_world_camera [K, 4, 4], one line each.
+    """Read T_world_camera [K, 4, 4] from a file with one pose per line.
 
     Raises:
         DataError: The file cannot be read, or a line is invalid.

@@ -60,7 +60,7 @@ class SequenceOptions:
         return not self.register_depth and not self._given()
 
     def over(self, rig: Rig) -> Rig:
-        """Return a rig with the cameras and the transform of these options, where they are set."""
+        """Return `rig` with the cameras and the transform that these options set."""
         return replace(rig, **self._given())
 
     def _given(self) -> dict[str, Camera | np.ndarray]:

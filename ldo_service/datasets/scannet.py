@@ -9,8 +9,8 @@ intrinsic/extrinsic_*.txt         optional: 4x4 from that camera to the sensor
 ScanNet's exports are aligned: their extrinsics are the identity, although color is larger than
 depth (1296x968 and 640x480). In this case, color is resampled to the depth image, and depth does
 not change. With other extrinsics, or with `SequenceOptions.register_depth`, depth is registered to
-the color camera. Poses are assumed to be those of the depth camera; an aligned export does not
-distinguish both.
+the color camera. Poses are assumed to be those of the depth camera. In an aligned export, the poses
+of both cameras are equal.
 """
 
 from dataclasses import replace
@@ -66,7 +66,11 @@ class ScanNetSequence(Sequence):
     def _on_one_grid(
         self, color: np.ndarray, depth: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return color, depth and depth scale in the camera of this sequence."""
+        """Bring color and depth to the pixel grid of this sequence's camera.
+
+        Returns:
+            Color, depth, and the units of depth per meter.
+        """
         if self._is_registering:
             return color, self._rig.register(depth.astype(np.float32) / DEPTH_SCALE), 1.0
         color, is_seen = resample_color(color, self._rig.color_camera, self._rig.depth_camera)

@@ -10,7 +10,7 @@ different focal lengths. By default, frames are read as they are, with the intri
 camera for both images. Color and depth then disagree by up to about thirty pixels.
 `SequenceOptions.register_depth` registers depth to the color camera instead and transforms the
 poses accordingly. The published calibration covers the depth camera only (585, 585, 320, 240 px).
-The rest of RIG is the best known estimate; the options can replace it.
+The other values of the constant `RIG` are estimates, which `SequenceOptions` can replace.
 """
 
 from dataclasses import replace
