@@ -80,7 +80,7 @@ def lit_share(
     solids: tuple[Solid, ...],
     point: Vector,
 ) -> np.ndarray:
-    """Return the fraction [P] of a square lamp that no solid hides from each point."""
+    """Return the fraction [P] of a square lamp that is visible from each point past the solids."""
     lamps = _lamp_points(lamp_center_m, lamp_side_m)
     is_hidden = np.zeros((LAMP_GRID**2, len(point[0])), bool)
     for solid in solids:
@@ -109,11 +109,11 @@ def _enlarged(solid: Solid, lamp_side_m: float) -> Solid:
 
 
 def _is_between(solid: Solid, point: Vector, lamp_m: Vector) -> np.ndarray:
-    """Return whether a solid hides a lamp point from each point.
+    """Return whether a solid lies between surface points and points of the lamp.
 
     Args:
-        solid: The solid that may be in between.
-        point: Points [P], meters.
+        solid: The solid.
+        point: Surface points [P], meters.
         lamp_m: One point of the lamp, or K points with components [K, 1].
 
     Returns:

@@ -97,7 +97,7 @@ SWAY_TARGET_M = 0.03
 
 
 def poses(path: Path, count: int, seed: int) -> np.ndarray:
-    """Return T_world_camera [count, 4, 4] on splines through the path, with the sway of a hand."""
+    """Return T_world_camera [count, 4, 4] on splines through the path, with hand shake."""
     rng = np.random.default_rng(seed)
     along = np.arange(count) * (len(path.eyes_m) / count)
     eyes = closed_spline(path.eyes_m, along) + _sway(rng, count, SWAY_EYE_M)

@@ -54,7 +54,10 @@ BODY = (
 
 
 def person_at(time_s: float) -> tuple[Solid, ...]:
-    """Return the body after `time_s` on `WAY_M`; at the end it stays behind the wall."""
+    """Return the solids of the person at `time_s` seconds after the start of the path `WAY_M`.
+
+    After the end of the path, the person stays outside the room, hidden by the wall.
+    """
     foot_m, heading, walked_m = _placed(time_s)
     swing = _swing(walked_m / STEP_M)
     return tuple(_in_world(part, foot_m, heading, swing) for part in BODY)

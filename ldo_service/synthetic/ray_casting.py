@@ -31,7 +31,8 @@ class Hits:
 class RayCaster:
     """Ray caster of one camera pose.
 
-    It projects each solid once, so that only rays within the solid's window are tested.
+    Each solid is projected into the image once. A ray is tested against a solid only if its pixel
+    lies in the window around that projection.
     """
 
     def __init__(
@@ -84,7 +85,10 @@ class RayCaster:
         return vector(self._T[:3, 3])
 
     def _directions(self, u: np.ndarray, v: np.ndarray) -> Vector:
-        """Return ray directions in the world with z = 1 in the camera, so t of o + t d is depth."""
+        """Return the world directions d of the rays, scaled to z = 1 in the camera.
+
+        With this scale, the parameter t of a point o + t d is its depth.
+        """
         x, y, _ = np.moveaxis(self.camera.rays_at(u, v), -1, 0)
         R = self._T
         return (
@@ -112,10 +116,10 @@ class _Window:
 
 
 def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
-    """Return the bounds of the projected corners.
+    """Return the window of a solid: the bounds of its projected corners.
 
-    The window is empty for a solid outside the view, and the whole image for a solid in view that
-    reaches behind the camera.
+    The window is empty if the solid is outside the field of view. It is the whole image if the
+    solid is in view and extends behind the camera.
     """
     offset = solid.corners_m() - T[:3, 3]
     x, y, z = (

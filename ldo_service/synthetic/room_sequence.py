@@ -47,9 +47,9 @@ def kinect_depth(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _is_shadowed(depth_m: np.ndarray) -> np.ndarray:
-    """Return a mask [H, W] of the far side of depth jumps along a row.
+    """Return a mask [H, W] of the pixels that the light of the Kinect's projector does not reach.
 
-    The projector does not reach these pixels.
+    They are on the far side of depth jumps along a row.
     """
     jump = np.diff(depth_m, axis=1, prepend=depth_m[:, :1])
     return jump > 0.05 * depth_m

@@ -25,7 +25,7 @@ def vector(components: Iterable[np.ndarray | float]) -> Vector:
 class Solid:
     """Convex solid that stands upright in the world, z up.
 
-    Its local frame has the solid's axes, and the solid fills the cube -1..1 there.
+    The axes of its local frame are the solid's axes. In this frame, the solid fills the cube -1..1.
     """
 
     shape: Shape
@@ -70,8 +70,9 @@ class Solid:
         """Return normals and texture coordinates at world points on the surface.
 
         Returns:
-            Unit normals in the world, and u_m [P] and v_m [P]. These run along the two axes of the
-            solid that the normal is not closest to; on sides v is up.
+            Unit normals in the world, and texture coordinates u_m [P] and v_m [P]. The solid's axis
+            nearest to the normal is left out; u and v run along the two remaining axes. On the
+            sides of the solid, v points up.
         """
         local = self.point_to_local(point)
         normal, axis = self.normal(local)
@@ -136,8 +137,9 @@ def _round(o: Vector, d: Vector, dimensions: int) -> tuple[np.ndarray, np.ndarra
 def _taper(o: Vector, d: Vector, m: float, k: float) -> tuple[np.ndarray, np.ndarray]:
     """Intersect rays with the infinite half cone x^2 + y^2 < (m + k z)^2 that contains the origin.
 
-    A ray flatter than the cone is inside one half of the double cone between its two roots. A
-    steeper ray is inside our half before the first root or after the second.
+    A ray meets the full double cone at two roots. A ray flatter than the cone is inside one half of
+    it between the roots. A steeper ray is inside the half with the origin either before the first
+    root or after the second.
     """
     r, dr = m + k * o[2], k * d[2]
     a = d[0] * d[0] + d[1] * d[1] - dr * dr
