@@ -1,8 +1,9 @@
 """C++17 kernels, bound with nanobind: small and stateless, with checked arguments.
 
 The kernels release the GIL. Each is compiled once per instruction set. The process uses the widest
-set that the machine has; `LDO_ISA=avx512|avx2|baseline` forces one. Results are bitwise equal for
-any number of threads, and differ in the last bits between instruction sets.
+instruction set of the machine; the environment variable `LDO_ISA=avx512|avx2|baseline` forces one.
+Results are bitwise equal for any number of threads. Between instruction sets, they differ in the
+last bits.
 """
 
 from ldo_service.errors import ConfigError

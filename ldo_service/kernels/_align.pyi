@@ -8,8 +8,9 @@ Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy, pixels.
 
 isa: str
 
-# Average the 2x2 blocks of an image [H, W] to [H // 2, W // 2]. Zeros are missing values. Values
-# within the relative `tolerance` of the lowest count; a block with fewer than `least` gives 0.
+# Average the 2x2 blocks of an image [H, W] to [H // 2, W // 2]. Zeros are missing values. Only
+# values within the relative `tolerance` of the lowest value of a block are averaged. A block with
+# fewer than `least` such values gives 0.
 def halve(values: Image, tolerance: float, least: int = 1) -> Image: ...
 
 # Combine gray levels [H, W] (0 where clipped) and depth [H, W] in meters (0 where missing) into
