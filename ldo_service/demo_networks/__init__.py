@@ -1,7 +1,8 @@
-"""The built-in networks for the synthetic scenes; CARD.md beside this says what they score.
+"""Built-in detector and labeller networks for the synthetic scenes; CARD.md lists their scores.
 
-They are trained by `training/train_demo.py` of the repository. `detector.model` and
-`vlm_labeller.model` take them by NAME; `ldo_service.detection.model_registry` opens them.
+The script `training/train_demo.py` of the repository trains them. The settings `detector.model` and
+`vlm_labeller.model` select them with the value `demo`. `ldo_service.detection.model_registry`
+opens them.
 """
 
 from pathlib import Path
