@@ -57,11 +57,14 @@ class Detections:
         return len(self.scores)
 
     def chosen(self, which: np.ndarray | slice) -> "Detections":
-        """Return the chosen detections."""
+        """Return the detections that an index array, a mask or a slice selects."""
         return Detections(self.boxes_px[which], self.scores[which], self.class_ids[which])
 
     def inside(self) -> "Detections":
-        """Return the detections that are partly inside the image, to which boxes were clipped."""
+        """Return the detections with a positive area.
+
+        Boxes were clipped to the image, so a box outside of it has no area left.
+        """
         sides_px = self.boxes_px[:, 2:] - self.boxes_px[:, :2]
         return self.chosen(np.flatnonzero(sides_px.min(axis=1) > 0))
 
@@ -70,7 +73,7 @@ class Detections:
         return self.chosen(np.argsort(-self.scores, kind="stable")[:most])
 
     def distinct(self, iou_max: float) -> "Detections":
-        """Return the detections after non-maximum suppression."""
+        """Return the detections that non-maximum suppression with `iou_max` keeps."""
         return self.chosen(
             non_maximum_suppression(self.boxes_px, self.scores, self.class_ids, iou_max)
         )
@@ -91,9 +94,9 @@ class OnnxDetector:
         Args:
             path: The ONNX file.
             config: Settings.
-            names: Class names, unless `config.names` gives others; empty: those it contains, or the
-                80 of COCO.
-            name: Name in errors and `identity`; empty: that of the file.
+            names: Class names, unless `config.names` gives others; empty: the names in the file's
+                metadata, or the 80 of COCO.
+            name: Name of the network in errors and in `identity`; empty: the name of the file.
 
         Raises:
             ConfigError: If a setting is invalid.
@@ -122,7 +125,7 @@ class OnnxDetector:
 
     @property
     def providers(self) -> list[str]:
-        """Execution providers it runs on, by onnxruntime's names."""
+        """Execution providers that the network runs on, by onnxruntime's names."""
         return self._network.providers
 
     def detect(self, image: np.ndarray) -> Detections:

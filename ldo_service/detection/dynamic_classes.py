@@ -1,4 +1,4 @@
-"""Dynamic mask of detections of classes that move by themselves.
+"""Dynamic mask: the pixels of detected objects that may move by themselves, such as people.
 
 Conventions: `ldo_service.geometry`.
 """
@@ -41,7 +41,7 @@ class Box:
     bottom: float
 
     def in_smaller(self, times: float) -> "Box":
-        """Return the box in an image that is `times` smaller."""
+        """Return the box in an image whose width and height were divided by `times`."""
         edges = (self.left, self.top, self.right, self.bottom)
         return Box(self.label, *(edge / times for edge in edges))
 
@@ -51,9 +51,10 @@ def dynamic_class_mask(
 ) -> np.ndarray:
     """Return the pixels of objects that may move by themselves, [H, W] bool.
 
-    Pixels of a box count if their depth is within `reach_m` of the median of its core, and if they
-    are connected to the core. Enclosed pixels without depth count too. A box without any depth
-    counts as a whole.
+    The core of a box is its middle part, half as wide and high. A pixel of the box is masked if its
+    depth is within `reach_m` of the core's median depth. It must also be connected to the core by
+    such pixels. Gaps of a few pixels without depth are masked too. A box without depth in its core
+    is masked as a whole.
 
     Args:
         boxes: Detections; labels that are not in `classes` are ignored.
@@ -85,7 +86,10 @@ def _foreground(depth_m: np.ndarray, core: np.ndarray, config: DynamicClassConfi
 
 
 def _window(box: Box, shape: tuple[int, ...], share: float) -> tuple[slice, slice]:
-    """Return rows and columns of the middle `share` of a box, within an image."""
+    """Return rows and columns of the middle part of a box, clipped to an image.
+
+    The part has the fraction `share` of the box's width and height.
+    """
     u, v = (box.left + box.right) / 2, (box.top + box.bottom) / 2
     half_u, half_v = share * (box.right - box.left) / 2, share * (box.bottom - box.top) / 2
     rows = np.clip([v - half_v, v + half_v], 0, shape[0]).round().astype(int)

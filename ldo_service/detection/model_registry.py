@@ -1,10 +1,10 @@
 """Registry of the user's networks (`ldo models`). Only `demo` comes with the package.
 
-    <folder>/<name>/model.onnx    a copy of the file: a detector, or the image encoder of a pair
+    <folder>/<name>/model.onnx    a copy of the file: a detector, or a labeller's image encoder
     <folder>/<name>/about.json    checksum, layout, classes, license
 
-A pair of encoders for a labeller (CLIP's layout) also has a text encoder with its byte pairs, or
-embeddings:
+A labeller is a pair of an image encoder and a text encoder, as in CLIP. Its folder also has the
+text encoder with its table of byte pairs. Computed text embeddings may replace these two files:
 
     text.onnx, bpe.txt.gz
     embeddings.npz or embeddings.safetensors
@@ -50,7 +50,7 @@ class ModelInfo(msgspec.Struct, frozen=True, kw_only=True):
     layout: str
     classes: tuple[str, ...]
     license: str = ""  # Text of the license; empty if not stated.
-    source: str = ""  # Name of the file it was copied from.
+    source: str = ""  # Name of the file that was copied.
     parts: dict[str, str] = {}  # Checksums of the other files of a pair, by name.
 
 
@@ -71,7 +71,7 @@ class Model:
         """Compare the files with their checksums.
 
         Raises:
-            ModelError: If a file is not the one that was registered.
+            ModelError: If a file differs from the one that was registered.
         """
         for part, registered in {FILE: self.about.sha256, **self.about.parts}.items():
             try:
@@ -87,13 +87,13 @@ class Model:
 
 
 class Models:
-    """Registered networks in a folder, by default the user's."""
+    """Registered networks in a folder; by default, that of `default_folder`."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder or default_folder()
 
     def add(self, name: str, file: Path, config: NetworkConfig, license: str = "") -> Model:
-        """Copy and register a detector; nothing is left behind if that fails.
+        """Copy a detector into the folder and register it; a failure leaves no files behind.
 
         Args:
             name: Name of the model.
@@ -121,8 +121,8 @@ class Models:
             name: Name of the model.
             pair: Files of the pair.
             config: Settings of the trial run that checks the files.
-            names: Names to choose from, stored with the pair; empty: those of its embeddings, or
-                COCO's.
+            names: Labels that the labeller chooses from, stored with the pair; empty: the names of
+                its embeddings, or those of COCO.
             license: Text of its license.
 
         Raises:
@@ -220,7 +220,7 @@ def default_folder() -> Path:
 def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
     """Open a detector by its registered name or its file.
 
-    Layout and class names of the configuration override the registered ones.
+    The layout and the class names in `config` override the registered ones.
 
     Args:
         model: `demo`, a registered name, or the path of an ONNX file.
@@ -256,9 +256,10 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
     """Open a pair of encoders by its registered name or a folder with its files.
 
     Args:
-        model: `demo`, a registered name, or a folder with files named as in this module.
+        model: `demo`, a registered name, or a folder with the files that the docstring of this
+            module lists.
         config: Settings.
-        names: Names to choose from; empty: those it was registered with.
+        names: Labels that the labeller chooses from; empty: those it was registered with.
 
     Raises:
         ConfigError: If there is no such model.
@@ -357,14 +358,14 @@ def _open_demo_detector(config: NetworkConfig) -> OnnxDetector:
 
 
 def _open_demo_labeller(config: DualEncoderConfig, names: Sequence[str] = ()) -> DualEncoder:
-    """Return the labeller of the package, which has no text encoder.
+    """Return the built-in labeller, which has a table of text embeddings and no text encoder.
 
     Args:
-        config: Settings; without `nothing`, that of the package is used.
-        names: Names to choose from; empty: all of its table.
+        config: Settings. If `nothing` is empty, `demo_networks.NOTHING` is used.
+        names: Labels that the labeller chooses from; empty: all names of the table.
 
     Raises:
-        ConfigError: If a name is not in its table.
+        ConfigError: If a name is not in the table.
     """
     pair = EncoderFiles(demo_networks.IMAGE_ENCODER, embeddings=demo_networks.TEXT_EMBEDDINGS)
     settings = replace(config, nothing=config.nothing or demo_networks.NOTHING)

@@ -26,15 +26,15 @@ class Network:
 
         Args:
             path: The ONNX file.
-            providers: Execution providers by preference, by onnxruntime's names or short: cpu,
-                cuda, tensorrt, openvino. One that this machine lacks is ignored with a warning; the
-                CPU is always the last.
+            providers: Execution providers by preference, as onnxruntime's names or short: cpu,
+                cuda, tensorrt, openvino. A provider that this machine lacks is ignored with a
+                warning. The CPU always comes last, even if it is not given.
             threads: Threads of one inference; with 1, the CPU gives bitwise equal results in every
                 run.
 
         Raises:
-            ConfigError: If a provider does not exist.
-            ModelError: If the file is no network.
+            ConfigError: If onnxruntime knows no provider of a given name.
+            ModelError: If the file does not exist or is no network.
         """
         wanted = available(providers)
         if not path.is_file():
@@ -53,20 +53,20 @@ class Network:
 
     @property
     def providers(self) -> list[str]:
-        """Execution providers it runs on, by onnxruntime's names, preferred ones first."""
+        """Execution providers that the network runs on, by onnxruntime's names, preferred first."""
         return list(self._session.get_providers())
 
     @property
     def inputs(self) -> list[tuple[str, str, list[int | str | None]]]:
-        """Name, type and shape of each input; a side without a fixed length is a name or None."""
+        """Name, type and shape of each input; an axis of variable length is a name or None."""
         return [(node.name, node.type, list(node.shape)) for node in self._session.get_inputs()]
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Metadata that its exporter wrote into the file.
+        """Metadata that the exporter of the network wrote into the file.
 
         Raises:
-            ModelError: If it is not text.
+            ModelError: If the metadata is not text.
         """
         try:
             return dict(self._session.get_modelmeta().custom_metadata_map)
@@ -84,7 +84,7 @@ class Network:
         except Exception as error:
             raise ModelError(f"its inference fails: {_first_line(error)}.") from error
         if not all(np.isfinite(output).all() for output in outputs):
-            raise ModelError("it yields NaN or infinity: its weights are damaged.")
+            raise ModelError("it yields NaN or infinity: its weights are damaged. Export it again.")
         return outputs
 
 

@@ -37,7 +37,7 @@ CAP = 256  # C_max: the numbers of one byte.
 
 
 def normalized(name: str) -> str:
-    """Return a name in lower case with single spaces for spaces, hyphens and underscores.
+    """Return a name in lower case, with one space for each run of spaces, hyphens or underscores.
 
     "TV-screen" becomes "tv screen".
     """
@@ -56,8 +56,8 @@ def class_names(
 
     Args:
         count: Number of classes.
-        given: Names from the user, which are preferred.
-        metadata: The entry `names` that exporters write, a dictionary or list of Python.
+        given: Names from the user, which override those of the metadata.
+        metadata: The metadata entry `names` of the network: a dictionary or list as Python source.
 
     Raises:
         ModelError: If the number of names is not `count`, or there are no names.
@@ -108,7 +108,10 @@ def _of_metadata(text: str) -> tuple[str, ...]:
     if isinstance(entry, dict) and set(entry) == set(range(len(entry))):
         entry = [entry[number] for number in range(len(entry))]
     if not isinstance(entry, list | tuple):
-        raise ModelError(f"its metadata names no classes: {text[:60]!r}.")
+        raise ModelError(
+            f"its metadata names no classes: {text[:60]!r}. Expected: a list, or a dictionary with "
+            "the keys 0, 1, ...; or give a file with one name per line."
+        )
     if not all(map(is_name, entry)):
         raise ModelError(
             f"its metadata has names that are not of 1 to {LONGEST} characters: {text[:60]!r}."
@@ -117,15 +120,15 @@ def _of_metadata(text: str) -> tuple[str, ...]:
 
 
 def canonical(name: str) -> str:
-    """Return the one name for all its synonyms: "couch" for "Sofa"."""
+    """Return the canonical form of a name, the same for all synonyms: "couch" for "Sofa"."""
     plain = normalized(name)
     return _table("same").get(plain, plain)
 
 
 def coco_class(name: str) -> str | None:
-    """Return the class of COCO that its annotators would have used: "dining table" for "desk".
+    """Return the COCO class that covers an object of this name: "dining table" for "desk".
 
-    None if COCO has no class for it.
+    This is the class that COCO's annotators would have chosen; None if there is no such class.
     """
     plain = canonical(name)
     found = _table("kinds").get(plain, plain)
@@ -133,10 +136,10 @@ def coco_class(name: str) -> str | None:
 
 
 def answers_to(query: str) -> tuple[str, ...]:
-    """Return the names that answer a query, nearest first.
+    """Return the class names that match a text query, the nearest first.
 
-    These are the name itself, the class of COCO above it, since detectors know no finer word, and
-    its own kinds.
+    The first is the query's canonical name. The COCO class that includes it follows, because
+    detectors may only know that class. The last are the names of its own subclasses.
     """
     plain = canonical(query)
     kinds = _table("kinds")
@@ -158,11 +161,12 @@ def _table(column: str) -> Mapping[str, str]:
 class Vocabulary:
     """Vocabulary of a map: `background`, `other`, the 80 names of COCO, then new names in order.
 
-    Synonyms share an index, see `synonyms.yaml`. Once there are `cap` names, a new one is `other`.
+    Synonyms have the same index, see `synonyms.yaml`. Once the vocabulary has `cap` names, each new
+    name gets the index of `other`.
     """
 
     def __init__(self, cap: int = CAP) -> None:
-        """Create a vocabulary with the names that all start with.
+        """Create a vocabulary with its initial names: `background`, `other` and those of COCO.
 
         Args:
             cap: Maximum number of names.
@@ -172,8 +176,8 @@ class Vocabulary:
         """
         if cap < len(FIRST_NAMES):
             raise ConfigError(
-                f"a vocabulary of {cap} has no room for the {len(FIRST_NAMES)} names it starts "
-                f"with: the cap must be at least {len(FIRST_NAMES)}."
+                f"cap={cap}, the maximum number of names in a vocabulary, must be at least "
+                f"{len(FIRST_NAMES)}, the number of its initial names."
             )
         self.cap = cap
         self._names: list[str] = [*FIRST_NAMES]
@@ -200,9 +204,9 @@ class Vocabulary:
         return self._indices.get(canonical(name))
 
     def index(self, name: str) -> int:
-        """Return the index of a name, which is added if it is not known.
+        """Return the index of a name, and add the name if it is unknown.
 
-        Without space for it, or for an empty name, that of `other`.
+        If the vocabulary is full or the name is empty, return the index of `other`.
         """
         plain = canonical(name)
         if plain in self._indices:
@@ -220,21 +224,23 @@ class Vocabulary:
 
     @staticmethod
     def unpack(packed: dict[str, Any]) -> "Vocabulary":
-        """Restore a vocabulary from `pack`, even if some of its names are synonyms now.
+        """Restore a vocabulary from `pack`.
+
+        All names keep their indices, even if a newer `synonyms.yaml` makes some of them synonyms.
 
         Raises:
-            ValueError: If these are not the names of a vocabulary.
+            ValueError: If the names do not start with the initial ones, repeat or exceed the cap.
         """
         names, vocabulary = packed["names"], Vocabulary(packed["cap"])
         start = len(FIRST_NAMES)
         if tuple(names[:start]) != FIRST_NAMES or not start <= len(names) <= vocabulary.cap:
             raise ValueError(
-                f"{len(names)} names must start with those of every vocabulary and be at most "
-                f"{vocabulary.cap}"
+                f"{len(names)} names must start with the {start} initial ones of every vocabulary "
+                f"and be at most {vocabulary.cap}"
             )
         vocabulary._names = list(names)
         vocabulary._indices = {name: index for index, name in enumerate(names)}
         if len(vocabulary._indices) != len(names):
-            raise ValueError("each name of a vocabulary must be there once")
+            raise ValueError("a name of the vocabulary is repeated; each name must occur once")
         vocabulary.refused = packed["refused"]
         return vocabulary

@@ -1,7 +1,8 @@
 """Input and output of networks of the YOLO family.
 
-Every box belongs to a cell of a grid over the input, one grid for each stride. So the number of
-boxes determines the layout. It is verified by the distance of the boxes from their cells.
+The networks predict boxes in the cells of grids over the input, one grid for each stride. The
+number of boxes therefore determines the layout of the output. As a check, the predicted boxes must
+lie near their cells.
 
             in                             out
     yolov5  RGB 0..1, centered             [1, 3 cells, 5 + C] cx, cy, w, h, objectness, classes
@@ -62,11 +63,11 @@ LAYOUTS = {
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Cells of the boxes.
+    """Grid cells in which a network predicts its boxes.
 
     Attributes:
-        corners_px: Upper left corners, [N, 2], pixels of the input.
-        strides_px: Sides, [N, 1], pixels of the input.
+        corners_px: Upper left corners of the cells, [N, 2], pixels of the input.
+        strides_px: Sides of the cells, [N, 1], pixels of the input.
         boxes_per_cell: Number of boxes per cell.
     """
 
@@ -99,9 +100,10 @@ class Head:
     is_decoded: bool  # False: boxes are offsets to their cells and log sizes.
 
     def candidates(self, output: np.ndarray, score_min: float) -> Candidates:
-        """Return the boxes of an output with a best class of at least this score.
+        """Return the boxes of an output whose best class has at least the score `score_min`.
 
-        The score is objectness * class, or that of the class alone without objectness.
+        The score is the product of objectness and class score. In layouts without objectness, it is
+        the class score.
         """
         rows = _rows(output, self.layout)
         scores = self._scores(rows)  # One column excludes most boxes.
@@ -119,7 +121,7 @@ class Head:
         """Check that scores are probabilities and boxes lie near their cells.
 
         Raises:
-            ModelError: If not.
+            ModelError: If a score is outside 0..1, or boxes lie far from their cells.
         """
         scores = _rows(output, self.layout)[:, 4:]
         low, high = float(scores.min()), float(scores.max())
@@ -131,7 +133,8 @@ class Head:
         if self.cells_apart(output) > CELLS_APART:
             raise ModelError(
                 f"read as {self.layout.name}, boxes lie {self.cells_apart(output):.0f} cells from "
-                "where they belong: export the network with boxes in pixels."
+                f"their own grid cells, expected at most {CELLS_APART:g}: export the network with "
+                "boxes in pixels."
             )
 
     def cells_apart(self, output: np.ndarray) -> float:
@@ -163,9 +166,9 @@ def detect_layout(output: np.ndarray, input_px: tuple[int, int], wanted: str = "
     """Determine the layout of a network's output.
 
     Args:
-        output: Its only output for an image.
-        input_px: Width and height of its input.
-        wanted: Name of the layout; empty: determined by the shape.
+        output: The only output of the network, for one image.
+        input_px: Width and height of the network's input.
+        wanted: Name of the layout; empty: determine it from the shape of the output.
 
     Raises:
         ModelError: If the output has no known layout, or not the wanted one.
@@ -205,7 +208,7 @@ def layout_named(name: str) -> Layout:
 
 
 def find_grid(count: int, input_px: tuple[int, int]) -> Grid | None:
-    """Return the grid with `count` boxes, or None.
+    """Return the grid for a network that predicts `count` boxes, or None if there is none.
 
     Grids have consecutive strides and one or three boxes per cell. Boxes are sorted by stride, the
     finest first. With three per cell, the grid is repeated three times. No two grids of an input
@@ -233,14 +236,14 @@ def _grid(input_px: tuple[int, int], strides: tuple[int, ...], boxes_per_cell: i
 
 
 def _layout_of(output: np.ndarray, input_px: tuple[int, int]) -> Layout:
-    """Return the layout with an axis that has as many boxes as a grid."""
+    """Return the layout whose box axis in this output has the length of a possible grid."""
     for layout in LAYOUTS.values():
         grid = find_grid(len(_rows(output, layout)), input_px)
         if grid is not None and grid.boxes_per_cell == layout.boxes_per_cell:
             return layout
     raise ModelError(
         f"its output {list(output.shape)} for an input of {input_px[0]}x{input_px[1]} pixels is "
-        f"none that is known. Expected: {EXPECTED}."
+        f"of no known layout. Expected: {EXPECTED}."
     )
 
 
@@ -257,7 +260,7 @@ def _corners(boxes: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Letterbox:
-    """Placement of an image in the input of a network: scaled in proportion, on gray.
+    """Placement of an image in the input of a network: scaled in proportion and padded with gray.
 
     Attributes:
         image_px: Width and height of the image.
@@ -292,9 +295,9 @@ class Letterbox:
     def to_image(self, boxes: np.ndarray) -> np.ndarray:
         """Return boxes [M, 4] of the input in pixels of the image, clipped to it.
 
-        Boxes are x0, y0, x1, y1. Networks measure from the corner of the first pixel, this project
-        from its center: x_image = (x_input - offset) * W / w - 0.5. So the image covers -0.5 .. W -
-        0.5.
+        Boxes are x0, y0, x1, y1. Networks place the origin at the corner of the first pixel; this
+        project places it at the pixel's center. So x_image = (x_input - offset) * W / w - 0.5, and
+        the image covers -0.5 to W - 0.5.
         """
         scale = np.divide(self.image_px, self.inner_px)
         corners = (boxes.reshape(-1, 2, 2) - self.offset_px) * scale

@@ -175,7 +175,7 @@ def test_normalized_boxes_raise(tmp_path, layout: str) -> None:
 
 
 def test_box_count_of_no_known_grid_raises(tmp_path, layout) -> None:
-    with pytest.raises(ModelError, match=r"none that is known. Expected: \[1, N, 5 \+ C\]"):
+    with pytest.raises(ModelError, match=r"of no known layout. Expected: \[1, N, 5 \+ C\]"):
         open_detector(tmp_path, layout, width=120, height=88)
 
 

@@ -51,7 +51,7 @@ def test_new_names_above_the_cap_are_other() -> None:
 
 
 def test_cap_below_the_first_names_raises() -> None:
-    with pytest.raises(ConfigError, match="no room for the 82 names"):
+    with pytest.raises(ConfigError, match="must be at least 82, the number"):
         Vocabulary(cap=81)
 
 
