@@ -4,11 +4,14 @@ A reference point p with gray level s and normal n lies at p_c = T_camera_refere
 Each point has two residuals:
 
     photometric   r = I(project(p_c)) - gain s - bias
-    geometric     r = (R n) . (p_c - q),  q the camera's surface at the nearest pixel
+    geometric     r = (R n) . (p_c - q)
+
+I is the gray image of the frame, and R is the rotation of T_camera_reference. q is the 3D point
+that the frame's depth image measures at the pixel nearest to project(p_c).
 
 The weights follow a t-distribution with 5 degrees of freedom, w = 6 / (5 + (r / sigma)^2) / sigma^2
 (Kerl, Sturm and Cremers, "Robust odometry estimation for RGB-D cameras", 2013, III). The unknowns
-are rotation and translation of T_reference_camera * exp(xi), then gain and bias.
+are the pose increment xi in T_reference_camera * exp(xi), gain and bias.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -48,9 +51,9 @@ class ResidualConfig:
 
 @dataclass(frozen=True, slots=True)
 class BrightnessModel:
-    """Brightness change and noise of a frame, estimated together with the pose.
+    """Brightness change and residual noise of a frame relative to its reference keyframe.
 
-    The defaults are the start values of the estimation.
+    Alignment estimates them together with the pose, starting from the defaults.
     """
 
     gain: float = 1.0
@@ -93,7 +96,7 @@ def normal_equations(
 ) -> NormalEquations:
     """Linearize the residuals of reference points in one pyramid level of a frame.
 
-    The result is bitwise reproducible on one instruction set.
+    Equal input gives a bitwise equal result on CPUs with the same instruction set.
 
     Args:
         points: Reference points, [7, N]; see `ReferencePoints`.
@@ -201,8 +204,9 @@ def align(
 ) -> Alignment:
     """Align a frame to reference points by Gauss-Newton, from an initial guess.
 
-    Each iteration also estimates the noise of intensity and depth (Kerl et al. 2013, equation 13),
-    which weighs color against geometry. Equal input gives a bitwise equal result.
+    Each iteration also estimates the noise of intensity and depth (Kerl et al. 2013, equation 13).
+    The noise sets the relative weight of photometric and geometric residuals. Equal input gives a
+    bitwise equal result.
 
     Args:
         reference: Surface points of the reference keyframe.
@@ -236,7 +240,7 @@ def evaluate(
     iterations: int = 0,
     converged: bool = True,
 ) -> Alignment:
-    """Return the alignment of a given pose, measured on the finest level without optimization.
+    """Evaluate the residuals of a given pose on the finest pyramid level, without optimization.
 
     Args:
         reference: Surface points of the reference keyframe.
@@ -244,8 +248,8 @@ def evaluate(
         T_camera_reference: The pose, [4, 4].
         appearance: Brightness change and noise of the frame.
         config: Settings.
-        iterations: Number of iterations to record in the result.
-        converged: Convergence to record in the result.
+        iterations: Value of `Alignment.iterations` in the result.
+        converged: Value of `Alignment.converged` in the result.
     """
     T = se3.orthonormalize(T_camera_reference)
     points = reference.points[0]
@@ -304,7 +308,7 @@ def _image_motion_px(step: np.ndarray, target: Level, reference: ReferencePoints
 
 
 def _pose_information(equations: NormalEquations) -> np.ndarray:
-    """Return the information [6, 6] of the pose; gain and bias are marginalized out (Schur)."""
+    """Return the information [6, 6] of the pose; a Schur complement marginalizes gain and bias."""
     hessian = equations.hessian
     brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
     cross = hessian[POSE, BRIGHTNESS]

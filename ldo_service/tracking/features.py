@@ -1,12 +1,13 @@
 """Poses from sparse features with PnP RANSAC, and from point clouds with GICP.
 
-Both methods need no accurate initial guess; they serve large motions and relocalization. ORB is
-fast and sufficient from frame to frame. SIFT costs ten times as much and also matches surfaces at
-half or twice the distance.
+Neither method needs an accurate initial guess, so both serve large motions and relocalization. ORB
+is fast and sufficient from frame to frame. SIFT takes ten times as long and also matches surfaces
+at half or twice the distance.
 
-Without texture, the pose comes from shape alone: `small_gicp` pairs each point of a cloud with its
-nearest neighbors. It converges from farther away than `alignment`, which pairs along the ray, and
-is less accurate. Conventions: `ldo_service.geometry`.
+GICP (`small_gicp`) estimates the pose of scenes without texture from their shape. It pairs each
+point with its nearest neighbors in the other cloud. The module `alignment` pairs points along the
+viewing ray instead. GICP converges from larger initial errors than `alignment` and is less
+accurate. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Sequence
@@ -73,14 +74,14 @@ class Features:
 
 @dataclass(frozen=True, slots=True)
 class FeaturePose:
-    """Pose from feature matches, with the number of RANSAC inliers."""
+    """Pose of a frame from feature matches, with the number of RANSAC inliers."""
 
     T_camera_reference: np.ndarray  # [4, 4]
     inliers: int
 
 
 def detect(view: Pyramid, config: FeatureConfig) -> Features:
-    """Detect ORB features in the full-resolution image, with the measured depth of each."""
+    """Detect ORB features in the full-resolution image, and read the measured depth of each."""
     orb = cv2.ORB.create(nfeatures=config.count, fastThreshold=config.fast_threshold)
     keypoints, descriptors = orb.detectAndCompute(view.gray, None)
     if descriptors is None:
@@ -91,7 +92,7 @@ def detect(view: Pyramid, config: FeatureConfig) -> Features:
 def detect_sift(
     gray: np.ndarray, depth_m: np.ndarray, camera: Camera, count: int, config: FeatureConfig
 ) -> Features:
-    """Detect the strongest SIFT features (Lowe 2004), with the measured depth of each.
+    """Detect the strongest SIFT features (Lowe 2004), and read the measured depth of each.
 
     Args:
         gray: Image, [H, W] uint8.
@@ -119,9 +120,12 @@ def _measured(
 
 
 def match(reference: Features, frame: Features, config: FeatureConfig) -> np.ndarray:
-    """Return index pairs [M, 2] (reference, frame) that pass the ratio test.
+    """Match features by descriptor, with Lowe's ratio test.
 
-    Each feature occurs in at most one pair.
+    Each feature occurs in at most one match.
+
+    Returns:
+        Index pairs, [M, 2]: a feature of the reference, then a feature of the frame.
     """
     if min(len(reference.pixels), len(frame.pixels)) < 2:
         return np.zeros((0, 2), int)
@@ -155,8 +159,8 @@ def _nearest_gradients(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the nearest frame descriptor of each reference descriptor, by Euclidean distance.
 
-    Returns the same as `_nearest_bits`. The sums are integers below 2^24, which float32 holds
-    exactly in any order of summation.
+    Returns the same as `_nearest_bits`. The sums are integers below 2^24. float32 represents them
+    exactly, so the result does not depend on the order of summation.
     """
     a, b = reference.astype(np.float32), frame.astype(np.float32)
     squares = np.sum(a * a, axis=1)[:, None] + np.sum(b * b, axis=1) - 2.0 * (a @ b.T)
@@ -169,12 +173,12 @@ def _nearest_gradients(
 def estimate_pose(
     reference: Features, frame: Features, camera: Camera, config: FeatureConfig
 ) -> FeaturePose | None:
-    """Estimate the pose of a frame from the 3D points of the reference features.
+    """Estimate the pose of a frame by PnP RANSAC from the 3D points of the reference features.
 
-    RANSAC is seeded here, so that equal input gives an equal result.
+    This function seeds RANSAC, so that equal input gives an equal result.
 
     Returns:
-        The pose, or None with fewer inliers than `config.min_inliers`.
+        The pose, or None if there are fewer inliers than `config.min_inliers`.
     """
     pairs = match(reference, frame, config)
     pairs = pairs[reference.points_camera[pairs[:, 0], 2] > 0]
@@ -261,6 +265,6 @@ def _cloud(points: np.ndarray, spacing_m: float) -> tuple[small_gicp.PointCloud,
 
 
 def _points(level: Level) -> np.ndarray:
-    """Return the points [N, 3] of the pixels with depth, meters in the camera."""
+    """Return the 3D points [N, 3] of all pixels with depth, in meters in the camera frame."""
     points = level.camera.rays() * level.depth_m[..., None]
     return points[level.depth_m > 0]

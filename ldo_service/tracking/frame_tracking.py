@@ -1,9 +1,9 @@
 """Frame-to-keyframe tracking: the pose of a frame against its reference keyframe.
 
-The tracker aligns a frame from the pose that constant velocity predicts. If the result is not OK,
-it aligns the frame from all other initial guesses too and chooses the best result. The tracking
-status follows from the quality of that result. The keyframe database serves to relocalize a LOST
-camera. `odometry` decides whether the frame becomes a keyframe.
+The tracker aligns a frame from the pose that constant velocity predicts. If the tracking status of
+the result is not OK, the tracker also aligns the frame from all other initial guesses. It chooses
+the best result, whose quality determines the tracking status. A LOST camera is relocalized in the
+keyframe database. The module `odometry` decides whether the frame becomes a keyframe.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -35,8 +35,8 @@ log = logging.getLogger(__name__)
 class FrameTracker:
     """Pose tracking of one camera, frame by frame.
 
-    `state` holds everything that the next frame depends on. Equal frames give bitwise equal
-    results.
+    `state` contains everything that the result of the next frame depends on. Equal sequences of
+    frames give bitwise equal results.
     """
 
     def __init__(self, config: OdometryConfig) -> None:
@@ -61,17 +61,17 @@ class FrameTracker:
 
     @property
     def can_reuse_keyframes(self) -> bool:
-        """True once the map has enough keyframes (`returning.after`) for keyframe reuse."""
+        """True once at least `returning.after` keyframes were made; 0 there disables the reuse."""
         return 0 < self.config.returning.after <= self.state.next_id
 
     def track(self, frame: RgbdFrame, prior: PriorPose | None = None) -> TrackedFrame:
-        """Return the pose of a frame. The frame may be blank.
+        """Track a frame, and return its pose with the tracking status.
 
         Args:
-            frame: The frame.
-            prior: Camera pose from another odometry. It is one more initial guess, and supplies
-                dead reckoning while tracking is LOST. A frame is OK only if its images confirm
-                the pose.
+            frame: The frame; it may have neither texture nor depth.
+            prior: Camera pose from another odometry, such as wheels. It is an additional initial
+                guess. A new submap after a loss starts at the pose that it predicts. It does not
+                replace the images: a frame is OK only if its images confirm the pose.
         """
         view, keyframe = self.view(frame), self.state.keyframe
         self._prior = prior
@@ -102,8 +102,8 @@ class FrameTracker:
     def start_submap(self, frame: RgbdFrame) -> TrackedFrame:
         """Return the LOST frame just tracked as the first frame of a new submap.
 
-        Odometry continues from the last pose before the loss, so that the odometry frame does not
-        jump. The motion since then is missing unless a prior supplies it.
+        The new submap starts at the last pose before the loss, so that the pose in odometry does
+        not jump. If an odometry prior measured the motion during the loss, that motion is added.
         """
         submap = len(self.state.submaps.roots)
         log.info("tracker: starting submap %d at frame %d.", submap, frame.index)
@@ -119,7 +119,7 @@ class FrameTracker:
         )
 
     def restart_at(self, frame: RgbdFrame, T_odom_camera: np.ndarray) -> None:
-        """Start a submap with the frame just tracked.
+        """Reset the tracking state, and start a submap with the frame just tracked.
 
         Args:
             frame: The frame.
@@ -143,20 +143,20 @@ class FrameTracker:
         """Relocalize the frame just tracked in a keyframe database.
 
         Returns:
-            The keyframe that the frame shows, and its alignment to that keyframe; None if none is
+            The matching keyframe and the alignment of the frame to it; None if no keyframe is
             verified.
         """
         found = self._relocalize(self.view(frame), places, is_lost=False)
         return None if found is None else (found[0], found[1].alignment)
 
     def view(self, frame: RgbdFrame) -> Pyramid:
-        """Return the pyramid of a frame; that of the last frame is cached."""
+        """Return the image pyramid of a frame; the pyramid of the last frame is cached."""
         if self._view is None or self._view[0] is not frame:
             self._view = (frame, pyramid_of(frame, self.config.pyramid))
         return self._view[1]
 
     def restore(self, state: OdometryState) -> None:
-        """Continue from a state."""
+        """Continue tracking from a saved state."""
         self.state, self._view = state, None
 
     # --- initial guesses and the tracking status --------------------------------------------------
@@ -168,14 +168,17 @@ class FrameTracker:
         )
 
     def _is_usable(self, view: Pyramid) -> bool:
-        """Return whether a view has enough measured depth to align frames to it."""
+        """Return whether a frame has enough measured depth to be tracked or become a keyframe."""
         measured = float(np.mean(view.levels[0].depth_m > 0))
         return measured >= self.config.tracking_quality.min_paired
 
     def _track_against(
         self, keyframe: ReferenceKeyframe, view: Pyramid, stamp_ns: int
     ) -> PoseHypothesis:
-        """Align from the predicted pose; if the result is not OK, from all other guesses too."""
+        """Align from the predicted pose, and try the other initial guesses if that is not enough.
+
+        It is not enough if the status is not OK or if the image moved far since the last frame.
+        """
         motion = self.state.motion
         T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
         resting = T_keyframe_odom @ motion.T_odom_camera
@@ -190,9 +193,10 @@ class FrameTracker:
         return self._guesses.align_from_all_guesses(predicted, keyframe, view, resting, carried)
 
     def _dead_reckoned_pose(self) -> np.ndarray | None:
-        """Return T_odom_camera [4, 4] by the prior's motion since the last OK frame.
+        """Return T_odom_camera [4, 4] of this frame by dead reckoning with the odometry prior.
 
-        Return None if the prior does not cover that motion.
+        Dead reckoning adds the motion of the prior since the last OK frame. The result is None if
+        the prior does not cover that time.
         """
         start, now = self.state.dead_reckoning_start, self._prior
         if start is None or now is None:
@@ -209,7 +213,8 @@ class FrameTracker:
     def _places_when_lost(self) -> KeyframeDatabase:
         """Add the last mapping keyframe to the database, and return the database.
 
-        The mapping keyframe is closer to the last camera pose than the reference keyframe.
+        The mapping keyframe is newer than the reference keyframe and thus closer to the last camera
+        pose, which helps to relocalize the camera.
         """
         before = self.state
         if before.mapping_keyframe is not None:
@@ -229,7 +234,7 @@ class FrameTracker:
         )
 
     def _places_of_other_submaps(self, submap: int) -> KeyframeDatabase:
-        """Return the keyframe records of all submaps that are not merged with a submap."""
+        """Return the keyframe records of all submaps that are not merged with the given one."""
         state = self.state
         are_merged = state.submaps.are_merged
         return KeyframeDatabase(
@@ -239,7 +244,10 @@ class FrameTracker:
     def _search_other_submaps(
         self, tracked: TrackedFrame, keyframe: ReferenceKeyframe, view: Pyramid
     ) -> TrackedFrame:
-        """Search other submaps at intervals; a confirmed match makes the frame a keyframe."""
+        """Search the keyframes of other submaps at intervals.
+
+        If a match is confirmed, the returned frame needs a keyframe, which then merges the submaps.
+        """
         before, config = self.state.submaps, self.config.submaps
         if tracked.status is not TrackingStatus.OK or not before.is_search_due(config):
             return tracked
@@ -337,7 +345,7 @@ class FrameTracker:
     ) -> np.ndarray | None:
         """Return the dynamic mask of a frame, [H, W] bool.
 
-        Pixels of the keyframe that have moved since then are added to its ignore mask.
+        Surface of the keyframe that has moved away since is added to the keyframe's ignore mask.
         """
         config = self.config.moving
         if not config.is_on:

@@ -1,8 +1,8 @@
 """Database of compressed keyframes for relocalization and keyframe reuse.
 
-A record holds a thumbnail of the keyframe and its strongest ORB features with their 3D points. It
-also holds the compressed gray image and depth at working resolution, from which the keyframe is
-rebuilt when frames are aligned to it again. Conventions: `ldo_service.geometry`.
+A record contains a thumbnail of the keyframe and its strongest ORB features with their 3D points.
+It also contains the compressed gray image and depth at working resolution. The keyframe is rebuilt
+from these images when frames are aligned to it again. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Sequence, Set
@@ -92,9 +92,9 @@ class KeyframeRecord:
         return Features(self.camera.project(points), points, self.descriptors)
 
     def sift_features(self, config: FeatureConfig) -> Features:
-        """Return SIFT features of the gray image, half as many as of a frame.
+        """Return the SIFT features of the gray image, at most `count_across_scales` / 2.
 
-        They are detected on the first call and cached.
+        The features are detected on the first call and cached.
         """
         if "_across_scales" not in self.__dict__:
             image = self._gray, self.depth_m, self.camera
@@ -103,9 +103,9 @@ class KeyframeRecord:
         return self.__dict__["_across_scales"]
 
     def history(self, otherwise: ResidualHistory) -> ResidualHistory:
-        """Return the residual history that frames aligned to this keyframe are compared with.
+        """Return the usual residual noise of frames near this keyframe, to judge an alignment by.
 
-        Noise differs between scenes, so the record's own noise is used if it is known.
+        Noise differs between scenes, so the history is made of the noise stored in this record.
 
         Args:
             otherwise: The history to return if the noise of this record is unknown.
@@ -115,7 +115,7 @@ class KeyframeRecord:
         return ResidualHistory((self.intensity_sigma,), (self.depth_noise_scale,))
 
     def pack(self) -> dict[str, Any]:
-        """Return arrays and plain values, the same object each time."""
+        """Return the record as arrays and plain values; each call returns the same object."""
         return self._packed
 
     @cached_property
@@ -125,7 +125,10 @@ class KeyframeRecord:
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "KeyframeRecord":
-        """Return the record from its packed form; version 0.1 wrote `segment` for `submap`."""
+        """Return the record from its packed form.
+
+        A packed form of version 0.1 has the key `segment` instead of `submap`; both are read.
+        """
         values = {**kept, "camera": Camera.of(kept["camera"])}
         if "segment" in values:
             values["submap"] = values.pop("segment")
@@ -138,14 +141,14 @@ class KeyframeRecord:
         return sum(array.nbytes for array in arrays) + len(self.gray) + len(self.depth)
 
     def keyframe(self, config: PyramidConfig) -> ReferenceKeyframe:
-        """Rebuild the keyframe for alignment; the result is bitwise equal each time."""
+        """Rebuild the keyframe, so that frames can be aligned to it; calls are bitwise equal."""
         view = build_pyramid(self._gray, self.depth_m, self.camera, config)
         return ReferenceKeyframe(
             view, self.T_odom_keyframe, self.id, self.submap, stored_features=self.features
         )
 
     def without(self, left_out: np.ndarray) -> "KeyframeRecord":
-        """Return the record without the features, intensity and depth of masked pixels.
+        """Return a copy of the record without the features, intensity and depth of masked pixels.
 
         Args:
             left_out: Mask, [H, W] bool, of the size of `camera`.
@@ -186,7 +189,7 @@ def make_keyframe_record(
         keyframe: The keyframe.
         features: Settings of ORB.
         config: Settings of the database.
-        history: Noise of the frames tracked before the keyframe; the record keeps its medians.
+        history: Noise of the frames tracked before the keyframe. Its medians are stored.
     """
     view, level = keyframe.view, keyframe.view.levels[0]
     left_out = resized(keyframe.ignore_mask, level.depth_m.shape)
@@ -220,12 +223,12 @@ def _depth_bytes(depth_m: np.ndarray, left_out: np.ndarray) -> bytes:
 
 
 def _are_still(points: np.ndarray, camera: Camera, left_out: np.ndarray) -> np.ndarray:
-    """Return which points are measured and outside the mask.
+    """Return the mask of the points that have a measured depth and project outside `left_out`.
 
     Args:
         points: Points in the camera, [N, 3] meters; z = 0 where unmeasured.
         camera: Intrinsics of the mask.
-        left_out: Mask, [H, W] bool.
+        left_out: Pixels to exclude, [H, W] bool.
 
     Returns:
         [N] bool.
@@ -238,7 +241,7 @@ def _are_still(points: np.ndarray, camera: Camera, left_out: np.ndarray) -> np.n
 
 
 def make_thumbnail(view: Pyramid) -> np.ndarray:
-    """Return the image at 20x15 with brightness and contrast normalized, [300] int8."""
+    """Return a thumbnail of a frame, 20x15 pixels as [300] int8, with normalized contrast."""
     small = cv2.resize(view.gray, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64)
     small -= small.mean()
     steps = CONTRAST * small / max(float(small.std()), 1.0)
@@ -259,8 +262,9 @@ class KeyframeDatabase:
     ) -> "KeyframeDatabase":
         """Return the database with a new record.
 
-        The new record replaces an older one at the same place. If there are too many records, the
-        one whose neighbors are closest to each other is removed.
+        The new record replaces the nearest older record if their poses differ by less than
+        `config.same`. If the database then exceeds `config.count` records, one record is removed:
+        the one whose previous and next record are closest to each other.
 
         Args:
             place: The new record.
@@ -273,14 +277,17 @@ class KeyframeDatabase:
         return KeyframeDatabase(kept)
 
     def with_reused(self, place: KeyframeRecord) -> "KeyframeDatabase":
-        """Return the database with a known record moved to the end, at its new odometry pose."""
+        """Return the database with the record of a reused keyframe moved to the end.
+
+        The given record replaces the older one with the same id; its pose in odometry is new.
+        """
         return KeyframeDatabase((*(other for other in self.all if other.id != place.id), place))
 
     def without(self, left_out: np.ndarray, keyframe: int) -> "KeyframeDatabase":
         """Return the database with pixels of one record masked; see `KeyframeRecord.without`.
 
         Args:
-            left_out: Mask, [H, W] bool.
+            left_out: Pixels to exclude, [H, W] bool.
             keyframe: Id of the record.
         """
         places = (p.without(left_out) if p.id == keyframe else p for p in self.all)
@@ -295,7 +302,8 @@ class KeyframeDatabase:
     ) -> tuple[KeyframeRecord, ...]:
         """Return all records except the one that a new record replaces.
 
-        That is the nearest one within `config.same`; the newest `config.recent` are never replaced.
+        The replaced record is the nearest one within the distance `config.same`. The newest
+        `config.recent` records are never replaced.
         """
         older = self.all[: max(0, len(self.all) - config.recent)]
         if not older:
@@ -313,17 +321,18 @@ class KeyframeDatabase:
 
     @cached_property
     def _thumbnails(self) -> np.ndarray:
-        """Thumbnails [N, 300] float32; integers, so that sums of products are exact."""
+        """Thumbnails [N, 300] as float32. Their values are integers, so correlations are exact."""
         return np.array([place.thumbnail for place in self.all], np.float32).reshape(
             -1, THUMBNAIL[0] * THUMBNAIL[1]
         )
 
 
 def neighbor_distances(path: Sequence[KeyframeRecord]) -> np.ndarray:
-    """Return the distance between the two neighbors of each inner record of a path.
+    """Return the distance between the previous and the next record of each inner record of a path.
 
     Returns:
-        [N-2] rad as of `motion.image_motion_rad`; infinite if the neighbors belong to two submaps.
+        [N-2], rad, as `motion.image_motion_rad` defines it; infinite if the previous and the next
+        record are in different submaps.
     """
     median_depth_m = np.array([place.median_depth_m for place in path[1:-1]])
     apart = image_motions_rad(se3.inverse(_poses(path[:-2])) @ _poses(path[2:]), median_depth_m)
@@ -335,7 +344,7 @@ def _apart(places: tuple[KeyframeRecord, ...], other: KeyframeRecord) -> np.ndar
     """Return the distance of each record to another one.
 
     Returns:
-        [N] rad as of `motion.image_motion_rad`; infinite for records of another submap.
+        [N], rad, as `motion.image_motion_rad` defines it; infinite for records of another submap.
     """
     moved = se3.inverse(_poses(places)) @ other.T_odom_keyframe
     submap = np.array([place.submap for place in places])
@@ -350,14 +359,14 @@ def load_keyframe_database(folder: Path) -> KeyframeDatabase:
     """Load the keyframe database of a finished run from its folder.
 
     Raises:
-        DataError: The folder has no database, or it is unreadable or empty.
+        DataError: The folder has no keyframe database, or the database is unreadable or empty.
     """
     files = [folder / name for name in (DATABASE_FILE, OLD_DATABASE_FILE)]
     path = next((file for file in files if file.is_file()), None)
     if path is None:
         raise DataError(
-            f"{folder} has no {DATABASE_FILE}, so localization in it is impossible. Give the "
-            "folder that `ldo run SOURCE --out DIR` wrote; repeat a run of an older version."
+            f"{folder} has no {DATABASE_FILE}, which localization needs. Give a folder that "
+            "`ldo run SOURCE --out DIR` wrote. If an older version wrote it, repeat the run."
         )
     try:
         kept = decode_state(path.read_bytes())
@@ -366,10 +375,11 @@ def load_keyframe_database(folder: Path) -> KeyframeDatabase:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
     except (msgspec.DecodeError, ValueError, KeyError, TypeError) as error:
         raise DataError(
-            f"{path} is not a keyframe database of `ldo run`: {error!r}. Repeat the run."
+            f"{path} is not a valid keyframe database ({error!r}). Repeat the run (`ldo run`)."
         ) from error
     if not len(places):
         raise DataError(
-            f"{path} holds no keyframe record: the run made no keyframe. Repeat the run."
+            f"{path} contains no keyframe, because the run made none. Check that the recording "
+            "has depth images, and repeat the run."
         )
     return places

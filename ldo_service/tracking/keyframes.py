@@ -75,14 +75,14 @@ class ReferenceKeyframe:
 
     @cached_property
     def reference(self) -> ReferencePoints:
-        """Surface points that frames are aligned to, without the masked pixels."""
+        """Surface points that frames are aligned to; masked pixels have none."""
         masks = [mask for mask in (self.ignore_mask, self.dynamic_class_mask) if mask is not None]
         return build_reference(self.view, np.logical_or.reduce(masks) if masks else None)
 
     def features(self, config: FeatureConfig) -> Features:
         """Return the ORB features.
 
-        They are detected on the first call and cached; most keyframes are never used for this.
+        The features are detected on the first call and cached. Most keyframes never need them.
         """
         if self.stored_features is not None:
             return self.stored_features
@@ -91,7 +91,7 @@ class ReferenceKeyframe:
         return self.__dict__["_features"]
 
     def pack(self) -> dict[str, Any]:
-        """Return arrays and plain values, the same object each time."""
+        """Return the keyframe as arrays and plain values; each call returns the same object."""
         return self._packed
 
     @cached_property
@@ -112,7 +112,7 @@ class ReferenceKeyframe:
 
     @staticmethod
     def unpack(kept: dict[str, Any], config: PyramidConfig) -> "ReferenceKeyframe":
-        """Return the keyframe from its packed form, under the same configuration."""
+        """Return the keyframe from its packed form; `config` must equal that of the packed one."""
         features = None if kept["features"] is None else Features(**kept["features"])
         view = build_pyramid(kept["gray"], kept["depth_m"], Camera.of(kept["camera"]), config)
         return ReferenceKeyframe(
@@ -134,13 +134,13 @@ def needs_keyframe(
     frames: int,
     config: KeyframeConfig,
 ) -> bool:
-    """Return whether a frame should become a keyframe.
+    """Return whether a frame should become the next reference keyframe.
 
     Args:
-        T_keyframe_camera: Pose of the frame in the reference keyframe, [4, 4].
-        overlap: Visible fraction of the keyframe's surface.
-        median_depth_m: Median depth of the keyframe.
-        frames: Number of frames since the keyframe.
+        T_keyframe_camera: Pose of the frame in the current reference keyframe, [4, 4].
+        overlap: Fraction of the reference keyframe's surface that the frame shows, 0..1.
+        median_depth_m: Median depth of the reference keyframe.
+        frames: Number of frames since the reference keyframe.
         config: Settings.
     """
     if frames < config.min_frames:
@@ -157,7 +157,7 @@ def needs_keyframe(
 def left_keyframe_view(
     T_keyframe_camera: np.ndarray, overlap: float, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
-    """Return whether a view is too far from its keyframe or shows too little of it."""
+    """Return whether a frame is too far from its keyframe or shows too little of its surface."""
     is_elsewhere = bool(limit_ratios(T_keyframe_camera, median_depth_m, config) > 1)
     return is_elsewhere or overlap < config.min_overlap
 
@@ -165,7 +165,10 @@ def left_keyframe_view(
 def needs_mapping_keyframe(
     T_mapped_camera: np.ndarray, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
-    """Return whether a frame is far enough from the last mapped frame for a mapping keyframe."""
+    """Return whether a frame should become a mapping keyframe.
+
+    It should if the camera has moved far enough since the last mapped frame.
+    """
     left = float(limit_ratios(T_mapped_camera, median_depth_m, config))
     return left > config.supporting and config.supporting <= 1
 
@@ -173,7 +176,7 @@ def needs_mapping_keyframe(
 def limit_ratios(
     T_keyframe_camera: np.ndarray, median_depth_m: np.ndarray | float, config: KeyframeConfig
 ) -> np.ndarray:
-    """Return the motion from a keyframe relative to the limits of `KeyframeConfig`.
+    """Return the motion since a keyframe as a fraction of the limits in `KeyframeConfig`.
 
     Args:
         T_keyframe_camera: Poses of the camera in its keyframe, [..., 4, 4].
@@ -181,7 +184,8 @@ def limit_ratios(
         config: Settings.
 
     Returns:
-        [...], the larger ratio of translation and rotation; above 1 a keyframe is needed.
+        [...]: the larger one of translation / max_translation and rotation / max_rotation_rad.
+        Above 1, a new keyframe is needed.
     """
     translation = se3.distances(T_keyframe_camera) / median_depth_m
     rotation_rad = se3.rotation_angles(T_keyframe_camera)
@@ -191,7 +195,7 @@ def limit_ratios(
 def keyframe_dynamic_class_mask(
     view: Pyramid, boxes: Sequence[Box], config: DynamicClassConfig
 ) -> np.ndarray:
-    """Return the dynamic mask of detected boxes at working resolution.
+    """Return the mask of detected objects of dynamic classes, at working resolution.
 
     Args:
         view: Pyramid of the keyframe.

@@ -1,8 +1,8 @@
 """Localization in a finished map, which does not change. Conventions: `ldo_service.geometry`.
 
-Odometry tracks the camera with its own keyframes. At intervals, the localizer relocalizes the frame
-in the keyframe database of the map, which yields T_map_odom. Odometry is continuous; T_map_odom
-jumps (REP-105).
+Odometry tracks the camera against keyframes that it makes itself. At intervals, the localizer
+relocalizes the current frame in the keyframe database of the map, which yields T_map_odom. Poses in
+odometry are continuous; T_map_odom may jump (REP-105).
 """
 
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ MAP = -1  # The map, in place of the number of a submap.
 
 @dataclass(frozen=True, slots=True)
 class MapFix:
-    """Pose of the odometry frame in the map, and the last match that supports it."""
+    """Pose of the odometry frame in the map, and the last relocalization match."""
 
     submap: int = 0  # Submap of odometry.
     T_map_odom: np.ndarray | None = None  # [4, 4]; None before the camera is found.
@@ -35,17 +35,20 @@ class MapFix:
     frames_since_search: int = 0  # Frames since the last search.
 
     def is_search_due(self, config: SubmapConfig) -> bool:
-        """Return whether to search with this frame: with every one until the camera is found."""
+        """Return whether to search the map with this frame.
+
+        Every frame is searched until the camera is found, then one in `config.look_every`.
+        """
         return self.T_map_odom is None or self.frames_since_search >= config.look_every
 
     def after(self, tracked: TrackedFrame) -> "MapFix":
-        """Return the fix after one more frame; a new submap of odometry has no fix yet."""
+        """Return the fix after one more frame; a new submap of odometry has an unknown pose."""
         if tracked.submap != self.submap:
             return MapFix(tracked.submap)
         return replace(self, frames_since_search=self.frames_since_search + 1)
 
     def with_search_result(self, look: SubmapMatch, config: SubmapConfig) -> "MapFix":
-        """Return the fix after a match; the match is accepted if the previous one agrees."""
+        """Return the fix after a match; T_map_odom changes only if the previous match agrees."""
         is_confirmed = self.pending_match is not None and self.pending_match.is_consistent_with(
             look, config
         )
@@ -66,7 +69,10 @@ class MapFix:
 
 
 class Localizer(Odometry):
-    """Odometry in a finished map; its own keyframes serve tracking and are not mapped."""
+    """Odometry of one camera, with its pose in a finished map.
+
+    It makes keyframes for tracking only; they do not change the map.
+    """
 
     def __init__(
         self,
@@ -74,12 +80,12 @@ class Localizer(Odometry):
         config: OdometryConfig | None = None,
         T_base_camera: np.ndarray | None = None,
     ) -> None:
-        """Start without a fix.
+        """Start without a known pose in the map.
 
         Args:
-            places: Keyframe database of the map; their T_odom_keyframe is T_map_keyframe.
-            config: See `Odometry`, as is T_base_camera.
-            T_base_camera: Camera on the robot, [4, 4].
+            places: Keyframe database of the map. Its poses T_odom_keyframe are in the map frame.
+            config: Settings; see `Odometry`.
+            T_base_camera: Pose of the camera on the robot, [4, 4]; see `Odometry`.
         """
         super().__init__(config, T_base_camera)
         self._places = places
@@ -96,12 +102,12 @@ class Localizer(Odometry):
 
         Args:
             frame: The frame.
-            prior: The last poses of another odometry.
+            prior: The last poses of another odometry, such as wheels.
             may_map: Unused, since nothing is mapped.
 
         Returns:
-            The pose of the frame in odometry and in the map; LOST until the camera is found in
-            the map. It has no reference because the keyframes of odometry are not in the map.
+            The pose of the frame in odometry and in the map. The status is LOST until the camera is
+            found in the map. `reference` is None, since the keyframes made here are not in the map.
         """
         # Track in odometry with its own keyframes.
         reading = self._read(prior, frame)
@@ -127,7 +133,7 @@ class Localizer(Odometry):
         )
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state that the next frames depend on; see `Odometry.snapshot`."""
+        """Return the state for `restore`; see `Odometry.snapshot`."""
         return {**super().snapshot(), "fix": self._fix.pack()}
 
     def restore(self, state: Mapping[str, Any], correction: MapCorrection | None = None) -> None:

@@ -1,8 +1,8 @@
 """Pose of the odometry frame in the map, by keyframe. Conventions: `ldo_service.geometry`.
 
-Odometry is continuous. The pose-graph optimizer moves keyframes in the map, and T_map_odom jumps
-accordingly (REP-105). T_map_odom of a frame is that of its reference keyframe, so that the frame
-moves with the keyframe.
+Poses in odometry are continuous. The pose-graph optimizer moves keyframes in the map, so T_map_odom
+may jump (REP-105). Each keyframe has its own T_map_odom = T_map_keyframe * T_keyframe_odom. A frame
+uses the T_map_odom of its reference keyframe, so that the frame moves with that keyframe.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -33,8 +33,8 @@ class MapCorrection:
 class MapFrame:
     """Pose of the odometry frame in the map, by keyframe.
 
-    It holds the poses of the last keyframes and of the reference keyframe. Poses of older keyframes
-    come from the last correction.
+    It stores the poses of the last keyframes and of the reference keyframe. The poses of older
+    keyframes come from the last correction by the pose-graph optimizer.
     """
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ class MapFrame:
         return self._T_map
 
     def correct(self, correction: MapCorrection) -> bool:
-        """Apply a correction if it is newer than the last one, and return whether it is."""
+        """Apply a correction if it is newer than the last one, and return whether it was newer."""
         is_newer = correction.version > self._poses.version
         if is_newer:
             self._remember(correction)
@@ -67,11 +67,11 @@ class MapFrame:
         return is_newer
 
     def T_map_odom(self, reference: int | None) -> np.ndarray:
-        """Return the odometry frame in the map [4, 4] at a keyframe that is held."""
+        """Return T_map_odom [4, 4] of a stored keyframe; None as keyframe gives the identity."""
         return np.eye(4) if reference is None else self._poses.T_map_odom(reference)
 
     def T_map_camera(self, tracked: TrackedFrame) -> np.ndarray | None:
-        """Return the camera pose in the map [4, 4], or None if its reference is not held."""
+        """Return the camera pose in the map [4, 4], or None if its reference is not stored."""
         if tracked.reference is None or tracked.reference not in self._poses:
             return None
         return self._poses[tracked.reference] @ tracked.T_reference_camera
@@ -88,7 +88,8 @@ class MapFrame:
         Args:
             keyframe: Id of the new keyframe.
             tracked: The frame.
-            next_reference: The keyframe that the next frame is aligned to; its pose is kept too.
+            next_reference: Id of the keyframe that the next frame is aligned to. Its pose stays
+                stored too.
         """
         self._poses.add(
             keyframe,
@@ -100,9 +101,9 @@ class MapFrame:
         self._keep(keyframe, tracked.reference, next_reference)
 
     def place_reference(self, tracked: TrackedFrame) -> None:
-        """Add the known keyframe that a frame was aligned to and that is the next reference.
+        """Add the reference of a frame, a known keyframe whose pose is not stored here any more.
 
-        Its pose comes from the last correction, or from odometry if the correction lacks it.
+        The pose comes from the last correction, or from odometry if the correction lacks it.
         """
         keyframe = tracked.reference
         if keyframe is None:
@@ -116,11 +117,11 @@ class MapFrame:
         self._keep(newest, keyframe)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the poses that are held, without the correction."""
+        """Return the stored poses, without the last correction."""
         return self._poses.snapshot()
 
     def restore(self, state: Mapping[str, Any], correction: MapCorrection | None) -> None:
-        """Continue from a snapshot and the last correction before it."""
+        """Continue from a snapshot and the last correction before the snapshot."""
         self._poses.restore(state)
         self._remember(correction)
 
@@ -128,7 +129,10 @@ class MapFrame:
         self._correction, self._T_map = correction, None
 
     def _keep(self, newest: int, *references: int | None) -> None:
-        """Drop all keyframes except references and recent ones that no correction may hold yet."""
+        """Drop all keyframes except for the references and the last `RECENT_KEYFRAMES`.
+
+        The last correction may not contain the most recent keyframes yet.
+        """
         self._poses.keep_only(self._needed(newest, references))
 
     def _needed(self, newest: int, references: tuple[int | None, ...]) -> Iterator[int]:

@@ -1,4 +1,4 @@
-"""Constant-velocity motion of the camera. Conventions: `ldo_service.geometry`."""
+"""Constant-velocity motion model of the camera. Conventions: `ldo_service.geometry`."""
 
 from dataclasses import dataclass, field
 
@@ -22,7 +22,7 @@ class ConstantVelocity:
     def predicted(self, stamp_ns: int) -> np.ndarray:
         """Return T_odom_camera [4, 4] at a stamp: T * exp(twist * elapsed / interval).
 
-        Without usable stamps, the elapsed time is one interval.
+        If a stamp is missing or not later than the last one, the elapsed time is one interval.
         """
         elapsed_ns = stamp_ns - self.stamp_ns
         timed = elapsed_ns > 0 and self.interval_ns > 0
@@ -30,12 +30,12 @@ class ConstantVelocity:
         return se3.orthonormalize(self.T_odom_camera @ se3.exp(self.twist * steps))
 
     def moved_to(self, T_odom_camera: np.ndarray, stamp_ns: int) -> "ConstantVelocity":
-        """Return the model at a new pose [4, 4], with the velocity from the last pose to it."""
+        """Return the model at a new pose [4, 4]; the velocity is the motion since the last pose."""
         twist = se3.log(se3.inverse(self.T_odom_camera) @ T_odom_camera)
         return ConstantVelocity(T_odom_camera, twist, stamp_ns - self.stamp_ns, stamp_ns)
 
     def without_velocity(self) -> "ConstantVelocity":
-        """Return the model at the same pose without velocity, which is unknown after a loss."""
+        """Return the model at the same pose with zero velocity, as after a loss of tracking."""
         return ConstantVelocity(self.T_odom_camera, np.zeros(6), 0, self.stamp_ns)
 
 
@@ -53,5 +53,10 @@ def image_motion_rad(T: np.ndarray, median_depth_m: float) -> float:
 
 
 def image_motions_rad(T: np.ndarray, median_depth_m: np.ndarray | float) -> np.ndarray:
-    """Return the image motions [...] in rad of transforms T [..., 4, 4] at depths [...]."""
+    """Return the image motions in rad of several transforms; see `image_motion_rad`.
+
+    Args:
+        T: Relative camera poses, [..., 4, 4].
+        median_depth_m: Median depth of each scene, [...].
+    """
     return se3.rotation_angles(T) + se3.distances(T) / median_depth_m

@@ -1,10 +1,13 @@
 """Motion segmentation by depth differences between a keyframe and an aligned frame.
 
-Both directions are compared. A point of the frame in front of the surface that the keyframe
-measured along the same ray has appeared since. A point of the keyframe in front of the surface that
-the frame measures there has disappeared since: the frame sees through it. Both contradict a static
-scene. A point of the frame behind the keyframe's surface does not: the surface hid it before.
-Conventions: `ldo_service.geometry`.
+The points of each image are projected into the other one and compared with its depth:
+
+- A point of the frame lies in front of the keyframe's surface: it has appeared since the keyframe.
+- A point of the keyframe lies in front of the frame's surface: it has disappeared since the
+  keyframe, as the frame measured depth behind it.
+
+Both cases contradict a static scene. A point of the frame behind the keyframe's surface does not
+contradict it, since that surface may have hidden the point. Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
@@ -74,19 +77,19 @@ class MotionSegmentationConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MotionEvidence:
-    """State of motion segmentation from frame to frame, at the compared pyramid level."""
+    """State of motion segmentation between frames, at pyramid level `config.level`."""
 
     contradicts: np.ndarray  # Pixels of the last frame that contradict a static scene, [h, w] bool.
     # Number of frames that saw through each point of the keyframe, [h, w] uint8; None if zero.
     gone: np.ndarray | None
 
     def fits(self, now: Level, then: Level) -> bool:
-        """Return whether the masks have the sizes of a frame and a keyframe."""
+        """Return whether the masks have the sizes of the frame (now) and the keyframe (then)."""
         is_of_keyframe = self.gone is None or self.gone.shape == then.depth_m.shape
         return is_of_keyframe and self.contradicts.shape == now.depth_m.shape
 
     def of_new_keyframe(self) -> "MotionEvidence":
-        """Return the evidence against a new keyframe, which no frame has seen through yet."""
+        """Return the state after a change of the keyframe: the counts in `gone` start at zero."""
         return MotionEvidence(self.contradicts, None)
 
 
@@ -99,11 +102,11 @@ class MotionMasks:
     suspicion: MotionEvidence  # State for the next frame.
 
     def has_large_change(self, known: np.ndarray | None, config: MotionSegmentationConfig) -> bool:
-        """Return whether a large part of the keyframe has moved in addition to a known mask.
+        """Return whether `moved_mask` has many pixels that a known mask lacks.
 
         Args:
-            known: Known moved pixels, [H, W] bool; None for none.
-            config: Settings.
+            known: Mask of pixels already known as moved, [H, W] bool; None if there is none.
+            config: Settings; `renewed_share` is the limit.
         """
         news = self.moved_mask if known is None else self.moved_mask & ~known
         return bool(np.mean(news) > config.renewed_share)
@@ -111,7 +114,7 @@ class MotionMasks:
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """Aligned frame and its keyframe, at the compared pyramid level."""
+    """Aligned frame (now) and its keyframe (then), at pyramid level `config.level`."""
 
     now: Level
     then: Level
@@ -121,14 +124,18 @@ class _Pair:
     config: MotionSegmentationConfig
 
     def limit_m(self, level: Level) -> np.ndarray:
-        """Return the depth difference [h, w] in meters that errors of a static scene explain."""
+        """Return the largest depth difference [h, w] in meters that is possible in a static scene.
+
+        It covers errors of the pose and noise of the depth.
+        """
         sigma_m = self.noise_scale * self.noise.sigma_m(level.depth_m)
         return self.config.min_m + self.config.sigmas * sigma_m
 
     def came(self, moved_mask: np.ndarray) -> np.ndarray:
         """Return the pixels [h, w] bool of the frame that have appeared since the keyframe.
 
-        They lie in front of the keyframe's surface, or on its moved pixels and not behind them.
+        Such a pixel lies in front of the keyframe's surface. A pixel that projects onto a moved
+        pixel of the keyframe also counts if it lies on the surface.
         """
         ahead_m = depth_gap_m(self.now, self.then, self.T_then_now, self.config)
         limit_m = self.limit_m(self.now)
@@ -136,7 +143,10 @@ class _Pair:
         return (ahead_m > limit_m) | (on_moved & (ahead_m > -limit_m))
 
     def gone(self, before: MotionEvidence | None) -> np.ndarray:
-        """Return the number of frames [h, w] uint8 that saw through each point of the keyframe."""
+        """Return how many frames saw through each point of the keyframe, [h, w] uint8.
+
+        A frame sees through a point if it measures a depth behind it.
+        """
         ahead_m = depth_gap_m(self.then, self.now, se3.inverse(self.T_then_now), self.config)
         through = _bytes(ahead_m > self.limit_m(self.then))
         count = cv2.morphologyEx(through, cv2.MORPH_OPEN, _square(1))
@@ -161,11 +171,12 @@ def segment_motion(
     Args:
         view: Pyramid of the frame.
         keyframe: Pyramid of the keyframe.
-        moved_mask: Known moved pixels of the keyframe, [H, W] bool; None for none.
+        moved_mask: Pixels of the keyframe already known as moved, [H, W] bool; None if there are
+            none.
         T_keyframe_camera: Pose of the frame in the keyframe, [4, 4].
         noise_scale: Factor on the depth noise, as estimated by alignment.
-        before: Evidence of the previous frame; after a change of the keyframe, that of
-            `MotionEvidence.of_new_keyframe`. None for none.
+        before: State after the previous frame, or None. If the keyframe has changed since, pass
+            the result of `MotionEvidence.of_new_keyframe`.
         config: Settings.
         noise: Depth noise of the camera.
     """
@@ -187,13 +198,13 @@ def segment_motion(
 def grow_mask(
     dynamic_mask: np.ndarray, view: Pyramid, config: MotionSegmentationConfig
 ) -> np.ndarray:
-    """Grow a dynamic mask to nearby pixels of similar depth, and by a margin.
+    """Grow a dynamic mask to nearby pixels of similar depth, then by a margin.
 
-    The grown mask must not be an input of `segment_motion`, or it would grow from frame to frame.
+    Do not pass the grown mask to `segment_motion`: it would grow from frame to frame.
 
     Args:
         dynamic_mask: Mask of `segment_motion`, [H, W] bool at working resolution.
-        view: Pyramid of the image of the mask.
+        view: Pyramid of the image that the mask belongs to.
         config: Settings.
 
     Returns:
@@ -217,17 +228,18 @@ def depth_gap_m(
 ) -> np.ndarray:
     """Return the distance by which each point of `view` lies in front of the surface of `other`.
 
-    The nearest surface within `edge_px` counts as the surface of `other`, so that outlines that are
-    slightly off make no difference.
+    The surface at a pixel is the least depth of `other` within `edge_px` pixels. This tolerates
+    object outlines that are displaced by a few pixels.
 
     Args:
-        view: Level of the points.
-        other: Level of the surface.
-        T_other_view: Relative pose, [4, 4].
+        view: Pyramid level with the points.
+        other: Pyramid level with the surface.
+        T_other_view: Pose of the camera of `view` in that of `other`, [4, 4].
         config: Settings.
 
     Returns:
-        [h, w] meters; negative behind the surface, NaN if either has no measurement.
+        [h, w] meters. Negative for points behind the surface; NaN where the point or the surface
+        was not measured.
     """
     u, v, z = _seen_from(view, other, T_other_view)
     depth_m = np.where(other.depth_m > 0, other.depth_m, np.float32(NOTHING_M))
@@ -277,11 +289,12 @@ def _rays(camera: Camera) -> np.ndarray:
 def _in_pieces(
     contradicts: np.ndarray, before: np.ndarray | None, config: MotionSegmentationConfig
 ) -> np.ndarray:
-    """Return the connected regions that are large enough and touch those of the previous frame.
+    """Return the connected regions of a mask that are large enough and also in the previous frame.
 
     Args:
         contradicts: Pixels that contradict a static scene, [h, w] bool.
-        before: The same of the previous frame; None to skip that test.
+        before: Such pixels of the previous frame; a region must come within `streak_px` pixels of
+            one of them. None skips this test.
         config: Settings.
 
     Returns:

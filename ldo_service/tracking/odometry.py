@@ -1,4 +1,4 @@
-"""RGB-D odometry in one pass: frame poses, keyframes and submaps.
+"""RGB-D odometry: one call per frame computes its pose and makes keyframes and submaps.
 
     odometry = Odometry()
     for frame in frames:
@@ -10,13 +10,14 @@
 
 1. Align the frame to the reference keyframe, or relocalize a lost camera (`FrameTracker`).
 2. Start a submap if the camera has been lost for long.
-3. Reuse a known keyframe as the reference if the map has one that shows the same surface.
-4. Make a keyframe and measure its pose relative to earlier ones. Merge two submaps if a match with
-   another submap is confirmed.
-5. Compute the odometry frame in the map from the last correction of the pose graph (`MapFrame`).
+3. If a keyframe is needed, reuse a known keyframe that shows the same surface as the reference.
+4. Otherwise make a new keyframe and measure its pose relative to earlier keyframes. Merge two
+   submaps if a match between them is confirmed.
+5. Compute T_map_odom from the last correction of the pose graph (`MapFrame`).
 
-The caller decides whether a frame may be mapped, as its consumers may have no credit. Without a new
-keyframe, tracking continues against the same reference. Conventions: `ldo_service.geometry`.
+The caller decides with `may_map` whether step 4 may make a keyframe. It passes False while the
+mapper is too slow to take another one. Tracking then continues against the same reference keyframe.
+Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -61,9 +62,9 @@ class Odometry:
         """Start without a keyframe.
 
         Args:
-            config: Settings; the defaults when None.
-            T_base_camera: Pose of the camera on the robot, [4, 4]; the poses of a prior are those
-                of the robot's base. None if the base is the camera.
+            config: Settings; None uses the defaults.
+            T_base_camera: Pose of the camera in the robot's base frame, [4, 4]. It converts the
+                poses of an odometry prior, which are poses of the base. None is the identity.
         """
         self.config = config or OdometryConfig()
         self._T_base_camera = np.eye(4) if T_base_camera is None else T_base_camera
@@ -81,15 +82,16 @@ class Odometry:
     def process(
         self, frame: RgbdFrame, prior: OdometryPriorBuffer | None = None, *, may_map: bool = True
     ) -> TrackingResult:
-        """Track a frame, and make a keyframe of it if one is needed. The frame may be blank.
+        """Track a frame, and make a keyframe of it if one is needed.
 
         Args:
-            frame: The frame; it is not changed. A keyframe keeps its own copy of the depth.
-            prior: The last poses of another odometry. They are one more initial guess, and supply
-                dead reckoning while tracking is LOST. A frame is OK only if its images confirm
-                the pose.
-            may_map: Allow a new keyframe or submap. If False, a keyframe that was needed is in
-                `TrackingResult.denied_keyframe`.
+            frame: The frame, which is not changed; it may have neither texture nor depth. A
+                keyframe keeps its own copy of the depth.
+            prior: The last poses of another odometry, such as wheels. They yield an additional
+                initial guess, and dead reckoning while tracking is LOST. They do not replace the
+                images: a frame is OK only if its images confirm the pose.
+            may_map: Allow a new keyframe or submap. If it is False and a keyframe is needed,
+                `TrackingResult.denied_keyframe` names its kind.
 
         Returns:
             The pose of the frame, and the keyframe that was made of it, if any.
@@ -133,10 +135,10 @@ class Odometry:
         )
 
     def correct(self, correction: MapCorrection) -> bool:
-        """Apply a correction of the pose graph; poses in odometry do not change.
+        """Apply corrected keyframe poses of the pose graph; poses in odometry do not change.
 
         Returns:
-            True if the correction is newer than the last one; an older one changes nothing.
+            True if the correction is newer than the last one. An older one changes nothing.
         """
         return self._map.correct(correction)
 
@@ -144,7 +146,8 @@ class Odometry:
         """Mask objects of dynamic classes in the reference keyframe.
 
         Args:
-            keyframe: The keyframe of the boxes. Nothing changes if it is not the reference.
+            keyframe: Id of the keyframe in which the boxes were detected. If it is no longer the
+                reference keyframe, nothing changes.
             boxes: Detections, in pixels of the keyframe's image.
         """
         state = self._frames.state
@@ -165,27 +168,27 @@ class Odometry:
         return None if keyframe is None else keyframe.id
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state that the next frames depend on, except for the last correction.
+        """Return the state that the next results depend on, except for the last correction.
 
         Returns:
-            Arrays and plain values. `places`, `keyframe` and `mapping_keyframe` hold the same
-            objects until they change.
+            Arrays and plain values. An entry that has not changed since the last snapshot is the
+            same object (keyframes and their records), so the caller can detect changes by identity.
         """
         return {**pack(self._frames.state), "poses": self._map.snapshot()}
 
     def restore(self, state: Mapping[str, Any], correction: MapCorrection | None = None) -> None:
-        """Continue from a snapshot: the next frames give bitwise equal results.
+        """Continue from a snapshot; the next frames give the same results bit for bit.
 
         Args:
             state: The snapshot.
-            correction: The last correction before it.
+            correction: The last correction before the snapshot.
         """
         self._frames.restore(unpack(dict(state), self.config.pyramid))
         self._map.restore(state["poses"], correction)
         self._earlier = RecentKeyframeCache(self.config.pyramid)
 
     def _read(self, prior: OdometryPriorBuffer | None, frame: RgbdFrame) -> PriorPose | None:
-        """Return the camera pose of the prior at the time of a frame, or None if unknown."""
+        """Return the camera pose by the odometry prior at the time of a frame, or None."""
         if prior is None:
             return None
         return prior.at(frame.stamp_ns, self._T_base_camera, self.config.prior)
@@ -193,13 +196,13 @@ class Odometry:
     # --- keyframe reuse ---------------------------------------------------------------------------
     @property
     def _is_connected_to_map(self) -> bool:
-        """True if the reference is a known keyframe or was measured from one."""
+        """True if the reference is a reused keyframe or has a measured pose relative to one."""
         return self._frames.state.origin is not KeyframeOrigin.NEW
 
     def _find_reusable_keyframe(
         self, frame: RgbdFrame, tracked: TrackedFrame
     ) -> ReusedKeyframe | None:
-        """Return a known keyframe that can replace the new one that a frame needs, or None."""
+        """Return a known keyframe to use instead of the new one that a frame needs, or None."""
         is_needed = tracked.needed_keyframe is not None and tracked.submap_measurement is None
         if not is_needed or not self._frames.can_reuse_keyframes:
             return None
@@ -219,10 +222,10 @@ class Odometry:
         return self._reuse.find(self._frames.view(frame), near, state.history)
 
     def _switch_to_keyframe(self, known: ReusedKeyframe, tracked: TrackedFrame) -> TrackedFrame:
-        """Make a known keyframe the reference, and return the frame as tracked against it.
+        """Make a known keyframe the reference, and return the frame's result relative to it.
 
-        The pose of the frame in odometry does not change; the keyframe gets a new pose in odometry
-        and the current submap.
+        The pose of the frame in odometry does not change. The keyframe gets a new pose in odometry
+        and moves to the current submap.
         """
         alignment = known.candidate.alignment
         T_odom_keyframe = se3.orthonormalize(
@@ -256,9 +259,10 @@ class Odometry:
         Args:
             frame: The frame just tracked.
             tracked: The tracking result of the frame.
-            kind: The kind of keyframe that the frame needs. A mapping keyframe becomes a reference
-                keyframe if `known` is given.
-            known: A known keyframe to connect the new keyframe to.
+            kind: The kind of keyframe that the frame needs. If `known` is given, a reference
+                keyframe is made instead of a mapping keyframe.
+            known: A known keyframe from which the new one is measured, to connect both in the pose
+                graph; or None.
         """
         window: list[RelativePose] = []
         if kind is KeyframeKind.MAPPING and known is None:
@@ -283,7 +287,8 @@ class Odometry:
         Args:
             frame: The frame.
             tracked: The tracking result of the frame, not LOST.
-            is_connected: The keyframe is measured from a known one, which allows keyframe reuse.
+            is_connected: The new keyframe is measured from a known one. The next frames may then
+                reuse known keyframes.
         """
         frames = self._frames
         if tracked.pose_source == "first":
@@ -302,8 +307,8 @@ class Odometry:
     def _add_mapping_keyframe(self, frame: RgbdFrame, tracked: TrackedFrame) -> int:
         """Make the frame a mapping keyframe, and return its id; the reference stays.
 
-        The last mapping keyframe is kept for relocalization, since a camera that is lost next is
-        near it.
+        The record of the last mapping keyframe is kept: it is the keyframe closest to the camera if
+        tracking is lost next.
         """
         keyframe = self._keyframe_of(frame, tracked)
         self._frames.state = replace(
@@ -315,9 +320,9 @@ class Odometry:
         return keyframe.id
 
     def _measure_window(self, tracked: TrackedFrame) -> list[RelativePose]:
-        """Measure the new reference keyframe from earlier keyframes of its submap.
+        """Measure the pose of the new reference keyframe relative to earlier ones of its submap.
 
-        The previous reference is excluded: tracking has measured that relative pose already.
+        The previous reference keyframe is excluded, since tracking has measured that pose already.
         """
         keyframe = self._frames.state.keyframe
         if keyframe is None or tracked.reference is None:

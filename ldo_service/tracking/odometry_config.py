@@ -1,4 +1,4 @@
-"""Settings of odometry and of its parts."""
+"""Settings of odometry and all its steps."""
 
 from dataclasses import dataclass, field
 
@@ -21,7 +21,7 @@ from .window import WindowConfig
 
 @dataclass(frozen=True, slots=True)
 class OdometryConfig:
-    """Settings of odometry and of its parts."""
+    """Settings of odometry and all its steps."""
 
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     align: AlignConfig = field(default_factory=AlignConfig)

@@ -1,8 +1,9 @@
 """Odometry prior: poses from another odometry, such as wheels, an inertial unit or another camera.
 
-The poses are in a frame of their own, so only the motion between two of them is used. It is an
-initial guess that the images then confirm or refute. A source that restarts or jumps begins a new
-session; the motion between two sessions is unknown. Conventions: `ldo_service.geometry`.
+The other odometry has its own coordinate frame, so only the motion between two of its poses is
+used. This motion yields an initial guess, which the images then confirm or refute. If the other
+odometry restarts or jumps, a new session begins. The motion between two sessions is unknown.
+Conventions: `ldo_service.geometry`.
 """
 
 from bisect import bisect_left
@@ -59,7 +60,7 @@ class PriorConfig:
 
 
 class PriorCheck(StrEnum):
-    """Outcome of adding a pose to the buffer; the values complete a log line."""
+    """Outcome of adding a pose to the buffer. Each value is the end of a log line on the pose."""
 
     FOLLOWS = "follows the last one"
     LATE = "has a stamp that is not after the last one's, and is dropped"
@@ -70,7 +71,7 @@ class PriorCheck(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StampedPose:
-    """Pose of the robot's base in the frame of the prior at one time."""
+    """Pose of the robot's base in the coordinate frame of the other odometry, at one time."""
 
     stamp_ns: int
     T_prior_base: np.ndarray  # [4, 4]
@@ -78,7 +79,7 @@ class StampedPose:
 
 @dataclass(frozen=True, slots=True)
 class PriorPose:
-    """Camera pose of the prior at one time."""
+    """Camera pose in the coordinate frame of the other odometry, at one time."""
 
     stamp_ns: int
     T_prior_camera: np.ndarray  # [4, 4]
@@ -87,7 +88,7 @@ class PriorPose:
 
 @dataclass(frozen=True, slots=True)
 class OdometryPriorBuffer:
-    """Last poses of the current session."""
+    """Last poses of another odometry in its current session."""
 
     poses: tuple[StampedPose, ...] = ()  # Ascending by stamp.
     session: int = 0  # Number of the session; restarts and jumps increase it.
@@ -95,9 +96,10 @@ class OdometryPriorBuffer:
     def added(
         self, stamp_ns: int, T_prior_base: np.ndarray, config: PriorConfig
     ) -> tuple["OdometryPriorBuffer", PriorCheck]:
-        """Return the buffer with a new pose [4, 4], and the outcome of the checks on the pose.
+        """Return the buffer with a new pose [4, 4], and the outcome of the checks on that pose.
 
-        A late or invalid pose is dropped; a restart or a jump begins a new session.
+        A pose that is late or holds NaN or infinity is dropped. After a restart or a jump, the new
+        pose begins a new session.
         """
         pose = StampedPose(stamp_ns, T_prior_base)
         verdict = self._judged(pose, config)
@@ -124,7 +126,7 @@ class OdometryPriorBuffer:
         return PriorCheck.FOLLOWS if is_possible else PriorCheck.JUMPED
 
     def at(self, stamp_ns: int, T_base_camera: np.ndarray, config: PriorConfig) -> PriorPose | None:
-        """Return the camera pose at a stamp, or None if the poses do not reach it.
+        """Return the camera pose at a stamp, or None if the buffer does not cover that time.
 
         Args:
             stamp_ns: Time of the frame.
@@ -151,10 +153,10 @@ class OdometryPriorBuffer:
         return interpolated(before, after, stamp_ns) if is_near else None
 
     def _beyond(self, stamp_ns: int, config: PriorConfig) -> np.ndarray | None:
-        """Return the pose [4, 4] extrapolated past the newest one, or None if it is too far.
+        """Extrapolate the pose [4, 4] past the newest one; return None if the stamp is too late.
 
-        The velocity comes from the earliest pose within `max_gap_s`: extrapolation from two poses
-        close in time would amplify their noise.
+        The velocity is the motion from the earliest pose within `max_gap_s` to the newest one. Two
+        poses closer in time would amplify their noise.
         """
         if not self.poses:
             return None
@@ -166,7 +168,7 @@ class OdometryPriorBuffer:
         return None if base is newest else interpolated(base, newest, stamp_ns)
 
     def pack(self) -> dict[str, Any]:
-        """Return arrays and plain values."""
+        """Return the buffer as arrays and plain values."""
         return {
             "stamps_ns": [pose.stamp_ns for pose in self.poses],
             "T_prior_base": [pose.T_prior_base for pose in self.poses],
@@ -186,10 +188,10 @@ def interpolated(a: StampedPose, b: StampedPose, stamp_ns: int) -> np.ndarray:
     Args:
         a: The earlier pose.
         b: The later pose.
-        stamp_ns: Time of the result; after b, the motion is extrapolated.
+        stamp_ns: Time of the result. If it is after b, the motion is extrapolated.
 
     Returns:
-        Pose [4, 4] of the base in the frame of the prior.
+        Pose [4, 4] of the robot's base in the coordinate frame of the other odometry.
     """
     share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
     T = se3.interpolate(a.T_prior_base[None], b.T_prior_base[None], np.array([share]))
@@ -198,17 +200,18 @@ def interpolated(a: StampedPose, b: StampedPose, stamp_ns: int) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class DeadReckoningStart:
-    """Pose of the last OK frame in odometry and in the prior."""
+    """Start of dead reckoning: the last OK frame, with its poses in odometry and in the prior."""
 
     T_odom_camera: np.ndarray  # [4, 4]
     reading: PriorPose  # Pose of the same frame in the prior.
 
     def dead_reckon(self, now: PriorPose, config: PriorConfig) -> np.ndarray | None:
-        """Return T_odom_camera [4, 4] by the motion of the prior since the OK frame.
+        """Return T_odom_camera [4, 4] at a later time: the last OK pose plus the prior's motion.
 
         T_odom_now = T_odom_then * inverse(T_prior_then) * T_prior_now
 
-        Return None if the prior is in another session, or if the OK frame is too long ago.
+        Return None if the prior has begun another session since, or if more than
+        `config.max_carried_s` have passed.
         """
         then, elapsed_s = self.reading, (now.stamp_ns - self.reading.stamp_ns) * 1e-9
         if now.session != then.session or not 0 <= elapsed_s <= config.max_carried_s:
@@ -217,7 +220,7 @@ class DeadReckoningStart:
         return se3.orthonormalize(self.T_odom_camera @ moved)
 
     def pack(self) -> dict[str, Any]:
-        """Return arrays and plain values."""
+        """Return the start as arrays and plain values."""
         return asdict(self)
 
     @staticmethod

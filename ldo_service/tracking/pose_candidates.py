@@ -63,7 +63,7 @@ def align_hypothesis(
     pose_source: str,
     config: AlignConfig,
 ) -> PoseHypothesis:
-    """Return the hypothesis of direct alignment from an initial guess.
+    """Align a frame directly to a keyframe from an initial guess, and return the hypothesis.
 
     Args:
         keyframe: The keyframe.
@@ -86,15 +86,15 @@ def support(
     view: Pyramid,
     config: AlignConfig,
 ) -> float:
-    """Return the fraction of the reference that a hypothesis explains, 0..1.
+    """Return the support of a hypothesis: the fraction of the keyframe's points it explains, 0..1.
 
-    Each hypothesis has estimated its own noise, and a wrong pose inflates it. Therefore all are
-    evaluated again with the smallest noise among them. Points with a measured depth dominate;
-    color alone has a small weight.
+    Alignment has estimated the noise of each hypothesis separately, and a wrong pose inflates the
+    estimate. All hypotheses are therefore evaluated with the smallest of these estimates. Points
+    with a measured depth dominate; points with gray level alone have the weight 0.05.
 
     Args:
         candidate: The hypothesis.
-        others: All hypotheses of the frame, whose smallest noise is used.
+        others: All hypotheses of the frame; the smallest of their noise estimates is used.
         keyframe: The keyframe.
         view: Pyramid of the frame.
         config: Settings.
@@ -120,10 +120,11 @@ def select_hypothesis(
     config: PoseHypothesisConfig,
     align_config: AlignConfig,
 ) -> PoseHypothesis:
-    """Select the hypothesis with the most support, and set whether it is confirmed.
+    """Select the hypothesis with the most support, and set its `is_confirmed`.
 
     Args:
-        candidates: The hypotheses. If T_keyframe_second is given, the last one started from it.
+        candidates: The hypotheses. If T_keyframe_second is given, the last hypothesis must have
+            started from it.
         T_keyframe_second: Independent estimate of the pose by features or GICP, [4, 4]; None if
             both failed.
         keyframe: The keyframe.
@@ -150,14 +151,14 @@ def select_hypothesis(
 
 
 def hypothesis_distance_rad(candidate: PoseHypothesis, T_keyframe_camera: np.ndarray) -> float:
-    """Return the distance of a hypothesis to a pose [4, 4]: rotation plus parallax, rad."""
+    """Return the distance in rad from a hypothesis to a pose [4, 4]; see `image_motion_rad`."""
     difference = se3.inverse(candidate.alignment.T_reference_camera) @ T_keyframe_camera
     return image_motion_rad(difference, candidate.median_depth_m)
 
 
 @dataclass(frozen=True, slots=True)
 class InitialGuessAligner:
-    """Alignment of a frame from its initial guesses; stateless."""
+    """Direct alignment of a frame from one or several initial guesses; stateless."""
 
     align: AlignConfig
     features: FeatureConfig
@@ -172,7 +173,7 @@ class InitialGuessAligner:
         T_keyframe_camera: np.ndarray,
         pose_source: str = "direct",
     ) -> PoseHypothesis:
-        """Return the hypothesis of alignment from an initial guess T_keyframe_camera [4, 4]."""
+        """Align from the initial guess T_keyframe_camera [4, 4], and return the hypothesis."""
         return align_hypothesis(keyframe, view, T_keyframe_camera, pose_source, self.align)
 
     def align_from_all_guesses(
@@ -183,14 +184,16 @@ class InitialGuessAligner:
         resting: np.ndarray,
         carried: np.ndarray | None,
     ) -> PoseHypothesis:
-        """Align from all other initial guesses, and return the best hypothesis.
+        """Align from all initial guesses besides constant velocity; return the best hypothesis.
 
         Args:
-            predicted: Hypothesis of the constant-velocity guess.
+            predicted: Hypothesis from the constant-velocity guess, which takes part in the choice.
             keyframe: The keyframe.
             view: Pyramid of the frame.
-            resting: T_keyframe_camera [4, 4] of the previous frame, the guess of no motion.
-            carried: T_keyframe_camera [4, 4] by dead reckoning with the prior; None if unknown.
+            resting: Initial guess that the camera has not moved: T_keyframe_camera [4, 4] of the
+                previous frame.
+            carried: Initial guess T_keyframe_camera [4, 4] by dead reckoning with the odometry
+                prior; None if the prior is unknown.
         """
         candidates = [predicted, self.align_from_guess(keyframe, view, resting)]
         if carried is not None:
@@ -205,7 +208,7 @@ class InitialGuessAligner:
         return replace(chosen, agrees_with_prior=is_expected)
 
     def is_large_step(self, candidate: PoseHypothesis, resting: np.ndarray, view: Pyramid) -> bool:
-        """Return whether the image moved so far that alignment may be in a wrong minimum.
+        """Return whether the camera moved so far that alignment may be in a wrong local minimum.
 
         Args:
             candidate: Hypothesis of the frame.
@@ -219,10 +222,10 @@ class InitialGuessAligner:
     def _independent_estimate(
         self, keyframe: ReferenceKeyframe, view: Pyramid, resting: np.ndarray
     ) -> tuple[np.ndarray | None, str]:
-        """Return T_keyframe_camera [4, 4] by features, or by GICP with too few features.
+        """Estimate T_keyframe_camera [4, 4] from ORB features, or by GICP if that fails.
 
         Returns:
-            The pose, or None if both fail, and the name of the method.
+            The pose, or None if both fail; and the name of the method.
         """
         known, seen = keyframe.features(self.features), detect(view, self.features)
         pose = estimate_pose(known, seen, view.camera, self.features)

@@ -1,9 +1,9 @@
 """Image pyramids, reference points and depth noise for direct alignment.
 
-Color and depth are halved by averaging 2x2 blocks, as `Camera.halved` expects. A pixel of the
-coarse image is centered on the corner that its four parents share. `cv2.pyrDown` centers it on one
-of the parents; that half pixel doubles the trajectory error. The reference points are the surface
-points of a keyframe to which frames are aligned.
+Gray images and depth are halved by averaging 2x2 blocks, as `Camera.halved` expects. The center of
+a coarse pixel is the corner between the four fine pixels of its block. `cv2.pyrDown` would center
+it on one of these pixels; this offset of half a pixel doubles the trajectory error. The reference
+points are the surface points of a keyframe, to which frames are aligned.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -86,8 +86,8 @@ def intrinsics(camera: Camera) -> Intrinsics:
 def mask_clipped(gray: np.ndarray) -> np.ndarray:
     """Set overexposed pixels of a gray image to 0, the value of invalid pixels.
 
-    The brightness of a clipped pixel does not follow that of its surface. After a change of the
-    exposure, such pixels would increase the residual of the right pose.
+    A clipped pixel has the same gray level for surfaces of different brightness. After a change of
+    the exposure, such pixels would increase the residuals even at the right pose.
 
     Args:
         gray: Image, [H, W] uint8.
@@ -103,7 +103,7 @@ def halved_image(image: np.ndarray, least: int = 1) -> np.ndarray:
 
     Args:
         image: Gray levels, [H, W] float32; 0 where invalid.
-        least: Minimum number of valid pixels in a block; blocks with fewer become 0.
+        least: Minimum number of valid pixels in a block. A block with fewer becomes 0.
 
     Returns:
         [H//2, W//2] float32.
@@ -116,8 +116,8 @@ def halved_depth(depth_m: np.ndarray, tolerance: float) -> np.ndarray:
 
     Args:
         depth_m: Depth, [H, W] float32 meters; 0 where unknown.
-        tolerance: Relative depth difference to the nearest pixel of a block; farther pixels are
-            excluded from the mean.
+        tolerance: Largest depth difference to the nearest pixel of the block, as a fraction of its
+            depth. Pixels farther away are excluded from the average.
 
     Returns:
         [H//2, W//2] float32 meters.
@@ -158,8 +158,8 @@ def pyramid_of(frame: RgbdFrame, config: PyramidConfig) -> Pyramid:
 class DepthNoise:
     """Axial noise sigma(z) = floor + growth (z - nearest)^2 of a depth camera.
 
-    The defaults are those of the Kinect (Nguyen, Izadi and Lovell 2012, equation 5). Mainly the
-    shape of the curve matters: alignment estimates a factor on it from the residuals of each frame.
+    The defaults are those of the Kinect (Nguyen, Izadi and Lovell 2012, equation 5). The shape of
+    the curve matters more than its scale: alignment estimates a factor on the curve for each frame.
     """
 
     floor_m: float = 0.0012
@@ -179,7 +179,7 @@ class DepthNoise:
         return self.floor_m, self.growth_per_m, self.nearest_m
 
     def sigma_m(self, depth_m: np.ndarray) -> np.ndarray:
-        """Return the standard deviation [...] of depths [...], in meters."""
+        """Return the standard deviation [...] of measured depths [...], both in meters."""
         return self.floor_m + self.growth_per_m * (depth_m - self.nearest_m) ** 2
 
 

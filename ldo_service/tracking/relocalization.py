@@ -1,22 +1,25 @@
 """Relocalization of a lost camera, and keyframe reuse. Conventions: `ldo_service.geometry`.
 
-Relocalization. A lost frame is compared with the keyframe records of the most similar thumbnails,
-and with a few more in rotation. The cost per frame is thus independent of the size of the database,
-and every record is tried at some time. If ORB finds nothing, SIFT is tried on the newest records
-and on others in rotation. It matches at twice the distance and costs ten times as much.
+Relocalization. A lost frame is compared with the keyframe records whose thumbnails are most similar
+to it. It is also compared with a few further records, which change from search to search. The time
+per frame is thus independent of the size of the database, and every record is tried eventually. If
+ORB features find no match, SIFT features are tried on the newest records and a few others. SIFT
+matches at twice the distance and takes ten times as long.
 
 A record is accepted if features and direct alignment agree on the pose. The criteria are stricter
 than in tracking, since no predicted pose supports the result. A match is ambiguous and rejected if
-a place far away in the same submap explains the view almost as well. The two ends of a corridor,
-for example, may look alike. Places of different submaps are not compared, as their relative pose is
-unknown here.
+a distant record of the same submap explains the frame almost as well. For example, the two ends of
+a corridor may look alike. Records of different submaps are not compared, since their relative pose
+is unknown here.
 
-Keyframe reuse. A robot that repeats its route would make the same keyframes every day, so that the
-map grows with time instead of space. Once the map has many keyframes, a frame that needs a keyframe
-first searches for a known one that shows the same surface. A known keyframe is reused only if map
-and images agree on the pose of the camera. Otherwise odometry has drifted, and new keyframes are
-made so that a loop closure can correct the map. A camera that arrives from newly mapped surface
-makes one more keyframe, measured from the known one, which adds a factor to the pose graph.
+Keyframe reuse. A robot that repeats its route would make similar keyframes on every run, and the
+map would grow without limit. This is avoided once the map has many keyframes. Before a new keyframe
+is made, the tracker searches for a known keyframe that shows the same surface. It is reused only if
+the map and the images agree on the pose of the camera. If they disagree, odometry has drifted. New
+keyframes are then made, so that a loop closure can correct the map.
+
+A camera may come from newly mapped surface back to a known keyframe. The tracker then makes one
+more keyframe, measured relative to the known one, to connect both in the pose graph.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -122,18 +125,18 @@ class Relocalizer:
         *,
         is_lost: bool = True,
     ) -> tuple[ReferenceKeyframe, PoseHypothesis] | None:
-        """Find a verified keyframe that a view shows.
+        """Find a keyframe that shows the same surface as a frame, and verify it by alignment.
 
         Args:
             view: Pyramid of the frame.
             places: Keyframe database to search.
-            turn: Number of the search; it selects the records in rotation.
-            history: Residual history, for records without their own.
-            is_lost: Allow the slow search by SIFT, which would delay a camera that is not lost.
+            turn: Number of searches before this one. It selects which further records are tried.
+            history: Residual noise of the last frames, for records that store none.
+            is_lost: Allow the search by SIFT, which is too slow while tracking works.
 
         Returns:
-            The keyframe and the alignment of the view to it, or None if no keyframe is verified
-            or the match is ambiguous.
+            The keyframe and the alignment of the frame to it. None if no keyframe is verified or
+            the match is ambiguous.
         """
         if not len(places):
             return None
@@ -151,13 +154,13 @@ class Relocalizer:
         return sure[1]
 
     def resembles_last_trusted(self, view: Pyramid, trusted: np.ndarray) -> bool:
-        """Return whether a view resembles the thumbnail [300] of the last OK frame."""
+        """Return whether a frame looks similar to the last OK frame, given its thumbnail [300]."""
         seen, trusted = make_thumbnail(view).astype(float), trusted.astype(float)
         scale = np.linalg.norm(seen) * np.linalg.norm(trusted)
         return bool(seen @ trusted >= self.config.familiar * scale > 0)
 
     def _distinct_candidates(self, ranked: Iterable[KeyframeRecord]) -> list[KeyframeRecord]:
-        """Return the most similar records that are distinct places, at most `alike`."""
+        """Return at most `alike` of the ranked records, which are all apart from each other."""
         likely: list[KeyframeRecord] = []
         for place in islice(ranked, RANKED * self.config.alike):
             if len(likely) == self.config.alike:
@@ -167,16 +170,23 @@ class Relocalizer:
         return likely
 
     def _poses(self, view: Pyramid, places: Iterable[KeyframeRecord]) -> list[PosedPlace]:
-        """Return the records with a pose by ORB features, most inliers first."""
+        """Match a frame with records by ORB features.
+
+        Returns:
+            The records that yield a pose of the frame, with that pose; most inliers first.
+        """
         seen = detect(view, self.features)
         return self._posed(view, seen, ((place, place.features) for place in places))
 
     def _poses_across_scales(
         self, view: Pyramid, places: Iterable[KeyframeRecord]
     ) -> list[PosedPlace]:
-        """Return the records with a pose by SIFT features, most inliers first.
+        """Match a frame with records by SIFT features.
 
-        SIFT also matches a camera that is much nearer or farther than the record.
+        SIFT also matches if the camera is at half or twice the distance to the surface.
+
+        Returns:
+            The records that yield a pose of the frame, with that pose; most inliers first.
         """
         config = self.features
         image = view.gray, view.depth_m, view.camera
@@ -194,7 +204,10 @@ class Relocalizer:
     def _first_verified(
         self, view: Pyramid, poses: Sequence[PosedPlace], history: ResidualHistory
     ) -> tuple[PosedPlace, tuple[ReferenceKeyframe, PoseHypothesis]] | None:
-        """Return the first record that direct alignment verifies, with the alignment."""
+        """Return the first record and feature pose that direct alignment verifies.
+
+        The second element is the keyframe of the record with the alignment.
+        """
         for place, pose in poses[: self.config.attempts]:
             keyframe = place.keyframe(self.pyramid)
             guess = se3.inverse(pose.T_camera_reference)
@@ -215,7 +228,7 @@ class Relocalizer:
     def _is_ambiguous(
         self, place: KeyframeRecord, pose: FeaturePose, poses: Iterable[PosedPlace]
     ) -> bool:
-        """Return whether a record of another place explains the view almost as well."""
+        """Return whether a distant record of the same submap matches the frame almost as well."""
         T_odom_camera = _seen_from(place, pose)
         return any(
             other.submap == place.submap
@@ -229,7 +242,7 @@ class Relocalizer:
 
 
 def _due(places: KeyframeDatabase, turn: int, count: int) -> list[KeyframeRecord]:
-    """Return the records of one turn: `count` records in rotation through the database."""
+    """Return the next `count` records of the database, which turns visit one after the other."""
     numbers = range(turn * count, (turn + 1) * count)
     return [places.all[number % len(places)] for number in numbers]
 
@@ -239,7 +252,7 @@ def _each_once(*groups: Iterable[KeyframeRecord]) -> list[KeyframeRecord]:
 
 
 def _seen_from(place: KeyframeRecord, pose: FeaturePose) -> np.ndarray:
-    """Return T_odom_camera [4, 4] of a feature pose against a record."""
+    """Return T_odom_camera [4, 4] of a frame, given its feature pose relative to a record."""
     return place.T_odom_keyframe @ se3.inverse(pose.T_camera_reference)
 
 
@@ -287,7 +300,11 @@ class ReusedKeyframe:
     candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
     def measures(self, keyframe: int) -> RelativePose:
-        """Return the relative-pose measurement of the keyframe that the frame became."""
+        """Return the measured pose of a new keyframe, made of this frame, relative to this one.
+
+        Args:
+            keyframe: Id of the new keyframe.
+        """
         seen = self.candidate.alignment
         return RelativePose(self.place.id, keyframe, seen.T_reference_camera, seen.information)
 
@@ -305,15 +322,15 @@ class KeyframeReuse:
     def find(
         self, view: Pyramid, near: Sequence[Nearby], history: ResidualHistory
     ) -> ReusedKeyframe | None:
-        """Find the first keyframe that a view verifiably shows at the pose that the map predicts.
+        """Find the first keyframe to which a frame aligns at the pose that the map predicts.
 
         Args:
             view: Pyramid of the frame.
-            near: Records with the poses predicted by the map, the nearest first.
-            history: Residual history of tracking, which the next frames are compared with too.
+            near: Records with T_keyframe_camera as the map predicts it, the nearest first.
+            history: Residual noise of the last frames. The alignment must not be much noisier.
 
         Returns:
-            The keyframe, or None if none is verified or the view is too far from all of them.
+            The keyframe, or None if no alignment is verified or all keyframes are too far.
         """
         for place, T_place_camera in near[: self.config.tries]:
             keyframe = place.keyframe(self.pyramid)
@@ -349,13 +366,15 @@ def find_nearby_keyframes(
     T_map_camera: np.ndarray,
     config: KeyframeConfig,
 ) -> list[Nearby]:
-    """Return the records within the keyframe limits of a camera pose, the nearest first.
+    """Return the records near a camera pose, the nearest first.
+
+    Near means that a frame with this pose would not need a new keyframe beside that record.
 
     Args:
         places: Records to choose from; those without a pose in the map are skipped.
         T_map_keyframe: Poses [4, 4] of the keyframes in the map, by id.
         T_map_camera: Pose of the camera in the map, [4, 4].
-        config: The limits.
+        config: Limits of rotation and translation; see `limit_ratios`.
     """
     known = [place for place in places if place.id in T_map_keyframe]
     if not known:

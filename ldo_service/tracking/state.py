@@ -17,7 +17,7 @@ from .tracking_quality import ResidualHistory, TrackingStatus
 
 
 class KeyframeOrigin(StrEnum):
-    """Origin of the reference keyframe, which matters for keyframe reuse."""
+    """Origin of the reference keyframe; keyframe reuse depends on it."""
 
     NEW = "new"
     TIED = "tied"  # New, and measured from a known keyframe.
@@ -26,7 +26,7 @@ class KeyframeOrigin(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OdometryState:
-    """State that the next frame depends on."""
+    """Complete state of odometry that the result of the next frame depends on."""
 
     # Keyframe records for relocalization and keyframe reuse.
     places: KeyframeDatabase = field(default_factory=KeyframeDatabase)
@@ -62,9 +62,9 @@ class OdometryState:
 
         Args:
             keyframe: The frame as a keyframe.
-            place: Its record, which is added to the database.
+            place: The record of the keyframe, which is added to the database.
             config: Settings of the database.
-            is_tied: The keyframe is measured from a known one.
+            is_tied: The pose of the keyframe was measured relative to a known keyframe.
         """
         return replace(
             self._against(keyframe, keyframe.T_odom_keyframe),
@@ -80,7 +80,7 @@ class OdometryState:
 
         Args:
             keyframe: The known keyframe.
-            place: Its record, which becomes the newest of the database.
+            place: The record of the keyframe, which moves to the end of the database.
             T_odom_camera: Pose of the frame just tracked, [4, 4].
         """
         return replace(
@@ -102,9 +102,9 @@ class OdometryState:
 
 
 def pack(state: OdometryState) -> dict[str, Any]:
-    """Return arrays and plain values.
+    """Return the state as arrays and plain values, for a checkpoint.
 
-    A keyframe is packed as gray image, depth, pose and masks; `unpack` computes the rest.
+    A keyframe is packed as gray image, depth, pose and masks. `unpack` computes everything else.
     """
     return {
         "places": [place.pack() for place in state.places.all],
@@ -128,7 +128,7 @@ def pack(state: OdometryState) -> dict[str, Any]:
 
 
 def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
-    """Return the state from its packed form, under the same configuration."""
+    """Return the state from its packed form; `config` must equal that of the packed state."""
     keyframe, suspicion, dynamic_mask = (
         values["keyframe"],
         values["suspicion"],
@@ -160,7 +160,7 @@ def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
 
 
 def _bits(mask: np.ndarray | None) -> dict[str, Any] | None:
-    """Pack a mask [H, W] bool to an eighth of its size, since it is written with each frame."""
+    """Pack a mask [H, W] bool to one bit per pixel, since it is saved with each frame."""
     return None if mask is None else {"bits": np.packbits(mask), "shape": list(mask.shape)}
 
 

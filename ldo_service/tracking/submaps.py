@@ -1,9 +1,9 @@
-"""Submaps: stretches of tracking without a loss, and their merging.
+"""Submaps: parts of the map between two losses of tracking, and their merging.
 
-A camera that stays lost starts a new submap with its own first keyframe. A submap is merged with
-another one after two consistent matches with keyframes of the other one, in views far apart. A
-single match may be a perceptual alias, such as the other end of a corridor. A false merge would put
-two places into one. Conventions: `ldo_service.geometry`.
+A camera that stays lost starts a new submap with its own first keyframe. Two submaps are merged
+after two consistent matches between them, from frames with clearly different poses. A single match
+may be a perceptual alias, such as the other end of a corridor. A false merge would place two
+different rooms on top of each other. Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -60,14 +60,18 @@ class SubmapMeasurement:
 
     @staticmethod
     def of(keyframe: ReferenceKeyframe, alignment: Alignment) -> "SubmapMeasurement":
-        """Return the measurement of an alignment of the frame to a keyframe."""
+        """Return the measurement that follows from the alignment of the frame to a keyframe."""
         T_keyframe_camera = alignment.T_reference_camera
         return SubmapMeasurement(
             keyframe.id, keyframe.submap, T_keyframe_camera, alignment.information
         )
 
     def measures(self, keyframe: int) -> RelativePose:
-        """Return the relative-pose measurement of the keyframe that the frame became."""
+        """Return the measured pose of a new keyframe, made of this frame, relative to this one.
+
+        Args:
+            keyframe: Id of the new keyframe.
+        """
         return RelativePose(self.keyframe, keyframe, self.T_keyframe_camera, self.information)
 
 
@@ -85,7 +89,7 @@ class SubmapMatch:
     def at(
         keyframe: ReferenceKeyframe, alignment: Alignment, here: int, T_here_camera: np.ndarray
     ) -> "SubmapMatch":
-        """Return the match of an alignment to a keyframe of another submap.
+        """Return the match that follows from the alignment to a keyframe of another submap.
 
         Args:
             keyframe: The keyframe.
@@ -106,14 +110,17 @@ class SubmapMatch:
         return image_motion_rad(difference, self.median_depth_m) < config.confirm_rad
 
     def is_distinct_from(self, other: "SubmapMatch", config: SubmapConfig) -> bool:
-        """Return whether two views are so far apart that aliases in both are unlikely."""
+        """Return whether the frames of two matches have clearly different camera poses.
+
+        Perceptual aliases in both of them are then unlikely.
+        """
         moved = se3.inverse(self.T_here_camera) @ other.T_here_camera
         return image_motion_rad(moved, 3.0 * self.median_depth_m) >= config.confirm_apart_rad
 
 
 @dataclass(frozen=True, slots=True)
 class Submaps:
-    """Submaps with their merges, and the search for further ones."""
+    """State of all submaps: which are merged, and how the search for further merges stands."""
 
     # Oldest submap that each submap is merged with, or itself.
     roots: tuple[int, ...] = ()
@@ -123,11 +130,19 @@ class Submaps:
     missed: int = 0  # Searches in a row without a match.
 
     def started(self) -> "Submaps":
-        """Return the submaps with a new one."""
+        """Return the state with one more submap, which is not merged with any other."""
         return Submaps((*self.roots, len(self.roots)))
 
     def after(self, is_lost: bool, stamp_ns: int) -> "Submaps":
-        """Return the state after a frame; a camera that restarts may have earlier stamps."""
+        """Return the state after one more frame.
+
+        If the camera restarts while LOST, stamps may go back. The LOST time then counts from the
+        earliest stamp.
+
+        Args:
+            is_lost: The tracking status of the frame is LOST.
+            stamp_ns: Stamp of the frame.
+        """
         known = self.lost_since_ns
         since_ns = stamp_ns if known is None else min(known, stamp_ns)
         return replace(
@@ -143,16 +158,19 @@ class Submaps:
         return stamp_ns - self.lost_since_ns >= 1e9 * config.begin_after_s
 
     def is_search_due(self, config: SubmapConfig) -> bool:
-        """Return whether unmerged submaps exist and the last search was long enough ago."""
+        """Return whether unmerged submaps exist and enough frames have passed since the search."""
         wait = config.look_every if self.pending_match is None else config.confirm_after
         return len(set(self.roots)) > 1 and self.frames_since_search >= wait
 
     def are_merged(self, submap: int, other: int) -> bool:
-        """Return whether two submaps are merged, directly or by others."""
+        """Return whether two submaps are merged, directly or through other submaps."""
         return self.roots[submap] == self.roots[other]
 
     def is_confirmed_by(self, look: SubmapMatch, config: SubmapConfig) -> bool:
-        """Return whether a match confirms the pending one: consistent, and from another view."""
+        """Return whether a match confirms the pending match.
+
+        It must agree on the relative pose, and its frame must have a clearly different pose.
+        """
         last = self.pending_match
         return (
             last is not None
@@ -161,11 +179,13 @@ class Submaps:
         )
 
     def with_search_result(self, found: SubmapMatch | None, config: SubmapConfig) -> "Submaps":
-        """Return the state after a search; the pending match stays until one contradicts it.
+        """Return the state after a search of the other submaps.
+
+        A match that is inconsistent with the pending match replaces it.
 
         Args:
-            found: The match, or None if the search found none. More than `misses` of these in a
-                row drop the pending match.
+            found: The match, or None if the search found none. More than `config.misses` searches
+                in a row without a match drop the pending match.
             config: Settings.
         """
         if found is None:
@@ -193,12 +213,12 @@ class Submaps:
         return replace(self, roots=roots, pending_match=None)
 
     def pack(self) -> dict[str, Any]:
-        """Return arrays and plain values."""
+        """Return the state as arrays and plain values."""
         return asdict(self)
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "Submaps":
-        """Return the submaps from their packed form."""
+        """Return the state from its packed form."""
         match = kept["pending_match"]
         return Submaps(
             **{

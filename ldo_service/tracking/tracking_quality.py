@@ -1,8 +1,9 @@
 """Tracking status from the quality of an alignment.
 
-Inlier fractions do not detect a wrong local minimum: its inflated noise estimate makes every
-residual an inlier. The status therefore depends on other measures: overlap with the reference,
-noise relative to its running median, condition of the information, and confirmation by features.
+Inlier fractions do not detect that alignment converged to a wrong local minimum. The noise estimate
+is too large there, so that every residual counts as an inlier. The status therefore depends on
+other measures: overlap with the reference keyframe, noise relative to its running median, condition
+number of the information, and confirmation by features.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +31,7 @@ class TrackingStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TrackingQualityConfig:
-    """Limits of the tracking status."""
+    """Limits that decide whether the tracking status is OK, WEAK or LOST."""
 
     # Minimum visible fraction of the reference points; chosen on apartment_floor1, not elsewhere.
     min_overlap: float = 0.15
@@ -87,7 +88,7 @@ class TrackingQualityConfig:
 
 @dataclass(frozen=True, slots=True)
 class ResidualHistory:
-    """Noise of the last OK frames."""
+    """Photometric and geometric noise of the last OK frames."""
 
     intensity_sigmas: tuple[float, ...] = ()  # Gray levels of the reference.
     depth_noise_scales: tuple[float, ...] = ()  # Times the sensor model.
@@ -101,7 +102,10 @@ class ResidualHistory:
         )
 
     def residual_ratio(self, alignment: Alignment, config: TrackingQualityConfig) -> float:
-        """Return the noise of an alignment over its running median, the larger of both ratios."""
+        """Return the noise of an alignment divided by its running median.
+
+        Of the photometric and the geometric ratio, the larger one is returned.
+        """
         usual_sigma = median(self.intensity_sigmas or (config.first_intensity_sigma,))
         usual_scale = median(self.depth_noise_scales or (config.first_depth_noise_scale,))
         intensity = max(usual_sigma, config.min_intensity_sigma)
@@ -112,7 +116,10 @@ class ResidualHistory:
 
 
 def exposure_corrected_sigma(alignment: Alignment) -> float:
-    """Return the photometric noise in gray levels of the reference, as it grows with exposure."""
+    """Return the photometric noise divided by the gain, in gray levels of the reference.
+
+    Noise in gray levels of the frame grows with its exposure.
+    """
     return alignment.intensity_sigma / max(alignment.gain, MIN_GAIN)
 
 
@@ -122,11 +129,11 @@ def classify_tracking(
     previous: TrackingStatus,
     config: TrackingQualityConfig,
 ) -> TrackingStatus:
-    """Return the tracking status of a frame by its best alignment.
+    """Return the tracking status of a frame, judged by its best alignment.
 
     The limits have hysteresis. After a WEAK frame they are stricter, unless features confirm the
-    pose. After a LOST frame they are strictest, unless features and a prior both confirm the pose.
-    A LOST frame is followed by an OK or a LOST frame, never by a WEAK one.
+    pose. After a LOST frame they are strictest, unless features and the odometry prior both confirm
+    the pose. The status changes from LOST to OK directly, never to WEAK.
 
     Args:
         candidate: Best hypothesis of the frame.

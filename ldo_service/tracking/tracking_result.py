@@ -24,7 +24,7 @@ class KeyframeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TrackedFrame:
-    """Pose of a frame against its reference keyframe, and the keyframe that it needs.
+    """Pose of a frame relative to its reference keyframe, and the kind of keyframe it needs.
 
     While the status is LOST, the pose is the last accepted one and `information` is zero.
     """
@@ -157,19 +157,19 @@ def make_tracking_result(
     denied_keyframe: KeyframeKind | None = None,
     awaits_mapping: bool = False,
 ) -> TrackingResult:
-    """Return the result of a tracked frame, with its place in the map.
+    """Return the result of a tracked frame, with its pose in the map.
 
     Args:
         tracked: The frame in odometry.
         T_map_odom: Odometry frame in the map, [4, 4]; its rotation is orthonormalized here.
-        graph_version: See `TrackingResult`, as are the arguments below.
-        submap: The root of the frame's submap.
+        graph_version: Version of the pose graph that T_map_odom comes from.
+        submap: The oldest submap that the pose graph has merged with the frame's submap.
         reference: The keyframe that the pose refers to.
         has_prior: The odometry prior covers the time of the frame.
-        keyframe: The keyframe made of the frame.
+        keyframe: The new keyframe made of the frame, if any.
         reused_keyframe: The known keyframe that is the reference from now on.
-        denied_keyframe: The kind of keyframe that was needed, but not allowed.
-        awaits_mapping: Odometry has not started.
+        denied_keyframe: The kind of keyframe that was needed but not allowed by `may_map`.
+        awaits_mapping: Odometry has not started, because its first frame may not be mapped.
     """
     return TrackingResult(
         status=tracked.status,

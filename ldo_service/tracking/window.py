@@ -1,9 +1,9 @@
 """Relative-pose measurements of a new keyframe from earlier ones.
 
-A single chain of measurements, each keyframe from the previous one, accumulates errors. The last
-keyframes show much of the same surface, so each new one is measured from several of them. The
-pose-graph optimizer solves these measurements together. On `synthetic:flat-exact` this reduces the
-trajectory error to less than half. Conventions: `ldo_service.geometry`.
+If each keyframe were measured relative to the previous one alone, errors would accumulate. The last
+keyframes show much of the same surface, so each new keyframe is measured relative to several of
+them. The pose-graph optimizer combines these measurements. On the sequence `synthetic:flat-exact`
+this reduces the trajectory error to less than half. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -87,8 +87,8 @@ def measure_against(
     Args:
         earlier: Earlier keyframes in order of preference.
         keyframe: The new keyframe.
-        usual: Brightness and noise of tracking; the start values of each alignment, and the scale
-            of its maximum noise.
+        usual: Brightness change and noise of the tracked frame. Each alignment starts from these
+            values, and `config.max_noise` is a multiple of this noise.
         align_config: Settings of alignment.
         config: Settings.
 

@@ -69,7 +69,7 @@ def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("body", [b"", b"nonsense", encode_state({"places": [{"id": 1}]})])
 def test_invalid_keyframe_database_is_refused(tmp_path: Path, body: bytes) -> None:
     (tmp_path / DATABASE_FILE).write_bytes(body)
-    with pytest.raises(DataError, match="is not a keyframe database of `ldo run`"):
+    with pytest.raises(DataError, match="is not a valid keyframe database"):
         load_keyframe_database(tmp_path)
 
 
