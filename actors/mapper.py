@@ -16,7 +16,7 @@ out  keyframe/refinement   KeyframeRefinement   keyframe poses refined by the re
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -89,14 +89,7 @@ class MapperConfig:
     min_iterations: int = 3  # Minimum, however many keyframes wait: new Gaussians need some.
     folder: str = ""  # Keyframe images; empty: a temporary folder, or one within the state.
     threads: int = 0  # Threads of the renderer; 0: all cores but one, which the tracker needs.
-    snapshot_keyframes: int = 10  # Minimum keyframes between published snapshots.
-    # Minimum fraction of new Gaussians, so that snapshots cost at most a few times the deltas.
-    snapshot_growth: float = 0.25
-    snapshot_keyframes_max: int = 200  # Longest wait of subscribers that missed a delta.
-    # Maximum Gaussians per message: 1.2 MB, 1.8 MB with labels, so that none blocks others long.
-    part_gaussians: int = 16_384
-    # Keyframes between deltas of changed Gaussians; all Gaussians in view change at every keyframe.
-    changed_keyframes: int = 5
+    publish: PublishConfig = field(default_factory=PublishConfig)
     # Newest keyframes for which every relative measurement is updated when the renderer moves them.
     # The pose graph has condensed older ones; for those only the one to the reference is updated.
     measured_keyframes: int = 64
@@ -106,22 +99,15 @@ class MapperConfig:
     refit: LoopRefitConfig = field(default_factory=LoopRefitConfig)
 
     def __post_init__(self) -> None:
-        amounts = (*("iterations", "min_iterations", "threads", "snapshot_growth"),)
+        amounts = ("iterations", "min_iterations", "threads")
         if min(getattr(self, name) for name in amounts) < 0:
             raise ConfigError(named(self, *amounts) + " must not be negative.")
-        counts = (
-            *("snapshot_keyframes", "part_gaussians", "checkpoint_keyframes"),
-            *("changed_keyframes", "measured_keyframes"),
-        )
+        counts = ("checkpoint_keyframes", "measured_keyframes")
         if min(getattr(self, name) for name in counts) < 1:
             raise ConfigError(named(self, *counts) + " must be at least 1.")
 
     def thread_count(self) -> int:
         return self.threads or max(1, (os.cpu_count() or 1) - 1)
-
-    def pace(self) -> PublishConfig:
-        """Return the settings of the map publisher."""
-        return PublishConfig(**{f.name: getattr(self, f.name) for f in fields(PublishConfig)})
 
 
 class Mapper(Actor):
@@ -163,7 +149,7 @@ class Mapper(Actor):
         self._objects_teller = ObjectPublisher()
         self._poses = KeyframePoses()
         self._links = RelativeMeasurements(self._poses, self.config.measured_keyframes)
-        self._publisher = MapPublisher(self._map, self.config.pace())
+        self._publisher = MapPublisher(self._map, self.config.publish)
         self._newest: tuple[int, int] = (0, -1)  # Stamp in ns and id of the newest keyframe.
         self._refit = LoopRefit(self._map, self.config.refit)
         self._checkpoint: dict[str, Any] = {}

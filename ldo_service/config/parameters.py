@@ -29,6 +29,7 @@ from ldo_service.loop_closing.place_database import RetrievalConfig
 from ldo_service.loop_closing.pose_estimation import DepthConsistencyConfig
 from ldo_service.loop_closing.subgraph import SubgraphConfig
 from ldo_service.loop_closing.verification import VerificationConfig
+from ldo_service.maps.publisher import PublishConfig
 from ldo_service.pose_graph.factors import NoiseConfig
 from ldo_service.pose_graph.landmarks import ObjectLandmarkConfig
 from ldo_service.pose_graph.loop_closures import LoopClosureConfig
@@ -192,9 +193,11 @@ def _mapper(config: Config) -> MapperConfig:
         iterations=mapper.iterations,
         folder=mapper.image_folder,
         threads=mapper.threads,
-        snapshot_keyframes=mapper.publish.snapshot_interval_keyframes,
-        part_gaussians=mapper.publish.max_gaussians_per_message,
-        changed_keyframes=mapper.publish.update_interval_keyframes,
+        publish=PublishConfig(
+            max_gaussians_per_message=mapper.publish.max_gaussians_per_message,
+            update_interval_keyframes=mapper.publish.update_interval_keyframes,
+            snapshot_interval_keyframes=mapper.publish.snapshot_interval_keyframes,
+        ),
         checkpoint_keyframes=mapper.checkpoint_interval_keyframes,
         refit=LoopRefitConfig(
             iterations=mapper.refit.iterations,

@@ -10,6 +10,7 @@ import numpy as np
 
 from ldo_service.conversions.objects import map_objects
 from ldo_service.conversions.poses import pose_to_message
+from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.runtime.process import trim_memory
 from ldo_service.schemas import (
@@ -34,13 +35,29 @@ VERSIONS_IN_A_CHECKPOINT = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class PublishConfig:
-    """Size and rate of the map messages; see `MapperConfig`."""
+    """Settings of the size and the rate of map messages."""
 
-    part_gaussians: int
-    changed_keyframes: int
-    snapshot_keyframes: int
-    snapshot_growth: float
-    snapshot_keyframes_max: int
+    # A message of so many Gaussians has 1.2 MB, 1.8 MB with labels: it blocks no other one long.
+    max_gaussians_per_message: int = 16_384
+    # Keyframes between deltas of changed Gaussians; all Gaussians in view change at every keyframe.
+    update_interval_keyframes: int = 5
+    snapshot_interval_keyframes: int = 10  # Minimum number of keyframes between two snapshots.
+    # A snapshot is published when the map has grown by this fraction since the previous one. All
+    # snapshots together then cost at most a few times as much as the deltas.
+    min_snapshot_growth: float = 0.25
+    # A snapshot is published after so many keyframes whatever the growth: a subscriber that missed
+    # a delta waits for it.
+    max_snapshot_interval_keyframes: int = 200
+
+    def __post_init__(self) -> None:
+        counts = (
+            *("max_gaussians_per_message", "update_interval_keyframes"),
+            "snapshot_interval_keyframes",
+        )
+        if min(getattr(self, name) for name in counts) < 1:
+            raise ConfigError(named(self, *counts) + " must be at least 1.")
+        if self.min_snapshot_growth < 0:
+            raise ConfigError(named(self, "min_snapshot_growth") + " must not be negative.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,18 +82,20 @@ class MapPublisher:
     of the whole map rarely.
     """
 
-    def __init__(self, map_: MapBuilder, pace: PublishConfig) -> None:
+    def __init__(self, map_: MapBuilder, config: PublishConfig | None = None) -> None:
+        self.config = config or PublishConfig()
         self.version = 0
-        self._map, self._pace = map_, pace
+        self._map = map_
         self._names_told = 0
-        self._since_snapshot = pace.snapshot_keyframes  # The first keyframe publishes one.
+        # The first keyframe publishes a snapshot.
+        self._since_snapshot = self.config.snapshot_interval_keyframes
         self._since_changed = 0
         self._in_snapshot = 0  # Number of Gaussians in the last snapshot.
 
     def on_keyframe(self, now: MessageContext) -> Iterator[MapDelta]:
         """Yield the deltas to publish after a new keyframe."""
         self._since_changed += 1
-        is_time = self._since_changed >= self._pace.changed_keyframes
+        is_time = self._since_changed >= self.config.update_interval_keyframes
         yield from self.deltas(now, with_changed=is_time)
 
     def deltas(self, now: MessageContext, *, with_changed: bool) -> Iterator[MapDelta]:
@@ -87,7 +106,7 @@ class MapPublisher:
             with_changed: Include changes of old Gaussians, and offload Gaussians afterwards.
         """
         changes = self._map.changes(with_changed=with_changed)
-        for part in split_changes(changes, self._pace.part_gaussians):
+        for part in split_changes(changes, self.config.max_gaussians_per_message):
             yield self.delta(
                 now,
                 removed=part.removed,
@@ -161,11 +180,12 @@ class MapPublisher:
         The required number is smaller if the map has grown much. Call it once per keyframe.
         """
         self._since_snapshot += 1
-        pace, grown = self._pace, self._map.size() - self._in_snapshot
-        has_grown = grown >= pace.snapshot_growth * self._in_snapshot
-        if self._since_snapshot >= (
-            pace.snapshot_keyframes if has_grown else pace.snapshot_keyframes_max
-        ):
+        config, growth = self.config, self._map.size() - self._in_snapshot
+        if growth >= config.min_snapshot_growth * self._in_snapshot:
+            interval = config.snapshot_interval_keyframes
+        else:
+            interval = config.max_snapshot_interval_keyframes
+        if self._since_snapshot >= interval:
             yield from self.publish_snapshot(now)
 
     def publish_snapshot(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
@@ -175,8 +195,8 @@ class MapPublisher:
         """
         yield from self.deltas(now, with_changed=True)
         self._since_snapshot, self._in_snapshot = 0, self._map.size()
-        parts = max(1, -(-self._map.size() // self._pace.part_gaussians))
-        pieces = rechunk(self._map.batches(), parts, self._pace.part_gaussians)
+        parts = max(1, -(-self._map.size() // self.config.max_gaussians_per_message))
+        pieces = rechunk(self._map.batches(), parts, self.config.max_gaussians_per_message)
         exposures = self._map.views.exposures
         for part, gaussians in enumerate(pieces):
             named = list(exposures) if part == 0 else []

@@ -29,6 +29,7 @@ from ldo_service.gaussians.loop_refit import LoopRefitConfig
 from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.gaussians.visibility import OffloadConfig
 from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.maps.publisher import PublishConfig
 from ldo_service.maps.replica import MapReplica
 from ldo_service.runtime.actor import FlowStatus
 from ldo_service.runtime.delivery_state import LoggedInput, RestoredState, restore_actor
@@ -52,12 +53,15 @@ from tests.actors.conftest import handle_all, replicate
 
 CONFIG = MapperConfig(
     iterations=2,
-    changed_keyframes=3,
-    snapshot_keyframes=2,
-    part_gaussians=3000,
-    snapshot_growth=0.0,
+    publish=PublishConfig(
+        max_gaussians_per_message=3000,
+        update_interval_keyframes=3,
+        snapshot_interval_keyframes=2,
+        min_snapshot_growth=0.0,
+    ),
 )
 
+RARE_SNAPSHOTS = replace(CONFIG.publish, snapshot_interval_keyframes=100)
 
 SLOW_CHECKPOINTS = replace(CONFIG, checkpoint_keyframes=5)
 
@@ -124,7 +128,8 @@ def test_replica_equals_the_map_while_gaussians_are_offloaded_and_loaded(keyfram
     """Gaussians beyond 3 m are offloaded, and loaded when a camera comes near."""
     offload = OffloadConfig(max_active=500, reach_m=3.0, clump_m=0.5)
     builder = MapBuilderConfig(sleep=offload, recent_cameras=1)
-    config = replace(CONFIG, builder=builder, changed_keyframes=1, iterations=1, min_iterations=1)
+    publish = replace(CONFIG.publish, update_interval_keyframes=1)
+    config = replace(CONFIG, builder=builder, publish=publish, iterations=1, min_iterations=1)
     mapper, replica = (
         Mapper(replace(config, refit=LoopRefitConfig(deduplicated_at_end=0))),
         MapReplica(),
@@ -143,12 +148,14 @@ def test_replica_equals_the_map_while_gaussians_are_offloaded_and_loaded(keyfram
 
 def test_changed_gaussians_are_sent_every_few_keyframes(keyframes) -> None:
     """Otherwise every keyframe would send all Gaussians in view."""
-    config = replace(CONFIG, snapshot_keyframes=100)
+    config = replace(CONFIG, publish=RARE_SNAPSHOTS)
     mapper, has_changes = Mapper(config), []
     for keyframe in keyframes[:7]:
         deltas = deltas_of(mapper.handle(keyframe))
         has_changes.append(any(len(delta.changed.ids.numpy()) for delta in deltas))
-        assert all(len(d.added.ids.numpy()) <= config.part_gaussians for d in deltas)
+        assert all(
+            len(d.added.ids.numpy()) <= config.publish.max_gaussians_per_message for d in deltas
+        )
     assert has_changes == [False, False, False, True, False, False, True]
 
 
@@ -241,7 +248,8 @@ def test_correction_older_than_a_refinement_does_not_undo_it(keyframes) -> None:
 
 
 def test_map_that_does_not_grow_still_gets_regular_snapshots(keyframes) -> None:
-    config = replace(CONFIG, snapshot_growth=100.0, snapshot_keyframes_max=3)
+    publish = replace(CONFIG.publish, min_snapshot_growth=100.0, max_snapshot_interval_keyframes=3)
+    config = replace(CONFIG, publish=publish)
     made = [list(mapper_made) for mapper_made in map(Mapper(config).handle, keyframes[:8])]
     has_snapshot = [any(isinstance(m, MapSnapshot) for m in messages) for messages in made]
     assert has_snapshot == [True, False, False, True, False, False, True, False]
@@ -536,7 +544,7 @@ def test_between_checkpoints_the_state_is_the_same_object(keyframes) -> None:
 
 def test_replica_follows_a_mapper_that_restarted_empty(keyframes) -> None:
     """The first delta, before any snapshot, is that of an empty map."""
-    config = replace(CONFIG, snapshot_keyframes=100)
+    config = replace(CONFIG, publish=RARE_SNAPSHOTS)
     replica = replicate(changes(handle_all(Mapper(config), keyframes[:4])))
     assert replica.version > 1
     restarted = Mapper(config)
@@ -609,7 +617,7 @@ def test_replica_has_equal_labels_and_label_names(keyframes) -> None:
 
 
 def test_label_names_are_sent_only_when_new(keyframes) -> None:
-    mapper, counts = Mapper(replace(LABELLING, snapshot_keyframes=100)), []
+    mapper, counts = Mapper(replace(LABELLING, publish=RARE_SNAPSHOTS)), []
     for keyframe in keyframes[:4]:
         made = handle_all(mapper, [keyframe, boxes_of(keyframe)])
         counts.append(sum(bool(delta.label_names) for delta in deltas_of(made)))
