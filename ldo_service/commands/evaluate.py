@@ -61,7 +61,7 @@ def open_table(rows: list[LabelErrors], calls_per_frame: float | None) -> Table:
         rows: Label errors of each map.
         calls_per_frame: Requests to the labeller per frame; None where the run did not count them.
     """
-    columns = ("map", "consistency", "beyond COCO: recall", "precision", "VLM calls per frame")
+    columns = ("map", "consistency", "beyond COCO: recall", "precision", "Labeller calls per frame")
     table = Table(*columns)
     for row in rows:
         calls = "not counted" if calls_per_frame is None else f"{calls_per_frame:.3f}"
