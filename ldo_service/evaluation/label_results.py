@@ -18,7 +18,7 @@ from .pictures import Color, contact_sheet, legend
 from .semantics import GATES, LabelErrors, LabelView, ListErrors, labelled_maps
 from .sheet import VIEWS, shrunk
 
-CAPTIONS = ["camera", "truth", "map", "error"]
+CAPTIONS = ["camera", "ground truth", "map", "error"]
 PAINT = 0.65  # Opacity of a label's color over the gray camera image.
 GOLDEN_RATIO = 0.618033988749895
 SHADES = ((0.95, 1.0), (0.55, 1.0), (0.85, 0.65))  # Saturation, value.
@@ -48,7 +48,7 @@ class LabelPicture:
 def label_sheet(
     pictures: list[LabelPicture], map_names: abc.Sequence[str], class_names: abc.Sequence[str]
 ) -> np.ndarray:
-    """Draw rows [camera, truth, map, error] as uint8 RGB, and a legend of the names that occur.
+    """Draw rows [camera, ground truth, map, error] as uint8 RGB, and a legend of the names that occur.
 
     Names are those of the full list (`label_lists.full_list`). Background is the gray camera
     image.

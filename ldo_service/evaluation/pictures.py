@@ -26,7 +26,7 @@ def trajectory_picture(estimate: Trajectory, truth: Trajectory | None) -> np.nda
     The estimate is aligned to the truth if at least three poses have a partner. The world axes are
     sorted by the extent of the camera motion: the two longest span the view from above.
     """
-    lines = [] if truth is None else [_Line(truth.T_world_camera[:, :3, 3], TRUTH, "truth")]
+    lines = [] if truth is None else [_Line(truth.T_world_camera[:, :3, 3], TRUTH, "ground truth")]
     lines.append(_Line(_aligned_positions(estimate, truth), ESTIMATE, "estimate"))
     lines = [line for line in lines if len(line.points_m)]
     points_m = np.concatenate([line.points_m for line in lines] or [np.zeros((1, 3))])
