@@ -3,7 +3,10 @@
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
-LIBRARIES = ("numpy", "gtsam", "onnxruntime", "opencv-python-headless", "msgspec")
+LIBRARIES = (
+    *("numpy", "scipy", "scikit-image", "gtsam", "small-gicp", "onnxruntime"),
+    *("opencv-python-headless", "msgspec"),
+)
 
 try:
     __version__ = version("ldo-slam")
