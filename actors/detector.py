@@ -1,6 +1,6 @@
 """Detection of objects of known classes in each keyframe.
 
-in   keyframe/new      Keyframe         Lossless(8)   a lost keyframe would get no detections
+in   keyframe/new      Keyframe         Backlog(4)    a lost keyframe would get no detections
 out  detection/boxes   DetectionBoxes                 one for every keyframe, possibly empty
 
 The service continues if the network cannot be loaded or fails. The detector then publishes messages
@@ -17,7 +17,7 @@ from ldo_service.conversions.objects import detections_to_message
 from ldo_service.detection.detectors import Detections, NetworkConfig
 from ldo_service.detection.model_registry import open_detector
 from ldo_service.errors import ConfigError, ModelError
-from ldo_service.runtime import Actor, In, Lossless, Out
+from ldo_service.runtime import Actor, Backlog, In, Out
 from ldo_service.schemas import DetectionBoxes, Keyframe
 from ldo_service.schemas.topics import DETECTION_BOXES, KEYFRAME_NEW
 
@@ -39,8 +39,9 @@ class Detector(Actor):
     """
 
     name = "detector"
-    inputs = (In(KEYFRAME_NEW, Lossless(8)),)
+    inputs = (In(KEYFRAME_NEW, Backlog(4)),)
     outputs = (Out(DETECTION_BOXES),)
+    is_backend = True
 
     def __init__(self, config: DetectorConfig | None = None) -> None:
         super().__init__()

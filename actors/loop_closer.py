@@ -1,7 +1,7 @@
 """Detection of loop closures between subgraphs of keyframes.
 
-in   keyframe/new       Keyframe         Lossless(8)   a lost keyframe could never close a loop
-in   detection/boxes    DetectionBoxes   Lossless(8)   object classes in every keyframe
+in   keyframe/new       Keyframe         Backlog(4)    a lost keyframe could never close a loop
+in   detection/boxes    DetectionBoxes   Backlog(16)   object classes in every keyframe
 in   graph/correction   GraphCorrection  Latest(1)     has all poses, so the newest suffices
 out  loop/closure       LoopClosure                    each accepted candidate
 out  loop/candidate     LoopCandidate                  each candidate; the reason if it is rejected
@@ -26,7 +26,7 @@ from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.loop_closing import LoopCandidateResult, LoopDetector, LoopsConfig
 from ldo_service.loop_closing.object_points import DetectionPoints, locate_detections
-from ldo_service.runtime import Actor, In, Latest, Lossless, Out
+from ldo_service.runtime import Actor, Backlog, In, Latest, Out
 from ldo_service.schemas import (
     Detection,
     DetectionBoxes,
@@ -49,7 +49,9 @@ log = logging.getLogger(__name__)
 
 # Maximum keyframes that wait for detections: two windows of the input. If more wait, their
 # detections were lost.
-MAX_PENDING_KEYFRAMES = 16
+# Maximum keyframes that wait for a slow detector: two minutes at 2 Hz, 33 MB at 640x480. If more
+# wait, the oldest is compared without its detections.
+MAX_PENDING_KEYFRAMES = 256
 # Number of newest keyframes for which the optimizer may not have published a pose yet; the tracker
 # keeps as many.
 RECENT_KEYFRAMES = 32
@@ -87,11 +89,12 @@ class LoopCloser(Actor):
 
     name = "loop_closer"
     inputs = (
-        In(KEYFRAME_NEW, Lossless(8)),
-        In(DETECTION_BOXES, Lossless(8)),
+        In(KEYFRAME_NEW, Backlog(4)),
+        In(DETECTION_BOXES, Backlog(16)),
         In(GRAPH_CORRECTION, Latest(1)),
     )
     outputs = (Out(LOOP_CLOSURE), Out(LOOP_CANDIDATE))
+    is_backend = True
 
     def __init__(self, config: LoopCloserConfig | None = None) -> None:
         super().__init__()

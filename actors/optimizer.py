@@ -1,12 +1,13 @@
 """Optimization of the pose graph of keyframes and objects.
 
-in   keyframe/new          Keyframe             Lossless(8)   each one links to the one before
-in   keyframe/refinement   KeyframeRefinement   Lossless(8)   better relative-pose measurements
-in   loop/closure          LoopClosure          Lossless(8)   rare, and costly to detect
-in   object/observation    ObjectObservation    Lossless(8)   every observation adds information
-out  graph/correction      GraphCorrection                    all keyframe poses and landmarks
+in   keyframe/measurements  KeyframeMeasurements  Backlog(64)   each one links to the one before
+in   keyframe/refinement    KeyframeRefinement    Backlog(64)   better relative-pose measurements
+in   loop/closure           LoopClosure           Backlog(64)   rare, and costly to detect
+in   object/observation     ObjectObservation     Backlog(64)   every observation adds information
+out  graph/correction       GraphCorrection                     all keyframe poses and landmarks
 
-gtsam holds the GIL during every call, so this actor runs in a process of its own by default.
+gtsam holds the GIL during every call, so this actor runs in a process of its own by default. No
+other actor waits for it: while it optimizes, its producers keep its messages on disk.
 """
 
 import logging
@@ -35,11 +36,11 @@ from ldo_service.pose_graph.landmarks import (
     ObjectLandmarks,
 )
 from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
-from ldo_service.runtime import Actor, In, Lossless, Out
+from ldo_service.runtime import Actor, Backlog, In, Out
 from ldo_service.schemas import (
     GraphCorrection,
     GraphLandmark,
-    Keyframe,
+    KeyframeMeasurements,
     KeyframeRefinement,
     LoopClosure,
     MeasuredPose,
@@ -49,13 +50,16 @@ from ldo_service.schemas import (
 )
 from ldo_service.schemas.topics import (
     GRAPH_CORRECTION,
-    KEYFRAME_NEW,
+    KEYFRAME_MEASUREMENTS,
     KEYFRAME_REFINEMENT,
     LOOP_CLOSURE,
     OBJECT_OBSERVATION,
 )
 
 log = logging.getLogger(__name__)
+
+# Messages of an input in memory. They are small, so that a backlog is read in few pieces.
+WINDOW = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +87,13 @@ class Optimizer(Actor):
 
     name = "optimizer"
     inputs = (
-        In(KEYFRAME_NEW, Lossless(8)),
-        In(KEYFRAME_REFINEMENT, Lossless(8)),
-        In(LOOP_CLOSURE, Lossless(8)),
-        In(OBJECT_OBSERVATION, Lossless(8)),
+        In(KEYFRAME_MEASUREMENTS, Backlog(WINDOW)),
+        In(KEYFRAME_REFINEMENT, Backlog(WINDOW)),
+        In(LOOP_CLOSURE, Backlog(WINDOW)),
+        In(OBJECT_OBSERVATION, Backlog(WINDOW)),
     )
     outputs = (Out(GRAPH_CORRECTION),)
+    is_backend = True
 
     def __init__(self, config: OptimizerConfig | None = None) -> None:
         super().__init__()
@@ -111,7 +116,7 @@ class Optimizer(Actor):
         self._repeated = self._bridged = self._refined = self._too_early = self._too_late = 0
 
     def handle(
-        self, message: Keyframe | KeyframeRefinement | LoopClosure | ObjectObservation
+        self, message: KeyframeMeasurements | KeyframeRefinement | LoopClosure | ObjectObservation
     ) -> Iterator[GraphCorrection]:
         """Yield a correction if the message changes the pose graph."""
         self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
@@ -129,10 +134,10 @@ class Optimizer(Actor):
             case KeyframeRefinement():
                 self._refine(message.poses)
                 self._waiting_number = message.number
-            case Keyframe() if message.keyframe in self._graph:
+            case KeyframeMeasurements() if message.keyframe in self._graph:
                 self._repeated += 1  # Sent again after a restart.
                 return
-            case Keyframe():
+            case KeyframeMeasurements():
                 self._take(message)
         yield self._correction(message.stamp_ns)
 
@@ -158,7 +163,7 @@ class Optimizer(Actor):
         )
 
     # --- keyframes --------------------------------------------------------------------------------
-    def _take(self, message: Keyframe) -> None:
+    def _take(self, message: KeyframeMeasurements) -> None:
         """Add a keyframe to the pose graph, then process the messages that waited for it."""
         if self._landmarks.needs_update():
             self._landmarks.update_graph(self._graph)
@@ -183,7 +188,7 @@ class Optimizer(Actor):
             self._refined += len(known)
             self._graph.replace([relative_pose_from_message(pose) for pose in known.values()])
 
-    def _add(self, message: Keyframe) -> None:
+    def _add(self, message: KeyframeMeasurements) -> None:
         T_odom_keyframe = pose_from_message(message.T_odom_keyframe)
         newest = self._newest.get(message.submap)
         known = [m for m in measurements_from_message(message) if m.a in self._graph]
@@ -197,7 +202,9 @@ class Optimizer(Actor):
         for pose in message.submap_measurements:
             self._join(pose)
 
-    def _add_first_keyframe(self, message: Keyframe, T_odom_keyframe: np.ndarray) -> None:
+    def _add_first_keyframe(
+        self, message: KeyframeMeasurements, T_odom_keyframe: np.ndarray
+    ) -> None:
         """Add the first keyframe of a submap; its pose relative to other submaps is unknown."""
         self._first[message.submap] = message.keyframe
         T_map_keyframe = T_map_submap(message.submap) @ T_odom_keyframe

@@ -6,7 +6,8 @@ in   odometry/prior   OdometryPrior    Latest(64)   0.3 s at 200 Hz: the time to
                                                     older poses may be dropped
 in   detection/boxes  DetectionBoxes   Latest(1)    dynamic objects are masked for tracking
 out  pose/tracked     TrackedPose                   one for every tracked frame
-out  keyframe/new     Keyframe                      made only when every consumer has credit
+out  keyframe/new     Keyframe                      made only when the mapper has credit
+out  keyframe/measurements  KeyframeMeasurements    the same without images
 
 The actor converts messages, buffers the odometry prior and counts. `Odometry.process` tracks a
 frame in one call. If `TrackerConfig.localize` names a finished run, a
@@ -25,6 +26,7 @@ import numpy as np
 
 from ldo_service.conversions.frames import (
     frame_from_message,
+    keyframe_measurements_message,
     keyframe_message,
     tracked_pose_message,
 )
@@ -39,6 +41,7 @@ from ldo_service.schemas import (
     FrameRgbd,
     GraphCorrection,
     Keyframe,
+    KeyframeMeasurements,
     OdometryPrior,
     TrackedPose,
 )
@@ -47,6 +50,7 @@ from ldo_service.schemas.topics import (
     DETECTION_BOXES,
     FRAME_RGBD,
     GRAPH_CORRECTION,
+    KEYFRAME_MEASUREMENTS,
     KEYFRAME_NEW,
     ODOMETRY_PRIOR,
     POSE_TRACKED,
@@ -127,7 +131,11 @@ class Tracker(Actor):
         In(ODOMETRY_PRIOR, Latest(64)),
         In(DETECTION_BOXES, Latest(1)),
     )
-    outputs = (Out(POSE_TRACKED), Out(KEYFRAME_NEW, is_nonblocking=True))
+    outputs = (
+        Out(POSE_TRACKED),
+        Out(KEYFRAME_NEW, is_nonblocking=True),
+        Out(KEYFRAME_MEASUREMENTS),
+    )
     is_prompt = True
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
@@ -148,7 +156,7 @@ class Tracker(Actor):
 
     def handle(
         self, message: FrameRgbd | GraphCorrection | OdometryPrior | DetectionBoxes
-    ) -> Iterator[TrackedPose | Keyframe]:
+    ) -> Iterator[TrackedPose | Keyframe | KeyframeMeasurements]:
         """Yield the pose of a frame, after its keyframe if the frame becomes one."""
         if isinstance(message, OdometryPrior):
             self._take_prior(message)
@@ -162,7 +170,7 @@ class Tracker(Actor):
         else:
             yield from self._track(frame_from_message(message))
 
-    def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
+    def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe | KeyframeMeasurements]:
         """Track a frame; yield its keyframe if it becomes one, then its pose."""
         hold_out = self.config.hold_out
         is_held_out = hold_out > 0 and frame.index % hold_out == hold_out - 1
@@ -172,7 +180,9 @@ class Tracker(Actor):
         if result.awaits_mapping:
             return  # Odometry starts with a later frame, when all consumers have credit.
         if result.keyframe is not None:
-            yield keyframe_message(frame, result, result.keyframe)
+            keyframe = keyframe_message(frame, result, result.keyframe)
+            yield keyframe
+            yield keyframe_measurements_message(keyframe)
         yield tracked_pose_message(frame, result, self._T_base_camera)
 
     def _count(self, frame: RgbdFrame, result: TrackingResult, is_held_out: bool) -> None:

@@ -69,6 +69,7 @@ class VlmLabeller(Actor):
         In(LABEL_ADD, Latest(32), has_priority=True),
     )
     outputs = (Out(LABEL_RESULT), Out(LABEL_NAMES))
+    is_backend = True
 
     def __init__(
         self, config: VlmLabellerConfig | None = None, labeller: Labeller | None = None

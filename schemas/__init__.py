@@ -19,7 +19,12 @@ from ldo_service.schemas.frames import (
 )
 from ldo_service.schemas.graph import GraphCorrection, GraphLandmark
 from ldo_service.schemas.health import Health, InputCount, OutputCount
-from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement, MeasuredPose
+from ldo_service.schemas.keyframe import (
+    Keyframe,
+    KeyframeMeasurements,
+    KeyframeRefinement,
+    MeasuredPose,
+)
 from ldo_service.schemas.labels import AddLabel, LabelNames, LabelRequest, LabelResult
 from ldo_service.schemas.loops import LoopCandidate, LoopClosure
 from ldo_service.schemas.map import (
@@ -55,6 +60,7 @@ __all__ = [
     "Image",
     "InputCount",
     "Keyframe",
+    "KeyframeMeasurements",
     "KeyframeRefinement",
     "LabelNames",
     "LabelRequest",

@@ -18,7 +18,9 @@ class InputCount(msgspec.Struct, frozen=True, kw_only=True):
     queued: int  # Messages in the mailbox now.
     peak_queued: int  # Maximum of `queued` so far.
     dropped_paused: int = 0  # Messages dropped while the service was paused.
-    lost: int = 0  # Messages that never arrived, by gaps in the sequence; 0 for lossless inputs.
+    # Messages that never arrived, by gaps in the sequence; of lossless inputs, those that the
+    # producer had to drop.
+    lost: int = 0
 
 
 class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
@@ -28,7 +30,12 @@ class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
     sent: int
     backpressure_waits: int  # Times that the stage waited for the window of a consumer.
     evicted_consumers: int  # Consumers evicted because their window stayed closed.
-    retransmitted: int = 0  # Lossless messages sent again after a loss.
+    # Lossless messages sent again, after a loss or from a backlog.
+    retransmitted: int = 0
+    # Unhandled messages of each consumer with a backlog, by its name.
+    behind: dict[str, int] = {}
+    backlog_mb: float = 0.0  # Size of the backlog on disk, MB.
+    backlog_dropped: int = 0  # Messages that the maximum size of the backlog dropped.
 
 
 class Health(Message, frozen=True, kw_only=True):

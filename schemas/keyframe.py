@@ -58,30 +58,57 @@ class Keyframe(Message, frozen=True, kw_only=True):
     submap_measurements: tuple[MeasuredPose, ...] = ()
 
     def check(self) -> None:
-        require_count("keyframe", self.keyframe)
-        require_count("frame", self.frame)
         require_rgbd(self.camera, self.color, self.depth_m)
-        require_matrix6("information", self.information)
+        require_count("frame", self.frame)
         require_finite("overlap", (self.overlap,))
-        require_count("submap", self.submap)
         if self.dynamic_mask.shape != (0, 0):
             self.dynamic_mask.require("dynamic_mask", "u1", (self.camera.height, self.camera.width))
-        if any(pose.keyframe != self.keyframe for pose in self.submap_measurements):
+        _check_measurements(self)
+
+
+class KeyframeMeasurements(Message, frozen=True, kw_only=True):
+    """Pose measurements of a keyframe without its images; published on keyframe/measurements.
+
+    The fields are those of `Keyframe`. The optimizer needs no images, so its backlog stays small.
+    """
+
+    keyframe: int
+    camera: CameraModel
+    reference: int | None
+    T_reference_keyframe: Pose
+    information: Matrix6
+    T_odom_keyframe: Pose
+    window_measurements: tuple[MeasuredPose, ...] = ()
+    submap: int = 0
+    submap_measurements: tuple[MeasuredPose, ...] = ()
+
+    def check(self) -> None:
+        _check_measurements(self)
+
+
+def _check_measurements(message: Keyframe | KeyframeMeasurements) -> None:
+    """Check the fields that both messages have.
+
+    Raises:
+        ValueError: A field is out of range, or a measurement is of another keyframe.
+    """
+    keyframe = message.keyframe
+    require_count("keyframe", keyframe)
+    require_matrix6("information", message.information)
+    require_count("submap", message.submap)
+    if any(pose.keyframe != keyframe for pose in message.submap_measurements):
+        raise ValueError(
+            f"submap_measurements of keyframe {keyframe} must measure this keyframe, not another "
+            "one"
+        )
+    if message.reference is not None and not 0 <= message.reference < keyframe:
+        raise ValueError(f"keyframe {keyframe} has reference {message.reference}, not an older one")
+    for pose in message.window_measurements:
+        if not pose.reference < pose.keyframe == keyframe:
             raise ValueError(
-                f"submap_measurements of keyframe {self.keyframe} must measure this keyframe, not "
-                "another one"
+                f"window_measurements of keyframe {keyframe} hold keyframe {pose.keyframe} in "
+                f"{pose.reference}; they must measure keyframe {keyframe} in older ones"
             )
-        if self.reference is not None and not 0 <= self.reference < self.keyframe:
-            raise ValueError(
-                f"keyframe {self.keyframe} has reference {self.reference}, not an older one"
-            )
-        for pose in self.window_measurements:
-            if not pose.reference < pose.keyframe == self.keyframe:
-                raise ValueError(
-                    f"window_measurements of keyframe {self.keyframe} hold keyframe "
-                    f"{pose.keyframe} in {pose.reference}; they must measure keyframe "
-                    f"{self.keyframe} in older ones"
-                )
 
 
 class KeyframeRefinement(Message, frozen=True, kw_only=True):

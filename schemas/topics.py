@@ -11,7 +11,7 @@ from ldo_service.schemas.detections import DetectionBoxes
 from ldo_service.schemas.frames import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
 from ldo_service.schemas.graph import GraphCorrection
 from ldo_service.schemas.health import Health
-from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement
+from ldo_service.schemas.keyframe import Keyframe, KeyframeMeasurements, KeyframeRefinement
 from ldo_service.schemas.labels import AddLabel, LabelNames, LabelRequest, LabelResult
 from ldo_service.schemas.loops import LoopCandidate, LoopClosure
 from ldo_service.schemas.map import MapDelta, MapRendering, MapSnapshot, RefineMap
@@ -54,6 +54,9 @@ ODOMETRY_PRIOR = Topic(
 FRAME_RGBD = Topic("frame/rgbd", FrameRgbd, "rectified frame, depth in meters")
 POSE_TRACKED = Topic("pose/tracked", TrackedPose, "camera pose of each frame", is_state=True)
 KEYFRAME_NEW = Topic("keyframe/new", Keyframe, "frame to be mapped, with its relative pose")
+KEYFRAME_MEASUREMENTS = Topic(
+    "keyframe/measurements", KeyframeMeasurements, "relative poses of each keyframe, no images"
+)
 KEYFRAME_REFINEMENT = Topic(
     "keyframe/refinement", KeyframeRefinement, "refined relative poses of keyframes"
 )
@@ -97,6 +100,7 @@ TOPICS: tuple[Topic, ...] = (
     FRAME_RGBD,
     POSE_TRACKED,
     KEYFRAME_NEW,
+    KEYFRAME_MEASUREMENTS,
     DETECTION_BOXES,
     LABEL_REQUEST,
     LABEL_RESULT,

@@ -85,6 +85,8 @@ def stage_parameters(config: Config) -> SupervisionConfig:
         max_restarts=supervision.max_restarts,
         heartbeat_s=supervision.heartbeat_s,
         stall_after_s=supervision.step_timeout_s,
+        backend_stall_after_s=supervision.backend_step_timeout_s,
+        backlog_mb=supervision.backlog_mb,
         evict_after_s=supervision.evict_after_s,
         nice=supervision.background_nice,
         max_message_mb=config.service.max_decoded_message_mb,

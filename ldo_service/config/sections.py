@@ -51,7 +51,7 @@ class Config:
         http = self.vlm_labeller.http
         max_s = http.deadline_s + http.timeout_s  # The time to connect counts separately.
         limits = {
-            "supervision.step_timeout_s": self.supervision.step_timeout_s,
+            "supervision.backend_step_timeout_s": self.supervision.backend_step_timeout_s,
             "service.control_timeout_s": self.service.control_timeout_s,
         }
         for name, limit_s in limits.items():

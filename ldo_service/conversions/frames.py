@@ -11,6 +11,7 @@ from ldo_service.schemas import (
     FrameRgbd,
     Image,
     Keyframe,
+    KeyframeMeasurements,
     LabelRequest,
     TrackedPose,
 )
@@ -119,6 +120,22 @@ def keyframe_message(frame: RgbdFrame, result: TrackingResult, keyframe: NewKeyf
         dynamic_mask=mask_to_array(result.dynamic_mask, frame.camera),
         submap=keyframe.submap,
         submap_measurements=() if merge is None else (relative_pose_to_message(merge),),
+    )
+
+
+def keyframe_measurements_message(keyframe: Keyframe) -> KeyframeMeasurements:
+    """Return the message with the measurements of a keyframe, without its images."""
+    return KeyframeMeasurements(
+        stamp_ns=keyframe.stamp_ns,
+        keyframe=keyframe.keyframe,
+        camera=keyframe.camera,
+        reference=keyframe.reference,
+        T_reference_keyframe=keyframe.T_reference_keyframe,
+        information=keyframe.information,
+        T_odom_keyframe=keyframe.T_odom_keyframe,
+        window_measurements=keyframe.window_measurements,
+        submap=keyframe.submap,
+        submap_measurements=keyframe.submap_measurements,
     )
 
 

@@ -12,6 +12,7 @@ from ldo_service.schemas import (
     GraphCorrection,
     GraphLandmark,
     Keyframe,
+    KeyframeMeasurements,
     MeasuredPose,
     Pose,
 )
@@ -55,7 +56,7 @@ def relative_pose_from_message(message: MeasuredPose) -> RelativePose:
     )
 
 
-def measurements_from_message(keyframe: Keyframe) -> list[RelativePose]:
+def measurements_from_message(keyframe: Keyframe | KeyframeMeasurements) -> list[RelativePose]:
     """Return all relative-pose measurements of a keyframe, the one from its reference first.
 
     A keyframe without a reference has none from it.

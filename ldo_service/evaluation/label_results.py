@@ -48,7 +48,7 @@ class LabelPicture:
 def label_sheet(
     pictures: list[LabelPicture], map_names: abc.Sequence[str], class_names: abc.Sequence[str]
 ) -> np.ndarray:
-    """Draw rows [camera, ground truth, map, error] as uint8 RGB, and a legend of the names that occur.
+    """Draw rows [camera, ground truth, map, error] as uint8 RGB, and a legend of their names.
 
     Names are those of the full list (`label_lists.full_list`). Background is the gray camera
     image.

@@ -45,7 +45,7 @@ UNREADABLE = (
 ABOUT = "ldo/recording"  # Name of the metadata record.
 # Version of the messages, states and journal entries in a recording, a field of its metadata. A
 # change after which an older recording no longer replays increments it. Version 1 had no number.
-RECORDING_VERSION = 2
+RECORDING_VERSION = 3
 # Bytes between two checks of the limits: 10 ms of a fast disk.
 CHECK_EVERY_BYTES = 64_000_000
 

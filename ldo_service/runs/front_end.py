@@ -35,7 +35,12 @@ from ldo_service.recordings.mcap_file import (
     require_version,
 )
 from ldo_service.schemas import Message, decode
-from ldo_service.schemas.topics import DETECTION_BOXES, KEYFRAME_NEW, POSE_TRACKED
+from ldo_service.schemas.topics import (
+    DETECTION_BOXES,
+    KEYFRAME_MEASUREMENTS,
+    KEYFRAME_NEW,
+    POSE_TRACKED,
+)
 
 from .source import Selection
 
@@ -43,7 +48,10 @@ log = logging.getLogger(__name__)
 
 FRONT_END = "front_end.mcap"  # File in the folder of a run.
 ACTORS = frozenset({FrameSource.name, Tracker.name, Detector.name})
-TOPICS = {topic.message: topic for topic in (POSE_TRACKED, KEYFRAME_NEW, DETECTION_BOXES)}
+TOPICS = {
+    topic.message: topic
+    for topic in (POSE_TRACKED, KEYFRAME_NEW, KEYFRAME_MEASUREMENTS, DETECTION_BOXES)
+}
 MESSAGES = {topic.name: topic.message for topic in TOPICS.values()}
 DETECTOR_LATENCY = "offline.latency_frames.detector"
 

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from ldo_service.actors.topology import GRAPH, ActorSpec
 from ldo_service.config import actor_parameters, config_yaml, stage_parameters
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.actor_graph import lossless_consumers
+from ldo_service.runtime.actor_graph import consumers_with_backlog, lossless_consumers
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.schemas import Health, decode, encode
@@ -83,6 +83,9 @@ class _RealTimeRun:
             config=stage_parameters(self._config),
             expected={
                 out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
+            },
+            with_backlog={
+                out.topic.name: consumers_with_backlog(GRAPH, out.topic.name) for out in box.outputs
             },
         )
 

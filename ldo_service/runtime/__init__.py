@@ -2,7 +2,7 @@
 
 - `Topic`: name and message type, with one producer (`ldo_service.schemas.topics`).
 - `In`, `Out`: ports of an actor, declared as class attributes. Each input declares its delivery
-  policy: `Lossless` or `Latest`.
+  policy: `Lossless`, `Backlog` or `Latest`.
 - `Actor`: inputs, outputs, `handle(message) -> messages`, `snapshot`, `restore`.
 - `Outlet`: sending half of a topic. It numbers messages and waits for lossless consumers.
 - `Mailbox`: bounded queue of all inputs of an actor. It counts each dropped message.
@@ -20,7 +20,7 @@ A handler is an ordinary generator: it opens no socket, reads no clock and start
 stage around it is asynchronous code.
 """
 
-from .actor import Actor, In, Latest, Lossless, Out
+from .actor import Actor, Backlog, In, Latest, Lossless, Out
 from .actor_graph import check_graph
 
-__all__ = ["Actor", "In", "Latest", "Lossless", "Out", "check_graph"]
+__all__ = ["Actor", "Backlog", "In", "Latest", "Lossless", "Out", "check_graph"]

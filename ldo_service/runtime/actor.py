@@ -35,6 +35,19 @@ class Lossless:
 
 
 @dataclass(frozen=True, slots=True)
+class Backlog(Lossless):
+    """Policy of a lossless input for which the producer never waits.
+
+    The producer stores the messages that the consumer has not handled on disk, up to
+    `supervision.backlog_mb`. A slow, stopped or dead consumer therefore delays no other actor, and
+    it receives every message in order once it continues. `window` bounds its own queue alone.
+    """
+
+    def __str__(self) -> str:
+        return f"Backlog({self.window})"
+
+
+@dataclass(frozen=True, slots=True)
 class Latest:
     """Policy of an input that queues the newest messages; older ones are dropped and counted."""
 
@@ -109,6 +122,8 @@ class Actor:
     # The actor queries an external server, whose answers no journal records. A replay skips the
     # actor and feeds its consumers from their own recorded inputs.
     talks_outside = False
+    # No other actor waits for the outputs, so a step may take minutes.
+    is_backend = False
     # A robot waits for the outputs, so this actor's thread has priority over other actors' threads.
     is_prompt = False
 

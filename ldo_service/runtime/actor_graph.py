@@ -5,7 +5,7 @@ from typing import Protocol
 
 from ldo_service.errors import ConfigError, LosslessCycle
 
-from .actor import In, Lossless, Out
+from .actor import Backlog, In, Lossless, Out
 
 
 class HasPorts(Protocol):
@@ -34,7 +34,9 @@ def check_graph(actors: Iterable[HasPorts]) -> None:
     makers = producers(actors)
     waiting: dict[str, list[str]] = {
         actor.name: [
-            makers[port.topic.name] for port in lossless(actor) if port.topic.name in makers
+            makers[port.topic.name]
+            for port in lossless(actor)
+            if port.topic.name in makers and not isinstance(port.policy, Backlog)
         ]
         for actor in actors
     }
@@ -76,6 +78,18 @@ def lossless_consumers(actors: Iterable[HasPorts], topic_name: str) -> frozenset
         actor.name
         for actor in actors
         if any(port.topic.name == topic_name for port in lossless(actor))
+    )
+
+
+def consumers_with_backlog(actors: Iterable[HasPorts], topic_name: str) -> frozenset[str]:
+    """Return the names of the lossless consumers for which the producer of a topic never waits."""
+    return frozenset(
+        actor.name
+        for actor in actors
+        if any(
+            port.topic.name == topic_name and isinstance(port.policy, Backlog)
+            for port in actor.inputs
+        )
     )
 
 

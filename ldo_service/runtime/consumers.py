@@ -12,6 +12,7 @@ from .actor import UNLIMITED
 class Consumer:
     """State of one consumer of a topic, as its producer knows it."""
 
+    is_awaited: bool = True  # The producer waits for its credit; False: it has a backlog.
     alive: bool = False
     handled: int = 0  # Offset of the first message that it has not handled.
     arrived: int = 0  # Offset of the first message that it has not received.
@@ -19,6 +20,10 @@ class Consumer:
     repeated_from: int = -1  # Offset at which the last retransmission began; -1: none.
     repeated_at_s: float = 0.0  # Event-loop time of the last retransmission.
     shut_since_s: float | None = None  # Event-loop time at which its window became full.
+    # Only for a consumer with a backlog: offset after the last message that was sent to it, and the
+    # event-loop time at which it was sent.
+    pushed: int = 0
+    pushed_at_s: float = 0.0
 
 
 class Consumers:
@@ -27,16 +32,26 @@ class Consumers:
     Consumers in `expected` are required: they must not miss a message. The producer therefore has
     no credit while one of them is disconnected. Other consumers limit the credit only while they
     are connected. The argument `seq` of all methods is the offset of the producer's next message.
+
+    The producer never waits for a consumer with a backlog, required or not. Its credit only decides
+    how many messages of the backlog it receives next.
     """
 
-    def __init__(self, expected: Iterable[str], handled: int = 0) -> None:
+    def __init__(
+        self, expected: Iterable[str], handled: int = 0, with_backlog: Iterable[str] = ()
+    ) -> None:
         """Initialize with the required consumers.
 
         Args:
             expected: Names of the required consumers.
             handled: Each required consumer has handled every message before this offset.
+            with_backlog: Names of those for which the producer does not wait.
         """
-        self._known = {name: Consumer(handled=handled) for name in expected}
+        self.with_backlog = frozenset(with_backlog)
+        self._known = {
+            name: Consumer(is_awaited=name not in self.with_backlog, handled=handled)
+            for name in expected
+        }
         self.expected = frozenset(self._known)
         self._evicted: dict[str, int] = {}  # Value of `handled` at the eviction, by consumer.
 
@@ -47,8 +62,9 @@ class Consumers:
         return name in self._known
 
     def room(self, seq: int) -> int:
-        """Return the number of messages that may be sent now to all consumers."""
-        limits = [c.limit - seq if c.alive else 0 for c in self._known.values()]
+        """Return the number of messages that may be sent now without waiting for a consumer."""
+        awaited = [c for c in self._known.values() if c.is_awaited]
+        limits = [c.limit - seq if c.alive else 0 for c in awaited]
         return max(0, min(limits, default=UNLIMITED))
 
     def handled(self, seq: int) -> int:
@@ -56,14 +72,26 @@ class Consumers:
         return min((c.handled for c in self._known.values()), default=seq)
 
     def all_received(self, seq: int) -> bool:
-        """Return whether every consumer has received every message before `seq`."""
-        return all(c.arrived >= seq for c in self._known.values())
+        """Return whether every consumer has received every message before `seq`.
+
+        A consumer with a backlog only needs the messages for which its window has room. The backlog
+        keeps the other ones.
+        """
+        return all(
+            c.arrived >= (seq if c.is_awaited else min(seq, c.limit))
+            for c in self._known.values()
+            if c.is_awaited or c.alive
+        )
+
+    def behind(self, seq: int) -> dict[str, int]:
+        """Return the number of unhandled messages of each consumer with a backlog, by name."""
+        return {name: seq - c.handled for name, c in self._known.items() if not c.is_awaited}
 
     def next_seq_by_consumer(self) -> dict[str, int]:
         """Return the offset of the next message for each consumer, by name."""
         return {name: consumer.handled for name, consumer in self._known.items()}
 
-    def join(self, name: str, seq: int) -> None:
+    def join(self, name: str, seq: int, *, has_backlog: bool = False) -> None:
         """Connect a consumer that sent a hello.
 
         A new consumer starts at `seq`. A known one receives again what it has not handled.
@@ -71,7 +99,46 @@ class Consumers:
         self._evicted.pop(name, None)
         consumer = self._known.setdefault(name, Consumer(handled=seq))
         consumer.alive, consumer.shut_since_s, consumer.repeated_from = True, None, -1
-        consumer.arrived = consumer.limit = consumer.handled
+        consumer.arrived = consumer.limit = consumer.pushed = consumer.handled
+        consumer.is_awaited = not (has_backlog or name in self.with_backlog)
+
+    def note_sent(self, seq: int, now_s: float) -> None:
+        """Note that message `seq` was published.
+
+        A consumer with a backlog accepts it only if it has received everything before it.
+        """
+        for consumer in self._known.values():
+            if not consumer.is_awaited and consumer.pushed == seq < consumer.limit:
+                consumer.pushed, consumer.pushed_at_s = seq + 1, now_s
+
+    def next_of_backlog(self, name: str, seq: int, now_s: float, repeat_after_s: float) -> range:
+        """Return the messages that a consumer with a backlog should receive now.
+
+        Args:
+            name: Name of the consumer.
+            seq: Offset of the first message that was not published.
+            now_s: Event-loop time at which the messages count as sent.
+            repeat_after_s: Time after which messages that have not arrived count as lost, seconds.
+        """
+        consumer = self._known[name]
+        is_overdue = now_s - consumer.pushed_at_s > repeat_after_s
+        if consumer.pushed < consumer.arrived or is_overdue:
+            consumer.pushed = consumer.arrived
+        messages = range(consumer.pushed, min(seq, consumer.limit))
+        if messages:
+            consumer.pushed, consumer.pushed_at_s = messages.stop, now_s
+        return messages
+
+    def skip_to(self, first: int) -> bool:
+        """Skip the messages before `first`, which the backlog no longer has.
+
+        Returns:
+            Whether a consumer has missed some of them.
+        """
+        late = [c for c in self._known.values() if not c.is_awaited and c.handled < first]
+        for consumer in late:
+            consumer.handled = first
+        return bool(late)
 
     def grant(self, grant: Credit) -> Consumer:
         """Update a known consumer from its credit message."""
@@ -99,7 +166,7 @@ class Consumers:
         """Return the connected consumers whose window has been full for over `patience_s`."""
         names: list[str] = []
         for name, consumer in self._known.items():
-            if consumer.alive and consumer.limit <= seq:
+            if consumer.alive and consumer.is_awaited and consumer.limit <= seq:
                 if consumer.shut_since_s is None:
                     consumer.shut_since_s = now_s
                 if now_s - consumer.shut_since_s > patience_s:

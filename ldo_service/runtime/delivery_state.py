@@ -75,8 +75,8 @@ class RestoredState:
             own={part: value for part, value in state.items() if not part.startswith("stage.")},
             inputs={topic: InletPosition(*past) for topic, past in links["in"].items()},
             outputs={
-                topic: OutletPosition(epoch, seq, tuple(_sent(state, topic)))
-                for topic, (epoch, seq) in links["out"].items()
+                topic: OutletPosition(epoch, seq, tuple(_sent(state, topic)), logged_from)
+                for topic, (epoch, seq, logged_from) in links["out"].items()
             },
             taken=tuple(LoggedInput(*state[part]) for part in _numbered(state, WAL)),
         )
@@ -137,7 +137,9 @@ class DeliveryState:
             return {}
         places = {
             "in": dict(inputs),
-            "out": {topic: (past.epoch, past.seq) for topic, past in outputs.items()},
+            "out": {
+                topic: (past.epoch, past.seq, past.logged_from) for topic, past in outputs.items()
+            },
         }
         if places != self._links:
             self._links = places

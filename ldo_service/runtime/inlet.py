@@ -13,7 +13,7 @@ from ldo_service.transport.flow_control import (
     SequenceTracker,
 )
 
-from .actor import In, Latest, Lossless
+from .actor import Backlog, In, Latest, Lossless
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,6 +132,7 @@ class LosslessInlet(Inlet):
             self.gap = self.gap or joins
             return 0
         lost = start - self.arrived if known else 0
+        self.numbers.lost += lost
         self.epoch, self.handled, self.arrived = epoch, start, start
         self.gap = True  # Request the messages that were sent before the hello.
         return lost
@@ -145,7 +146,8 @@ class LosslessInlet(Inlet):
             return False
         self.gap = header.seq > self.arrived or len(self.waiting) >= self.window
         if self.gap:
-            self.gaps += 1
+            # With a backlog, the producer publishes while the window is full: that is no gap.
+            self.gaps += not isinstance(self.port.policy, Backlog)
             return False
         self.arrived += 1
         return True
@@ -186,7 +188,7 @@ class LosslessInlet(Inlet):
     def grant(self, consumer: str, *, waits_for_disk: bool = False) -> ConsumerHello | Credit:
         """Return the message to the producer: a hello until it is connected, then credit."""
         if not self.is_connected:
-            return ConsumerHello(consumer)
+            return ConsumerHello(consumer, isinstance(self.port.policy, Backlog))
         limit = self.handled + self.window
         where = self.epoch, self.handled, self.arrived, limit
         return Credit(consumer, *where, self.gap, waits_for_disk)

@@ -26,7 +26,7 @@ from ldo_service.transport.flow_control import (
 )
 from ldo_service.transport.interface import Publisher, Transport, call_soon
 
-from .actor import In, Lossless
+from .actor import Backlog, In, Lossless
 from .inlet import Delivery, Inlet, LosslessInlet
 from .stage_commands import StageCommand
 
@@ -90,7 +90,10 @@ class Mailbox:
             transport.subscribe(
                 producer_hello_key(topic), lambda _, body: self._welcomed(link, body)
             )
-            transport.subscribe(retransmit_key(topic), arrived)
+            has_backlog = isinstance(port.policy, Backlog)
+            transport.subscribe(
+                retransmit_key(topic, self._consumer if has_backlog else ""), arrived
+            )
         transport.subscribe(data_key(topic), arrived)
 
     # --- arriving, on any thread --------------------------------------------------------------

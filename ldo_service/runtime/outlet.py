@@ -1,14 +1,13 @@
-"""Outlet (the sending half of a topic) and the set of all outlets of one actor."""
+"""Outlet: the sending half of a topic."""
 
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 
 import msgspec
 
 from ldo_service.schemas import Message, OutputCount
-from ldo_service.schemas.topics import Topic
 from ldo_service.transport.flow_control import (
     ConsumerHello,
     Credit,
@@ -23,11 +22,11 @@ from ldo_service.transport.flow_control import (
     producer_hello_key,
     retransmit_key,
 )
-from ldo_service.transport.interface import Transport, call_soon
+from ldo_service.transport.interface import Publisher, Transport, call_soon
 
 from .actor import Out
 from .consumers import Consumer, Consumers
-from .step import Produced
+from .outbox import Outbox
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +39,9 @@ class Outlet:
     no credit while one of them is disconnected. Other consumers limit the credit only while they
     are connected. A nonblocking port sends without waiting, because its actor has checked the
     credits before.
+
+    The outlet never waits for a consumer with a backlog. It keeps the unhandled messages in its
+    outbox on disk, and sends them as the consumer grants credit.
     """
 
     # Half a credit period; a shorter time would retransmit messages that are still on their way.
@@ -55,6 +57,9 @@ class Outlet:
         evict_after_s: float = 30.0,
         on_evicted: Callable[[str], None] = lambda _consumer: None,
         past: OutletPosition | None = None,
+        *,
+        with_backlog: Iterable[str] = (),
+        outbox: Outbox | None = None,
     ) -> None:
         """Open the topic on the network.
 
@@ -68,6 +73,8 @@ class Outlet:
             on_evicted: Called with the name of an evicted consumer.
             past: Position of the previous process. The outlet continues its numbering, and sends
                 again the messages that a required consumer has not handled.
+            with_backlog: Names of the required consumers for which it does not wait.
+            outbox: Storage of unhandled messages; by default in memory.
         """
         self.port, self.topic = port, port.topic
         past = past or OutletPosition(epoch, 0)
@@ -76,12 +83,15 @@ class Outlet:
         self._loop = asyncio.get_running_loop()
         self._seq = past.seq
         self._sent_at_s = self._loop.time()
-        self._consumers = Consumers(expected, past.handled)
-        self._unhandled = deque(past.unhandled)
+        self._consumers = Consumers(expected, past.handled, with_backlog)
+        self._outbox = outbox or Outbox(past.unhandled)
         self._unsent = deque(past.unhandled)
         self._changed = asyncio.Event()  # The state of a consumer changed.
         self._ahead: set[str] = set()  # Consumers that received messages unknown to this outlet.
         self._repeating: asyncio.Task[None] | None = None
+        # Publisher of the backlog and its running task, by consumer.
+        self._backlogs: dict[str, Publisher] = {}
+        self._pushing: dict[str, asyncio.Task[None]] = {}
         self._closed = False
         self._parts: list[tuple[bytes, bytes]] = []  # Parts of an incomplete state.
         self._last_value: tuple[tuple[bytes, bytes], ...] = ()
@@ -89,6 +99,7 @@ class Outlet:
         self._open(transport)
 
     def _open(self, transport: Transport) -> None:
+        self._transport = transport
         topic = self.topic.name
         self._publisher = transport.publisher(data_key(topic))
         self._again = transport.publisher(retransmit_key(topic))
@@ -119,7 +130,7 @@ class Outlet:
         held = UnackedMessage(self._seq, header, body)
         self._unsent.append(held)
         if self._consumers:
-            self._unhandled.append(held)
+            self._outbox.add(held)
         self._note_state(message, header, body)
         self._seq += 1
 
@@ -131,13 +142,22 @@ class Outlet:
             held = self._unsent.popleft()
             self.sent += 1
             self._sent_at_s = self._loop.time()
+            self._consumers.note_sent(held.seq, self._sent_at_s)
             await self._publisher.send(held.header, held.body)
 
     def rollback(self) -> None:
         """Discard the staged messages and reuse their numbers."""
         self._seq = self._next
-        self._unhandled = deque(sent for sent in self._unhandled if sent.seq < self._seq)
+        self._outbox.truncate(self._seq)
         self._unsent.clear()
+
+    def store(self) -> None:
+        """Write unhandled messages to the outbox on disk; may be called on any thread.
+
+        Raises:
+            OSError: The disk is full or cannot be written.
+        """
+        self._outbox.store()
 
     @property
     def _next(self) -> int:
@@ -171,7 +191,10 @@ class Outlet:
         """Return the position to save; None if there is no required consumer."""
         if not self._consumers.expected:
             return None
-        return OutletPosition(self._epoch, self._seq, tuple(self._unhandled))
+        logged_from = None
+        if self._outbox.is_logged:
+            logged_from = min(self._consumers.handled(self._seq), self._seq)
+        return OutletPosition(self._epoch, self._seq, self._outbox.in_memory, logged_from)
 
     # --- consumers --------------------------------------------------------------------------
     def _requested(self, _header: bytes, body: memoryview) -> None:
@@ -197,16 +220,20 @@ class Outlet:
             if name in self._consumers:
                 self._granted(request)
                 return
-        self._consumers.join(name, self._seq)
+        has_backlog = isinstance(request, ConsumerHello) and request.has_backlog
+        self._consumers.join(name, self._seq, has_backlog=has_backlog)
+        self._consumers.skip_to(self._outbox.first(self._seq))
         self._post_welcomes()
 
     def reset(self, epoch: int) -> None:
         """Restart numbering at 0 under a new epoch; all consumers must connect again."""
-        if self._repeating is not None:
-            self._repeating.cancel()
+        self._cancel_repeating()
         self._epoch, self._seq = epoch, 0
-        self._consumers = Consumers(self._consumers.expected)
-        for forgotten in (self._unhandled, self._unsent, self._parts, self._ahead):
+        self._consumers = Consumers(
+            self._consumers.expected, with_backlog=self._consumers.with_backlog
+        )
+        self._outbox.restart(epoch)
+        for forgotten in (self._unsent, self._parts, self._ahead):
             forgotten.clear()
         self._last_value = ()
         self._post_welcomes()
@@ -222,7 +249,9 @@ class Outlet:
             return
         consumer = self._consumers.grant(grant)
         self._forget_handled()
-        if consumer.arrived < self._next:
+        if not consumer.is_awaited:
+            self._push_backlog(grant.consumer)
+        elif consumer.arrived < self._next:
             self._retransmit(consumer, grant.gap)
         self._changed.set()
 
@@ -238,9 +267,34 @@ class Outlet:
         self._ahead.add(grant.consumer)
 
     def _forget_handled(self) -> None:
-        oldest = self._consumers.handled(self._seq)
-        while self._unhandled and self._unhandled[0].seq < oldest:
-            self._unhandled.popleft()
+        self._outbox.forget(self._consumers.handled(self._seq))
+
+    # --- retransmission ---------------------------------------------------------------------
+    def _push_backlog(self, name: str) -> None:
+        """Send a consumer with a backlog the messages for which it has room."""
+        if name in self._pushing:
+            return
+        if self._consumers.skip_to(self._outbox.first(self._seq)):
+            self._post_welcomes()  # They say where the backlog begins now.
+            return
+        messages = self._consumers.next_of_backlog(
+            name, self._next, self._loop.time(), self.REPEAT_AFTER_S
+        )
+        if messages:
+            self.repeated += len(messages)
+            self._pushing[name] = self._loop.create_task(self._push(name, messages))
+
+    async def _push(self, name: str, messages: range) -> None:
+        try:
+            if name not in self._backlogs:
+                key = retransmit_key(self.topic.name, name)
+                self._backlogs[name] = self._transport.publisher(key)
+            for seq in messages:
+                message = await asyncio.to_thread(self._outbox.read, seq)
+                if message is not None:
+                    await self._backlogs[name].send(message.header, message.body)
+        finally:
+            del self._pushing[name]
 
     def _retransmit(self, consumer: Consumer, gap: bool) -> None:
         """Retransmit the messages that a consumer has not received.
@@ -257,16 +311,23 @@ class Outlet:
         if is_on_its_way or self._repeating is not None:
             return
         consumer.repeated_from, consumer.repeated_at_s = consumer.arrived, now
-        lost = [sent for sent in self._unhandled if consumer.arrived <= sent.seq < self._next]
+        lost = range(consumer.arrived, self._next)
         self.repeated += len(lost)
         self._repeating = self._loop.create_task(self._send_again(lost))
 
-    async def _send_again(self, lost: list[UnackedMessage]) -> None:
+    async def _send_again(self, lost: range) -> None:
         try:
-            for sent in lost:
-                await self._again.send(sent.header, sent.body)
+            for seq in lost:
+                message = self._outbox.read(seq)
+                if message is not None:
+                    await self._again.send(message.header, message.body)
         finally:
             self._repeating = None
+
+    def _cancel_repeating(self) -> None:
+        for task in (self._repeating, *self._pushing.values()):
+            if task is not None:
+                task.cancel()
 
     def _presence(self, name: str, alive: bool) -> None:
         if not alive and not self._closed and name in self._consumers:
@@ -304,91 +365,19 @@ class Outlet:
             backpressure_waits=self.waited,
             evicted_consumers=self.evicted,
             retransmitted=self.repeated,
+            behind=self._consumers.behind(self._seq),
+            backlog_mb=1e-6 * self._outbox.size_bytes,
+            backlog_dropped=self._outbox.dropped,
         )
 
     def close(self) -> None:
         """Cancel retransmission and close the publishers."""
         self._closed = True
-        if self._repeating is not None:
-            self._repeating.cancel()
-        for publisher in (self._publisher, self._again, self._welcomes):
+        self._cancel_repeating()
+        for publisher in (
+            self._publisher,
+            self._again,
+            self._welcomes,
+            *self._backlogs.values(),
+        ):
             publisher.close()
-
-
-class Outlets:
-    """Set of all outlets of an actor.
-
-    They stage the outputs of a step. They send these outputs after the step is saved, and discard
-    them if the step fails.
-    """
-
-    def __init__(self, outlets: Iterable[Outlet] = ()) -> None:
-        self._all = {outlet.topic.message: outlet for outlet in outlets}
-
-    def __getitem__(self, message: type[Message]) -> Outlet:
-        return self._all[message]
-
-    @property
-    def is_nonblocking(self) -> bool:
-        """True if one of the ports is nonblocking."""
-        return any(outlet.port.is_nonblocking for outlet in self._all.values())
-
-    @property
-    def has_required_consumers(self) -> bool:
-        """True if a topic has a required consumer, which must not miss a message."""
-        return any(outlet.position() for outlet in self._all.values())
-
-    def room(self) -> dict[Topic, int]:
-        """Return the credits of the nonblocking ports; their actor checks them before a step."""
-        return {
-            outlet.topic: outlet.credits()
-            for outlet in self._all.values()
-            if outlet.port.is_nonblocking
-        }
-
-    def past(self) -> dict[str, OutletPosition | None]:
-        """Return the position to save for each topic; None without required consumers."""
-        return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
-
-    def hold(self, produced: Sequence[Produced]) -> None:
-        """Stage the outputs of a step."""
-        for out in produced:
-            self._all[type(out.message)].stage_message(out.message, out.body)
-
-    async def release(self, *, is_saved: bool = True) -> None:
-        """Send the staged outputs of a step.
-
-        If the step is not saved, topics with required consumers keep theirs staged.
-        """
-        for outlet in self._all.values():
-            if is_saved or outlet.position() is None:
-                await outlet.commit()
-
-    def take_back(self) -> None:
-        """Discard the staged outputs."""
-        for outlet in self._all.values():
-            outlet.rollback()
-
-    async def flush(self) -> None:
-        """Wait until every lossless consumer has received all messages."""
-        for outlet in self._all.values():
-            await outlet.flush()
-
-    def renew(self, epoch: int) -> None:
-        """Restart numbering of all topics under a new epoch."""
-        for outlet in self._all.values():
-            outlet.reset(epoch)
-
-    def check_windows(self) -> None:
-        """Evict stalled consumers of all topics."""
-        for outlet in self._all.values():
-            outlet.evict_stalled()
-
-    def counts(self) -> tuple[OutputCount, ...]:
-        """Return the counters of all outputs for the health message."""
-        return tuple(outlet.counts() for outlet in self._all.values())
-
-    def close(self) -> None:
-        """Close all outlets."""
-        for outlet in self._all.values():
-            outlet.close()

@@ -22,7 +22,7 @@ from .delivery_state import LoggedInput
 from .inlet import Delivery
 from .journal import Journal, Kind
 from .mailbox import Mailbox
-from .outlet import Outlet, Outlets
+from .outlets import OutletOpener, Outlets
 from .stage_commands import CommandReceiver, StageCommand
 from .stage_metrics import StageMetrics
 from .state_saver import SAVE_AGAIN_S, StateSaver, UnsavedStateError
@@ -54,6 +54,7 @@ class Stage:
         config: SupervisionConfig | None = None,
         store: StateStore | None = None,
         expected: Mapping[str, frozenset[str]] | None = None,
+        with_backlog: Mapping[str, frozenset[str]] | None = None,
         on_evicted: Callable[[str], None] = lambda _consumer: None,
         journal: Journal | None = None,
     ) -> None:
@@ -65,13 +66,15 @@ class Stage:
             config: Limits of supervision.
             store: Storage of the state; in memory by default.
             expected: Names of the consumers that must not miss a message, by output topic.
+            with_backlog: Those of them for which the stage does not wait, by output topic.
             on_evicted: Called with the name of an evicted consumer.
             journal: Receiver of the journal entries.
         """
         self._make, self._transport = make, transport
         self._config = config = config or SupervisionConfig()
-        self._checkpointer = Checkpointer(store or MemoryStore())
-        self._expected = expected or {}
+        self._store = store or MemoryStore()
+        self._checkpointer = Checkpointer(self._store)
+        self._expected, self._with_backlog = expected or {}, with_backlog or {}
         self._on_evicted = on_evicted
         self._journal = journal or Journal()
         self._actor = self._restored_actor()
@@ -130,16 +133,16 @@ class Stage:
             self._mailbox.close()
 
     def _open_outlets(self) -> None:
+        opener = OutletOpener(
+            self._transport, self._config, self._store, self._checkpointer.past.outputs
+        )
         self._outlets = Outlets(
-            Outlet(
+            opener.open(
                 port,
-                self.name,
-                self._epoch,
-                self._transport,
-                self._expected.get(port.topic.name, ()),
-                self._config.evict_after_s,
+                (self.name, self._epoch),
+                self._expected.get(port.topic.name, frozenset()),
+                self._with_backlog.get(port.topic.name, frozenset()),
                 self._on_evicted,
-                self._checkpointer.past.outputs.get(port.topic.name),
             )
             for port in self._actor.outputs
         )
@@ -377,7 +380,7 @@ class Stage:
             self._outlets.check_windows()
             header = Header(self.name, self._epoch, 0, self._metrics.last_stamp_ns)
             self._health.post(encode_link(header), encode(self.health()))
-            if self._metrics.busy_s > self._config.stall_after_s:
+            if self._metrics.busy_s > self._config.step_timeout_s(self._actor.is_backend):
                 raise StageStalled(self.name, self._metrics.busy_s)
             await asyncio.sleep(self._config.heartbeat_s)
 

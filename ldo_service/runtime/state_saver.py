@@ -12,7 +12,7 @@ from .delivery_state import LoggedInput
 from .inlet import Delivery
 from .journal import Journal
 from .mailbox import Mailbox
-from .outlet import Outlets
+from .outlets import Outlets
 from .stage_metrics import StageMetrics
 
 # Time between two attempts to save: short for a user who frees disk space, and cheap.
@@ -143,6 +143,7 @@ class StateSaver:
 
     # --- in the actor's thread ------------------------------------------------------------------
     def _write(self, actor: Actor, state: State) -> None:
+        self._outlets.store()  # First: the state refers to the messages of a backlog.
         self._checkpointer.write(actor, state)
         self._metrics.facts = {
             **actor.metrics(),

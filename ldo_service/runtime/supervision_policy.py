@@ -46,6 +46,11 @@ class SupervisionConfig:
     heartbeat_s: float = 0.5  # Heartbeat period; a stopped process shows within two periods.
     # Maximum duration of a step: 100x the slowest step measured (mapper, 1.5 M Gaussians).
     stall_after_s: float = 60.0
+    # The same for actors for which no other waits: one optimization may take minutes.
+    backend_stall_after_s: float = 600.0
+    # Maximum size on disk of the unhandled messages of one topic, MB: 11 minutes of keyframes of
+    # 640x480 at 2 Hz.
+    backlog_mb: float = 2000.0
     # Time without progress after which a consumer is evicted, because it holds up the robot.
     evict_after_s: float = 30.0
     # Nice value of threads with work that may be late. On a shared core (Linux) they have a
@@ -55,9 +60,12 @@ class SupervisionConfig:
     max_message_mb: float = 64.0
 
     def __post_init__(self) -> None:
-        times = (self.restart_window_s, self.heartbeat_s, self.stall_after_s, self.evict_after_s)
+        times = (
+            *(self.restart_window_s, self.heartbeat_s, self.stall_after_s),
+            *(self.backend_stall_after_s, self.evict_after_s),
+        )
         if (
-            min(*times, self.max_message_mb) <= 0
+            min(*times, self.max_message_mb, self.backlog_mb) <= 0
             or min(self.max_restarts, self.restart_delay_s, self.restart_delay_max_s) < 0
         ):
             raise ConfigError(
@@ -69,10 +77,16 @@ class SupervisionConfig:
                     "restart_delay_max_s",
                     "heartbeat_s",
                     "stall_after_s",
+                    "backend_stall_after_s",
                     "evict_after_s",
                     "max_message_mb",
+                    "backlog_mb",
                 )
                 + " must be positive; max_restarts and the delays may be 0."
             )
         if not 0 <= self.nice <= 19:
             raise ConfigError(f"supervision.background_nice={self.nice} must be within 0..19.")
+
+    def step_timeout_s(self, is_backend: bool) -> float:
+        """Return the maximum duration of a step, seconds."""
+        return self.backend_stall_after_s if is_backend else self.stall_after_s

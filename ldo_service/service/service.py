@@ -29,7 +29,7 @@ from ldo_service.errors import ConfigError, StageError
 from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import new_path, prepare_recording
 from ldo_service.runtime import check_graph
-from ldo_service.runtime.actor_graph import lossless_consumers
+from ldo_service.runtime.actor_graph import consumers_with_backlog, lossless_consumers
 from ldo_service.runtime.journal import Journal
 from ldo_service.runtime.process import (
     ChildProcess,
@@ -192,6 +192,10 @@ class Service:
                 store=FolderStore(self.state / "state", syncs=self.config.service.fsync),
                 expected={
                     out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
+                },
+                with_backlog={
+                    out.topic.name: consumers_with_backlog(GRAPH, out.topic.name)
+                    for out in box.outputs
                 },
                 on_evicted=evicted,
                 journal=self._journal(box.name),

@@ -27,7 +27,7 @@ State = Mapping[str, Any]
 CONTENTS = "contents.msgpack"
 # Version of the content of the parts. A change of any actor's state that makes older states
 # incompatible increments it. Version 1 had no number.
-STATE_VERSION = 2
+STATE_VERSION = 3
 
 
 class _Contents(msgspec.Struct, frozen=True):
@@ -39,6 +39,19 @@ class _Contents(msgspec.Struct, frozen=True):
 
 class StateStore(Protocol):
     """Store of the last state of each actor."""
+
+    @property
+    def syncs(self) -> bool:
+        """True if a saved state survives a power cut."""
+        ...
+
+    def backlog_folder(self, actor: str) -> Path | None:
+        """Return the folder for messages that an actor's consumers have not handled.
+
+        Returns:
+            The folder; None if the store is in memory.
+        """
+        ...
 
     def save(self, actor: str, state: State) -> None:
         """Replace the state of an actor; an empty state is ignored."""
@@ -56,8 +69,14 @@ class StateStore(Protocol):
 class MemoryStore:
     """Store in memory; it is lost when its process ends, but not when an actor fails."""
 
+    syncs = False
+
     def __init__(self) -> None:
         self._states: dict[str, State] = {}
+
+    def backlog_folder(self, actor: str) -> None:  # noqa: ARG002
+        """Return None: messages stay in memory too."""
+        return
 
     def save(self, actor: str, state: State) -> None:
         """Replace the state of an actor; an empty state is ignored."""
@@ -88,9 +107,13 @@ class FolderStore:
             folder: Folder of all states.
             syncs: Sync every file to the disk, so that the state survives a power cut too.
         """
-        self._folder, self._syncs = folder, syncs
+        self._folder, self.syncs = folder, syncs
         self._saved: dict[str, State] = {}
         self._files: dict[str, dict[str, str]] = {}  # File of each part, by actor.
+
+    def backlog_folder(self, actor: str) -> Path:
+        """Return the folder for messages that an actor's consumers have not handled."""
+        return self._folder / f"{actor}.backlog"
 
     def save(self, actor: str, state: State) -> None:
         """Replace the state of an actor; an empty state is ignored.
@@ -103,7 +126,7 @@ class FolderStore:
         folder = self._folder / actor
         folder.mkdir(parents=True, exist_ok=True)
         if actor not in self._saved:
-            if self._syncs:
+            if self.syncs:
                 sync(self._folder)
             self._files[actor] = _read_contents_or_nothing(folder)
             _remove_unreferenced(folder, self._files[actor])
@@ -117,14 +140,14 @@ class FolderStore:
         if new != old:
             self._saved.pop(actor, None)  # The list may refer to the new files from here on.
             body = msgspec.msgpack.encode(_Contents(new))
-            write_atomically(folder / CONTENTS, body, syncs=self._syncs)
+            write_atomically(folder / CONTENTS, body, syncs=self.syncs)
         for file in set(old.values()) - set(new.values()):
             _remove(folder / file)
         self._saved[actor], self._files[actor] = dict(state), new
 
     def _write(self, path: Path, body: bytes) -> None:
         path.write_bytes(body)
-        if self._syncs:
+        if self.syncs:
             sync(path)
 
     def load(self, actor: str) -> State | None:

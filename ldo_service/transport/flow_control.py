@@ -58,6 +58,7 @@ class ConsumerHello(msgspec.Struct, frozen=True, tag="join", array_like=True):
     """Handshake of a consumer."""
 
     consumer: str
+    has_backlog: bool = False  # The producer does not wait for its credit.
 
 
 class Credit(msgspec.Struct, frozen=True, tag="grant", array_like=True):
@@ -101,10 +102,14 @@ class OutletPosition(NamedTuple):
     epoch: int
     seq: int  # Offset of the next message.
     unhandled: tuple[UnackedMessage, ...] = ()
+    # Offset of the first unhandled message if these are in a log on disk; None: no log.
+    logged_from: int | None = None
 
     @property
     def handled(self) -> int:
         """Offset of the first message that some consumer has not handled."""
+        if self.logged_from is not None:
+            return self.logged_from
         return self.unhandled[0].seq if self.unhandled else self.seq
 
 
@@ -133,12 +138,13 @@ def data_key(topic: str) -> str:
     return topic
 
 
-def retransmit_key(topic: str) -> str:
+def retransmit_key(topic: str, consumer: str = "") -> str:
     """Return the key of retransmitted messages.
 
-    Only lossless consumers subscribe to it; other consumers receive each message once.
+    Only lossless consumers subscribe to it; other consumers receive each message once. A consumer
+    with a backlog has a key of its own, so that no other consumer receives its backlog.
     """
-    return f"link/again/{topic}"
+    return f"link/again/{topic}/{consumer}" if consumer else f"link/again/{topic}"
 
 
 def credit_key(topic: str) -> str:

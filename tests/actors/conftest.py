@@ -6,7 +6,7 @@ import pytest
 
 from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.tracker import Tracker
-from ldo_service.conversions.frames import raw_frame_to_message
+from ldo_service.conversions.frames import keyframe_measurements_message, raw_frame_to_message
 from ldo_service.datasets import Sequence
 from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import (
@@ -27,6 +27,11 @@ def camera_messages(sequence: Sequence, indices: Iterable[int]) -> list[CameraRg
 def handle_all(actor, messages: Iterable[Message]) -> list:
     """Return all messages that an actor publishes for the given inputs."""
     return [out for message in messages for out in actor.handle(message)]
+
+
+def without_images(messages: Iterable[Message]) -> list[Message]:
+    """Return the messages, keyframes as the measurements that the optimizer receives."""
+    return [keyframe_measurements_message(m) if isinstance(m, Keyframe) else m for m in messages]
 
 
 def replicate(messages: Iterable[Message], replica: MapReplica | None = None) -> MapReplica:

@@ -6,7 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.actors.loop_closer import MAX_PENDING_KEYFRAMES, LoopCloser, LoopCloserConfig
+from ldo_service.actors import loop_closer
+from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
 from ldo_service.conversions.frames import camera_to_message
 from ldo_service.conversions.poses import (
     correction_to_message,
@@ -300,7 +301,10 @@ def test_a_keyframe_sent_twice_counts_once(first_walk) -> None:
     )
 
 
-def test_missing_detections_do_not_block_loop_closing(first_walk, second_walk) -> None:
+def test_missing_detections_do_not_block_loop_closing(
+    first_walk, second_walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop_closer, "MAX_PENDING_KEYFRAMES", 4)
     messages = with_empty_detections([*first_walk, *second_walk])
     incomplete = [m for m in messages if not (isinstance(m, DetectionBoxes) and m.keyframe == 4)]
     actor = LoopCloser()
@@ -310,7 +314,7 @@ def test_missing_detections_do_not_block_loop_closing(first_walk, second_walk) -
     handle_all(undetected, [*first_walk, *second_walk])
     assert (
         undetected.metrics()["keyframes_without_detections"]
-        == len([*first_walk, *second_walk]) - MAX_PENDING_KEYFRAMES
+        == len([*first_walk, *second_walk]) - loop_closer.MAX_PENDING_KEYFRAMES
     )
 
 

@@ -9,7 +9,12 @@ import pytest
 
 from ldo_service.actors.mapper import Mapper, MapperConfig
 from ldo_service.actors.optimizer import Optimizer
-from ldo_service.conversions.frames import frame_from_message, mask_from_array, mask_to_array
+from ldo_service.conversions.frames import (
+    frame_from_message,
+    keyframe_measurements_message,
+    mask_from_array,
+    mask_to_array,
+)
 from ldo_service.conversions.poses import (
     correction_to_message,
     keyframe_poses_from_correction,
@@ -230,7 +235,7 @@ def test_correction_older_than_a_refinement_does_not_undo_it(keyframes) -> None:
     mapper, optimizer = Mapper(replace(CONFIG, builder=builder, iterations=6)), Optimizer()
     for keyframe in keyframes[:4]:
         made = list(mapper.handle(keyframe))
-        (before,) = optimizer.handle(keyframe)
+        (before,) = optimizer.handle(keyframe_measurements_message(keyframe))
         refinements = [m for m in made if isinstance(m, KeyframeRefinement)]
         assert list(mapper.handle(before)) == [], "it was sent before the renderer moved them"
         for refinement in refinements:

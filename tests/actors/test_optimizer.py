@@ -11,8 +11,12 @@ from ldo_service.conversions.poses import (
 )
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import T_map_submap
-from ldo_service.schemas import Keyframe, MeasuredPose, Pose
-from tests.actors.conftest import handle_all
+from ldo_service.schemas import GraphCorrection, Keyframe, MeasuredPose, Pose
+from tests.actors.conftest import handle_all, without_images
+
+
+def corrections_of(optimizer: Optimizer, keyframes: list[Keyframe]) -> list[GraphCorrection]:
+    return handle_all(optimizer, without_images(keyframes))
 
 
 def with_references_only(keyframes: list[Keyframe]) -> list[Keyframe]:
@@ -21,7 +25,7 @@ def with_references_only(keyframes: list[Keyframe]) -> list[Keyframe]:
 
 
 def test_each_keyframe_gives_a_correction_of_all_poses(keyframes) -> None:
-    corrections = handle_all(Optimizer(), with_references_only(keyframes))
+    corrections = corrections_of(Optimizer(), with_references_only(keyframes))
     assert [c.graph_version for c in corrections] == list(range(1, len(keyframes) + 1))
     last = keyframe_poses_from_correction(corrections[-1])
     assert list(last) == [k.keyframe for k in keyframes]
@@ -33,15 +37,15 @@ def test_each_keyframe_gives_a_correction_of_all_poses(keyframes) -> None:
 
 def test_a_keyframe_sent_twice_counts_once(keyframes) -> None:
     optimizer = Optimizer()
-    handle_all(optimizer, keyframes[:2])
-    assert handle_all(optimizer, keyframes[1:2]) == []
+    corrections_of(optimizer, keyframes[:2])
+    assert corrections_of(optimizer, keyframes[1:2]) == []
     assert optimizer.metrics()["keyframes_repeated"] == 1
 
 
 def test_a_missing_reference_is_bridged_by_odometry(keyframes, caplog) -> None:
     optimizer = Optimizer()
     missing = next(k.reference for k in keyframes if k.reference)
-    (*_, last) = handle_all(
+    (*_, last) = corrections_of(
         optimizer, [k for k in with_references_only(keyframes) if k.keyframe != missing]
     )
     assert "was never received; using odometry" in caplog.text
@@ -56,8 +60,8 @@ def test_window_measurement_replaces_a_missing_reference(keyframes) -> None:
     optimizer = Optimizer()
     *_, last = keyframes
     older = last.window_measurements[-1]
-    handle_all(optimizer, [k for k in keyframes if k.keyframe <= older.reference])
-    (correction,) = handle_all(optimizer, [last])
+    corrections_of(optimizer, [k for k in keyframes if k.keyframe <= older.reference])
+    (correction,) = corrections_of(optimizer, [last])
     poses = keyframe_poses_from_correction(correction)
     T_older_last = se3.inverse(poses[older.reference]) @ poses[last.keyframe]
     np.testing.assert_allclose(
@@ -76,34 +80,35 @@ def test_window_measurements_reduce_the_pose_error(keyframes, room) -> None:
         true = [(T_first_world @ truth[k.frame])[:3, 3] for k in keyframes]
         return float(np.sqrt(np.mean(np.square(np.subtract(estimated, true)).sum(axis=1))))
 
-    without_windows = error_m(handle_all(Optimizer(), with_references_only(keyframes)))
-    with_windows = error_m(handle_all(Optimizer(), keyframes))
+    without_windows = error_m(corrections_of(Optimizer(), with_references_only(keyframes)))
+    with_windows = error_m(corrections_of(Optimizer(), keyframes))
     assert with_windows < 0.8 * without_windows
 
 
 def test_restored_optimizer_republishes_last_correction_and_continues(keyframes) -> None:
     first, second = Optimizer(), Optimizer()
-    *_, last = handle_all(first, keyframes[:-1])
+    *_, last = corrections_of(first, keyframes[:-1])
     second.restore(first.snapshot())
     (again,) = second.on_restored()
     assert again.graph_version == last.graph_version + 1, "the last version may have been sent"
     assert (again.stamp_ns, again.keyframes) == (last.stamp_ns, last.keyframes)
-    (expected,) = handle_all(first, keyframes[-1:])
-    (correction,) = handle_all(second, keyframes[-1:])
+    (expected,) = corrections_of(first, keyframes[-1:])
+    (correction,) = corrections_of(second, keyframes[-1:])
     for keyframe, T in keyframe_poses_from_correction(correction).items():
         np.testing.assert_allclose(T, keyframe_poses_from_correction(expected)[keyframe], atol=1e-6)
 
 
 def test_same_keyframes_give_bitwise_equal_corrections(keyframes) -> None:
     one, two = (
-        [msgspec.msgpack.encode(c) for c in handle_all(Optimizer(), keyframes)] for _ in range(2)
+        [msgspec.msgpack.encode(c) for c in corrections_of(Optimizer(), keyframes)]
+        for _ in range(2)
     )
     assert one == two
 
 
 def test_an_information_of_zero_does_not_break_the_graph(keyframes) -> None:
     without_information = msgspec.structs.replace(keyframes[1], information=(0.0,) * 36)
-    assert len(handle_all(Optimizer(), [keyframes[0], without_information])) == 2
+    assert len(corrections_of(Optimizer(), [keyframes[0], without_information])) == 2
 
 
 # --- submaps -------------------------------------------------------------------------------------
@@ -139,7 +144,7 @@ def with_submap_measurement(keyframe: Keyframe, known: Keyframe) -> Keyframe:
 
 
 def test_a_new_submap_is_placed_far_from_the_others(keyframes) -> None:
-    (*_, last) = handle_all(Optimizer(), in_two_submaps(keyframes, 3))
+    (*_, last) = corrections_of(Optimizer(), in_two_submaps(keyframes, 3))
     assert last.merged_submaps == ()
     for k in keyframes:
         T_odom_keyframe = pose_from_message(k.T_odom_keyframe)
@@ -153,10 +158,10 @@ def test_submap_measurement_merges_newer_submap_into_the_older_frame(keyframes, 
     caplog.set_level("INFO")
     *before, last = in_two_submaps(keyframes, 3)
     first, restored = Optimizer(), Optimizer()
-    handle_all(first, before)
+    corrections_of(first, before)
     restored.restore(first.snapshot())
     for optimizer in (first, restored):
-        (correction,) = handle_all(optimizer, [with_submap_measurement(last, keyframes[1])])
+        (correction,) = corrections_of(optimizer, [with_submap_measurement(last, keyframes[1])])
         assert correction.merged_submaps == ((1, 0),)
         for k in keyframes:
             np.testing.assert_allclose(
@@ -171,7 +176,7 @@ def test_submap_measurement_merges_newer_submap_into_the_older_frame(keyframes, 
 def test_submap_measurement_to_an_unknown_keyframe_is_discarded(keyframes, caplog) -> None:
     *before, last = in_two_submaps(keyframes, 3)
     optimizer = Optimizer()
-    handle_all(optimizer, [k for k in before if k.keyframe != 1])
-    (correction,) = handle_all(optimizer, [with_submap_measurement(last, keyframes[1])])
+    corrections_of(optimizer, [k for k in before if k.keyframe != 1])
+    (correction,) = corrections_of(optimizer, [with_submap_measurement(last, keyframes[1])])
     assert correction.merged_submaps == ()
     assert "submap measurement to unknown keyframe 1" in caplog.text

@@ -6,7 +6,11 @@ import pytest
 
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import CameraExtrinsics, Tracker, TrackerConfig
-from ldo_service.conversions.frames import frame_from_message, frame_to_message
+from ldo_service.conversions.frames import (
+    frame_from_message,
+    frame_to_message,
+    keyframe_measurements_message,
+)
 from ldo_service.conversions.poses import (
     correction_to_message,
     keyframe_poses_from_correction,
@@ -24,6 +28,7 @@ from ldo_service.schemas import (
     FrameRgbd,
     GraphCorrection,
     Keyframe,
+    KeyframeMeasurements,
     KeyframeRefinement,
     LoopClosure,
     OdometryPrior,
@@ -92,8 +97,9 @@ def test_nothing_is_published_before_the_first_keyframe_has_a_credit(frames) -> 
     tracker.situation = FlowStatus(credits={KEYFRAME_NEW: 0})
     assert handle_all(tracker, frames[:3]) == []
     tracker.situation = FlowStatus(credits={KEYFRAME_NEW: 8})
-    keyframe, pose = handle_all(tracker, frames[3:4])
+    keyframe, measurements, pose = handle_all(tracker, frames[3:4])
     assert isinstance(keyframe, Keyframe)
+    assert measurements == keyframe_measurements_message(keyframe)
     assert keyframe.frame == 3
     np.testing.assert_array_equal(pose_from_message(pose.T_odom_camera), np.eye(4))
 
@@ -126,7 +132,7 @@ def test_odometry_does_not_jump_when_a_loop_is_closed(frames, tracked) -> None:
     for number, frame in enumerate(frames):
         out = handle_all(tracker, [frame])
         poses += poses_of(out)
-        made = [message for message in out if isinstance(message, Keyframe)]
+        made = [message for message in out if isinstance(message, KeyframeMeasurements)]
         corrections = [c for keyframe in made for c in optimizer.handle(keyframe)]
         if number == 25:
             newest = poses[-1].reference or 0

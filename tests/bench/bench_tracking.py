@@ -31,7 +31,7 @@ from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RgbdFrame, Trajectory
 from ldo_service.kernels import isa
-from ldo_service.schemas import TrackedPose
+from ldo_service.schemas import Keyframe, TrackedPose
 from ldo_service.tracking import Odometry, OdometryConfig, TrackingStatus
 from ldo_service.tracking.window import WindowConfig
 from tests.bench.tracking_peers import Step, peers
@@ -130,6 +130,8 @@ def corrected(sequence: Sequence, indices: range) -> Trajectory:
         for message in tracker.handle(frame_to_message(sequence[index])):
             if isinstance(message, TrackedPose):
                 poses.append(message)
+                continue
+            if isinstance(message, Keyframe):
                 continue
             for correction in optimizer.handle(message):
                 T_map = keyframe_poses_from_correction(correction)

@@ -159,11 +159,11 @@ def test_record_command_refuses_to_overwrite_a_recording(recording: Path, capsys
 def test_a_recording_of_another_version_is_refused(
     recording: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mcap_file, "RECORDING_VERSION", 3)
+    monkeypatch.setattr(mcap_file, "RECORDING_VERSION", 4)
     code, _, err = ldo(capsys, "replay", recording)
     assert code == DataError.exit_code
     assert_one_paragraph(err)
-    assert "has version=2, but must have version=3" in err
+    assert "has version=3, but must have version=4" in err
 
 
 def test_selected_actors_are_opened_and_unknown_ones_refused(

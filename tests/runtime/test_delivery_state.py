@@ -348,7 +348,7 @@ def test_stored_state_is_parsed_into_its_parts() -> None:
     sent = tuple(UnackedMessage(seq, b"header", b"body %d" % seq) for seq in (9, 10, 11))
     state = {
         "values": [1],
-        "stage.offsets": {"in": {NUMBERS.name: (5, 3)}, "out": {DOUBLES.name: (7, 12)}},
+        "stage.offsets": {"in": {NUMBERS.name: (5, 3)}, "out": {DOUBLES.name: (7, 12, None)}},
         **{f"stage.outbox test.double {one.seq}": one for one in reversed(sent)},
         "stage.wal 4": logged_input(8),
     }

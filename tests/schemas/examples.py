@@ -33,6 +33,7 @@ from ldo_service.schemas import (
     Image,
     InputCount,
     Keyframe,
+    KeyframeMeasurements,
     KeyframeRefinement,
     LabelNames,
     LabelRequest,
@@ -158,6 +159,20 @@ EXAMPLES: dict[str, Message] = {
         information=INFORMATION,
         T_odom_keyframe=OTHER_POSE,
         overlap=0.75,
+    ),
+    "keyframe_measurements": KeyframeMeasurements(
+        stamp_ns=3,
+        keyframe=4,
+        camera=CAMERA,
+        reference=3,
+        T_reference_keyframe=POSE,
+        information=INFORMATION,
+        T_odom_keyframe=OTHER_POSE,
+        window_measurements=(
+            MeasuredPose(
+                reference=1, keyframe=4, T_reference_keyframe=OTHER_POSE, information=INFORMATION
+            ),
+        ),
     ),
     "keyframe_with_a_window": Keyframe(
         stamp_ns=3,

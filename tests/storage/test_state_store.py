@@ -293,6 +293,6 @@ def test_state_of_another_version_is_rejected_and_unchanged(
     file.write_bytes(msgspec.msgpack.encode(contents))
     before = {path.name: path.read_bytes() for path in file.parent.iterdir()}
     for use in (lambda s: s.load("mapper"), lambda s: s.save("mapper", {"step": [2]})):
-        with pytest.raises(DataError, match=f"version={version}, and this service reads 2"):
+        with pytest.raises(DataError, match=f"version={version}, and this service reads 3"):
             use(FolderStore(tmp_path))
     assert {path.name: path.read_bytes() for path in file.parent.iterdir()} == before

@@ -1,0 +1,127 @@
+"""Outbox of a topic: the messages that some lossless consumer has not handled."""
+
+from collections import deque
+from collections.abc import Iterable
+from threading import Lock
+
+from ldo_service.storage.message_log import LoggedMessage, MessageLog
+from ldo_service.transport.flow_control import UnackedMessage
+
+# Newest messages that stay in memory although the log has them: consumers that are not behind take
+# retransmissions from here.
+MESSAGES_IN_MEMORY = 8
+
+
+class Outbox:
+    """Numbered messages in order, in memory or, for consumers that may be far behind, on disk.
+
+    Without a log, all messages are in memory, and the stage saves them with its state. With a log,
+    `store` writes them to disk, and only the newest stay in memory.
+    """
+
+    def __init__(
+        self,
+        unhandled: Iterable[UnackedMessage] = (),
+        log: MessageLog | None = None,
+        max_bytes: int | None = None,
+    ) -> None:
+        """Initialize with the messages of the previous process.
+
+        Args:
+            unhandled: Messages that the previous process saved with its state.
+            log: Log on disk, which bounds its size itself.
+            max_bytes: Maximum size of the messages in memory, bytes, if there is no log; the
+                oldest are dropped beyond it. None: the consumers' windows bound the outbox.
+        """
+        self._lock = Lock()
+        self._memory = deque(unhandled)
+        self._log, self._max_bytes = log, max_bytes
+        self._bytes = sum(len(message.body) for message in self._memory)
+        self._dropped = 0  # Messages dropped from memory.
+
+    @property
+    def is_logged(self) -> bool:
+        """True if the messages are written to a log on disk."""
+        return self._log is not None
+
+    @property
+    def in_memory(self) -> tuple[UnackedMessage, ...]:
+        """Messages to save with the state of the stage; none if they are in a log."""
+        return () if self._log else tuple(self._memory)
+
+    @property
+    def dropped(self) -> int:
+        """Messages dropped because of the maximum size."""
+        return self._dropped + (self._log.dropped if self._log else 0)
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the messages on disk, or in memory if there is no log, bytes."""
+        return self._log.size_bytes if self._log else self._bytes
+
+    def first(self, end: int) -> int:
+        """Return the number of the first message; `end` if there is none.
+
+        Args:
+            end: Number after the last message.
+        """
+        with self._lock:
+            in_memory = self._memory[0].seq if self._memory else end
+        in_log = end if self._log is None or self._log.first == self._log.next else self._log.first
+        return min(in_memory, in_log)
+
+    def add(self, message: UnackedMessage) -> None:
+        """Add the next message."""
+        with self._lock:
+            self._memory.append(message)
+            self._bytes += len(message.body)
+            while self._max_bytes is not None and self._bytes > self._max_bytes:
+                self._bytes -= len(self._memory.popleft().body)
+                self._dropped += 1
+
+    def store(self) -> None:
+        """Write the messages to the log, if there is one; may be called on any thread.
+
+        Raises:
+            OSError: The log cannot be written. All messages stay in memory.
+        """
+        if self._log is None:
+            return
+        with self._lock:
+            new = [m for m in self._memory if m.seq >= self._log.next]
+        self._log.append(LoggedMessage(*message) for message in new)
+        with self._lock:
+            while len(self._memory) > MESSAGES_IN_MEMORY and self._memory[0].seq < self._log.next:
+                self._bytes -= len(self._memory.popleft().body)
+
+    def read(self, seq: int) -> UnackedMessage | None:
+        """Return a message, None if it is lost; reads the disk, so call it in a thread."""
+        with self._lock:
+            if self._memory and self._memory[0].seq <= seq <= self._memory[-1].seq:
+                return self._memory[seq - self._memory[0].seq]
+        found = self._log.read(seq) if self._log else None
+        return UnackedMessage(*found) if found else None
+
+    def forget(self, before: int) -> None:
+        """Delete the messages before a number, which all consumers have handled."""
+        with self._lock:
+            while self._memory and self._memory[0].seq < before:
+                self._bytes -= len(self._memory.popleft().body)
+        if self._log:
+            self._log.forget(before)
+
+    def truncate(self, end: int) -> None:
+        """Delete the messages from a number on, which were not sent."""
+        with self._lock:
+            while self._memory and self._memory[-1].seq >= end:
+                self._bytes -= len(self._memory.pop().body)
+        if self._log:
+            self._log.truncate(end)
+
+    def restart(self, epoch: int) -> None:
+        """Delete all messages and begin at number 0 of a new epoch."""
+        with self._lock:
+            self._memory.clear()
+            self._bytes = 0
+        if self._log:
+            self._log.restart(epoch)

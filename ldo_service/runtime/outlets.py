@@ -1,0 +1,169 @@
+"""All outlets of one actor."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from ldo_service.schemas import Message, OutputCount
+from ldo_service.schemas.topics import Topic
+from ldo_service.storage.message_log import MessageLog
+from ldo_service.storage.state_store import StateStore
+from ldo_service.transport.flow_control import OutletPosition
+from ldo_service.transport.interface import Transport
+
+from .actor import Out
+from .outbox import Outbox
+from .outlet import Outlet
+from .step import Produced
+from .supervision_policy import SupervisionConfig
+
+
+@dataclass(frozen=True, slots=True)
+class OutletOpener:
+    """Opener of the outlets of a stage, which continue where its previous process stopped.
+
+    Attributes:
+        transport: The network.
+        config: Limits of supervision.
+        store: Storage of the state. A backlog is on disk if the state is.
+        past: Saved position of the previous process, by topic name.
+    """
+
+    transport: Transport
+    config: SupervisionConfig
+    store: StateStore
+    past: Mapping[str, OutletPosition]
+
+    def open(
+        self,
+        port: Out,
+        source: tuple[str, int],
+        expected: frozenset[str],
+        with_backlog: frozenset[str],
+        on_evicted: Callable[[str], None],
+    ) -> Outlet:
+        """Open the outlet of a port.
+
+        Args:
+            port: The output of the actor.
+            source: Name of the actor, and number of this run of it.
+            expected: Names of the required consumers.
+            with_backlog: Names of those for which the outlet does not wait.
+            on_evicted: Called with the name of an evicted consumer.
+        """
+        name, epoch = source
+        past = self.past.get(port.topic.name, OutletPosition(epoch, 0))
+        return Outlet(
+            port,
+            name,
+            epoch,
+            self.transport,
+            expected,
+            self.config.evict_after_s,
+            on_evicted,
+            past,
+            with_backlog=with_backlog,
+            outbox=self._outbox(name, port.topic, past) if with_backlog else None,
+        )
+
+    def _outbox(self, source: str, topic: Topic, past: OutletPosition) -> Outbox:
+        max_bytes = round(self.config.backlog_mb * 1e6)
+        folder = self.store.backlog_folder(source)
+        if folder is None:
+            return Outbox(past.unhandled, max_bytes=max_bytes)
+        log = MessageLog(
+            folder / topic.name.replace("/", "."),
+            past.epoch,
+            past.handled,
+            past.seq,
+            max_bytes=max_bytes,
+            syncs=self.store.syncs,
+        )
+        return Outbox(log=log)
+
+
+class Outlets:
+    """Set of all outlets of an actor.
+
+    They stage the outputs of a step. They send these outputs after the step is saved, and discard
+    them if the step fails.
+    """
+
+    def __init__(self, outlets: Iterable[Outlet] = ()) -> None:
+        self._all = {outlet.topic.message: outlet for outlet in outlets}
+
+    def __getitem__(self, message: type[Message]) -> Outlet:
+        return self._all[message]
+
+    @property
+    def is_nonblocking(self) -> bool:
+        """True if one of the ports is nonblocking."""
+        return any(outlet.port.is_nonblocking for outlet in self._all.values())
+
+    @property
+    def has_required_consumers(self) -> bool:
+        """True if a topic has a required consumer, which must not miss a message."""
+        return any(outlet.position() for outlet in self._all.values())
+
+    def room(self) -> dict[Topic, int]:
+        """Return the credits of the nonblocking ports; their actor checks them before a step."""
+        return {
+            outlet.topic: outlet.credits()
+            for outlet in self._all.values()
+            if outlet.port.is_nonblocking
+        }
+
+    def past(self) -> dict[str, OutletPosition | None]:
+        """Return the position to save for each topic; None without required consumers."""
+        return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
+
+    def hold(self, produced: Sequence[Produced]) -> None:
+        """Stage the outputs of a step."""
+        for out in produced:
+            self._all[type(out.message)].stage_message(out.message, out.body)
+
+    async def release(self, *, is_saved: bool = True) -> None:
+        """Send the staged outputs of a step.
+
+        If the step is not saved, topics with required consumers keep theirs staged.
+        """
+        for outlet in self._all.values():
+            if is_saved or outlet.position() is None:
+                await outlet.commit()
+
+    def store(self) -> None:
+        """Write unhandled messages to the outboxes on disk; may be called on any thread.
+
+        Raises:
+            OSError: The disk is full or cannot be written.
+        """
+        for outlet in self._all.values():
+            outlet.store()
+
+    def take_back(self) -> None:
+        """Discard the staged outputs."""
+        for outlet in self._all.values():
+            outlet.rollback()
+
+    async def flush(self) -> None:
+        """Wait until every lossless consumer has received all messages."""
+        for outlet in self._all.values():
+            await outlet.flush()
+
+    def renew(self, epoch: int) -> None:
+        """Restart numbering of all topics under a new epoch."""
+        for outlet in self._all.values():
+            outlet.reset(epoch)
+
+    def check_windows(self) -> None:
+        """Evict stalled consumers of all topics."""
+        for outlet in self._all.values():
+            outlet.evict_stalled()
+
+    def counts(self) -> tuple[OutputCount, ...]:
+        """Return the counters of all outputs for the health message."""
+        return tuple(outlet.counts() for outlet in self._all.values())
+
+    def close(self) -> None:
+        """Close all outlets."""
+        for outlet in self._all.values():
+            outlet.close()

@@ -1,0 +1,244 @@
+"""Append-only log of numbered messages on disk, for consumers that are far behind."""
+
+import logging
+import struct
+import zlib
+from bisect import bisect_right
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import NamedTuple
+
+from .atomic_write import sync
+
+log = logging.getLogger(__name__)
+
+# Size at which a segment ends, bytes. A segment is deleted as a whole, so that this is also the
+# disk space that handled messages may still occupy.
+SEGMENT_BYTES = 32_000_000
+# Record before each message: its number, the sizes of its header and body in bytes, and the CRC-32
+# of both.
+_RECORD = struct.Struct("<QIII")
+
+
+class LoggedMessage(NamedTuple):
+    """Message of a log."""
+
+    seq: int
+    header: bytes
+    body: bytes
+
+
+@dataclass
+class _Segment:
+    """File with consecutive messages."""
+
+    path: Path
+    first: int  # Number of its first message.
+    # Position after each message, bytes. Message `first + i` ends at `ends[i]`.
+    ends: list[int] = field(default_factory=list)
+
+    @property
+    def next(self) -> int:
+        return self.first + len(self.ends)
+
+    @property
+    def size(self) -> int:
+        return self.ends[-1] if self.ends else 0
+
+
+class MessageLog:
+    """Log of consecutive messages in a folder; any thread may call its methods.
+
+    The oldest messages are deleted when the log exceeds its maximum size. The numbers of the log
+    belong to one epoch of their producer. Files of other epochs are deleted.
+    """
+
+    def __init__(
+        self, folder: Path, epoch: int, first: int, end: int, *, max_bytes: int, syncs: bool = False
+    ) -> None:
+        """Open the log, and discard messages outside a range.
+
+        Args:
+            folder: Folder of the log; created with the first message.
+            epoch: Epoch of the numbers.
+            first: Number of the first message that is still needed.
+            end: Number after the last message. A killed process may have written more.
+            max_bytes: Maximum size of the log, bytes.
+            syncs: Sync every message to the disk, so that the log survives a power cut too.
+        """
+        self._folder, self._epoch, self._max_bytes, self._syncs = folder, epoch, max_bytes, syncs
+        self._lock = Lock()
+        self._segments: list[_Segment] = []
+        self._first = first
+        self.dropped = 0  # Messages deleted because of the maximum size.
+        self._scan(end)
+        self.forget(first)
+
+    @property
+    def first(self) -> int:
+        """Number of the first message."""
+        with self._lock:
+            return max(self._first, self._segments[0].first) if self._segments else self._first
+
+    @property
+    def next(self) -> int:
+        """Number of the message to append next."""
+        with self._lock:
+            return self._next
+
+    @property
+    def _next(self) -> int:
+        return self._segments[-1].next if self._segments else self._first
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all files, bytes."""
+        with self._lock:
+            return sum(segment.size for segment in self._segments)
+
+    def append(self, messages: Iterable[LoggedMessage]) -> None:
+        """Append messages whose numbers follow the last one; earlier numbers are skipped.
+
+        Raises:
+            OSError: The disk is full or cannot be written. The log ends after a whole message.
+        """
+        with self._lock:
+            for message in messages:
+                if message.seq >= self._next:
+                    self._append(message)
+
+    def _append(self, message: LoggedMessage) -> None:
+        if self._segments and message.seq != self._next:
+            self._clear()  # The messages between were lost with their file.
+        if not self._segments or self._segments[-1].size >= SEGMENT_BYTES:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            if not self._segments:
+                self._first = message.seq
+            self._segments.append(_Segment(self._path(message.seq), message.seq))
+        segment = self._segments[-1]
+        header, body = message.header, message.body
+        with segment.path.open("r+b" if segment.ends else "wb") as file:
+            file.seek(segment.size)
+            file.write(_RECORD.pack(message.seq, len(header), len(body), _checksum(header, body)))
+            file.write(header)
+            file.write(body)
+        if self._syncs:
+            sync(segment.path)
+        segment.ends.append(segment.size + _RECORD.size + len(header) + len(body))
+        self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        """Delete the oldest segments beyond the maximum size, but never the last one."""
+        size = sum(segment.size for segment in self._segments)
+        while size > self._max_bytes and len(self._segments) > 1:
+            oldest = self._segments.pop(0)
+            size -= oldest.size
+            self.dropped += max(0, oldest.next - max(self._first, oldest.first))
+            self._first = oldest.next
+            _remove(oldest.path)
+
+    def read(self, seq: int) -> LoggedMessage | None:
+        """Return a message; None if it was deleted or its file is damaged."""
+        with self._lock:
+            segment = self._segment_of(seq)
+            if segment is None or seq < self._first:
+                return None
+            number = seq - segment.first
+            start = segment.ends[number - 1] if number else 0
+            size = segment.ends[number] - start
+            try:
+                with segment.path.open("rb") as file:
+                    file.seek(start)
+                    raw = file.read(size)
+            except OSError as error:
+                log.error("%s cannot be read (%s); message %d is lost.", segment.path, error, seq)
+                return None
+        if len(raw) < size:
+            log.error("%s is truncated; message %d is lost.", segment.path, seq)
+            return None
+        _, header_bytes, _, checksum = _RECORD.unpack_from(raw)
+        end = _RECORD.size + header_bytes
+        header, body = raw[_RECORD.size : end], raw[end:]
+        if _checksum(header, body) != checksum:
+            log.error("%s is damaged; message %d is lost.", segment.path, seq)
+            return None
+        return LoggedMessage(seq, header, body)
+
+    def forget(self, before: int) -> None:
+        """Delete the segments that only hold messages before a number."""
+        with self._lock:
+            self._first = max(self._first, before)
+            while self._segments and self._segments[0].next <= before:
+                _remove(self._segments.pop(0).path)
+
+    def truncate(self, end: int) -> None:
+        """Delete the messages from a number on."""
+        with self._lock:
+            while self._segments and self._segments[-1].first >= end:
+                _remove(self._segments.pop().path)
+            if self._segments and self._segments[-1].next > end:
+                last = self._segments[-1]
+                del last.ends[end - last.first :]
+                with suppress(OSError), last.path.open("r+b") as file:
+                    file.truncate(last.size)
+
+    def restart(self, epoch: int) -> None:
+        """Delete all messages and begin at number 0 of a new epoch."""
+        with self._lock:
+            self._clear()
+            self._epoch, self._first = epoch, 0
+
+    def _clear(self) -> None:
+        while self._segments:
+            _remove(self._segments.pop().path)
+
+    def _segment_of(self, seq: int) -> _Segment | None:
+        place = bisect_right(self._segments, seq, key=lambda segment: segment.first) - 1
+        if place < 0 or seq >= self._segments[place].next:
+            return None
+        return self._segments[place]
+
+    def _path(self, first: int) -> Path:
+        return self._folder / f"{self._epoch}-{first:012d}.log"
+
+    def _scan(self, end: int) -> None:
+        """Index the files of this epoch up to the first gap, and delete all other files."""
+        for path in sorted(self._folder.glob("*.log")):
+            epoch, _, number = path.stem.partition("-")
+            first = int(number) if number.isdecimal() else -1
+            follows = not self._segments or first == self._segments[-1].next
+            if epoch != str(self._epoch) or first < 0 or not follows:
+                _remove(path)
+                continue
+            segment = _Segment(path, first, _ends(path, first))
+            if segment.ends:
+                self._segments.append(segment)
+        self.truncate(end)
+
+
+def _ends(path: Path, first: int) -> list[int]:
+    """Return the position after each whole message of a file."""
+    ends: list[int] = []
+    with suppress(OSError), path.open("rb") as file:
+        size = path.stat().st_size
+        while len(raw := file.read(_RECORD.size)) == _RECORD.size:
+            seq, header, body, _ = _RECORD.unpack(raw)
+            end = file.tell() + header + body
+            if seq != first + len(ends) or end > size:
+                break
+            ends.append(end)
+            file.seek(end)
+    return ends
+
+
+def _checksum(header: bytes, body: bytes) -> int:
+    return zlib.crc32(body, zlib.crc32(header))
+
+
+def _remove(path: Path) -> None:
+    """Remove a file; if that fails, the next process removes it."""
+    with suppress(OSError):
+        path.unlink()
