@@ -62,7 +62,7 @@ def test_keys_and_tls_require_each_other(tmp_path: Path) -> None:
     )
     with pytest.raises(ConfigError, match="needs keys"):
         Endpoint("mule", "tls/0.0.0.0:7447")
-    with pytest.raises(ConfigError, match="write tls/"):
+    with pytest.raises(ConfigError, match="Write it as tls/"):
         Endpoint("mule", "tcp/0.0.0.0:7447", keys)
     Endpoint("mule", "tls/0.0.0.0:7447", keys).require_safe()
 
