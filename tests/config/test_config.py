@@ -45,8 +45,8 @@ def test_comment_is_printed_with_its_setting() -> None:
     lines = explained_yaml(Config(), with_advanced=True).splitlines()
     reasons = {key.strip(): reason for key, _, reason in (line.partition("  # ") for line in lines)}
     assert reasons["start_after_lost_s: 3.0"].endswith("0 never starts one.")
-    assert reasons["pyramid_levels: 4"].startswith("More levels let the alignment converge")
-    assert reasons["pyramid_levels: 4"].endswith("end at 40 pixels.")
+    assert reasons["pyramid_levels: 4"].startswith("Number of pyramid levels. More levels")
+    assert reasons["pyramid_levels: 4"].endswith("ends at 40 pixels.")
 
 
 def test_settings_override_the_file(tmp_path: Path) -> None:
