@@ -1,1 +1,1 @@
-"""Image regions of keyframes, tracked over keyframes until they have a name."""
+"""Image regions that may be objects: proposed per keyframe, tracked, and labelled by a labeller."""

@@ -1,13 +1,16 @@
 """Segments of a keyframe by geometry and color: possible objects and structural planes.
 
-    apart      connected in depth, and no structure (see `planes`)
-    standing   the part of that which stands on a flat surface: a cup on a table
-    convex     the part of that which no concave crease divides: a cabinet next to an oven
-    flat       lies on structure, with another color: a picture, a window, a rug
-    room       a plane of structure: no object, but it may appear in an object's box
+A segment has one of five kinds:
+
+    apart      connected without depth steps, and not on a structural plane (see `planes`)
+    standing   within a segment `apart`: stands on a flat surface, such as a cup on a table
+    convex     within a segment `apart`: bounded by concave creases, such as a cabinet by an oven
+    flat       on a structural plane, with another color: a picture, a window, a rug
+    room       a structural plane: it is no object, but it may appear in an object's box
 
 Convex segments follow Stein et al., CVPR 2014: objects are convex, and creases between them are
-concave. Segments overlap: a couch with its cushions is apart, and the cushions are standing.
+concave. Segments overlap: a couch with its cushions is one segment `apart`, and each cushion on it
+is a segment `standing`.
 """
 
 from collections.abc import Iterator
@@ -112,7 +115,7 @@ def segment_geometry(
 
 
 def components(mask: np.ndarray, min_px: int = 1) -> Iterator[Foreground]:
-    """Yield the parts of a mask [H, W] bool that are connected by the sides of their pixels."""
+    """Yield the 4-connected components of a mask [H, W] bool with at least `min_px` pixels."""
     count, parts, boxes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     for part in range(1, count):
         column, row, width, height, area = (int(value) for value in boxes[part])
@@ -128,15 +131,15 @@ def _joined(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndar
 
 
 def _on_planes(found: Planes, apart: np.ndarray) -> np.ndarray:
-    """Return the flat surfaces of objects with their edges, [h, w] bool."""
+    """Return the planes that are not structural, with their edges, [h, w] bool."""
     return cv2.dilate(((found.number > 0) & apart).astype(np.uint8), _3X3) > 0
 
 
 def _concave(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndarray:
-    """Return where the normals of neighbors turn towards each other, [h, w] bool.
+    """Return the pixels on concave creases, [h, w] bool.
 
-    A crease is concave if (p_b - p_a) . (n_b - n_a) < 0 for normals towards the camera. The normals
-    must differ by more than noise.
+    A crease between points a and b is concave if (p_b - p_a) . (n_b - n_a) < 0, with normals n
+    towards the camera. The normals must differ by at least the angle `config.crease`.
     """
     points = seen.rays / np.maximum(seen.smooth, np.float32(1e-3))[..., None]
     r, concave = config.crease_px, np.zeros(seen.inverse.shape, bool)
@@ -150,9 +153,11 @@ def _concave(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.nda
 def _divided(
     apart: np.ndarray, concave: np.ndarray, config: GeometricSegmentationConfig
 ) -> Iterator[np.ndarray]:
-    """Yield the convex pieces of each object, [h, w] bool, grown over the creases around them.
+    """Yield the convex pieces of each component of `apart`, [h, w] bool.
 
-    A piece with most of an object is the object itself, and is not yielded.
+    Concave creases divide a component into pieces. Each piece is grown over the creases around it.
+    A piece with at least half of the component's pixels is not yielded, because it shows the same
+    object as the component.
     """
     of_thing = np.asarray(cv2.connectedComponents(apart.astype(np.uint8), connectivity=4)[1])
     sizes = np.bincount(of_thing.ravel())
@@ -165,7 +170,7 @@ def _divided(
 
 
 def _across(values: np.ndarray, r: int, axis: int) -> np.ndarray:
-    """Return the differences of values r pixels to either side."""
+    """Return the difference of the values `r` pixels after and before each pixel along an axis."""
     swapped = np.swapaxes(values, 0, axis)
     return np.swapaxes(swapped[2 * r :] - swapped[: -2 * r], 0, axis)
 
@@ -173,7 +178,7 @@ def _across(values: np.ndarray, r: int, axis: int) -> np.ndarray:
 def _colored(
     color: np.ndarray, of_room: np.ndarray, config: GeometricSegmentationConfig, camera: Camera
 ) -> Iterator[np.ndarray]:
-    """Yield for each structural plane where its color differs from its main color, [h, w] bool."""
+    """Yield for each structural plane its pixels that differ from its main color, [h, w] bool."""
     k, (height, width) = shrink_factor(camera.width, config.planes), of_room.shape
     small = cv2.resize(
         color[: height * k, : width * k], (width, height), interpolation=cv2.INTER_AREA
@@ -197,7 +202,7 @@ def _steps(lab: np.ndarray) -> np.ndarray:
 def _of_plane(even: np.ndarray, lab: np.ndarray, config: GeometricSegmentationConfig) -> np.ndarray:
     """Return the pixels of a plane with its main color, [h, w] bool, grown over their edges.
 
-    The main color is that of the largest even component.
+    The components of `even` have no color edges inside. The largest one gives the main color.
     """
     count, parts = cv2.connectedComponents(even.astype(np.uint8), connectivity=4)
     parts = np.asarray(parts, np.int32)
@@ -215,7 +220,10 @@ def _of_plane(even: np.ndarray, lab: np.ndarray, config: GeometricSegmentationCo
 
 
 def _filled(part: Foreground) -> Foreground:
-    """Return a part with holes filled and grown by a pixel, as its color begins at an edge."""
+    """Return a mask with filled holes, grown by one pixel.
+
+    Growing restores the color edge around the segment, which belongs to it.
+    """
     outline, _ = cv2.findContours(
         part.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
     )
@@ -224,6 +232,6 @@ def _filled(part: Foreground) -> Foreground:
 
 
 def _enlarged(part: Foreground, k: int) -> Foreground:
-    """Return a part at the size of the image, k times as large."""
+    """Return a mask of the small image enlarged by k, to the size of the full image."""
     mask = np.repeat(np.repeat(part.mask, k, axis=0), k, axis=1)
     return Foreground(k * part.row, k * part.column, mask)

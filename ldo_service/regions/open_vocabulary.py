@@ -1,8 +1,9 @@
 """Label requests to an open-vocabulary labeller and the use of its results (paper, III.B).
 
-A label result arrives late. It describes the pixels of a region in one keyframe, so these are
-stored until then. The label stays with the region as a vote next to the votes of the detector's
-boxes. When a later keyframe observes the region, the label is applied again.
+A label result arrives later than its keyframe. It describes the pixels of a region in that
+keyframe, so these are stored until it arrives. The result is also stored as a vote of the region,
+next to the votes of the detector's boxes. A later keyframe that observes the region gets its label
+too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,11 +56,11 @@ class OpenVocabularyConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PendingRequest:
-    """Pending label request.
+    """Label request without a result so far.
 
     Attributes:
         box_px: Box of the region in the keyframe, [4], x0 y0 x1 y1, pixels.
-        part: Mask of the region.
+        part: Mask of the region in the keyframe.
         label: Label of the detector; empty without one.
         score: Score of the detector.
         kind: Kind of the region, see `geometric_segmentation`.
@@ -85,8 +86,8 @@ class OpenVocabularyLabeling:
 
         Args:
             config: Settings.
-            is_heard: True if labels are added to the detections; else they are only collected as
-                votes.
+            is_heard: True if labels of regions are added to the detections. If false, they are only
+                stored as votes of the regions.
         """
         self.config, self._is_heard = config or OpenVocabularyConfig(), is_heard
         self._regions = RegionTracker(self.config.regions)
@@ -159,8 +160,8 @@ class OpenVocabularyLabeling:
             vocabulary: Vocabulary of the map.
 
         Returns:
-            The labels; None if the result has no label, is overruled by the region's votes, or has
-            no pending request.
+            The labels. None if the result has no label or no pending request, or if the votes of
+            the region give another label.
         """
         asked = self._open.pop((region, keyframe), None)
         if asked is None:
@@ -195,7 +196,7 @@ class OpenVocabularyLabeling:
         )
 
     def shown_in(self, region: int) -> tuple[int, ...]:
-        """Return the keyframes with views in the label request of a region; see `RegionTracker`."""
+        """Return the keyframes whose images are in the label request of a region."""
         return self._regions.shown_in(region)
 
     def carried(
@@ -205,7 +206,17 @@ class OpenVocabularyLabeling:
         vocabulary: Vocabulary,
         T_map_keyframe: Mapping[int, np.ndarray],
     ) -> RegionDetections | None:
-        """Return the label of a region in an earlier keyframe; None if unknown or not visible."""
+        """Propagate the mask and the label of a region into an earlier keyframe.
+
+        Args:
+            region: Id of the region.
+            view: Images and pose of the earlier keyframe.
+            vocabulary: Vocabulary of the map.
+            T_map_keyframe: Current poses of all keyframes, [4, 4], by id.
+
+        Returns:
+            Detections with the label; None if the region has no label or is not visible there.
+        """
         place = view.keyframe, view.depth_m, view.camera, T_map_keyframe
         opinion = self._regions.carried(region, *place)
         return opinion and add_region_labels(
@@ -213,9 +224,10 @@ class OpenVocabularyLabeling:
         )
 
     def _filter_answer(self, answer: RegionLabelResult, asked: PendingRequest) -> RegionLabelResult:
-        """Return a label result without labels that are no objects.
+        """Return a label result without the labels in `config.structure`.
 
-        A label below min_sure is removed, unless the region is a box of the detector.
+        A label with a confidence below min_sure is also removed, unless the region is a box of the
+        detector.
         """
         others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))
         if not self._is_object(answer.label):
@@ -273,10 +285,11 @@ class OpenVocabularyLabeling:
 def match_boxes_to_regions(
     boxes: int, found: Sequence[RegionProposal]
 ) -> tuple[Foreground | None, ...]:
-    """Return for each of the detector's boxes the mask of its object, or None if it has no region.
+    """Return for each of the detector's boxes the mask of its region, or None if it has none.
 
-    It is the segment by depth and creases, or the foreground without structure. Segments by color
-    ("flat") are not used: they include the edge of the surface behind.
+    The mask is that of a segment by depth and creases, or else the foreground of the box without
+    structural planes. Segments by color ("flat") are not used, because they include the edge of the
+    surface behind the object.
     """
     parts: list[Foreground | None] = [None] * boxes
     for one in found:
@@ -293,8 +306,9 @@ def add_region_labels(
 ) -> RegionDetections:
     """Add the labels of regions to the detections of a keyframe.
 
-    A region without a box is added. The label of a region with a box is added next to the label of
-    the detector. It replaces the detector's label if boxes vote for region labels.
+    A region without a box is added as a new box. For a region with a box, its label is added as the
+    labeller's label of that box. If `boxes_vote`, it also replaces the detector's label, whose vote
+    it contains already.
 
     Args:
         claims: Detections of the keyframe.
@@ -327,7 +341,7 @@ def add_region_labels(
 
 
 def _is_part_of_one(opinion: RegionLabel, opinions: Sequence[RegionLabel]) -> bool:
-    """Return whether most of its box lies in that of a larger region with the same label."""
+    """Return whether most of the label's box lies in the box of a larger region of that label."""
     larger = [
         other.of.box_px
         for other in opinions

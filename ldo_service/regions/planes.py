@@ -1,12 +1,12 @@
 """Planes of a keyframe, and the structural ones among them: walls, floors and ceilings.
 
-Inverse depth is linear in the image on a plane: n . (ray z) = d gives 1 / z = n . ray / d. So
-planes are fitted to it by least squares. Its noise is the same near and far, for a Kinect
-0.0014 / m.
+On a plane, inverse depth is linear in the image coordinates: n . (ray z) = d gives 1 / z =
+n . ray / d. Planes are therefore fitted to inverse depth by least squares. The noise of inverse
+depth is the same at all distances: 0.0014 / m for a Kinect.
 
-A plane is structure if almost no surface behind it is visible along its outline. Floors meet walls,
-and objects stand in front of both. A table top, a cabinet front or a seat ends where the camera
-sees past it to a farther surface.
+A plane is structural if almost no farther surface is visible along its outline. Floors and walls
+end where they meet each other or where an object in front hides them. A table top, a cabinet front
+or a seat ends where the camera sees a farther surface past its edge.
 """
 
 from dataclasses import dataclass
@@ -25,8 +25,9 @@ _LEAST = np.float32(1e-6)
 class PlaneConfig:
     """Settings of the planes.
 
-    They were set on `synthetic:flat` by how well regions cover its objects, and not varied since.
-    Lengths in pixels are those of the small image that all of this is computed in.
+    The values were chosen on the sequence `synthetic:flat`, where regions covered the objects best,
+    and were not varied on other data. Lengths in pixels refer to the image after its reduction to
+    `width_px`.
     """
 
     width_px: int = 320  # Width of that image; normals over a few of its pixels are stable enough.
@@ -90,8 +91,8 @@ class Planes:
 
     Attributes:
         number: Plane of each pixel, [h, w] int32; 0 without one.
-        inverses: Inverse depth of each plane across the image, P of [h, w] float32, 1 / m; that of
-            plane 1 comes first.
+        inverses: Inverse depth that each of P planes would have at every pixel of the image, P
+            arrays [h, w] float32, 1 / m. Plane 1 comes first.
     """
 
     number: np.ndarray
@@ -126,7 +127,10 @@ def compute_depth_features(
 
 
 def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
-    """Fit planes to the largest surfaces; a wall that an object divides is one plane."""
+    """Fit planes to the largest surfaces; surfaces on one plane get the same number.
+
+    A wall that an object in front divides into two surfaces is therefore one plane.
+    """
     number, inverses = np.zeros(seen.inverse.shape, np.int32), []
     for piece in np.argsort(-seen.sizes, kind="stable")[: config.most]:
         size = seen.sizes[piece]
@@ -149,7 +153,8 @@ def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
 def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -> np.ndarray:
     """Return the number of the structural plane of each pixel, [h, w] int32; 0 without one.
 
-    A pixel belongs to the plane if it lies on it, or next to it and no farther from it than noise.
+    A pixel belongs to a plane if it is one of the plane's pixels. A pixel next to them also belongs
+    to it if its distance from the plane is within the noise.
     """
     out = np.zeros(found.number.shape, np.int32)
     for number, inverse in enumerate(found.inverses, 1):
@@ -171,7 +176,7 @@ def disc(radius_px: int) -> np.ndarray:
 
 
 def _shrunk_inverse(depth_m: np.ndarray, k: int) -> np.ndarray:
-    """Return the mean inverse depth of the measured ones among k x k pixels."""
+    """Return the mean inverse depth of the measured pixels in each block of k x k pixels."""
     height, width = (side // k * k for side in depth_m.shape)
     depth_m = depth_m[:height, :width]
     measured = (depth_m > 0).astype(np.float32)
@@ -202,9 +207,12 @@ def _pieces(
 
 
 def _fitted(seen: DepthFeatures, part: np.ndarray, config: PlaneConfig) -> np.ndarray | None:
-    """Return a, b, c of 1 / z = a x + b y + c, or None if the surface is not plane.
+    """Fit a plane 1 / z = a x + b y + c to a surface.
 
-    Two more fits exclude outliers.
+    The fit is repeated twice without outliers.
+
+    Returns:
+        a, b, c; None if the surface is not planar.
     """
     v, u = np.nonzero(part)
     v, u = v[::4], u[::4]
@@ -224,8 +232,8 @@ def _share_behind(
 ) -> float:
     """Return the fraction of a plane's outline with a surface behind it.
 
-    A surface is behind if it is farther than the plane would be there. Objects that lie on the
-    plane do not count.
+    The depth just outside the outline is compared with the plane, extended to there. A surface is
+    behind if it is farther than the extended plane. Objects in front of the plane are not counted.
     """
     near, far = config.gap_px
     ring = (cv2.dilate(part, disc(far)) > 0) & (cv2.dilate(part, disc(near)) == 0) & ~seen.is_step

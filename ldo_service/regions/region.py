@@ -19,9 +19,10 @@ Votes = tuple[tuple[str, float, float], ...]  # Label, sum of its votes, highest
 
 
 def with_vote(votes: Votes, name: str, sure: float, weight: float = 1.0) -> Votes:
-    """Return votes with one for a label; twice the confidence counts four times.
+    """Add a vote for a label; the value of a vote is the square of its confidence.
 
-    In the demo, a third of the boxes with a score of 0.3 are right, and nearly all with 0.6.
+    The square is used because in the demo a third of the boxes with a score of 0.3 are right, and
+    nearly all with a score of 0.6.
 
     >>> votes = with_vote((("tv", 0.25, 0.5),), "tv", 0.6)
     >>> with_vote(votes, "oven", 0.5, weight=4)
@@ -31,9 +32,9 @@ def with_vote(votes: Votes, name: str, sure: float, weight: float = 1.0) -> Vote
 
 
 def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
-    """Return votes with that of a box, up to a sum of `most` for its label.
+    """Add the vote of a detector's box, but let the sum for its label not exceed `most`.
 
-    The sum is limited because each keyframe repeats the same box.
+    The sum is limited because the detector finds the same box again in each keyframe.
 
     >>> with_box(with_box((), "tv", 0.6, 0.4), "tv", 0.5, 0.4)
     (('tv', 0.4, 0.6),)
@@ -45,7 +46,7 @@ def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
 
 
 def with_votes_of(votes: Votes, others: Votes, share: float) -> Votes:
-    """Return votes with those of another region, weighted by `share`, 0..1.
+    """Add the votes of another region, multiplied by the weight `share`, 0..1.
 
     >>> with_votes_of((("clock", 1.0, 0.5),), (("radiator", 2.0, 0.8), ("clock", 0.5, 0.4)), 0.5)
     (('clock', 1.25, 0.5), ('radiator', 1.0, 0.4))
@@ -68,7 +69,7 @@ def winning_label(votes: Votes, least: float) -> tuple[str, float]:
 
 
 def _added(votes: Votes, more: Votes) -> Votes:
-    """Return votes with others added."""
+    """Return the sum of two sets of votes."""
     sums = {name: (total, most) for name, total, most in votes}
     for name, total, most in more:
         before, surest = sums.get(name, (0.0, 0.0))
@@ -128,19 +129,19 @@ class Region:
         id: Id of the region.
         keyframe: Keyframe of the newest observation.
         box_px: Box of the newest observation, x0 y0 x1 y1, pixels.
-        shape: Observation that others are compared with: the requested one or, before any request,
-            the largest.
+        shape: Observation that later observations are compared with. It is the one in the label
+            request or, before any request, the largest.
         seen: Number of keyframes that observed the region.
         best: Observation with the best view.
         views: Best views, the best first.
-        label: Label of the detection with the highest score.
-        score: Score of that detection, 0..1.
+        label: Label of the detector's box with the highest score.
+        score: Score of that box, 0..1.
         votes: Votes for each label.
         questions: Number of label requests so far.
         quality: Summed quality of the views at the last label request.
         answer: Label result with the highest confidence, without alternatives.
-        is_supported: True if a keyframe showed the region standing on an object; it is no part
-            of that object.
+        is_supported: True if the region stood on another object in a keyframe. It is then a
+            separate object, not part of the other one.
     """
 
     id: int
@@ -173,7 +174,7 @@ class RegionRequest:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionLabel:
-    """Label of a region in a keyframe, with its confidence `sure`, 0..1."""
+    """Label of a region in a keyframe: box and mask `of`, label, and confidence `sure`, 0..1."""
 
     of: RegionProposal
     label: str
@@ -182,7 +183,7 @@ class RegionLabel:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionUpdate:
-    """Result of a keyframe: new label requests, and labels of its regions."""
+    """Result of tracking a keyframe: new label requests, and labels of the keyframe's regions."""
 
     questions: list[RegionRequest]
     opinions: list[RegionLabel]
@@ -191,7 +192,7 @@ class RegionUpdate:
 def observe_region(
     keyframe: int, candidate: RegionProposal, depth_m: np.ndarray, camera: Camera
 ) -> RegionObservation | None:
-    """Return an observation with points of the surface; None where depth is unknown.
+    """Return the observation of a region with points of its surface; None if it has no depth.
 
     Args:
         keyframe: Id of the keyframe.
@@ -213,10 +214,11 @@ def observe_region(
 
 
 def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return which of N pixels to keep, at most MAX_POINTS.
+    """Select at most MAX_POINTS of N pixels that spread evenly over a region.
 
-    These are pixels on a grid, or every n-th pixel of a region that is too thin for a grid. Every
-    n-th pixel of a rectangle would lie on a few lines.
+    The selected pixels lie on a grid. If the region is too thin for a grid, every n-th pixel is
+    selected. This would not do for all regions: every n-th pixel of a rectangle may lie on a few
+    lines.
     """
     step = max(1, int(np.sqrt(len(rows) / MAX_POINTS)))
     while True:
@@ -231,7 +233,7 @@ def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def merge_observation(region: Region, seen: RegionObservation, max_boxes: float) -> Region:
-    """Return a region with one more observation.
+    """Add an observation to a region.
 
     Args:
         region: The region.

@@ -1,4 +1,4 @@
-"""Matching of a keyframe's regions with known ones, and mask propagation between keyframes."""
+"""Matching of a keyframe's regions with region tracks, and mask propagation between keyframes."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,7 +35,10 @@ class ProjectedPoints:
     counts: np.ndarray
 
     def only(self, regions: Sequence[int]) -> "ProjectedPoints":
-        """Return the points of some regions, each once, numbered in this order."""
+        """Return the points of the given regions only, and number the regions in this order.
+
+        Each region must be given only once.
+        """
         places = np.full(len(self.counts), -1)
         places[regions] = np.arange(len(regions))
         of = places[self.of]
@@ -58,7 +61,7 @@ def projected(
     T_map_keyframe: Mapping[int, np.ndarray],
     max_gap_m: float,
 ) -> ProjectedPoints:
-    """Return the points of regions that are visible in a keyframe.
+    """Project the points of regions into a keyframe, and return those that are visible there.
 
     Args:
         regions: Regions with points.
@@ -91,9 +94,10 @@ def reverse_overlap(
 ) -> float:
     """Return the fraction of an observation's points that lie in the mask of a region.
 
-    Only points inside the image of the region's observation count. Points that were occluded there
-    lower the fraction. So an object that is fully visible now, and was mostly occluded at its best
-    before, is a new region.
+    The points are projected into the keyframe of the region's stored observation, `shape`. Points
+    outside its image are not counted. Points that were occluded there count as outside of the mask
+    and lower the fraction. An object that was mostly occluded in `shape` and is fully visible now
+    therefore becomes a new region.
 
     Args:
         seen: The observation.
@@ -144,8 +148,9 @@ def propagate_mask(
 ) -> Foreground | None:
     """Project a region's mask from an earlier keyframe into the current one.
 
-    Every fourth pixel of a row and of a column is sampled. It belongs to the region if its point
-    lies in the mask and on the surface of the observation.
+    Every fourth pixel of every fourth row is sampled. Its 3D point is projected into the earlier
+    keyframe. The pixel belongs to the region if the point lies in the mask and on the surface of
+    the earlier observation.
 
     Args:
         seen: The earlier observation of the region.
@@ -154,8 +159,8 @@ def propagate_mask(
         depth_m: Depth of the current keyframe, [H, W], meters; 0 where unknown.
         camera: Intrinsics of both keyframes.
         T_seen_now: Transform from the current camera to the earlier one, [4, 4].
-        max_gap_m: Largest distance to the observed surface that still belongs to the region; larger
-            where its points are farther apart.
+        max_gap_m: Maximum distance of a point from the observed surface. A larger distance is
+            allowed if the points of the observation are farther apart than that.
 
     Returns:
         The mask in the current keyframe, or None if fewer than 12 sampled pixels belong to the
@@ -197,7 +202,7 @@ def _points(
 
 
 def _spacing_m(seen: RegionObservation, camera: Camera) -> float:
-    """Return the spacing of an observation's points as if they filled a square."""
+    """Return the spacing of an observation's points in meters, as if they were on a square grid."""
     m_per_px = float(np.median(seen.p_camera[:, 2])) / camera.fx
     return float(np.sqrt(seen.size_px / len(seen.p_camera))) * m_per_px
 
@@ -230,14 +235,14 @@ class RegionMatcher:
         """Project the points of known regions into a keyframe.
 
         Args:
-            regions: Regions as they were before this keyframe; those of unknown keyframes are
-                ignored.
+            regions: Regions as they were before this keyframe. A region whose keyframe has no pose
+                in T_map_keyframe is ignored.
             keyframe: Id of the keyframe.
             depth_m: Depth of the keyframe, [H, W], meters; 0 where unknown.
             camera: Intrinsics of all keyframes.
             T_map_keyframe: Current poses of all keyframes and this one, [4, 4], by id.
             max_gap_m: Maximum distance from the measured depth of a visible point.
-            min_points: Minimum visible points of a region for any conclusion.
+            min_points: Minimum visible points of a region; with fewer, it is not matched.
         """
         self._regions = [r for r in regions if r.shape.keyframe in T_map_keyframe]
         self._depth_m, self._camera, self._T_map_keyframe = depth_m, camera, T_map_keyframe
@@ -249,11 +254,12 @@ class RegionMatcher:
     def same(
         self, sighting: RegionObservation, overlap: float, taken: Collection[int]
     ) -> int | None:
-        """Return the id of the region that an observation shows; None without one.
+        """Return the id of the region that matches an observation best; None if none matches.
 
         Args:
             sighting: The observation.
-            overlap: Minimum fraction of the points of each that lies in the mask of the other.
+            overlap: Minimum fraction of the region's points in the mask of the observation, and of
+                the observation's points in the mask of the region.
             taken: Ids of regions that are matched already.
         """
         shares = self._seen.shares_in(sighting.candidate.part)
@@ -278,8 +284,8 @@ class RegionMatcher:
     def overlaps(self, shown: Sequence[tuple[int, Foreground]]) -> np.ndarray:
         """Return the intersection over union of the regions' masks in the keyframe, [M, M].
 
-        The intersection of two regions is the fraction of the points of each in the mask of the
-        other. The diagonal is 1. Regions with too few visible points have 0.
+        It is estimated from two fractions: that of the points of region a in the mask of region b,
+        and the reverse. The diagonal is 1. A region with too few visible points has 0 with others.
 
         Args:
             shown: Ids of M regions, each once, and their masks in the keyframe.
@@ -296,7 +302,7 @@ class RegionMatcher:
         return iou
 
     def carried(self, region: int) -> Foreground | None:
-        """Return the mask of a region in the keyframe; see `propagate_mask`."""
+        """Propagate the mask of a region into the keyframe; see `propagate_mask`."""
         i = next(i for i, one in enumerate(self._regions) if one.id == region)
         shape, is_its = self._regions[i].shape, self._seen.of == i
         T_map_now, T_map_seen = (self._T_map_keyframe[k] for k in (self._keyframe, shape.keyframe))

@@ -1,11 +1,12 @@
 """Region proposals of a keyframe for an open-vocabulary labeller (paper, III.B).
 
-The paper requests a label if the best detection of a region has a score below 0.6, or gives it no
-reliable label. So a proposal is one of two:
+The paper requests a label for a region if its best detection has a score below 0.6 or gives no
+reliable label. A proposal is therefore one of the following:
 
-- A box with a low score that no box with a high score explains.
-- A segment by depth, creases or color that neither such a box nor the map's labels explain (see
-  `geometric_segmentation`). The label of an object does not explain a region that stands on it.
+- A box with a low score that does not show the object of a box with a high score.
+- A segment by depth, creases or color (see `geometric_segmentation`) that no box matches and whose
+  pixels mostly have no reliable label in the map. A segment that stands on a labelled object is a
+  proposal too, because that label describes the object below.
 
 `region_tracker` follows proposals over keyframes by their positions.
 """
@@ -68,7 +69,7 @@ class RegionProposalConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionProposal:
-    """Region proposal: a region without a reliable label, or one with a certain detection.
+    """Region proposal: a region that has no reliable label, or that a box with a high score shows.
 
     Attributes:
         box_px: Box of the region, [4], x0 y0 x1 y1, pixels.
@@ -98,9 +99,10 @@ def propose_regions(
     room: Sequence[Foreground],
     config: RegionProposalConfig,
 ) -> list[RegionProposal]:
-    """Return the regions of a keyframe for label requests and those with certain detections.
+    """Return the regions of a keyframe that need a label, and those of boxes with a high score.
 
-    Both are tracked. The largest region comes first. The same arguments give the same proposals.
+    The region tracker follows both. The largest region comes first. The same arguments give the
+    same proposals.
 
     Args:
         boxes_px: Boxes of the detector, [M, 4], pixels.
@@ -143,10 +145,10 @@ def _boxed(
     room: Sequence[Foreground],
     config: RegionProposalConfig,
 ) -> tuple[list[RegionProposal], list[bool]]:
-    """Return proposals of the detector's boxes, and which of the regions `found` they use.
+    """Return a proposal for each distinct box, and which of the regions `found` these use.
 
-    A box becomes the region that fits it best. Without one, it becomes its foreground, without
-    structural planes if enough of it is left.
+    A box gets the region that fits it best. If none fits, it gets its own foreground. Structural
+    planes are removed from the foreground if the remainder is large enough.
     """
     asked, is_taken, pieces = [], [False] * len(found), None
     regions_px = _boxes(found)
@@ -167,15 +169,16 @@ def _boxed(
 
 
 def remove_structure(part: Foreground, room: Sequence[Foreground], inside: float) -> Foreground:
-    """Return a part without structural planes that mostly extend outside of its box.
+    """Remove from the mask of an object the structural planes that lie mostly outside its box.
 
-    Examples are a wall between the leaves of a plant and a floor between the legs of a table. If
-    this would remove most of the part, as of a clock on its wall, it stays whole.
+    Examples are the wall between the leaves of a plant and the floor between the legs of a table.
+    If this would remove most of the mask, the mask stays unchanged. An example is a clock, whose
+    mask lies on the plane of its wall.
 
     Args:
-        part: The part.
+        part: The mask of the object.
         room: Structural planes.
-        inside: Minimum fraction of a plane within the box to belong to the object.
+        inside: Minimum fraction of a plane inside the box; such a plane is not removed.
 
     >>> plant, wall = np.ones((2, 4), bool), np.zeros((6, 8), bool)
     >>> wall[:, 3:] = True
@@ -200,7 +203,7 @@ def labeled_regions(
 ) -> list[RegionProposal]:
     """Return the regions `found` that have a reliable label in the map and match no box.
 
-    Regions that stand on an object are excluded, since they are proposals.
+    Regions that stand on an object are excluded, because they are proposals already.
 
     Args:
         boxes_px: Boxes of the detector, [M, 4], pixels.
@@ -220,9 +223,9 @@ def labeled_regions(
 def regions_of_image(
     found: Sequence[Segment], shape: tuple[int, ...], config: RegionProposalConfig
 ) -> list[RegionProposal]:
-    """Return the segments of an image [H, W] that a labeller could recognize, each once.
+    """Return the segments of an image [H, W] that a labeller could recognize, without duplicates.
 
-    A region does not contain the regions that stand on it.
+    The pixels of objects that stand on a region are removed from its mask.
     """
     out: list[RegionProposal] = []
     for kind in _ORDER:
@@ -237,7 +240,7 @@ def regions_of_image(
 
 
 def _without(one: RegionProposal, others: np.ndarray) -> RegionProposal:
-    """Return a region without the pixels of others, [H, W] bool."""
+    """Return a region without the pixels `others`, [H, W] bool."""
     part, (height, width) = one.part, one.part.mask.shape
     here = others[part.row : part.row + height, part.column : part.column + width]
     return replace(one, part=Foreground(part.row, part.column, part.mask & ~here))
@@ -246,7 +249,9 @@ def _without(one: RegionProposal, others: np.ndarray) -> RegionProposal:
 def distinct_boxes(
     boxes_px: np.ndarray, scores: np.ndarray, config: RegionProposalConfig
 ) -> list[int]:
-    """Return the numbers of the boxes with the highest score of each object.
+    """Return for each object the number of the box with the highest score.
+
+    Boxes with an IoU of at least `same_iou` show one object.
 
     >>> boxes = np.array([[0, 0, 10, 10], [1, 0, 10, 10], [20, 0, 30, 10.0]])
     >>> distinct_boxes(boxes, np.array([0.9, 0.4, 0.5]), RegionProposalConfig())
@@ -259,7 +264,7 @@ def distinct_boxes(
 def _is_worth_a_look(
     candidate: RegionProposal, shape: tuple[int, ...], config: RegionProposalConfig
 ) -> bool:
-    """Return whether a region is large enough, full enough and no room."""
+    """Return whether a region is worth a label request, by its size and how it fills its box."""
     width, height = candidate.box_px[2:] - candidate.box_px[:2]
     size_px = np.count_nonzero(candidate.part.mask)
     is_object = size_px <= config.max_share * shape[0] * shape[1]
@@ -268,7 +273,7 @@ def _is_worth_a_look(
 
 
 def _share(explained: np.ndarray, part: Foreground) -> float:
-    """Return the fraction of a part's pixels that are explained; 1 for an empty part."""
+    """Return the fraction of a mask's pixels that are true in `explained`; 1 for an empty mask."""
     height, width = part.mask.shape
     here = explained[part.row : part.row + height, part.column : part.column + width]
     return float(here[part.mask].mean()) if part.mask.any() else 1.0

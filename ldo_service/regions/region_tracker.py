@@ -1,16 +1,18 @@
 """Region tracks: regions over keyframes, with label requests and votes for their labels.
 
-Two observations belong to one region if most of the visible points of each lie in the other (see
-`region_matching`). A region stores its best views and its votes, from the detector's boxes and from
-label results. Its label is the one with the most votes.
+Two observations are of one region if most of the visible points of each lie in the mask of the
+other (see `region_matching`). A view is the crop of an image around the region. A region stores its
+best views and its votes, from the detector's boxes and from label results. Its label is the one
+with the most votes.
 
-An object may be segmented differently in each keyframe. So the votes of labelled regions that
-overlap are shared, weighted by their overlap. A region that stands on an object does not share
-votes with the object.
+An object may be segmented differently in each keyframe, so several regions may show it. The label
+of a region is therefore decided by its own votes plus those of overlapping labelled regions,
+weighted by their overlap. A region that stands on an object does not get the votes of that object,
+nor the reverse.
 
-The tracker requests a label for a region once no better view has come for a while. The request
-shows the region at its best. Most regions are only parts or shadows of objects. So the number of
-requests is limited, and regions with the best views go first.
+The tracker requests a label for a region when it has found no better view for a while. The request
+contains the best views. Most regions show only parts or shadows of objects. The number of requests
+is therefore limited, and regions with the best views come first.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -112,7 +114,8 @@ class RegionTrackerConfig:
             )
         if self.views > MAX_VIEWS:
             raise ConfigError(
-                f"views={self.views} must be at most {MAX_VIEWS}, the views in a label request."
+                f"views={self.views} must be at most {MAX_VIEWS}, the maximum number of views in a "
+                "label request."
             )
         if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.min_points >= 1):
             raise ConfigError(
@@ -170,7 +173,7 @@ class RegionTracker:
             camera: Intrinsics of both.
             T_map_keyframe: Current poses of this keyframe and those of earlier observations,
                 [4, 4], by id.
-            named: Regions that the map has a label for; they get no label request.
+            named: Regions that have a reliable label in the map; they get no label request.
         """
         config, told, taken = self.config, list[tuple[int, RegionProposal]](), set[int]()
         regions, place = [*self._regions.values()], (keyframe, depth_m, camera, T_map_keyframe)
@@ -203,14 +206,14 @@ class RegionTracker:
     def _same(
         self, sighting: RegionObservation, known: RegionMatcher, taken: Collection[int]
     ) -> Region | None:
-        """Return the known region that an observation shows, or None."""
+        """Return the known region that matches an observation, or None."""
         same = known.same(sighting, self.config.overlap, taken)
         return None if same is None else self._regions[same]
 
     def _propagated(
         self, known: RegionMatcher, taken: Collection[int]
     ) -> list[tuple[int, RegionProposal]]:
-        """Propagate the masks of labelled regions that are visible without a matching segment."""
+        """Propagate the masks of labelled regions that are visible but matched no observation."""
         found: list[tuple[int, RegionProposal]] = []
         for number in known.seen():
             region = self._regions[number]
@@ -228,9 +231,10 @@ class RegionTracker:
     def _opinions(
         self, shown: Sequence[tuple[int, RegionProposal]], known: RegionMatcher
     ) -> list[RegionLabel]:
-        """Return the labels of regions with a label result, by the votes of overlapping regions.
+        """Return the labels of the keyframe's regions that have a label result.
 
-        Boxes of regions without a result keep the detector's labels.
+        Overlapping regions add their votes. Regions without a label result are omitted, so that
+        their boxes keep the labels of the detector.
         """
         regions = [(self._regions[number], of) for number, of in shown]
         named = [(region, of) for region, of in regions if self._label_of(region)[0]]
@@ -246,7 +250,7 @@ class RegionTracker:
         return opinions
 
     def shown_in(self, region: int) -> tuple[int, ...]:
-        """Return the keyframes of the best views of a region, which are in its label request."""
+        """Return the keyframes of the best views of a region, which its label request contains."""
         known = self._regions.get(region)
         return tuple(view.keyframe for view in known.views) if known else ()
 
@@ -258,9 +262,10 @@ class RegionTracker:
         camera: Camera,
         T_map_keyframe: Mapping[int, np.ndarray],
     ) -> RegionLabel | None:
-        """Return the label of a region in an earlier keyframe; None if unlabelled or not visible.
+        """Propagate the mask and the label of a region into an earlier keyframe.
 
-        The arguments are those of `observe_keyframe`.
+        The arguments have the meaning of those of `observe_keyframe`. The result is None if the
+        region has no label or is not visible in the keyframe.
         """
         known, config = self._regions.get(region), self.config
         label, sure = self._label_of(known) if known else ("", 0.0)
@@ -272,7 +277,11 @@ class RegionTracker:
         return part and RegionLabel(RegionProposal(part.box_px, part), label, sure)
 
     def _questions(self, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> list[RegionRequest]:
-        """Return label requests for pending regions, best views first, up to the allowed number."""
+        """Return label requests for the regions that need one now, up to the allowed number.
+
+        The regions whose views improved most since their last request come first, weighted by size
+        and kind.
+        """
         config = self.config
         self._allowed = min(self._allowed + config.per_keyframe, float(config.at_once))
         due = [r for r in self._regions.values() if self._is_due(r, now, T_map_keyframe)]
@@ -282,7 +291,7 @@ class RegionTracker:
         return asked
 
     def _asked(self, region: Region) -> RegionRequest:
-        """Return a label request with the best observation of a region, and count it."""
+        """Create a label request with the best observation of a region, and count the request."""
         quality = sum(view.quality for view in region.views)
         shape = region.best if region.best and region.questions == 0 else region.shape
         region = replace(region, questions=region.questions + 1, quality=quality, shape=shape)
@@ -294,7 +303,7 @@ class RegionTracker:
         )
 
     def _keep(self, region: Region) -> None:
-        """Store a region as the last observed."""
+        """Store a region as the most recently observed one."""
         self._regions.pop(region.id, None)
         self._regions[region.id] = region
 
@@ -303,11 +312,11 @@ class RegionTracker:
         return self.name(region) if region.answer and region.answer.label else ("", 0.0)
 
     def name(self, region: Region) -> tuple[str, float]:
-        """Return the label of a region by its own votes, and its confidence; ("", 0) if unknown."""
+        """Return the label of a region by its own votes, and its confidence; ("", 0) if none."""
         return winning_label(region.votes, self.config.min_votes)
 
     def answered(self, region: int, answer: RegionLabelResult) -> str:
-        """Add a label result to the votes of a region and return its label now.
+        """Add a label result to the votes of a region, and return the label that then wins.
 
         A result with a high confidence prevents further label requests.
         """
@@ -337,7 +346,7 @@ class RegionTracker:
         return replace(region, best=best, views=tuple(views[: self.config.views]))
 
     def _is_due(self, region: Region, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> bool:
-        """Return whether a label request for a region is pending."""
+        """Return whether a label request for a region should be made now."""
         if self._is_settled(region) or region.questions >= self.config.max_questions:
             return False
         best = region.best
@@ -357,7 +366,7 @@ class RegionTracker:
         )
 
     def _forget(self) -> None:
-        """Drop the regions observed longest ago beyond the maximum."""
+        """Drop the regions observed longest ago until at most `config.most` remain."""
         while len(self._regions) > self.config.most:
             del self._regions[next(iter(self._regions))]
 
@@ -376,7 +385,10 @@ class RegionTracker:
 
 
 def _worth(region: Region) -> float:
-    """Return a weight by size and kind: large regions are rarely shadows or parts."""
+    """Return the weight of a region's label request, by its size and kind.
+
+    Large regions have a higher weight, because they are rarely shadows or parts of objects.
+    """
     assert region.best is not None
     of = region.best.candidate
     factor = 0.3 if of.kind == "convex" else 1.0

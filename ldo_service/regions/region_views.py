@@ -27,7 +27,7 @@ class ViewConfig:
         if not (self.context >= 0 and min(self.good_side_px, self.sharp) > 0 and self.side_px > 0):
             raise ConfigError(
                 named(self, "context", "side_px", "good_side_px", "sharp")
-                + ": context must not be negative, the others must be positive."
+                + ": context must be at least 0, and the other settings must be positive."
             )
         if not 0 <= self.least <= 1:
             raise ConfigError(named(self, "least") + ": must be in [0, 1].")
@@ -35,7 +35,7 @@ class ViewConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionView:
-    """View of a region.
+    """View of a region: a crop of the color image of a keyframe around its box.
 
     Attributes:
         keyframe: Keyframe of the view.
@@ -63,7 +63,7 @@ def region_view(
     part: Foreground,
     config: ViewConfig,
 ) -> RegionView:
-    """Return the view of a region in a keyframe.
+    """Cut out the view of a region in a keyframe, and rate its quality.
 
     Args:
         keyframe: Id of the keyframe.
@@ -90,7 +90,9 @@ def region_view(
 
 
 def size_factor(box_px: np.ndarray, config: ViewConfig) -> float:
-    """Return the side of a square with the area of the box, relative to `good_side_px`, at most 1.
+    """Return a quality factor, 0..1, for the size of a box.
+
+    It is the side of a square with the area of the box, divided by `good_side_px`, at most 1.
 
     >>> size_factor(np.array([0, 0, 64, 64]), ViewConfig())
     0.5
@@ -100,9 +102,9 @@ def size_factor(box_px: np.ndarray, config: ViewConfig) -> float:
 
 
 def border_factor(box_px: np.ndarray, shape: tuple[int, ...], config: ViewConfig) -> float:
-    """Return a factor for the distance of the box from the border of the image.
+    """Return a quality factor for the distance of the box from the border of the image.
 
-    It is 1 from a tenth of the box's longer side on, and `least` at the border.
+    It is `least` at the border and 1 if the distance is at least a tenth of the box's longer side.
     """
     height, width = shape[:2]
     gaps = *(box_px[:2] + 0.5), width - 0.5 - box_px[2], height - 0.5 - box_px[3]
@@ -112,7 +114,7 @@ def border_factor(box_px: np.ndarray, shape: tuple[int, ...], config: ViewConfig
 
 
 def sharpness_factor(crop: np.ndarray, config: ViewConfig) -> float:
-    """Return v / (v + sharp) with the variance v of the Laplacian.
+    """Return a quality factor for sharpness: v / (v + sharp), with v the Laplacian's variance.
 
     Pech-Pacheco et al., ICPR 2000.
     """
@@ -124,7 +126,11 @@ def sharpness_factor(crop: np.ndarray, config: ViewConfig) -> float:
 def facing_factor(
     depth_m: np.ndarray, camera: Camera, part: Foreground, config: ViewConfig
 ) -> float:
-    """Return the mean cosine of surface normals and viewing rays; `least` if unknown."""
+    """Return a quality factor for how directly the camera faces the surface of a region.
+
+    It is `least + (1 - least) c`, with the mean cosine c between normals and viewing rays; `least`
+    if no normal is known.
+    """
     height, width = part.mask.shape
     if min(height, width) < 3 or not part.mask.any():
         return config.least
