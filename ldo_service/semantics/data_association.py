@@ -1,13 +1,13 @@
 """Data association between the regions of a keyframe and object landmarks (paper, III.C).
 
-The predicted box of a landmark contains its members that the measured depth does not occlude. It is
-the box that a detector would draw around the visible part. A landmark and a region may be the same
-object if
+An object landmark has a sample of Gaussians, its members. The predicted box of a landmark encloses
+its members that the measured depth does not occlude. It is the box that a detector would draw
+around the visible part of the object. A landmark and a region may be the same object if
 
-    IoU of their boxes >= 0.4,  they share a class,  and their depths meet;
+    IoU of their boxes >= 0.4,  they share a class,  and their depth ranges meet.
 
-the assignment with the largest sum of IoU is used. Before that, a region that shows a part of
-another region's object is merged into that region.
+Of all such assignments, the one with the largest sum of IoU is used. Before the assignment, a
+region that shows a part of another region's object is merged into that region.
 """
 
 from dataclasses import dataclass, replace
@@ -58,7 +58,7 @@ class AssociationConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MapView:
-    """The map and the part of it that a keyframe shows.
+    """Data of a keyframe for the association: map, visible Gaussians, regions and depth.
 
     Attributes:
         keyframe: Id of the keyframe.
@@ -94,8 +94,8 @@ class MapView:
             raise ValueError(f"labels, ids and anchors must have the {n} rows of the map.")
         if len(self.regions) != v or (v and not self.indices[-1] < n):
             raise ValueError(
-                f"{len(self.regions)} regions for {v} Gaussians: must be one for each, and the "
-                f"indices below {n}, the rows of the map."
+                f"regions has {len(self.regions)} entries for {v} Gaussians: it must have one for "
+                f"each, and all indices must be below {n}, the number of rows of the map."
             )
         if v and self.regions.max() >= len(self.boxes):
             raise ValueError(
@@ -119,8 +119,8 @@ class RegionStatistics:
     Attributes:
         numbers: Numbers of the regions within the keyframe, [R], ascending.
         boxes: Boxes of the regions, [R, 4], pixels.
-        members: Ids of a sample of their Gaussians, [R, 256], in the order of `shuffled`; NO_MEMBER
-            beyond.
+        members: Ids of a sample of their Gaussians, [R, 256], in the order of `shuffled`. Unused
+            entries at the end are NO_MEMBER.
         p_map: Positions of these Gaussians in the map frame, [R, 256, 3], meters.
         distributions: Means of their label distributions, [R, C], weighted by opacity.
         near_m: Near end of the depth range of these Gaussians, [R], meters.
@@ -162,10 +162,10 @@ def compute_region_statistics(
 
 
 def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationConfig) -> MapView:
-    """Return a view in which regions that are parts of another region belong to it.
+    """Assign the Gaussians of a region that shows a part of another region's object to the latter.
 
-    The containing region may have lost all of its Gaussians to its parts. It then has the depth of
-    its largest part.
+    The containing region may have no Gaussians left, because its parts got them all. It then has
+    the depth range of its largest part.
     """
     near_m = np.full(len(view.boxes), np.inf)
     far_m = -near_m
@@ -187,11 +187,10 @@ def find_containing_regions(
     far_m: np.ndarray,
     config: AssociationConfig,
 ) -> np.ndarray:
-    """Return for each of M regions the region that contains all of its object.
+    """Return for each of M regions the number of the region that contains it, or its own number.
 
-    That is the region itself where no other contains it. A region contains another if they share a
-    class, their depths meet, and the other box lies in its box. Of several such regions, the
-    largest is used.
+    Region a contains region b if they share a class, their depth ranges meet, and the box of b lies
+    in the box of a. If several regions contain b, the largest is returned.
 
     Args:
         boxes: Boxes of the regions, [M, 4], pixels.
@@ -230,7 +229,7 @@ def find_containing_regions(
 
 
 def share_a_class(classes: np.ndarray) -> np.ndarray:
-    """Return which pairs of M regions may be of one class, [M, M] bool.
+    """Return which pairs of M regions may show objects of one class, [M, M] bool.
 
     Two regions share a class if any label of one equals any label of the other.
 
@@ -247,9 +246,10 @@ def share_a_class(classes: np.ndarray) -> np.ndarray:
 
 
 def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Return the rows of each region's first 256 Gaussians in shuffled order, [R, 256]; -1 beyond.
+    """Return the rows of each region's first 256 Gaussians in shuffled order, [R, 256].
 
-    In regions with more than 512 Gaussians, only a fraction that contains about 512 is sorted.
+    Entries are -1 for regions with fewer Gaussians. To save time, only about 512 candidates are
+    sorted in a region with more Gaussians than that.
     """
     ordinal = np.full(len(counts), -1)
     ordinal[numbers] = np.arange(len(numbers))
@@ -272,16 +272,17 @@ def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.nda
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PredictedBoxes:
-    """Predicted appearance of K landmarks in a keyframe.
+    """Predicted boxes and visibility of K landmarks in a keyframe.
 
     Attributes:
         boxes: Boxes of the visible members, [K, 4], pixels. If no member is visible, the box of the
             members in front of measured depth; empty (x0 > x1) if all are occluded or out of view.
-        shown: Fraction of the reliable members that are in the image where depth was measured, [K].
-        through: Fraction of the reliable members that the camera sees through, [K]: the measured
-            depth lies far behind them, so they do not exist any more.
-        near_m: Near end of the depth range, [K], meters.
-        far_m: Far end of the depth range, [K], meters.
+        shown: Fraction of the reliable members that are visible, [K]: the measured depth at their
+            pixel fits the landmark's depth range.
+        through: Fraction of the reliable members that no longer exist, [K]: the measured depth at
+            their pixel is behind the landmark's depth range.
+        near_m: Near end of the members' depth range, [K], meters.
+        far_m: Far end of the members' depth range, [K], meters.
         rows: Rows of the members in the map, [K, 256]; -1 where a member is not resident.
     """
 
@@ -296,7 +297,10 @@ class PredictedBoxes:
 def predict_boxes(
     table: np.ndarray, view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
 ) -> PredictedBoxes:
-    """Predict the appearance of landmarks [K]; without resident members, that of the centroid."""
+    """Predict boxes and visibility of landmarks [K] in a keyframe.
+
+    A landmark without resident members is represented by its centroid.
+    """
     where = rows_of(table["members"], view.ids)
     there = ((where >= 0) & reliable_members(table))[:, :PROBES]
     p_map = view.rows[np.maximum(where[:, :PROBES], 0), :3].astype(float)
@@ -323,7 +327,11 @@ def predict_boxes(
 
 
 def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels [..., 2] of points [..., 3] and the depth [...] there; 0 outside the image."""
+    """Project points [..., 3], and read the measured depth at their pixels.
+
+    Returns:
+        Pixels [..., 2], and measured depth [...] in meters; 0 outside the image.
+    """
     z = np.maximum(p_camera[..., 2:], 1e-6)
     px = view.camera.project(np.concatenate([p_camera[..., :2], z], axis=-1))
     size = view.camera.width, view.camera.height
@@ -345,8 +353,8 @@ class AssociationCosts:
 
     Attributes:
         iou: IoU of predicted box and region box, [K, R].
-        allowed: Pairs that may be the same object, [K, R] bool: their boxes overlap, their depths
-            meet, and they share a class.
+        allowed: Pairs that may be the same object, [K, R] bool: their boxes overlap, their depth
+            ranges meet, and they share a class.
     """
 
     iou: np.ndarray
@@ -371,9 +379,12 @@ def association_costs(
 def associate(
     iou: np.ndarray, allowed: np.ndarray, min_iou: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs of rows and columns of iou [K, R] with the largest sum, rows ascending.
+    """Match rows with columns of iou [K, R], each at most once, so that the sum of IoU is largest.
 
     A pair must be allowed and have an IoU of at least min_iou. The same arrays give the same pairs.
+
+    Returns:
+        Rows in ascending order, and their columns.
     """
     gain = np.where(allowed & (iou >= min_iou), iou, 0)
     k, r = linear_sum_assignment(gain, maximize=True)

@@ -46,7 +46,7 @@ def mean_distributions(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def normalized(p: np.ndarray) -> np.ndarray:
-    """Return rows that sum to one; an empty row gets all of its mass on background."""
+    """Scale rows to a sum of one; a row of zeros becomes a row with all mass on background."""
     total = p.sum(axis=-1, keepdims=True)
     nothing = np.zeros(p.shape[-1])
     nothing[BACKGROUND] = 1
@@ -56,8 +56,8 @@ def normalized(p: np.ndarray) -> np.ndarray:
 def sparse(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the heaviest labels [..., 8] uint8 and their weights [..., 8] float32.
 
-    The heaviest label comes first; of equal ones, the lower number. Mass missing from a sum of one
-    belongs to `other`.
+    The heaviest label comes first; of labels with equal weight, the lower index comes first. If the
+    weights sum to less than one, the remaining mass belongs to `other`.
     """
     order = np.argsort(-p, axis=-1, kind="stable")[..., :KEPT]
     return order.astype(np.uint8), np.take_along_axis(p, order, axis=-1).astype(np.float32)
@@ -92,9 +92,10 @@ def entropy(p: np.ndarray) -> np.ndarray:
 
 
 def common_mass(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the common mass of two distributions without background, [...], 0..1.
+    """Return the common mass of pairs of distributions, ignoring background, [...], 0..1.
 
-    It is sum_c min(p_c, q_c), divided by the smaller of the two masses that are not background.
+    It is sum_c min(p_c, q_c) over all labels c except background. This is divided by the sum of p_c
+    or the sum of q_c, whichever is smaller.
     """
     p, q = p.copy(), q.copy()
     p[..., BACKGROUND] = q[..., BACKGROUND] = 0

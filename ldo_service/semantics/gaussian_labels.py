@@ -64,15 +64,17 @@ def smooth_labels(
     *,
     threads: int = 1,
 ) -> Disagreement:
-    """Smooth the labels of the Gaussians `indices` towards their neighbors among them, in place.
+    """Move the label distributions of the Gaussians `indices` towards those of their neighbors.
+
+    Labels change in place. Only Gaussians in `indices` are neighbors.
 
         p_i <- (1 - rate K_i) p_i + rate sum_j k_ij p_j,  K_i = sum_j k_ij,  w_ij = 1 / |N_i|
 
-    The step follows the gradient of the expected disagreement, sum_j k_ij p_j, and keeps a
-    distribution. Candidate neighbors are the first eight Gaussians in the same voxel (two sigma
-    wide) and the first ones of the surrounding voxels, sixteen in total. Those within radius_m are
-    neighbors. Every Gaussian reads the labels from before the step. The result is bitwise equal for
-    any number of threads.
+    The step follows the gradient of the expected disagreement, sum_j k_ij p_j, and its result is
+    again a distribution. Voxels are two sigma wide. Candidates are the first eight Gaussians in the
+    same voxel and the first ones of the surrounding voxels, sixteen in total. The candidates within
+    radius_m are the neighbors N_i. Every Gaussian reads the labels from before the step. The result
+    is bitwise equal for any number of threads.
 
     Args:
         rows: Gaussians of the map, [N, 16].
@@ -108,8 +110,9 @@ def smooth_labels(
 class LabelConfig:
     """Settings of the label update with each observation.
 
-    A study with voxels on one floor of a Replica apartment gave the constants of `corrected`.
-    usual_extent_m and hold_back were chosen on the same frames with two detectors.
+    The constants of `corrected` were chosen with voxels in place of Gaussians, on one floor of a
+    Replica apartment. usual_extent_m and hold_back were chosen on the same frames with two
+    detectors.
     """
 
     ema: Literal["paper", "corrected"] = "corrected"
@@ -164,20 +167,21 @@ def fields(labels: np.ndarray) -> np.ndarray:
 def observe(
     labels: np.ndarray, seen: Observations, config: LabelConfig, *, threads: int = 1
 ) -> None:
-    """Fold the observations of a keyframe into label rows [N, 32], in place.
+    """Update label rows [N, 32] by the observations of a keyframe, in place.
 
-    An observed label s changes the distribution to p <- (1 - a) p + a onehot(s). With `paper`, a =
-    1 - keep, so that keep = 0.9 needs seven observations to flip a label. Misses are counted, and
-    miss_limit in a row turn a Gaussian into background.
+    An observed label s changes the distribution to p <- (1 - a) p + a onehot(s). The setting `ema`
+    selects how a is computed. With `paper`, a = 1 - keep; seven observations then change the label
+    if keep = 0.9. Misses are counted, and miss_limit misses in a row turn a Gaussian into
+    background.
 
-    With `corrected`, the mean of all observations is weighted, and the weights decay with age. With
-    w = confidence, W <- keep W + w and a = w / W, so that the first observation counts in full. A
-    miss is an observation of background with w = miss_weight. It counts if the last observed
-    object, or one of usual_extent_m, would appear at least min_px large.
+    With `corrected`, p is the weighted mean of all observations, and the weights decay with age.
+    With w = confidence, W <- keep W + w and a = w / W, so that the first observation has a = 1. A
+    miss is an observation of background with w = miss_weight. It counts only if the object would
+    appear at least min_px large. The size is that of the last observed object, or usual_extent_m.
 
-    Uncertain observations of settled Gaussians are held back. The step of `paper`, and w, are
-    multiplied by 1 - hold_back exp(-2 H) (1 - confidence), with the entropy H of p, once p has a
-    label.
+    An uncertain observation changes a Gaussian less if its distribution has a low entropy. With
+    `paper` a, and with `corrected` w, is multiplied by 1 - hold_back exp(-2 H) (1 - confidence).
+    H is the entropy of p. The factor is applied only if p has a label.
 
     The result is bitwise equal for any number of threads. Paper, III.A; ALGORITHMS, Semantics on
     Gaussians.
@@ -224,9 +228,9 @@ def observe(
 
 
 def clear_background(labels: np.ndarray, indices: np.ndarray) -> None:
-    """Remove background and its evidence from rows `indices` [V] of labels [N, 32], in place.
+    """Remove the weight of background from rows `indices` [V] of labels [N, 32], in place.
 
-    The other labels keep their proportions.
+    The evidence is reduced in proportion. The other labels keep their proportions to each other.
 
     >>> labels = new_labels(1)
     >>> row = fields(labels)
@@ -253,7 +257,7 @@ def background(labels: np.ndarray) -> np.ndarray:
 
 
 def top_labels(labels: np.ndarray) -> np.ndarray:
-    """Return the likeliest label, [N] uint8; background where no other label is likelier."""
+    """Return the likeliest label, [N] uint8; if background is as likely, return background."""
     rows = fields(labels)
     return np.where(rows["weights"][:, 0] > background(labels), rows["ids"][:, 0], BACKGROUND)
 

@@ -46,8 +46,8 @@ class Regions:
         boxes: Boxes, [M, 4] float32, x0 y0 x1 y1, pixels.
         scores: Scores, [M] float32, 0..1. Where regions overlap, the largest overlap times score
             wins.
-        rects: Column, row, width and height of the area of `sums`, [M, 4] int32; with width 0, the
-            region is all of its box.
+        rects: Column, row, width and height of the rectangle that the table of each region covers,
+            [M, 4] int32. With width 0, the region has no table and is its whole box.
         sums: Summed-area tables [height + 1, width + 1] of the masks, one after the other, [S]
             int32.
     """
@@ -82,8 +82,8 @@ class Assignment:
     """Regions of V Gaussians.
 
     Attributes:
-        regions: Number of the region, [V] int32; UNMATCHED; or HIDDEN: out of the image, or not at
-            the depth that was measured there.
+        regions: Number of the region, [V] int32. UNMATCHED: in no region. HIDDEN: outside of the
+            image, or not at the depth that was measured at its pixel.
         overlaps: Overlap with that region by the rule, [V] float32; 0 without a region.
         depths_m: Depths of the Gaussians in the camera frame, [V] float32.
     """
@@ -106,16 +106,16 @@ def assign_gaussians(
 ) -> Assignment:
     """Assign Gaussians to the regions of an image.
 
-    Each Gaussian is projected as it is rendered, S = J R Sigma R' J' + 0.3 px^2 I. Its splat is the
-    axis-aligned box of two standard deviations around its center, cut to the image. A Gaussian is
-    expected if its center lies in the image within max_depth_gap_m of depth_m there. It may belong
-    to a region if
+    Each Gaussian is projected as in rendering, S = J R Sigma R' J' + 0.3 px^2 I. Its splat is the
+    axis-aligned box of two standard deviations around its center, clipped to the image. A Gaussian
+    is considered if its center lies in the image, at most max_depth_gap_m from depth_m at that
+    pixel. The others are HIDDEN. It may be assigned to a region if
 
         overlap > min_overlap,  overlap = |splat * region| / |splat|, or by `iou` / |splat + region|
 
-    With `coverage`, its center must lie in the region too, because depth was tested there. Of
-    several regions, it gets the one with the largest overlap times score; of equals, the first. The
-    result is bitwise equal for any number of threads.
+    With `coverage`, its center must lie in the region too, because depth was tested at the center.
+    If several regions qualify, it gets the one with the largest overlap times score; of equal ones,
+    the first. The result is bitwise equal for any number of threads.
 
     Args:
         rows: Gaussians of the map, [N, 16] float32.

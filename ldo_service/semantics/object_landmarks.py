@@ -1,9 +1,9 @@
 """Table of object landmarks: a sample of Gaussians each, and the values derived from it.
 
-A landmark stores the ids of at most 256 member Gaussians and a vote for each. The members are those
-of its Gaussians that come first when ids are shuffled by a fixed rule. This makes them a uniform
-sample that does not depend on the order of arrival. Position and label are derived from the rows
-and labels of the map and change with them.
+A landmark stores the ids of at most 256 of its Gaussians, its members, and votes for each. The
+members are the Gaussians whose ids come first when all ids are shuffled by a fixed rule. They are
+therefore a uniform sample, independent of the order in which Gaussians were added. Position and
+label are derived from the rows and labels of the members in the map and change with them.
 """
 
 import numpy as np
@@ -71,7 +71,7 @@ def entropies(table: np.ndarray) -> np.ndarray:
 
 # --- members --------------------------------------------------------------------------------------
 def shuffled(ids: np.ndarray) -> np.ndarray:
-    """Return a sort key for each id, [...] uint64, unique per id; that of NO_MEMBER is the last.
+    """Return a sort key for each id, [...] uint64, unique per id; NO_MEMBER has the largest key.
 
     Multiplication by an odd number permutes the 64-bit numbers. The golden ratio spreads
     consecutive ids.
@@ -83,9 +83,9 @@ def shuffled(ids: np.ndarray) -> np.ndarray:
 def joined(
     members: np.ndarray, votes: np.ndarray, others: np.ndarray, other_votes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the members [K, 256] and votes of the unions of two member lists per row.
+    """Return the union of two member lists for each of K landmarks: members [K, 256] and votes.
 
-    A member of both keeps its votes of the first list. A member without votes is removed.
+    A member of both lists keeps its votes from the first. A member with zero votes is removed.
 
     Args:
         members: Ids of the first list, [K, M].
@@ -109,14 +109,14 @@ def _in_order(ids: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def reliable_members(table: np.ndarray) -> np.ndarray:
     """Return which members are reliable, [K, 256] bool.
 
-    Reliable members have at least a third of the highest number of votes. Edges of regions
-    sometimes lie next to an object, but never in the same place for long.
+    A reliable member has at least a third of the landmark's highest number of votes. Gaussians next
+    to an object get few votes, because the edges of regions vary between keyframes.
     """
     return (table["votes"] > 0) & (3 * table["votes"] >= table["votes"].max(axis=1, keepdims=True))
 
 
 def rows_of(members: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """Return the rows of members [...] among the map's ids [N], ascending; -1 if not resident."""
+    """Return the rows of members [...] in the map with ascending ids [N]; -1 if not resident."""
     if len(ids) == 0:
         return np.full(members.shape, -1)
     # Sorted queries search neighboring entries: four times faster.
@@ -181,7 +181,8 @@ def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndar
 
         mu = sum_m w_m x_m / sum_m w_m,  Sigma = sum_m w_m (x_m - mu) (x_m - mu)' / sum_m w_m
 
-    Outliers, the 2 % at each end of an axis, do not count. Paper, III.C (landmarks).
+    The points at the two ends of each axis, 2 % each, are excluded as outliers. Paper, III.C
+    (landmarks).
 
     Example: two points lie on the x axis; the one at 4 has three times the weight. mu = 12 / 4,
     Sigma = (9 + 3) / 4.
@@ -201,10 +202,10 @@ def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def trimmed(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest values [K, D] of values [K, M, D] without 2 % at each end.
+    """Return the lowest and the highest of values [K, M, D] without 2 % at each end, [K, D] each.
 
-    Only values where `valid` [K, M] is true count. Without any, the result is infinity and minus
-    infinity.
+    Only values where `valid` [K, M] is true are used. If there are none, the lowest value is
+    infinity and the highest is minus infinity.
     """
     count = np.count_nonzero(valid, axis=1)[:, None]
     ordered = np.where(valid[:, None], np.swapaxes(values, 1, 2), np.inf)
@@ -223,8 +224,8 @@ def boxes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return T_map_object [K, 4, 4] and sizes [K, 3] of boxes around points [K, M, 3].
 
-    A box is parallel to the axes of the map, or to the main axes of the points if that saves a
-    fifth of the volume.
+    A box is parallel to the axes of the map. If a box along the principal axes of the points has at
+    most four fifths of its volume, that box is returned instead.
     """
     _, main = np.linalg.eigh(covariance)
     main = main[..., ::-1] * np.sign(_largest(main[..., ::-1]))[:, None]  # Fix the arbitrary signs.
@@ -245,13 +246,16 @@ def boxes(
 
 
 def _largest(axes: np.ndarray) -> np.ndarray:
-    """Return of each axis, a column of [K, 3, 3], the component of largest magnitude, [K, 3]."""
+    """Return the component of largest magnitude of each column of matrices [K, 3, 3], [K, 3]."""
     at = np.argmax(np.abs(axes), axis=1)[:, None]
     return np.take_along_axis(axes, at, axis=1)[:, 0]
 
 
 def _commonest(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return the most frequent valid value of each row, [K] of [K, M]; of equals, the smallest."""
+    """Return the most frequent valid value of each row of [K, M], [K].
+
+    Of equally frequent values, the smallest is returned.
+    """
     ordered = np.sort(np.where(valid, values, np.iinfo(np.int32).max).astype(np.int64), axis=1)
     width = ordered.shape[1]
     starts = np.concatenate(
@@ -272,7 +276,7 @@ def moved(table: np.ndarray, T_new_old: np.ndarray) -> None:
 
 # --- visibility -----------------------------------------------------------------------------------
 def within(table: np.ndarray, camera: Camera, T_camera_map: np.ndarray) -> np.ndarray:
-    """Return which landmarks have a bounding sphere in the view of a camera, [K] bool."""
+    """Return which landmarks have a bounding sphere that meets the view of a camera, [K] bool."""
     p = table["centroid"] @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
     # Twice the radius of the box, since members lie outside it too.
     radius = np.linalg.norm(table["size"], axis=1)

@@ -75,15 +75,16 @@ class Objects:
         """Update the objects from a keyframe.
 
         A region without an associated landmark creates a candidate. A candidate becomes an object
-        after min_keyframes observations that agree: KL(p || p_t) < max_divergence. The mean label
-        distribution of its Gaussians was p before; that of the Gaussians in the region is p_t now.
-        Both are weighted by opacity. A keyframe that exceeds the divergence restarts the count.
-        Objects are associated first, candidates with the remaining regions.
+        after min_keyframes observations that agree: KL(p || p_t) < max_divergence. Here, p is the
+        mean label distribution of the candidate's Gaussians before the keyframe. p_t is that of the
+        Gaussians in the region. Both means are weighted by opacity. A keyframe that exceeds the
+        divergence restarts the count. Regions are associated with objects first, and the remaining
+        regions with candidates.
 
         Args:
             view: The map and the regions of the keyframe.
-            spared: Labels that the detector does not know, [256] bool. Their objects count as
-                missed only if depth shows that their place is empty.
+            spared: Labels that the detector does not know, [256] bool. An object with such a label
+                is missed only if the measured depth shows that it is gone.
 
         Returns:
             The changes of the objects.
@@ -130,10 +131,11 @@ class Objects:
         regions: RegionStatistics,
         r: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return landmarks that are not missed, [K] bool, and numbers of remaining regions.
+        """Find regions that show only a piece of a landmark that no region was matched with.
 
-        A landmark is not missed if it was matched or a region shows a piece of it. The remaining
-        regions are neither matched nor such pieces.
+        Returns:
+            Landmarks that are matched or have such a piece, [K] bool; they are not missed. Numbers
+            of the regions that are neither matched nor such a piece.
         """
         excused, is_left = np.zeros(len(near), bool), np.ones(len(regions.numbers), bool)
         excused[k], is_left[r] = True, False
@@ -209,7 +211,11 @@ class Objects:
         excused: np.ndarray,
         spared: np.ndarray | None,
     ) -> np.ndarray:
-        """Return the numbers of landmarks that the detector missed or whose place is empty."""
+        """Return the numbers of the landmarks in `near` that are missed in the keyframe.
+
+        A landmark is missed if it is visible and the detector did not find it. It is also missed if
+        the measured depth lies behind it, so that it is gone.
+        """
         sides = np.clip(looks.boxes[:, 2:] - looks.boxes[:, :2], 0, None)
         is_large = np.sqrt(np.prod(sides, axis=1)) >= self.config.min_side_px
         is_visible = (looks.shown >= self.config.min_visible) & is_large
@@ -272,7 +278,7 @@ class Objects:
         return tuple(merged), gone
 
     def _age(self, k: int) -> tuple[bool, int, int]:
-        """Return a sort key: objects before candidates, then by id."""
+        """Return a sort key for landmark `k`: objects come before candidates, older ones first."""
         return self._table["id"][k] == CANDIDATE, int(self._table["id"][k]), k
 
     def _join(self, keep: int, goes: int, view: MapView) -> None:
@@ -283,7 +289,10 @@ class Objects:
 
     # --- candidates -------------------------------------------------------------------------------
     def _begin(self, view: MapView, regions: RegionStatistics, left: np.ndarray) -> None:
-        """Create a candidate for each remaining region; drop the candidates seen longest ago."""
+        """Create a candidate for each region in `left`.
+
+        If there are more than max_candidates, the candidates observed longest ago are dropped.
+        """
         new = new_landmarks(len(left), view.keyframe)
         new["members"], new["seen"] = regions.members[left], 1
         new["votes"] = one_each(new["members"])
@@ -299,10 +308,11 @@ class Objects:
 
     # --- corrections ------------------------------------------------------------------------------
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
-        """Move each landmark with the anchor keyframe of most of its members after a correction.
+        """Move the landmarks after a correction of the keyframe poses.
 
-        Landmarks of offloaded Gaussians get the position that these will have when they are loaded.
-        `refresh` updates the others.
+        Each landmark moves with the anchor keyframe of most of its members. A landmark whose
+        Gaussians are offloaded thus gets the position that they will have when they are loaded.
+        `refresh` updates landmarks with resident Gaussians.
 
         Args:
             T_new_old: Correction of each moved keyframe in the map frame, [4, 4], by id.
@@ -322,7 +332,9 @@ class Objects:
         anchors: np.ndarray,
         seen_from: tuple[Camera, np.ndarray] | None = None,
     ) -> None:
-        """Derive landmarks from the map again after corrections, late labels and refinement.
+        """Derive pose, size and label of landmarks from the map again.
+
+        This is needed after corrections, late label results and optimization of the Gaussians.
 
         Args:
             rows: Gaussians of the map, [N, 16].
@@ -356,8 +368,8 @@ class Objects:
         table = np.ascontiguousarray(packed["landmarks"])
         if table.dtype != np.uint8 or table.ndim != 2 or table.shape[1] != LANDMARK.itemsize:
             raise ValueError(
-                f"landmarks are {table.dtype}{table.shape} of another version; "
-                f"must be uint8[K, {LANDMARK.itemsize}]."
+                f"landmarks are {table.dtype}{table.shape}, must be uint8[K, {LANDMARK.itemsize}]: "
+                "another version of the service wrote them."
             )
         out = Objects(config)
         out._table = table.copy().view(LANDMARK)[:, 0]
@@ -378,7 +390,7 @@ class Objects:
 def _seen(
     view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
 ) -> tuple[MapView, RegionStatistics]:
-    """Return a view with parts merged into whole regions, and the statistics of its regions."""
+    """Merge regions that show parts of one object, and compute the statistics of the regions."""
     regions = compute_region_statistics(view, T_camera_map, config)
     whole = merge_parts(view, regions, config)
     return whole, regions if whole is view else compute_region_statistics(

@@ -19,7 +19,7 @@ from .object_landmarks import (
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ObjectSighting:
-    """An object in a keyframe: an observation or a miss.
+    """Observation of an object in a keyframe, or a miss of an object that should be visible.
 
     Attributes:
         object: Id of the object.
@@ -79,7 +79,10 @@ def update_votes(
 
 
 def add_views(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.ndarray) -> None:
-    """Add the view of a keyframe to landmarks; a large box with most of the object scores high."""
+    """Add a keyframe to the best views of landmarks.
+
+    The score of a view is the visible fraction `shown` times the square root of the box's area.
+    """
     scores = shown * np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1))
     add_view(table, np.full(len(table), keyframe), scores, boxes)
 
@@ -101,9 +104,10 @@ def add_view(
 
 
 def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[tuple[int, int]]:
-    """Return pairs of a matched and an unmatched landmark with one label and boxes that may meet.
+    """Return pairs of landmarks that may be the same object.
 
-    Both are numbers of `table`, from those in `near` [K].
+    One landmark of a pair is in `matched` and the other is not. They have the same label, and the
+    spheres around their boxes meet. Both are numbers of rows of `table` from `near` [K].
     """
     here, is_matched = table[near], np.isin(near, matched)
     name, place = labels_of(here), here["T_map_object"][:, :3, 3]
@@ -114,7 +118,9 @@ def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[
 
 
 def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: float) -> bool:
-    """Return whether the fraction `least` of one landmark lies in the box of the other.
+    """Return whether at least the fraction `least` of one landmark lies in the box of the other.
+
+    It suffices if this holds in one of the two directions.
 
     Args:
         one: A table of one landmark.
@@ -127,9 +133,9 @@ def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: floa
 
 
 def merge_into(one: np.ndarray, gone: np.ndarray) -> None:
-    """Add the members, counts and views of one landmark to another, both tables [1], in place.
+    """Add the members, counts and views of the landmark `gone` to `one`, both tables [1], in place.
 
-    The values that depend on the members must be derived again.
+    The caller must derive pose, size and label of `one` again.
     """
     one["members"], one["votes"] = joined(
         one["members"], one["votes"], gone["members"], gone["votes"]

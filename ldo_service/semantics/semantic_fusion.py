@@ -91,9 +91,9 @@ def fuse_confidences(
         alpha = r_YOLO^beta / (r_YOLO^beta + r_VLM^beta + epsilon)
         SemConf = alpha Conf_YOLO + (1 - alpha) Conf_VLM
 
-    The label is the detector's if alpha Conf_YOLO >= (1 - alpha) Conf_VLM. Without a label of the
-    labeller, alpha is 1. `fixed` has one alpha for all that have both labels; `detector` ignores
-    the labeller.
+    The label is the detector's if alpha Conf_YOLO >= (1 - alpha) Conf_VLM, else the labeller's.
+    Without a label of the labeller, alpha is 1. With the rule `fixed`, alpha is the constant
+    `fixed_alpha` wherever both labels exist. With the rule `detector`, the labeller is ignored.
 
     Args:
         detector_labels: Labels of the detector, [V] int.
@@ -151,10 +151,11 @@ def label_image(
     *,
     threads: int = 1,
 ) -> np.ndarray:
-    """Return the label s with the largest sum_i w_i p_i(s) over the Gaussians, [H, W] uint8.
+    """Render the labels of the map: at each pixel the s with the largest sum_i w_i p_i(s).
 
-    Of equals, the lower number is used; pixels without Gaussians are background. Each rendering
-    computes three labels, so this is for evaluation and pictures.
+    w_i is the weight of Gaussian i in the pixel and p_i its label distribution. Of equal labels,
+    the lower index is used. Pixels without Gaussians are background. One rendering computes three
+    labels only, so the function is slow and meant for evaluation and pictures.
 
     Args:
         rows: Gaussians of the map, [N, 16].
@@ -163,6 +164,9 @@ def label_image(
         camera: Intrinsics of the image.
         T_camera_map: Transform from the map to the camera, [4, 4].
         threads: Number of threads.
+
+    Returns:
+        Labels, [H, W] uint8.
     """
     assert shown.contributions is not None
     made_by = shown.contributions.indices
@@ -225,7 +229,7 @@ def fuse_detections(
     spared: np.ndarray | None = None,
     threads: int = 1,
 ) -> FusionResult:
-    """Fold the labels of a keyframe's regions into the labels [N, 32] of the map, in place.
+    """Update the labels [N, 32] of the map with the labels of a keyframe's regions, in place.
 
     Args:
         rows: Gaussians of the map, [N, 16].
@@ -236,10 +240,11 @@ def fuse_detections(
         depth_m: Measured depth, [H, W], meters.
         claims: Labels of the regions by detector and labeller.
         config: Settings of the fusion.
-        is_late: The keyframe was fused before and `claims` are late labels of some of its regions.
-            Gaussians outside of these are not missed. Where the detector's contribution is the
-            larger one, it is not counted again.
-        spared: Labels that the detector does not know and cannot miss, [256] bool.
+        is_late: True if the keyframe was fused before, and `claims` has only the regions with late
+            labels. Gaussians outside of these regions then get no miss. Where the detector's label
+            wins, it is not counted a second time.
+        spared: Labels that the detector does not know, [256] bool. Gaussians with such a label get
+            no miss.
         threads: Number of threads.
 
     Returns:
@@ -275,7 +280,10 @@ def fuse_detections(
 def regions_of(
     claims: RegionDetections, depth_m: np.ndarray, camera: Camera, config: SemanticFusionConfig
 ) -> Regions:
-    """Return regions that are boxes or their foregrounds, each without those that lie on it."""
+    """Return the regions of the boxes, without the pixels of smaller regions that lie in them.
+
+    By the setting `region`, a region is the foreground of its box or the whole box.
+    """
     if config.region == "box" or len(claims.boxes) == 0:
         return Regions.of_boxes(np.reshape(claims.boxes, (-1, 4)), claims.scores())
     known = claims.parts or (None,) * len(claims.boxes)
@@ -299,10 +307,10 @@ def observations(
     *,
     is_late: bool = False,
 ) -> Observations:
-    """Return the labels and confidences of Gaussians in regions, and misses of the others in view.
+    """Return the observations of Gaussians: labels with confidences in regions, misses elsewhere.
 
-    The extent of an object is the side of a square with the area of its box, at the depth of the
-    Gaussian.
+    The extent of an object is the side of a square with the area of its box, converted to meters at
+    the depth of the Gaussian.
     """
     # Tables indexed by outcome: hidden, in no region, in region 0, 1, ...
     # intp avoids a conversion in `take`.

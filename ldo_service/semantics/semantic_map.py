@@ -76,9 +76,9 @@ class SemanticMap:
     """Labels of the Gaussians of a MapBuilder, and the objects among them.
 
     The MapBuilder stores the images and the current pose of each keyframe. The detections of a
-    keyframe are fused once, label results of its regions when they arrive. Results are as
-    deterministic as the builder. Without any detections and labels, the map is bitwise equal to one
-    without this class.
+    keyframe are fused once. Label results of its regions are fused when they arrive. The same
+    inputs give the same results if the MapBuilder is deterministic. Without any detections and
+    labels, the map is bitwise equal to one without this class.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class SemanticMap:
         return None
 
     def on_keyframe_mapped(self, keyframe: int) -> KeyframeSemantics | None:
-        """Fuse the stored detections of a keyframe that is mapped now; None without any."""
+        """Fuse the stored detections of a keyframe that was just mapped; None if it has none."""
         if keyframe not in self._waiting:
             return None
         return self._fuse_keyframe(keyframe, self._waiting.pop(keyframe))
@@ -163,7 +163,7 @@ class SemanticMap:
     ) -> KeyframeSemantics | None:
         """Fuse the detections of a mapped keyframe.
 
-        If its images are not stored any more, the Gaussians in the boxes are unknown. The
+        If its images are no longer stored, the Gaussians in the boxes cannot be found. The
         detections are then counted and dropped.
         """
         self._done[keyframe] = None
@@ -192,8 +192,8 @@ class SemanticMap:
     def _seen(self, keyframe: int) -> tuple[TrainingView, Contributions]:
         """Return a keyframe with completed depth, and the Gaussians that contribute to its image.
 
-        Missing depth, as on dark surfaces, comes from the map, where other keyframes measured it.
-        Pixels of the ignore mask have no depth.
+        Missing depth, such as on dark surfaces, is filled with depth rendered from the map. Pixels
+        of the ignore mask have no depth.
         """
         made_by, view = self._map.visible_contributions(keyframe), self._map.views[keyframe]
         in_map_m = self._map.render_keyframe(keyframe).median_depth_m
@@ -231,7 +231,7 @@ class SemanticMap:
         return claims, tuple(question.region for question in questions)
 
     def _is_labellers(self, label: int) -> bool:
-        """Return whether only the labeller gave a label; the detector does not know it."""
+        """Return whether only the labeller ever gave this label, and never the detector."""
         return label in self._by_labeller and label not in self._by_detector
 
     def _undetectable_labels(self) -> np.ndarray | None:
@@ -283,7 +283,8 @@ class SemanticMap:
     def apply_label(self, region: int, keyframe: int, answer: RegionLabelResult) -> bool:
         """Fuse a label result of the labeller for a region of a keyframe.
 
-        Without the images of the keyframe, the Gaussians of the region are unknown.
+        If the images of the keyframe are no longer stored, the Gaussians of the region cannot be
+        found, and nothing is fused.
 
         Returns:
             True if the label was fused.
@@ -306,8 +307,8 @@ class SemanticMap:
     def _tell_where_shown(self, region: int, told: int) -> None:
         """Fuse the label of a region in the other keyframes of its label request.
 
-        This is for labels that only the labeller gives. A label of the detector is fused there
-        already.
+        This is called only for labels that the detector never gives. A label that the detector
+        gives was fused with the detections of those keyframes already.
         """
         assert self.naming is not None
         for keyframe in self.naming.shown_in(region):
@@ -358,8 +359,8 @@ class SemanticMap:
     def metrics(self) -> dict[str, float]:
         """Return the counters of the semantics.
 
-        `label_disagreement` is that of the newest labelled keyframe, summed over its Gaussians:
-        `_literal` as the paper prints it, `_expected` as the smoothing reduces it.
+        The two `label_disagreement` metrics are those of the newest labelled keyframe, summed over
+        its Gaussians; see `gaussian_labels.Disagreement`.
         """
         labelled = 0
         if self._boxes:

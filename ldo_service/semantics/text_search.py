@@ -33,7 +33,7 @@ class SearchHit:
 def search(
     text: str, objects: Sequence[Mapping[str, float]], encode: Encode | None = None
 ) -> list[SearchHit]:
-    """Return the objects that match `text`, best first; of equals, the first.
+    """Return the objects that match `text`, best first; equal scores keep the order of `objects`.
 
     The score of an object with the probabilities p by name is
 
@@ -62,7 +62,10 @@ def search(
 def text_similarity(
     text: str, names: Sequence[str], encode: Encode | None = None
 ) -> dict[str, float]:
-    """Return the nearness of each name to `text`, see `search`; names without any are omitted."""
+    """Return the nearness of each name to `text`, as `search` defines it.
+
+    Names that are not near to it are omitted.
+    """
     itself, *akin = answers_to(text)
     near = dict.fromkeys(akin, SYNONYM_SCORE) | {itself: 1.0}
     others = [name for name in names if name not in near]
@@ -78,7 +81,10 @@ def text_similarity(
 
 
 def suggest_names(text: str, names: Sequence[str], max_names: int = 5) -> str:
-    """Return a sentence with the name that looks like `text`, or else with the most common ones."""
+    """Return a sentence that suggests the name spelled most like `text`.
+
+    If no name is similar, the sentence lists the most common names.
+    """
     distinct = sorted(set(names), key=lambda name: (-names.count(name), name))
     more = " and more" if len(distinct) > max_names else ""
     common = f"There is {', '.join(distinct[:max_names])}{more}."
