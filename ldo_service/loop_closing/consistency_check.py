@@ -1,6 +1,7 @@
-"""Consistency of loop hypotheses with the map: plausible drift and perceptual aliasing.
+"""Checks of loop hypotheses against the map: plausible drift and perceptual aliasing.
 
-Rooms with the same furniture look alike in images; the path of the camera distinguishes them.
+Rooms with the same furniture look alike in images. The keyframe poses in the map distinguish them,
+because drift along the camera path is bounded.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -20,7 +21,7 @@ from .verification import LoopHypothesis
 
 @dataclass(frozen=True, slots=True)
 class ConsistencyCheckConfig:
-    """Limits on drift, view change and ambiguity of loop hypotheses."""
+    """Limits of the drift that a loop hypothesis implies, and of its ambiguity."""
 
     drift_m: float = 0.5  # Allowed position drift on any path.
     drift: float = 0.1  # Additional drift per meter of path; ten times the drift of depth cameras.
@@ -44,22 +45,30 @@ class ConsistencyCheckConfig:
 class ConsistencyChecker:
     """Check of loop hypotheses against the known keyframe poses.
 
-    It cannot check hypotheses between submaps that are not merged, as their relative pose is
-    unknown.
+    Hypotheses between submaps that are not merged pass unchecked, because the relative pose of the
+    submaps is unknown.
     """
 
     def __init__(
         self, poses: KeyframePoses, joined: Mapping[int, int], config: ConsistencyCheckConfig
     ) -> None:
-        """Check against `poses`; `joined` maps each merged submap to the older one."""
+        """Create a checker.
+
+        Args:
+            poses: Keyframe poses in the map.
+            joined: Merged submaps, each with the older one that it is merged into.
+            config: Limits.
+        """
         self._poses, self._joined, self._config = poses, joined, config
 
     def possible_matches(
         self, old: Sequence[SubgraphKeyframe], new: SubgraphKeyframe
     ) -> np.ndarray:
-        """Return which of S stored views a keyframe may show again, [S] bool.
+        """Return which of S stored keyframes may show the same surfaces as a new one, [S] bool.
 
-        A view is excluded if its distance or rotation exceeds the drift plus the width of a view.
+        A keyframe is excluded if its distance or its rotation from the new one is too large. The
+        limit is the maximum drift plus the largest pose difference of two cameras that see the same
+        surfaces (`view_depths`, `view_rad`).
         """
         if new.keyframe not in self._poses:
             return np.ones(len(old), bool)
@@ -82,7 +91,10 @@ class ConsistencyChecker:
         return may
 
     def check_drift(self, proposal: LoopHypothesis) -> LoopHypothesis:
-        """Return a hypothesis, rejected if the drift since then cannot explain it."""
+        """Reject a hypothesis if it implies more drift than the path between its keyframes allows.
+
+        The result is the hypothesis, with a rejected_reason if it is rejected.
+        """
         old, new = proposal.old, proposal.new
         if proposal.rejected_reason or not self._is_known(old, new):
             return proposal
@@ -97,9 +109,10 @@ class ConsistencyChecker:
         return proposal
 
     def reject_aliased(self, proposals: Sequence[LoopHypothesis]) -> list[LoopHypothesis]:
-        """Return the hypotheses; ambiguous ones are rejected.
+        """Reject ambiguous hypotheses, and return all.
 
-        One is ambiguous if another place far away explains the view nearly as well.
+        A hypothesis is ambiguous if another one places the new keyframe far away from it and has
+        nearly as many inliers (`rival_inliers`, `rival_rad`).
         """
         return [
             replace(proposal, rejected_reason="ambiguous: another place fits as well")
@@ -120,7 +133,7 @@ class ConsistencyChecker:
         return apart_rad > self._config.rival_rad
 
     def _T_map(self, proposal: LoopHypothesis, new: SubgraphKeyframe) -> np.ndarray:
-        """Return T_map_keyframe [4, 4] of a keyframe of the new subgraph by a hypothesis."""
+        """Return T_map_keyframe [4, 4] of a new keyframe if the hypothesis is true."""
         T_new_odom = se3.inverse(proposal.new.place.T_odom_keyframe)
         T_map_newodom = self._poses[proposal.old.keyframe] @ proposal.T_old_new @ T_new_odom
         return T_map_newodom @ new.place.T_odom_keyframe
@@ -132,7 +145,7 @@ class ConsistencyChecker:
         return se3.inverse(self._poses[old.keyframe]) @ self._poses[new.keyframe]
 
     def _is_known(self, old: SubgraphKeyframe, new: SubgraphKeyframe) -> bool:
-        """Return whether the relative pose of two keyframes is known."""
+        """Return whether both keyframes have poses in the map and lie in merged submaps."""
         if old.keyframe not in self._poses or new.keyframe not in self._poses:
             return False
         return self._root(old.place.submap) == self._root(new.place.submap)
@@ -143,7 +156,7 @@ class ConsistencyChecker:
     def _drift(
         self, old: SubgraphKeyframe, new: SubgraphKeyframe, T_old_new: np.ndarray
     ) -> tuple[float, float]:
-        """Return the difference in m and rad between a measured pose and the map."""
+        """Return the difference between a measured relative pose and the map, in m and rad."""
         T_map_new = self._poses[old.keyframe] @ T_old_new
         T_gap = se3.inverse(T_map_new) @ self._poses[new.keyframe]
         return float(np.linalg.norm(T_gap[:3, 3])), se3.rotation_angle(T_gap)

@@ -1,6 +1,6 @@
-"""Loop detection: takes keyframes and returns verified loop candidates.
+"""Loop detector: groups keyframes into subgraphs and finds earlier subgraphs of the same place.
 
-Visual words are clusters of ORB features that are learned online, from the first image on.
+Visual words are clusters of ORB features. They are learned during the run, from the first image on.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -59,7 +59,7 @@ class VisualWordsConfig:
 
 
 class VisualWords:
-    """Vocabulary of descriptors; each word represents the features that are nearest to it.
+    """Vocabulary of ORB descriptors, called words; a feature is counted for the nearest word.
 
     Words never change and are never removed. The same images in the same order give the same words.
     """
@@ -70,7 +70,10 @@ class VisualWords:
         self.words = np.zeros((0, BYTES), np.uint8) if words is None else words
 
     def learn(self, descriptors: np.ndarray) -> None:
-        """Add descriptors [N, 32] that are far from every word, up to the limits."""
+        """Add descriptors [N, 32] as words if they differ from every word by over `apart_bits`.
+
+        `count` and `learned_at_once` limit the number of words.
+        """
         room = min(self._config.count - len(self.words), self._config.learned_at_once)
         if room <= 0 or not len(descriptors):
             return
@@ -91,7 +94,7 @@ class VisualWords:
         return np.bincount(nearest, minlength=self._config.count).astype(np.float32)
 
     def _distances(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the distances [N] to the nearest word in bits; 256 while there is no word."""
+        """Return the Hamming distances [N] to the nearest word, in bits; 256 without words."""
         if not len(self.words):
             return np.full(len(descriptors), 8 * BYTES)
         return np.array([int(m.distance) for m in _matches(descriptors, self.words)])
@@ -129,7 +132,7 @@ class LoopsConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoopCandidateResult:
-    """Loop candidate with all its scores."""
+    """Loop candidate: new subgraph, similar stored subgraph, and result of the verification."""
 
     new: Subgraph
     likeness: RetrievalMatch
@@ -142,7 +145,7 @@ class LoopCandidateResult:
 
 
 class LoopDetector:
-    """Detector that groups keyframes into subgraphs and searches earlier ones for each new one."""
+    """Detector that groups keyframes into subgraphs and finds similar earlier subgraphs of each."""
 
     def __init__(self, config: LoopsConfig) -> None:
         """Start with an empty place database."""
@@ -183,7 +186,7 @@ class LoopDetector:
             stamp_ns: Stamp of the keyframe.
             sightings: Detections as points; None if no detector ran.
             poses: T_map_keyframe of the stored keyframes; unknown ones are not checked.
-            joined: Merged submaps, each with the older one.
+            joined: Merged submaps, each with the older one that it is merged into.
         """
         findings: list[LoopCandidateResult] = []
         if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
@@ -197,8 +200,9 @@ class LoopDetector:
     def flush(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[LoopCandidateResult]:
         """Return the loop candidates of the unfinished subgraph if it is long enough.
 
-        It is called when no keyframe follows. A run often ends where it began, and after a loss the
-        newest keyframes are near the lost camera.
+        Callers use it when no keyframe follows: at the end of a run and after a loss of tracking.
+        Loops are likely then. A run often ends where it began, and the newest keyframes are near
+        the place where tracking was lost.
         """
         if len(self._open) < self._config.subgraphs.least:
             return []
@@ -227,7 +231,10 @@ class LoopDetector:
         return SubgraphKeyframe(place, frame, stamp_ns, self._path_m, looked, sightings, words)
 
     def _step_m(self, place: KeyframeRecord) -> float:
-        """Return the distance from the previous keyframe; 0 after a loss, as it is unknown then."""
+        """Return the distance from the previous keyframe in meters.
+
+        In a new submap it is unknown, and the result is 0.
+        """
         if self._last is None or self._last[0] != place.submap:
             return 0.0
         return float(np.linalg.norm(place.T_odom_keyframe[:3, 3] - self._last[1][:3, 3]))
@@ -254,7 +261,11 @@ class LoopDetector:
     def _findings(
         self, new: Subgraph, poses: KeyframePoses, joined: Mapping[int, int]
     ) -> list[LoopCandidateResult]:
-        """Return all candidates; the first verified one, by number of inliers, closes the loop."""
+        """Return all loop candidates of a new subgraph.
+
+        They are verified in the order of their inliers, most first. The first accepted one becomes
+        the loop closure; the following ones are rejected.
+        """
         known = ConsistencyChecker(poses, joined, self._config.plausibility)
         is_possible = known.possible_matches(
             [old.views[0] for old in self.subgraphs], new.views[-1]
@@ -272,10 +283,11 @@ class LoopDetector:
         return [LoopCandidateResult(new, like, checks[index]) for index, like in enumerate(likely)]
 
     def _proposal(self, old: Subgraph, new: Subgraph, known: ConsistencyChecker) -> LoopHypothesis:
-        """Return the hypothesis for a candidate, or a rejected one.
+        """Return a loop hypothesis for a candidate; it is rejected if no method finds a pose.
 
-        Features come first: their poses are accurate to centimeters, those of landmarks to
-        decimeters. The map comes last, as its poses also need to be confirmed by images.
+        The methods are tried in the order features, landmarks, map. Poses from features are
+        accurate to centimeters, and those from landmarks to decimeters. Poses from the map come
+        last, because two images must also confirm them.
         """
         verifier, stages = self._verifier, self._config.stages
         if stages == "semantic":
@@ -300,7 +312,10 @@ class LoopDetector:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return the state; parts in `subgraphs` and `views` never change, the rest is small."""
+        """Return the state for a checkpoint.
+
+        The entries of `subgraphs` and `views` are never modified later. The other values are small.
+        """
         return {
             "subgraphs": [subgraph.pack() for subgraph in self._memory.subgraphs],
             "views": [view.pack() for view in self._open],
@@ -309,7 +324,7 @@ class LoopDetector:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a snapshot."""
+        """Replace the state by that of a snapshot."""
         self.__init__(self._config)
         for packed in state["subgraphs"]:
             self._memory.add(Subgraph.unpack(packed))

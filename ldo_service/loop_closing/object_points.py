@@ -1,4 +1,7 @@
-"""Detections of a few keyframes as labelled points. Conventions: `ldo_service.geometry`."""
+"""Detections as labelled 3D points, and the landmarks of a subgraph that they form.
+
+Conventions: `ldo_service.geometry`.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -79,7 +82,7 @@ def locate_detections(
     camera: Camera,
     config: LandmarkConfig,
 ) -> DetectionPoints:
-    """Return detections as points: the median of the foreground of each box.
+    """Locate detections in 3D: each becomes the median point of the foreground of its box.
 
     Args:
         labels: Label indices, [K].
@@ -126,7 +129,7 @@ class SubgraphLandmarks:
 
     @property
     def names(self) -> np.ndarray:
-        """Likeliest detector label of each landmark, however small its score, [K] int64."""
+        """Likeliest label of each landmark, [K] int64; background and `other` are ignored."""
         said = np.where(self.labels < HIDDEN_NAMES, -1, self.weights).argmax(axis=1)
         return self.labels[np.arange(len(self)), said].astype(np.int64)
 
@@ -138,10 +141,11 @@ class SubgraphLandmarks:
 def cluster_landmarks(
     seen: Sequence[DetectionPoints], T_odom_camera: Sequence[np.ndarray], config: LandmarkConfig
 ) -> SubgraphLandmarks:
-    """Return the landmarks of a few keyframes: detections of one object are merged.
+    """Merge the detections of a subgraph's keyframes into landmarks, one per object.
 
-    The distribution of a landmark is the mean over its detections. Each has the score on its label
-    and the rest on `other`. The position is the mean, too.
+    The label distribution of a landmark is the mean over its detections. A detection puts its score
+    on its label and the remaining probability on `other`. The position of a landmark is the mean of
+    its detections.
 
     Args:
         seen: Detections of each keyframe.
@@ -180,7 +184,10 @@ def _same(
     names: Sequence[int],
     limit_m: float,
 ) -> int:
-    """Return the nearest landmark with this label, or the number of landmarks if none is near."""
+    """Return the index of the nearest landmark with this label.
+
+    If none is within `limit_m`, return the number of landmarks.
+    """
     gaps_m = [
         float(np.linalg.norm(place / count - p_odom)) if name == label else np.inf
         for place, count, name in zip(places, counts, names, strict=True)
@@ -192,8 +199,8 @@ def _same(
 def layout_histogram(landmarks: SubgraphLandmarks) -> np.ndarray:
     """Return a histogram of pairs of labels and their distances, [512] float32.
 
-    Unlike the labels alone, it distinguishes a row of chairs from chairs around a table. It has no
-    directions, so it is the same from every viewpoint.
+    Unlike a histogram of labels, it distinguishes a row of chairs from chairs around a table. It
+    contains distances but no directions, so it does not depend on the viewpoint.
     """
     out = np.zeros(LAYOUT_WORDS, np.float32)
     first, second = np.triu_indices(len(landmarks), 1)
@@ -212,7 +219,7 @@ def layout_histogram(landmarks: SubgraphLandmarks) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LandmarkAgreement:
-    """Agreement of the landmarks of two subgraphs that are at one place."""
+    """Agreement of the landmarks of two subgraphs after alignment by a relative pose."""
 
     count: int  # Pairs with matching distributions.
     contradicted: int  # New landmarks where all old ones nearby have other labels.
@@ -223,9 +230,9 @@ class LandmarkAgreement:
 def possible_pairs(
     old: SubgraphLandmarks, new: SubgraphLandmarks, config: LandmarkConfig
 ) -> np.ndarray:
-    """Return the index pairs [M, 2] of landmarks with a KL divergence below the limit both ways.
+    """Return the index pairs [M, 2] of landmarks with similar label distributions.
 
-    The limit is 0.3 nats (III.C).
+    The KL divergence must be below `config.max_divergence` in both directions (III.C: 0.3 nats).
     """
     return np.argwhere(_divergences(old, new) < config.max_divergence)
 
@@ -245,7 +252,7 @@ def compare_landmarks(
 def compare_landmarks_at(
     old: SubgraphLandmarks, new: SubgraphLandmarks, T_old_new: np.ndarray, config: LandmarkConfig
 ) -> LandmarkAgreement:
-    """Return the agreement of landmarks that are near each other after a motion.
+    """Compare the landmarks that a relative pose brings near each other.
 
     Args:
         old: Landmarks of the old subgraph.
@@ -267,6 +274,6 @@ def compare_landmarks_at(
 
 
 def _divergences(a: SubgraphLandmarks, b: SubgraphLandmarks) -> np.ndarray:
-    """Return the larger KL divergence of both directions, [K, L] nats."""
+    """Return for each pair of landmarks the larger KL divergence of its two directions, [K, L]."""
     p, q = a.distributions[:, None], b.distributions[None]
     return np.maximum(divergence(p, q), divergence(q, p))

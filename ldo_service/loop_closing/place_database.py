@@ -1,6 +1,7 @@
-"""Place database: all subgraphs so far, and the search for the place of a new one (coarse step).
+"""Place database: stored subgraphs, and the search for those similar to a new one (coarse step).
 
-Histograms are compared by TF-IDF, with weights of words learned from all stored subgraphs.
+Histograms are compared by TF-IDF. The weight of a word comes from the number of stored subgraphs
+that contain it.
 """
 
 from dataclasses import dataclass
@@ -21,8 +22,9 @@ class Histograms:
 
     similarity of rows a, b = cos(a * idf, b * idf),  idf_w = log(1 + N / n_w)
 
-    n_w of the N rows contain word w (Sivic and Zisserman 2003). The 1 keeps a positive weight for
-    words in all rows while there are few rows. Sums run in a fixed order, on one thread.
+    n_w of the N rows contain word w (Sivic and Zisserman 2003). Without the 1, words that are in
+    all rows would have no weight, which matters while there are few rows. Sums are computed in a
+    fixed order, on one thread.
 
     >>> known = Histograms(2)
     >>> known.add(np.array([1.0, 0.0]))
@@ -119,8 +121,9 @@ class RetrievalMatch:
 class PlaceDatabase:
     """Stored subgraphs in the order of insertion, with tables of their histograms.
 
-    Beyond `count` subgraphs, the one with the nearest neighbors along the path is removed. So a
-    month in one building thins the path evenly, and no part of it is lost completely.
+    If there are more than `count` subgraphs, the one whose neighbors along the camera path are
+    nearest is removed. A long run in one building thus thins the path evenly, and each part of the
+    path keeps some subgraphs.
     """
 
     def __init__(self, words: int, stages: Stages, config: RetrievalConfig) -> None:
@@ -180,10 +183,12 @@ class PlaceDatabase:
     def _scores(
         self, new: Subgraph, similarity: np.ndarray, layout: np.ndarray, appearance: np.ndarray
     ) -> np.ndarray:
-        """Return the scores of all subgraphs, [S]; 0 for those that are no candidates.
+        """Return the scores of all stored subgraphs, [S]; 0 for those that are no candidates.
 
-        Labels select the candidates; the layout and the images then rank them. Images alone decide
-        if one of the subgraphs has no detections. Similar images can also replace similar labels.
+        A subgraph is a candidate if its labels or its visual words are similar to the new one. The
+        score is a mean of the similarities of labels, layout and visual words. If either of the two
+        subgraphs has no detections, visual words alone select and rank. The setting `stages` may
+        also switch off labels or images.
         """
         config = self._config
         looks_alike = appearance >= config.min_appearance
@@ -200,8 +205,8 @@ class PlaceDatabase:
     def _are_far(self, new: Subgraph) -> np.ndarray:
         """Return which subgraphs are more than `exclude_frames` before the new one, [S] bool.
 
-        Subgraphs more than `exclude_frames` after it also count: a restarted camera counts from 0
-        again.
+        Subgraphs more than `exclude_frames` after the new one are included too, because frame
+        numbers start at 0 again after a restart of the camera.
         """
         first = np.array([subgraph.first_frame for subgraph in self.subgraphs])
         last = np.array([subgraph.last_frame for subgraph in self.subgraphs])

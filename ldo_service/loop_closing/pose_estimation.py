@@ -43,10 +43,10 @@ def ransac_rigid(
     Args:
         p_a: Points, [K, 3], meters.
         p_b: Points, [L, 3], meters.
-        pairs: Indices (a, b) of possible correspondences, [M, 2]. A point may be in several pairs
-            and counts only in the nearest.
-        limit_m: Maximum distance of an inlier.
-        iterations: Number of triples.
+        pairs: Indices (a, b) of possible correspondences, [M, 2]. A point may be in several pairs;
+            only the one with the smallest distance can be an inlier.
+        limit_m: Maximum distance of an inlier, meters.
+        iterations: Number of triples to try.
         rng: Source of random triples.
 
     Returns:
@@ -69,7 +69,7 @@ def ransac_rigid(
 
 
 def _are_alike(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
-    """Return whether two triangles [3, 3] have the same side lengths and are not degenerate."""
+    """Return whether two triangles [3, 3] have equal sides, within 2 limit_m, and some area."""
     sides_a, sides_b = (np.linalg.norm(p - np.roll(p, 1, axis=0), axis=1) for p in (p_a, p_b))
     if np.abs(sides_a - sides_b).max() > 2 * limit_m:
         return False
@@ -80,7 +80,7 @@ def _are_alike(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
 def _supported(
     p_a: np.ndarray, p_b: np.ndarray, pairs: np.ndarray, T_a_b: np.ndarray, limit_m: float
 ) -> RansacResult:
-    """Return a transform with its inliers; each point counts once."""
+    """Find the inliers of a transform; each point is in at most one inlier pair."""
     gaps_m = np.linalg.norm(p_a[pairs[:, 0]] - se3.transform(T_a_b, p_b[pairs[:, 1]]), axis=1)
     inliers = np.zeros(len(pairs), bool)
     used: tuple[set[int], set[int]] = set(), set()

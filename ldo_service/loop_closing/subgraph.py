@@ -144,9 +144,10 @@ class Subgraph:
 
 
 def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfig) -> bool:
-    """Return whether a keyframe continues from the previous one.
+    """Return whether a keyframe continues the subgraph of the previous one.
 
-    Keyframe reuse may have returned to old keyframes between the two.
+    It must be near the previous keyframe and in the same submap. They are far apart if the tracker
+    reused old keyframes between them.
     """
     moved = se3.inverse(before.T_odom_keyframe) @ place.T_odom_keyframe
     is_near = image_motion_rad(moved, before.median_depth_m) <= config.gap_rad
@@ -154,7 +155,10 @@ def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfi
 
 
 def is_complete(views: Sequence[SubgraphKeyframe], config: SubgraphConfig) -> bool:
-    """Return whether keyframes are enough for a subgraph, by number or by motion."""
+    """Return whether keyframes complete a subgraph.
+
+    It is complete with `most` keyframes, or with `least` if the camera moved enough (`turned_rad`).
+    """
     if len(views) < config.least:
         return False
     first, last = views[0].place, views[-1].place
@@ -166,7 +170,10 @@ def is_complete(views: Sequence[SubgraphKeyframe], config: SubgraphConfig) -> bo
 
 
 def evenly_spaced(views: Sequence[SubgraphKeyframe], count: int) -> tuple[SubgraphKeyframe, ...]:
-    """Return `count` views at equal steps with the first and the last; for one, the middle view."""
+    """Select `count` keyframes at equal steps, including the first and the last.
+
+    If `count` is 1, the middle keyframe is selected.
+    """
     if count == 1:
         return (views[len(views) // 2],)
     at = np.rint(np.linspace(0, len(views) - 1, min(count, len(views)))).astype(int)

@@ -1,8 +1,9 @@
 """Verification of loop candidates: the pose between two keyframes of two subgraphs (fine step).
 
-A pose comes from ORB features, from landmarks or from the map, and is refined on the images. It is
-accepted if all of these agree: two keyframes of the new subgraph, the refined pose, the surfaces,
-and the detections. Conventions: `ldo_service.geometry`.
+A pose comes from ORB features, from landmarks or from the map. Direct alignment refines it on the
+images. The pose is accepted if a second keyframe of the new subgraph or landmarks confirm it, and
+if the refinement changes it little. The surfaces must also overlap without conflict, and the
+detections must not contradict. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Callable, Iterator
@@ -131,9 +132,10 @@ class VerificationResult:
 
 
 class Verifier:
-    """Verifier of loop candidates; deterministic, so equal subgraphs give equal bits.
+    """Verifier of loop candidates.
 
-    It caches the keyframes that it decompressed last.
+    Equal subgraphs give bitwise equal results. The verifier caches the keyframes that it
+    decompressed last.
     """
 
     def __init__(
@@ -149,9 +151,9 @@ class Verifier:
 
     # --- hypotheses -------------------------------------------------------------------------------
     def hypothesis_from_features(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
-        """Return the pose from feature matches that a second new keyframe confirms.
+        """Return the pose from feature matches, if another keyframe of `new` gives the same pose.
 
-        If there is no confirmation by features, see `_from_single_keyframe`.
+        If none does, `_from_single_keyframe` looks for another confirmation.
         """
         found: list[LoopHypothesis] = []
         for a, b in islice(_likely_pairs(old, new), self._config.pairs):
@@ -168,9 +170,10 @@ class Verifier:
     def _from_single_keyframe(
         self, found: list[LoopHypothesis], old: Subgraph, new: Subgraph
     ) -> LoopHypothesis:
-        """Return the pose with most inliers, rejected unless something else confirms it.
+        """Return the pose with most inliers; it is rejected if nothing confirms it.
 
-        Three landmarks or the image of another keyframe can confirm it.
+        It is confirmed by at least `witness_landmarks` matching landmarks, or by another keyframe
+        of `new` whose images pass the verification at this pose.
         """
         best = max(found, key=lambda proposal: proposal.inliers, default=None)
         if best is None:
@@ -187,7 +190,7 @@ class Verifier:
         return replace(best, rejected_reason="not confirmed by a second keyframe")
 
     def _is_confirmed_by(self, best: LoopHypothesis, view: SubgraphKeyframe) -> bool:
-        """Return whether image and surface of another new keyframe agree with a pose."""
+        """Return whether a pose passes the verification with another new keyframe, `view`."""
         T_old_view = _between(best.old, view, _odometry_frames(best))
         check = self.verify(replace(best, new=view, T_old_new=T_old_view))
         return check.closure is not None
@@ -204,9 +207,9 @@ class Verifier:
         )
 
     def hypothesis_from_landmarks(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
-        """Return the pose that most landmarks agree with.
+        """Return the relative pose of the subgraphs that most landmarks agree with.
 
-        It is given between the keyframes that are nearest to each other at this pose.
+        It is expressed as the pose between the two keyframes that it brings nearest to each other.
         """
         config = self._config.landmarks
         pairs = possible_pairs(old.landmarks, new.landmarks, config)
@@ -225,11 +228,11 @@ class Verifier:
     def hypothesis_from_map(
         self, old: Subgraph, new: Subgraph, T_old_new: KnownPose
     ) -> LoopHypothesis:
-        """Return the pose in the map, if images of two new keyframes refine it to the same pose.
+        """Return a pose refined from the map, if two new keyframes give the same result.
 
-        Different viewpoints of a place share few features, so the map gives the initial guess. This
-        finds no loop after a large drift. It adds closures between nearby keyframes before they
-        drift apart.
+        Images of a place from different viewpoints have few features in common. The pose in the map
+        is therefore the initial guess, and the images refine it. After a large drift, this finds no
+        loop. It adds closures between nearby keyframes before they drift apart.
         """
         found: list[LoopHypothesis] = []
         for a, b, T in islice(_nearest_pairs(old, new, T_old_new), self._config.map_pairs):
@@ -243,7 +246,10 @@ class Verifier:
         return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=refused)
 
     def _check_overlap(self, proposal: LoopHypothesis) -> VerificationResult | None:
-        """Return the verification, or None without an alignment if an overlap is too small."""
+        """Verify a hypothesis if the overlap of the surfaces is large enough in both directions.
+
+        Return None, without an alignment, if it is not.
+        """
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         T_old_new, least = proposal.T_old_new, self._config.blind_overlap
         if self._fit(old, new, T_old_new).overlap < least:
@@ -255,7 +261,7 @@ class Verifier:
     def _with_semantics(
         self, proposal: LoopHypothesis, old: Subgraph, new: Subgraph
     ) -> LoopHypothesis:
-        """Return a hypothesis with the agreement of the landmarks that it brings together."""
+        """Return a hypothesis with the agreement of the landmarks at its relative pose."""
         T, config = _odometry_frames(proposal), self._config.landmarks
         semantics = compare_landmarks_at(old.landmarks, new.landmarks, T, config)
         return replace(proposal, semantics=semantics)
@@ -278,9 +284,9 @@ class Verifier:
         return VerificationResult(proposal, min(fit.overlap, 1.0), fit.rmse_m, refused, closure)
 
     def accept_unverified(self, proposal: LoopHypothesis) -> VerificationResult:
-        """Return a closure with the pose of the landmarks, as it is.
+        """Accept the pose from landmarks as a loop closure without refinement or checks.
 
-        The fine stage of the paper alone would accept it.
+        This is what the paper's fine step does; it is used for comparison (stages: semantic).
         """
         sigma_m = self._config.landmarks.reach_m / np.sqrt(proposal.inliers)
         sigmas = np.repeat([sigma_m / _depth(proposal), sigma_m], 3)
@@ -302,7 +308,11 @@ class Verifier:
     ) -> str:
         """Return the reason to reject a pose, or "" to accept it.
 
-        `shared` is the smaller one of the overlaps of both surfaces.
+        Args:
+            proposal: The hypothesis with the pose before refinement.
+            alignment: Result of the refinement on the images.
+            fit: Comparison of the new surface with the old depth at the refined pose.
+            shared: Overlap of the surfaces, the smaller one of both directions.
         """
         config, by_landmarks = self._config, proposal.evidence == "landmarks"
         moved = se3.inverse(proposal.T_old_new) @ alignment.T_reference_camera
@@ -329,7 +339,7 @@ class Verifier:
 def _likely_pairs(
     old: Subgraph, new: Subgraph
 ) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe]]:
-    """Return all pairs of keyframes; those with most common visual words come first."""
+    """Iterate over all pairs of an old and a new keyframe, most common visual words first."""
     pairs = list(product(old.views, new.views))
     shared = [float(np.minimum(a.words, b.words).sum()) for a, b in pairs]
     return (pairs[index] for index in np.argsort(-np.array(shared), kind="stable"))
@@ -356,13 +366,13 @@ def _nearest_pairs(
 def _between(
     old: SubgraphKeyframe, new: SubgraphKeyframe, T_oldodom_newodom: np.ndarray
 ) -> np.ndarray:
-    """Return T_old_new [4, 4] of two keyframes."""
+    """Return T_old_new [4, 4] of two keyframes, given the pose between their odometry frames."""
     T_odom_old, T_odom_new = old.place.T_odom_keyframe, new.place.T_odom_keyframe
     return se3.orthonormalize(se3.inverse(T_odom_old) @ T_oldodom_newodom @ T_odom_new)
 
 
 def _odometry_frames(proposal: LoopHypothesis) -> np.ndarray:
-    """Return T_oldodom_newodom [4, 4] of a hypothesis."""
+    """Return the pose between the odometry frames of both subgraphs that a hypothesis implies."""
     T_odom_old = proposal.old.place.T_odom_keyframe
     return T_odom_old @ proposal.T_old_new @ se3.inverse(proposal.new.place.T_odom_keyframe)
 
