@@ -1,4 +1,4 @@
-"""Evaluation of a run against ground truth: trajectories, rendered views and pictures of both."""
+"""Evaluation of a run against ground truth: trajectories, rendered images, labels and loops."""
 
 from .pictures import contact_sheet, depth_picture, trajectory_picture
 from .trajectory import ErrorStatistics, TrajectoryErrors, evaluate_trajectory, fit_rigid_transform

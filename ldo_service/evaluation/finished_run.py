@@ -46,9 +46,10 @@ class Exposures:
     matrices: np.ndarray
 
     def at(self, stamp_ns: int) -> Exposure:
-        """Return the exposure at a stamp, linear in time between the keyframes before and after.
+        """Return the exposure at a stamp, interpolated linearly between the neighboring keyframes.
 
-        Without keyframes it is the exposure of the map.
+        Without keyframes, return the default exposure, which leaves the colors of the map
+        unchanged.
         """
         if len(self.stamps_ns) == 0:
             return Exposure()
@@ -65,7 +66,8 @@ class PosedMap:
     """A map with the poses, exposures and labels that belong to it.
 
     Attributes:
-        name: "online" as the run left it, "refined" after further iterations.
+        name: "online" for the map at the end of the run, "refined" for the map after further
+            optimization.
         rows: Gaussians, [N, 16] (see `gaussians.rows`).
         trajectory: T_map_camera of the frames that are not LOST.
         exposures: Exposures of the keyframes.
@@ -97,9 +99,9 @@ class PosedMap:
 class FinishedRun:
     """A finished run.
 
-    `estimates` holds T_map_camera as published (online) and after the last correction (final). If
-    there were further iterations, it also holds the poses after them (refined). Pictures are saved
-    to `folder`.
+    `estimates` holds T_map_camera as published during the run ("online") and after the last
+    correction of the pose graph ("final"). If the map was optimized further after the run, it also
+    holds the poses after that ("refined"). Pictures are saved to `folder`.
     """
 
     folder: Path
@@ -120,7 +122,7 @@ class FinishedRun:
         return np.array([f.stamp_ns * 1e-9 for f in self.frames if f.status == status])
 
     def require_source(self, sequence: Sequence) -> None:
-        """Raise DataError if the frames are not those of the sequence."""
+        """Raise DataError if a frame of the run is not in the sequence with the same stamp."""
         for frame in self.frames:
             is_there = 0 <= frame.index < len(sequence)
             if not is_there or sequence.stamps_ns[frame.index] != frame.stamp_ns:

@@ -1,4 +1,4 @@
-"""Time of each step of an iteration of the Gaussian optimizer, on a synthetic scene."""
+"""Timing of each step of an iteration of the Gaussian optimizer, on a synthetic scene."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -30,8 +30,8 @@ def bench_camera(width: int, height: int) -> Camera:
 def walls(n: int, camera: Camera, seed: int = 0) -> np.ndarray:
     """Return flat Gaussians, rows [n, 16], on the walls of a room around the camera.
 
-    They are ordered by image row. Each is about as wide as its fraction of the pixels. A tenth of
-    them lies beyond the image edges.
+    They are ordered by image row. Each Gaussian covers about as many pixels as the image has per
+    Gaussian. A tenth of the Gaussians lies outside of the image.
     """
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-0.65, 0.65, n), np.sort(rng.uniform(-0.5, 0.5, n))
@@ -56,13 +56,13 @@ def noise_frame(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Iteration:
-    """Steps of an iteration against one view, as `GaussianOptimizer.step` runs them.
+    """Steps of an iteration for one training image, as `GaussianOptimizer.step` runs them.
 
     Args:
-        n: Gaussians around the view.
-        camera: Camera of the view.
+        n: Number of Gaussians in front of the camera.
+        camera: Camera of the image.
         threads: Threads of the kernels.
-        elsewhere: Additional Gaussians in other directions, invisible in all pixels.
+        elsewhere: Number of additional Gaussians in other directions, outside of the image.
     """
 
     def __init__(self, n: int, camera: Camera, *, threads: int = 1, elsewhere: int = 0) -> None:
@@ -86,17 +86,17 @@ class Iteration:
         return self._planes
 
     def loss(self) -> np.ndarray:
-        """Compute the derivatives by the planes, [5, H, W]."""
+        """Compute the derivatives of the loss with respect to the planes, [5, H, W]."""
         frame = self._color, self._depth_m, self._exposure
         image_loss(self._planes, *frame, _WEIGHTS, self._by_planes, threads=self.threads)
         return self._by_planes
 
     def backward(self) -> RowGradients:
-        """Compute the derivatives by rows and pose, without a step."""
+        """Compute the derivatives with respect to rows and pose, without a step of Adam."""
         return self._rasterizer.gradients(self._by_planes)
 
     def descent(self) -> VisibleGaussians:
-        """Compute the derivatives by rows and pose and take a step of Adam in the same pass."""
+        """Compute the derivatives of `backward`, and take a step of Adam in the same pass."""
         return self._adam.step_fused(self.gaussians, self._rasterizer, self._by_planes, rate=0.1)
 
     def steps(self) -> Steps:
@@ -106,10 +106,10 @@ class Iteration:
 
 @dataclass(frozen=True, slots=True)
 class IterationTimes:
-    """Median times in milliseconds.
+    """Median times of the steps of an iteration in milliseconds.
 
-    A step of Adam runs inside the backward pass, so `adam_ms` is the difference between the pass
-    with it and the pass without.
+    The step of Adam runs inside the backward pass. `adam_ms` is the time of the backward pass with
+    it, minus that of the backward pass without it.
     """
 
     forward_ms: float
@@ -140,8 +140,9 @@ def medians_ms(
 ) -> list[dict[str, float]]:
     """Measure the median time of each step in milliseconds.
 
-    The runs take turns, after one turn of warm-up, so that other load on the machine slows all of
-    them. For a run with the step "descent", the result includes the time of the whole iteration.
+    The runs are measured in alternation, after one round of warm-up, so that other load on the
+    machine affects all of them equally. For a run with the step "descent", the result also has the
+    time of the whole iteration.
     """
     times: list[dict[str, list[float]]] = [{name: [] for name in steps} for steps in runs]
     for _ in range(repeats + 1):

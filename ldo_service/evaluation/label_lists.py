@@ -1,4 +1,4 @@
-"""Label lists for evaluation: their names, and the mappings from data sets and maps to them."""
+"""Label lists: the classes of an evaluation, and mappings of data-set and map labels to them."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ MAX_NAMES = UNKNOWN
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LabelSet:
-    """Names by index, background first.
+    """List of the label names of an evaluation, background first.
 
     Attributes:
-        name: Name of the list in tables.
-        names: The names.
-        place: Function from any name to the corresponding name in the list.
+        name: Name of the list in tables of results.
+        names: The label names by index.
+        place: Function that maps any label name to the corresponding name in the list.
     """
 
     name: str
@@ -30,9 +30,9 @@ class LabelSet:
     place: Callable[[str], str]
 
     def of_truth(self, class_names: Sequence[str]) -> np.ndarray:
-        """Return the list index by class id of the data set, [256] uint8.
+        """Return a table from class ids of the data set to indices in the list, [256] uint8.
 
-        It is VOID for ignored classes.
+        Ignored classes map to VOID.
         """
         table = np.full(256, VOID, np.uint8)
         for class_id, name in enumerate(class_names):
@@ -41,9 +41,9 @@ class LabelSet:
         return table
 
     def of_map(self, names: Sequence[str]) -> np.ndarray:
-        """Return the list index by label of the map, [256] uint8.
+        """Return a table from labels of the map to indices in the list, [256] uint8.
 
-        It is UNKNOWN for names that are not in the list.
+        Labels whose name is not in the list map to UNKNOWN.
         """
         table = np.full(256, UNKNOWN, np.uint8)
         for label, name in enumerate(names):
@@ -53,18 +53,19 @@ class LabelSet:
 
 
 def coco_list(class_names: Iterable[str]) -> LabelSet:
-    """Return background and the COCO classes that a data set contains, by the table of synonyms.
+    """Return the list of background and the COCO classes that a data set contains.
 
-    Names without a COCO class map to background. The name `other` is not in the list.
+    The table of synonyms maps names of the data set to COCO classes. Names without a COCO class map
+    to background. The name `other` is not in the list.
     """
     mapped = {coco_class(name) for name in class_names}
     return LabelSet("COCO", (BACKGROUND, *(n for n in COCO if n in mapped)), _in_coco)
 
 
 def full_list(class_names: Iterable[str]) -> LabelSet:
-    """Return background and all object names of a data set.
+    """Return the list of background and all object names of a data set.
 
-    Objects with a COCO class get its name.
+    An object that has a COCO class is listed under the name of that class.
 
     Raises:
         DataError: There are more names than a label image can hold.
@@ -72,14 +73,17 @@ def full_list(class_names: Iterable[str]) -> LabelSet:
     placed = (place_of_object(name) for name in class_names if not is_void(name))
     names = tuple(dict.fromkeys((BACKGROUND, *placed)))
     if len(names) > MAX_NAMES:
-        raise DataError(f"{len(names)} object names; at most {MAX_NAMES} can be evaluated.")
+        raise DataError(
+            f"the data set has {len(names)} object names, expected at most {MAX_NAMES}. Merge "
+            "some of its classes."
+        )
     return LabelSet("all names", names, place_of_object)
 
 
 def object_labels(map_names: Sequence[str]) -> np.ndarray:
     """Return a table [256] uint8 from labels of a map to object labels.
 
-    Labels of building parts become background; the others stay.
+    Labels of building parts, such as walls, become background. All other labels stay unchanged.
     """
     table = np.arange(256, dtype=np.uint8)
     table[[k for k, name in enumerate(map_names) if place_of_object(name) == BACKGROUND]] = 0
@@ -92,9 +96,10 @@ def is_void(name: str) -> bool:
 
 
 def place_of_object(name: str) -> str:
-    """Return the name in the full list of any name.
+    """Map a label name to the corresponding name in the full list.
 
-    It is the COCO class if there is one, background for the building, else the name itself.
+    This is its COCO class if there is one. Otherwise, it is background for parts of the building,
+    and the name itself for any other object.
     """
     plain = canonical(name)
     return BACKGROUND if plain in BUILDING else coco_class(plain) or plain

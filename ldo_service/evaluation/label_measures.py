@@ -19,7 +19,7 @@ MIN_SHARE = 0.005  # Least fraction of the pixels of a view; smaller objects are
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Correspondences:
-    """Pixels of two views that show the same points.
+    """Pixels of two images that show the same surface points.
 
     Attributes:
         first: Flat pixel indices of the first view, [M].
@@ -32,7 +32,7 @@ class Correspondences:
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Agreement of labels at corresponding pixels of view pairs."""
+    """Agreement of labels at corresponding pixels of pairs of images."""
 
     same: int = 0  # Pixels with the same object in both views.
     objects: int = 0  # Pixels with an object in at least one view.
@@ -42,9 +42,9 @@ class Agreement:
 
     @property
     def share(self) -> float:
-        """Fraction of agreeing pixels.
+        """Fraction of the pixels in `objects` that agree; NaN if there are none.
 
-        It is NaN without objects, because background alone would always agree.
+        Pixels that are background in both images are excluded, because they agree almost always.
         """
         return self.same / self.objects if self.objects else float("nan")
 
@@ -54,8 +54,9 @@ def correspondences(
 ) -> Correspondences:
     """Return the corresponding pixels of two views.
 
-    A pixel is projected by its measured depth and the poses to the nearest pixel of the second
-    view. The pair counts if the depth measured there is equal to 2 %, so both show one surface.
+    A pixel of the first view is projected into the second view with its measured depth, and rounded
+    to the nearest pixel. The two pixels correspond if the depth measured there differs by at most
+    2 % from the projected depth, so that both show one surface.
 
     Args:
         first: The first view.
@@ -76,7 +77,7 @@ def correspondences(
 
 
 def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) -> Agreement:
-    """Compare two label images [H, W] at corresponding pixels; label 0 is background."""
+    """Count the corresponding pixels of two label images [H, W] that agree; 0 is background."""
     here, there = first.ravel()[pixels.first], second.ravel()[pixels.second]
     objects = (here > 0) | (there > 0)
     return Agreement(int(np.sum((here == there) & objects)), int(np.sum(objects)))
@@ -107,11 +108,11 @@ class DetectionCounts:
 
 
 class OpenNames:
-    """Scores of open-vocabulary names over pixels and over objects, accumulated view by view.
+    """Scores of names without a COCO class, over pixels and over objects, added view by view.
 
-    The name of an object is that of most of its pixels, over all views in which it has 0.5 % of
-    the pixels. Every instance of the data set is an object here, including parts of the building:
-    a wall can get a wrong name.
+    An object is an instance of the data set. The map's name for it is the one that most of its
+    pixels have, over all views in which it fills at least 0.5 % of the image. Parts of the building
+    are included, because the map may give a wall the name of an object.
     """
 
     def __init__(self, labels: LabelSet, map_names: Sequence[str]) -> None:
@@ -165,7 +166,7 @@ class OpenNames:
 
 
 def is_beyond_coco(name: str) -> bool:
-    """Return whether a name is that of an object without a COCO class."""
+    """Return whether a name is the name of an object that has no COCO class."""
     return place_of_object(name) not in (BACKGROUND, "other", *COCO)
 
 
@@ -178,7 +179,7 @@ def _table(names: Sequence[str]) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
-    """Segmentation metrics, 0..1; NaN without pixels that count."""
+    """Segmentation metrics, 0..1; NaN if no pixel is evaluated."""
 
     classes: int  # Number of evaluated classes.
     pixel_accuracy: float  # Accuracy over all pixels that count.
@@ -189,9 +190,10 @@ class Segmentation:
 
 
 def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
-    """Count the pixels of each true class by the class shown.
+    """Count pixels by true class and class shown: a confusion matrix.
 
-    Confusions of several images may be added: the sum gives the metrics of all pixels together.
+    The matrices of several images may be added. The metrics of the sum are those of all pixels
+    together.
 
     >>> confusion(np.uint8([0, 0, 1, 255]), np.uint8([0, 1, 254, 1]), 2).tolist()
     [[1, 1, 0], [0, 0, 1]]
@@ -211,15 +213,16 @@ def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
 
 
 def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
-    """Return the metrics of a confusion [C, C + 1].
+    """Return the metrics of a confusion matrix [C, C + 1].
 
         accuracy = right / true,  IoU = right / (true + shown - right)
 
-    for each class. The means are over the classes with more than the fraction `gate` of the
-    pixels. `shown` includes pixels of the other classes, and unknown pixels are wrong. Long et
-    al., CVPR 2015, section 5, define the same four means.
+    for each class, with `true` pixels of the class, `shown` pixels labelled with it, and `right`
+    pixels in both. The means are over the classes that have more than the fraction `gate` of the
+    pixels. Pixels shown with an unknown name are wrong. Long et al., CVPR 2015, section 5, define
+    the same four means.
 
-    A cup of two pixels, one of them found, and one pixel of the wall labelled as cup:
+    Example: a cup has two pixels, of which one is found, and one pixel of the wall is labelled cup.
 
     >>> found = segmentation(np.array([[7, 1, 0], [1, 1, 0]]))
     >>> found.pixel_accuracy, round(found.mean_iou, 3), round(found.object_iou, 3)
@@ -241,7 +244,7 @@ def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
 
 
 def class_ious(counts: np.ndarray) -> np.ndarray:
-    """Return the IoU of each class of a confusion [C, C + 1], [C].
+    """Return the IoU of each class of a confusion matrix [C, C + 1], [C].
 
     It is NaN for a class that is neither in the ground truth nor shown.
     """

@@ -18,7 +18,7 @@ from .pictures import Color, contact_sheet, legend
 from .semantics import GATES, LabelErrors, LabelView, ListErrors, labelled_maps
 from .sheet import VIEWS, shrunk
 
-CAPTIONS = ["camera", "ground truth", "map", "error"]
+CAPTIONS = ["camera", "truth", "map", "error"]
 PAINT = 0.65  # Opacity of a label's color over the gray camera image.
 GOLDEN_RATIO = 0.618033988749895
 SHADES = ((0.95, 1.0), (0.55, 1.0), (0.85, 0.65))  # Saturation, value.
@@ -39,7 +39,7 @@ FIGURES = ("mean_iou", "object_iou", "weighted_iou", "mean_accuracy", "pixel_acc
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LabelPicture:
-    """A view and the label above its row."""
+    """One row of the contact sheet: a labelled view, and the text above it."""
 
     label: str
     view: LabelView
@@ -48,10 +48,10 @@ class LabelPicture:
 def label_sheet(
     pictures: list[LabelPicture], map_names: abc.Sequence[str], class_names: abc.Sequence[str]
 ) -> np.ndarray:
-    """Draw rows [camera, ground truth, map, error] as uint8 RGB, and a legend of their names.
+    """Draw a row [camera, truth, map, error] per picture, and a legend of the names that occur.
 
-    Names are those of the full list (`label_lists.full_list`). Background is the gray camera
-    image.
+    Names are those of the full list (`label_lists.full_list`). Pixels of background show the camera
+    image in gray. The result is uint8 RGB.
 
     Raises:
         ValueError: There is no picture.
@@ -84,9 +84,9 @@ def _pictures(
 
 
 def label_colors(indices: abc.Sequence[int]) -> np.ndarray:
-    """Return a color for each of some indices, [256, 3] uint8.
+    """Return a color table [256, 3] uint8 with different colors for the given label indices.
 
-    Hues advance by the golden ratio, in three shades.
+    From one index to the next, the hue advances by the golden ratio, in three shades.
     """
     colors = np.zeros((256, 3), np.uint8)
     for place, index in enumerate(indices):
@@ -136,7 +136,10 @@ def _color(rgb: np.ndarray) -> Color:
 def sheet_of_labels(
     run: FinishedRun, sequence: Sequence, errors: LabelErrors, threads: int = 1
 ) -> np.ndarray | None:
-    """Draw some frames, including the best and the worst; None if no frame has an object."""
+    """Draw the contact sheet of some frames, including those with most and fewest label errors.
+
+    Return None if no frame has an object.
+    """
     truth = sequence.true_labels()
     chosen = frames_to_show(errors.lists[0])
     if truth is None or not chosen:

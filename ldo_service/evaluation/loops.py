@@ -80,7 +80,7 @@ class SeenKeyframe:
 
 @dataclass(frozen=True, slots=True)
 class LoopErrors:
-    """Scores of loop closing, see `PROTOCOL`; None if the denominator is 0."""
+    """Scores of loop closing, see `PROTOCOL`; a ratio is None if its denominator is 0."""
 
     closures: int
     true_closures: int
@@ -94,19 +94,19 @@ class LoopErrors:
 
     @property
     def precision(self) -> float | None:
-        """Fraction of the closures that connect true pairs."""
+        """Fraction of the loop closures that connect a true pair of subgraphs."""
         return self.true_closures / self.closures if self.closures else None
 
     @property
     def recall(self) -> float | None:
-        """Fraction of the queries that closed a true pair."""
+        """Fraction of the queries that have a loop closure with a true partner."""
         return self.closed_queries / self.queries if self.queries else None
 
 
 def seen_keyframes(
     frames: Mapping[int, int], sequence: Frames, truth: Trajectory
 ) -> dict[int, SeenKeyframe]:
-    """Return keyframes with a true pose within 20 ms, by id.
+    """Return the keyframes that have a true pose within 20 ms of their stamp, by id.
 
     Args:
         frames: Frame index of each keyframe, by id.
@@ -123,7 +123,10 @@ def seen_keyframes(
 
 
 def _seen(id: int, index: int, sequence: Frames, T_world_camera: np.ndarray) -> SeenKeyframe:
-    """Return a keyframe with every n-th pixel of its depth, which is enough to measure overlap."""
+    """Return a keyframe with its depth subsampled to every n-th pixel.
+
+    This resolution is enough to measure overlap.
+    """
     frame = sequence[index]
     step = max(1, frame.camera.width // KEPT_ACROSS)
     first, camera = step // 2, frame.camera
@@ -168,9 +171,9 @@ def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> 
 
 
 def overlap(new: SeenKeyframe, old: SeenKeyframe) -> float:
-    """Return the fraction of the measured pixels of `new` with a surface that `old` measured too.
+    """Return the fraction of the measured pixels of `new` whose surface `old` measured too.
 
-    About 40 pixels per row are compared.
+    For speed, only about 40 pixels per row are compared.
     """
     step = max(1, new.camera.width // ASKED_ACROSS)
     sampled = np.zeros(new.depth_m.shape, bool)
@@ -189,7 +192,11 @@ def overlap(new: SeenKeyframe, old: SeenKeyframe) -> float:
 
 
 def _subgraphs(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> list[tuple[int, ...]]:
-    """Return the compared subgraphs, and subgraphs of the keyframes between them."""
+    """Return all subgraphs of a run as tuples of keyframe ids, sorted.
+
+    The candidates name the subgraphs that were compared. The remaining consecutive keyframes are
+    grouped into subgraphs of at most five; groups of fewer than three are dropped.
+    """
     named = {subgraph for c in found.candidates for subgraph in (c.newer, c.older)}
     taken = {keyframe for subgraph in named for keyframe in subgraph}
     left = [keyframe for keyframe in sorted(keyframes) if keyframe not in taken]

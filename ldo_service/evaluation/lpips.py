@@ -1,4 +1,4 @@
-"""LPIPS, a perceptual distance, by a network that the user provides (Zhang et al., CVPR 2018)."""
+"""LPIPS, a perceptual image distance (Zhang et al., CVPR 2018), with a network from the user."""
 
 from pathlib import Path
 
@@ -19,7 +19,8 @@ class Lpips:
     Height and width of the network may be dynamic.
 
     Raises:
-        ConfigError: The file does not fit; raised on opening or at the first images.
+        ConfigError: The file is no network with that layout. The error occurs on opening it or at
+            the first pair of images.
     """
 
     def __init__(self, path: Path, *, threads: int = 1) -> None:

@@ -56,7 +56,7 @@ def depth_picture(depth_m: np.ndarray, range_m: tuple[float, float] | None = Non
 
 
 def depth_range(depth_m: np.ndarray) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of the measured depth [H, W], or zeros without any."""
+    """Return the 2nd and 98th percentile of the measured depth [H, W]; zeros if there is none."""
     seen = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
     if seen.size == 0:
         return 0.0, 0.0
@@ -85,9 +85,9 @@ def contact_sheet(
         ValueError: The table is empty, or a row has another length.
     """
     if not rows or any(len(row) != len(captions) for row in rows) or not captions:
-        raise ValueError("a contact sheet must have rows with one image per caption")
+        raise ValueError("a contact sheet must have at least one row, with one image per caption")
     if labels is not None and len(labels) != len(rows):
-        raise ValueError("a contact sheet must have a label for each row or none")
+        raise ValueError("a contact sheet must have a label for each row, or no labels at all")
     height, width = rows[0][0].shape[:2]
     gap, label_px = 6, CAPTION_PX if labels else 0
     row_px = label_px + height + gap

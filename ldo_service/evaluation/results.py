@@ -52,12 +52,13 @@ def evaluate_run(
     Args:
         run: The run.
         sequence: Its source, with ground truth and true labels if known.
-        advance: Called with the number of units done; `work` returns their total.
+        advance: Progress function, called with the number of frames done so far; `work` returns
+            the total.
         distance: LPIPS, see `views.evaluate_rendering`.
         threads: Threads of the renderer.
 
     Raises:
-        DataError: A file does not fit, or nothing can be evaluated.
+        DataError: A file of the run does not fit the sequence, or nothing can be evaluated.
         ConfigError: A picture cannot be written.
     """
     judged, truth = EvaluatedFrames.of(run.frames), sequence.truth()
@@ -98,9 +99,9 @@ def has_labels(run: FinishedRun) -> bool:
 
 
 def missing_labels(run: FinishedRun, sequence: Sequence) -> str:
-    """Return why labels are not evaluated.
+    """Return the reason why labels are not evaluated, as a text.
 
-    The reason is empty if they are evaluated. It is also empty if the run has no map, or if
+    The text is empty if they are evaluated. It is also empty if the run has no map, or if
     neither the map nor the source has labels.
     """
     has_truth = sequence.true_labels() is not None

@@ -1,4 +1,4 @@
-"""Evaluation of map labels against the true labels, in views at the poses of the run."""
+"""Evaluation of the labels of a map: rendered at the poses of frames, compared with the truth."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ class ListErrors:
     Attributes:
         labels: The list, C names.
         frames: Indices of the frames.
-        confusions: Confusion [C, C + 1] of each frame.
+        confusions: Confusion matrix [C, C + 1] of each frame, see `label_measures.confusion`.
     """
 
     labels: LabelSet
@@ -68,11 +68,11 @@ class ListErrors:
         return np.sum(self.confusions, axis=0)
 
     def figures(self, gate: float) -> Segmentation:
-        """Return the metrics of all pixels together."""
+        """Return the metrics of all pixels together, see `label_measures.segmentation`."""
         return segmentation(self.pooled, gate)
 
     def per_image_iou(self) -> float:
-        """Return the mean IoU per frame, averaged over frames; NaN without any."""
+        """Return the mean IoU of each frame, averaged over frames; NaN without frames."""
         ious = [segmentation(counts).mean_iou for counts in self.confusions]
         return float(np.nanmean(ious)) if np.any(np.isfinite(ious)) else float("nan")
 
@@ -91,7 +91,7 @@ class LabelErrors:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LabelView:
-    """A view with its true labels and the labels that the map shows.
+    """A frame with its true labels and the labels rendered from the map.
 
     Attributes:
         frame: The frame.
@@ -109,9 +109,10 @@ class LabelView:
     def __post_init__(self) -> None:
         if not self.truth.class_ids.shape == self.truth.instance_ids.shape == self.shown.shape:
             raise DataError(
-                f"the true labels of frame {self.frame.index} have {self.truth.class_ids.shape} "
-                f"and {self.truth.instance_ids.shape} pixels, the frame has {self.shown.shape}: "
-                "export them at the size of the frames."
+                f"the true labels of frame {self.frame.index} have the shapes "
+                f"{self.truth.class_ids.shape} (classes) and {self.truth.instance_ids.shape} "
+                f"(instances), expected {self.shown.shape}, the shape of the frame. Export the "
+                "labels at the size of the frames."
             )
 
 
@@ -193,7 +194,7 @@ def evaluate_labels(
         sequence: Source with the true labels.
         run: The run.
         judged: Frames to evaluate.
-        advance: Called with the number of frames done.
+        advance: Progress function, called with the number of frames done so far.
         threads: Threads of the renderer.
 
     Returns:
@@ -231,7 +232,7 @@ def labelled_maps(
 
 
 class Pairs:
-    """Pairs of frames that are three apart and both have a pose."""
+    """Pairs of frames whose indices differ by three and that both have a pose."""
 
     def __init__(self, sequence: datasets.Sequence, run: FinishedRun) -> None:
         self._sequence = sequence

@@ -19,8 +19,8 @@ def rendering_sheet(
 ) -> np.ndarray:
     """Draw rows [camera, map, error, camera depth, map depth] of some frames, as uint8 RGB.
 
-    The label above a row has the frame number, its PSNR and the common scale of both depths. The
-    frames are the best, the worst, and others evenly spread.
+    The text above a row gives the frame number, its PSNR and the common range of both depth images.
+    The frames are those with the best and the worst PSNR, and others evenly spread between them.
 
     Args:
         errors: Errors of the frames.
@@ -79,7 +79,7 @@ def _scale(view: RenderedView) -> str:
 
 
 def _range_m(view: RenderedView) -> tuple[float, float]:
-    """Return the range of the camera's depth, or of the map's if the camera measured none."""
+    """Return the depth range of the camera image, or of the rendering if no depth was measured."""
     measured_m = view.frame.depth_m
     return depth_range(measured_m if measured_m.any() else view.rendering.depth_m)
 

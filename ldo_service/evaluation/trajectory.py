@@ -45,11 +45,14 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryErrors:
-    """Errors of a trajectory, see `PROTOCOL`; relative errors are None below 1 s of poses."""
+    """Errors of a trajectory, see `PROTOCOL`.
+
+    The relative errors are None if the poses span less than 1 s.
+    """
 
     poses: int  # Number of associated poses.
     ate_m: ErrorStatistics
-    rpe_poses: int  # Number of poses in 1 s.
+    rpe_poses: int  # Interval of the relative errors: the number of poses in 1 s.
     rpe_translation_m: ErrorStatistics | None
     rpe_rotation_deg: ErrorStatistics | None
     T_truth_estimate: np.ndarray  # Alignment, [4, 4].
@@ -79,7 +82,7 @@ def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryEr
 
 
 def associated(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
-    """Return index pairs [M, 2] by nearest stamp within 20 ms.
+    """Match estimated and true poses by nearest stamp within 20 ms; return index pairs [M, 2].
 
     Raises:
         DataError: There are fewer than 3 pairs.
@@ -95,7 +98,10 @@ def associated(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
 
 
 def _relative_errors(T_estimate: np.ndarray, T_truth: np.ndarray, interval: int) -> np.ndarray:
-    """Return (Q_i^-1 Q_j)^-1 (P_i^-1 P_j), [M, 4, 4], for all j = i + interval."""
+    """Return the relative errors (Q_i^-1 Q_j)^-1 (P_i^-1 P_j), [M, 4, 4], for j = i + interval.
+
+    P are estimated poses and Q are true poses.
+    """
     motion_estimate = se3.inverse(T_estimate[:-interval]) @ T_estimate[interval:]
     motion_truth = se3.inverse(T_truth[:-interval]) @ T_truth[interval:]
     return se3.inverse(motion_truth) @ motion_estimate

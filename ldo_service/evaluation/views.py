@@ -41,8 +41,8 @@ LOST frames have no pose and are only counted, WEAK frames are evaluated."""
 class DepthError:
     """Error of the rendered depth of one image."""
 
-    l1_m: float  # NaN if no pixel counts.
-    share: float  # Fraction of the measured pixels that count; NaN if none is measured.
+    l1_m: float  # Mean absolute error; NaN if no pixel was compared.
+    share: float  # Compared pixels as a fraction of the measured ones; NaN if none is measured.
 
 
 def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -75,9 +75,9 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
         (2 m_a m_b + c1) (2 s_ab + c2) / ((m_a^2 + m_b^2 + c1) (s_a^2 + s_b^2 + c2))
 
-    per channel under an 11x11 Gaussian window of sigma 1.5 px, over the pixels with their window in
-    the image. It has one scale; MS-SSIM, which some publish under this name, is often higher.
-    Wang et al., TIP 2004.
+    It is computed per channel under an 11x11 Gaussian window of sigma 1.5 px. The mean is over the
+    pixels whose window lies in the image. Only one scale is used. Some papers call the multi-scale
+    MS-SSIM by the same name; its values are often higher. Wang et al., TIP 2004.
 
     Raises:
         ValueError: The images differ in shape, or a side is below 11 pixels.
@@ -95,11 +95,11 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def depth_error(rendered_m: np.ndarray, opacity: np.ndarray, measured_m: np.ndarray) -> DepthError:
-    """Return the mean |rendered - measured| over pixels with measured depth and a rendered surface.
+    """Compare rendered with measured depth, over pixels that have both.
 
     Args:
         rendered_m: Rendered depth, [H, W], meters.
-        opacity: Rendered opacity, [H, W], 0..1; there is a surface above one half.
+        opacity: Rendered opacity, [H, W], 0..1. Pixels above 0.5 have a rendered depth.
         measured_m: Measured depth, [H, W], meters; 0 where not measured.
     """
     measured = measured_m > 0
@@ -172,40 +172,43 @@ class RenderingErrors:
     views: tuple[ViewErrors, ...]
 
     def mean(self, figure: str) -> float | None:
-        """Return the mean of a metric over frames; None without any."""
+        """Return the mean over frames of a metric, a field of ViewErrors; None if all are NaN."""
         values = self._values(figure)
         return float(np.mean(values)) if len(values) else None
 
     def median(self, figure: str) -> float | None:
-        """Return the median of a metric over frames; None without any."""
+        """Return the median over frames of a metric, as `mean`."""
         values = self._values(figure)
         return float(np.median(values)) if len(values) else None
 
     def _values(self, figure: str) -> np.ndarray:
-        """Return the values of a metric without NaN."""
+        """Return the values of a metric of all frames, except NaN."""
         values = np.array([getattr(view, figure) for view in self.views], float)
         return values[~np.isnan(values)]
 
 
 # --- protocols ------------------------------------------------------------------------------------
 def every_pixel(view: RenderedView) -> Images:
-    """Return the images with every pixel, at the exposure of the frame."""
+    """Return camera image and rendering unmasked; the rendering has the exposure of the frame.
+
+    That exposure is interpolated between keyframes.
+    """
     return view.seen, view.shown
 
 
 def exposure_fitted(view: RenderedView) -> Images:
-    """Return the images with the exposure fitted to the frame itself."""
+    """Return camera image and rendering, with the exposure fitted to the camera image."""
     shown = view.rendering.color
     return view.seen, fit_exposure(shown, view.seen).applied(shown)
 
 
 def map_as_it_is(view: RenderedView) -> Images:
-    """Return the images with the brightness of the map."""
+    """Return camera image and rendering, without any exposure correction of the rendering."""
     return view.seen, view.rendering.color.clip(0, 1)
 
 
 def measured_pixels(view: RenderedView) -> Images:
-    """Return the images with pixels without measured depth black in both."""
+    """Return camera image and rendering, both black where no depth was measured."""
     is_measured = (view.frame.depth_m > 0)[..., None]
     return view.seen * is_measured, view.shown * is_measured
 
@@ -220,14 +223,17 @@ TRAINING = {"B training": measured_pixels}
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedFrames:
-    """Frames of a run for each protocol, including LOST frames without a pose."""
+    """Frames to evaluate under each protocol: held-out ones, and a selection of the mapped ones.
+
+    They include LOST frames, which have no pose.
+    """
 
     held_out: tuple[RunFrame, ...]
     training: tuple[RunFrame, ...]
 
     @staticmethod
     def of(frames: Iterable[RunFrame]) -> "EvaluatedFrames":
-        """Return the frames for each protocol, out of all frames of a run."""
+        """Select the frames for each protocol from all frames of a run."""
         frames = tuple(frames)
         training = tuple(frame for frame in frames if not frame.is_held_out)
         return EvaluatedFrames(
@@ -281,7 +287,7 @@ def evaluate_rendering(
         sequence: Source of the frames.
         judged: Frames to evaluate.
         maps: The maps.
-        advance: Called with the number of frames done.
+        advance: Progress function, called with the number of frames done so far.
         distance: LPIPS of two images [H, W, 3] in 0..1; None to omit it.
         threads: Threads of the renderer.
 
@@ -303,7 +309,7 @@ def evaluate_rendering(
 def evaluate_view(
     view: RenderedView, is_held_out: bool, distance: Distance | None = None
 ) -> Iterator[tuple[str, ViewErrors]]:
-    """Yield the protocols that a frame belongs to, with its errors under each."""
+    """Yield each protocol that applies to a frame, with the errors of the frame under it."""
     rendering = view.rendering
     depth = depth_error(rendering.depth_m, rendering.opacity, view.frame.depth_m)
     for protocol, images in (HELD_OUT if is_held_out else TRAINING).items():

@@ -265,7 +265,7 @@ def test_labels_of_another_size_are_a_data_error(
         return replace(whole, class_ids=whole.class_ids[::2])
 
     monkeypatch.setattr(sequence, "true_labels", lambda: replace(truth, frame=halved))
-    with pytest.raises(DataError, match="export them at the size"):
+    with pytest.raises(DataError, match="Export the labels at the size"):
         errors_of(sequence, labelled)
 
 
