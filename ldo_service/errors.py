@@ -12,8 +12,9 @@
     │   └── StageStalled
     └── ReplayDiverged            5
 
-Every message is one paragraph: the problem, its place, and what to do next. Expected outcomes of an
-algorithm (tracking lost, a rejected loop closure) are values in messages, not errors.
+The number is the exit code; a class without a number has that of its base class. Every error text
+is one paragraph: the problem, where it is, and what to do next. Expected outcomes of an algorithm,
+such as lost tracking or a rejected loop closure, are values in messages between actors, not errors.
 """
 
 from collections.abc import Iterable
@@ -33,7 +34,10 @@ class ConfigError(LdoError):
 
 
 class LosslessCycle(ConfigError):
-    """Cycle of lossless inputs in which each actor could wait for the next."""
+    """Error of a graph of actors: a cycle of lossless inputs, in which all actors could deadlock.
+
+    A lossless input makes the sending actor wait for the receiving one.
+    """
 
     def __init__(self, path: list[str]) -> None:
         super().__init__(
@@ -44,11 +48,11 @@ class LosslessCycle(ConfigError):
 
 
 class EndpointError(ConfigError):
-    """Server that does not reply or sends an invalid reply."""
+    """Failed request to an HTTP server, such as a labeller's: no reply or an invalid one."""
 
 
 class ModelError(ConfigError):
-    """Network that has the wrong format or fails."""
+    """Neural network file that has the wrong format, or whose inference fails."""
 
 
 class DataError(LdoError):
@@ -58,17 +62,17 @@ class DataError(LdoError):
 
 
 class FrameError(DataError):
-    """Single unreadable frame, which is skipped and counted; the log has the first one."""
+    """Single frame that cannot be used; the caller skips and counts it, and logs the first one."""
 
 
 class StageError(LdoError):
-    """Actor that cannot be restarted any more."""
+    """Failure of an actor that the service does not restart again; the service stops."""
 
     exit_code = 4
 
 
 class RestartsExhausted(StageError):
-    """Actor that failed more often than its restart budget allows."""
+    """Failure of an actor that failed more often than `supervision.max_restarts` allows."""
 
     def __init__(self, actor: str, restarts: int, window_s: float) -> None:
         super().__init__(
@@ -79,7 +83,7 @@ class RestartsExhausted(StageError):
 
 
 class StageStalled(StageError):
-    """Step that exceeds its time limit."""
+    """Step of an actor, the handling of one message, that exceeds its time limit."""
 
     def __init__(self, actor: str, age_s: float) -> None:
         super().__init__(
@@ -105,7 +109,9 @@ class ReplayDiverged(LdoError):
 
 
 def named(parameters: object, *fields: str) -> str:
-    """Return fields of a parameter object with their values, as the beginning of an error.
+    """Format fields of a parameter object with their values, as the beginning of an error text.
+
+    Example: `ViewSamplingConfig.count=0`.
 
     Args:
         parameters: An instance of a dataclass such as `ViewSamplingConfig`.
@@ -116,7 +122,7 @@ def named(parameters: object, *fields: str) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str, prefix: str = "") -> str:
-    """Return a sentence with a suggestion for an unknown name.
+    """Return a sentence that suggests the known name most similar to an unknown one.
 
     Args:
         name: The unknown name.
