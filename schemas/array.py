@@ -1,4 +1,4 @@
-"""Array on the wire: bytes, shape and dtype."""
+"""NumPy array as a field of messages: bytes, shape and dtype."""
 
 from math import prod
 from typing import Literal, cast, get_args
@@ -37,7 +37,9 @@ class Array(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, values: np.ndarray) -> "Array":
-        """Return an array with a copy of `values`: later changes to them do not affect the message.
+        """Return an array with a copy of `values`.
+
+        Because it is a copy, later changes of `values` do not affect the message.
 
         Raises:
             ValueError: The dtype is not one of `DTYPES`.
@@ -49,7 +51,10 @@ class Array(msgspec.Struct, frozen=True):
         return cls(cast(DType, dtype), values.shape, memoryview(little.tobytes()))
 
     def numpy(self) -> np.ndarray:
-        """Return a read-only view without a copy; in a received message it may be unaligned."""
+        """Return the array as a read-only NumPy view, without a copy.
+
+        In a received message, its memory may be unaligned.
+        """
         view = np.frombuffer(self.data, "<" + self.dtype).reshape(self.shape)
         view.flags.writeable = False
         return view

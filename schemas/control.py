@@ -1,15 +1,15 @@
-"""Commands to the whole service, and its replies."""
+"""Commands to the whole service, and the replies to them."""
 
 from ldo_service.schemas.message import Message
 
 
 class ControlRequest(Message, frozen=True, kw_only=True):
-    """Command to the service, sent as the payload of a query on control.
+    """Command to the service, sent as the payload of a Zenoh query on the topic control.
 
-    stamp_ns is the clock of the sender, or 0. Commands:
+    stamp_ns is the time by the clock of the sender, or 0. Commands:
 
-    pause    drop and count all frames from now on
-    resume   take frames again
+    pause    the service drops and counts all frames from now on
+    resume   the service accepts frames again
     save     every actor writes a checkpoint of its whole state now
     reset    every actor restarts with an empty state and a new epoch
     """

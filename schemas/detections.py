@@ -13,8 +13,8 @@ TOLERANCE_PX = 1e-3  # Tolerance for rounding beyond the edge of the image.
 class Detection(msgspec.Struct, frozen=True, kw_only=True):
     """Box of an object with label and score.
 
-    Pixel centers are at integer coordinates: the box around pixel (3, 5) alone is 2.5, 4.5, 3.5,
-    5.5.
+    Pixel centers are at integer coordinates. A box around only the pixel (3, 5) is therefore 2.5,
+    4.5, 3.5, 5.5.
     """
 
     label: str  # Lower case, single spaces; synonyms of a class share one label.
@@ -38,8 +38,8 @@ class Detection(msgspec.Struct, frozen=True, kw_only=True):
 class DetectionBoxes(Message, frozen=True, kw_only=True):
     """Detections in a keyframe, published on detection/boxes once for every keyframe.
 
-    stamp_ns is that of the keyframe. If `network` is empty, no detector ran: the keyframe may show
-    objects although `detections` is empty.
+    stamp_ns is that of the keyframe. If `network` is empty, no detector ran. `detections` is then
+    empty even if the keyframe shows objects.
     """
 
     keyframe: int  # Id of the keyframe.

@@ -112,7 +112,8 @@ class CameraRgbd(Message, frozen=True, kw_only=True):
 class CameraColor(Message, frozen=True, kw_only=True):
     """Raw color image of a camera program, published on camera/color.
 
-    The frame that it is paired into has its stamp.
+    The actor frame_source pairs it with a depth image. The resulting frame has the stamp of the
+    color image.
     """
 
     frame: int  # Running number of the camera program, and of the paired frame.
@@ -125,10 +126,11 @@ class CameraColor(Message, frozen=True, kw_only=True):
 
 
 class CameraDepth(Message, frozen=True, kw_only=True):
-    """Raw depth image of a camera program, published on camera/depth; it has its own stamp.
+    """Raw depth image of a camera program, published on camera/depth.
 
-    Depth is already registered if its camera equals the color camera and T_color_depth is the
-    identity. Any other depth is registered to the color image.
+    stamp_ns is the exposure of the depth image. If `camera` equals the color camera and
+    T_color_depth is the identity, depth is registered already. Otherwise, the service registers it
+    to the color image.
     """
 
     frame: int  # Running number of the camera program; pairing uses stamps instead.
@@ -194,4 +196,7 @@ def require_rgbd(camera: CameraModel, color: Array, depth_m: Array) -> None:
     depth_m.require("depth_m", "f4", size)
     depth = depth_m.numpy()
     if not (depth.min() >= 0 and depth.max() < float("inf")):  # NaN fails both comparisons.
-        raise ValueError("depth_m must be finite and at least 0, where 0 means not measured")
+        raise ValueError(
+            f"depth_m is {depth.min():g} to {depth.max():g} m, must be finite and at least 0, "
+            "where 0 means not measured"
+        )

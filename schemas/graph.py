@@ -1,4 +1,4 @@
-"""Output of the optimizer: poses of keyframes and landmarks in the map."""
+"""Output of the pose-graph optimizer: poses of keyframes and landmarks in the map."""
 
 import msgspec
 import numpy as np
@@ -34,8 +34,8 @@ class GraphLandmark(msgspec.Struct, frozen=True, kw_only=True):
 class GraphCorrection(Message, frozen=True, kw_only=True):
     """Poses of all keyframes in the map, published on graph/correction.
 
-    Poses are absolute, so the newest message replaces all earlier ones. It has 56 bytes per
-    keyframe.
+    The poses are in the map frame, not relative to earlier messages. The newest message therefore
+    replaces all earlier ones. A message has 56 bytes per keyframe.
     """
 
     graph_version: int  # Ascending.
@@ -55,8 +55,8 @@ class GraphCorrection(Message, frozen=True, kw_only=True):
         require_count("last_refinement", self.last_refinement)
         if any(not 0 <= older < submap for submap, older in self.merged_submaps):
             raise ValueError(
-                f"merged_submaps is {self.merged_submaps}; every submap must be merged into an "
-                "older one"
+                f"merged_submaps is {self.merged_submaps}, must be pairs of a submap and an older "
+                "one that it is merged into"
             )
         self.keyframes.require("keyframes", "i8", (None,))
         count = self.keyframes.shape[0]

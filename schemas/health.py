@@ -1,4 +1,4 @@
-"""Heartbeat of a stage, published twice a second, also while the stage waits."""
+"""Heartbeat of an actor, published by its stage twice a second, also while the stage waits."""
 
 from typing import Literal
 
@@ -41,7 +41,8 @@ class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
 class Health(Message, frozen=True, kw_only=True):
     """Heartbeat of an actor, published on health/<actor>.
 
-    stamp_ns is that of the last handled message.
+    A stage is the runtime around an actor. stamp_ns is that of the last message that the actor
+    handled.
     """
 
     actor: str

@@ -15,9 +15,9 @@ def message_types() -> tuple[type[Message], ...]:
 def json_schema() -> dict[str, object]:
     """Return one document with the schemas of all messages.
 
-    `$defs` has each message by name, `topics` the message of each topic, and `answers` the reply to
-    a query on a topic that takes requests. Binary fields are base64 strings in terms of JSON
-    Schema; on the wire they are MessagePack's `bin`.
+    `$defs` contains each message by name. `topics` refers to the message of each topic. `answers`
+    refers to the reply for each topic that takes requests by query. JSON Schema describes binary
+    fields as base64 strings. In MessagePack, they have the type `bin`.
     """
     _, definitions = msgspec.json.schema_components(message_types())
     return {

@@ -31,12 +31,15 @@ class MeasuredPose(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Keyframe(Message, frozen=True, kw_only=True):
-    """Frame that is mapped, placed relative to its reference keyframe; published on keyframe/new.
+    """Frame to be mapped, with its pose relative to a reference keyframe.
 
-    Only the optimizer owns poses in the map. A receiver computes T_map_keyframe = T_map_reference @
-    T_reference_keyframe. If it missed the reference, it uses T_odom_keyframe and any other keyframe
-    of the submap. The first keyframe of a submap has no reference: tracking was lost before it, and
-    its pose in other submaps is unknown.
+    Published on keyframe/new. The message has no pose in the map, because the pose-graph optimizer
+    changes those poses. A receiver computes T_map_keyframe = T_map_reference @
+    T_reference_keyframe. If the receiver missed the reference, it uses T_odom_keyframe and any
+    other keyframe of the submap.
+
+    The first keyframe of a submap has no reference. Tracking was lost before it, so its pose in
+    other submaps is unknown.
     """
 
     keyframe: int  # Id, ascending.
@@ -106,15 +109,16 @@ def _check_measurements(message: Keyframe | KeyframeMeasurements) -> None:
     for pose in message.window_measurements:
         if not pose.reference < pose.keyframe == keyframe:
             raise ValueError(
-                f"window_measurements of keyframe {keyframe} hold keyframe {pose.keyframe} in "
-                f"{pose.reference}; they must measure keyframe {keyframe} in older ones"
+                f"window_measurements of keyframe {keyframe} contain the pose of keyframe "
+                f"{pose.keyframe} in keyframe {pose.reference}; they must be poses of keyframe "
+                f"{keyframe} in older keyframes"
             )
 
 
 class KeyframeRefinement(Message, frozen=True, kw_only=True):
-    """Measurements that replace earlier ones of the same pairs of keyframes.
+    """Refined relative poses of keyframes, published on keyframe/refinement by the mapper.
 
-    Published on keyframe/refinement.
+    Each replaces the earlier measurement of the same pair of keyframes.
     """
 
     poses: tuple[MeasuredPose, ...]

@@ -1,4 +1,4 @@
-"""Open-vocabulary labels of regions: requests, results and the list of names."""
+"""Open-vocabulary labels of image regions: requests, results and the names to choose from."""
 
 from ldo_service.schemas.detections import MAX_LABEL_LENGTH
 from ldo_service.schemas.frames import Image
@@ -12,7 +12,7 @@ Box = tuple[float, float, float, float]
 
 
 class LabelRequest(Message, frozen=True, kw_only=True):
-    """Region that needs a label, published on label/request.
+    """Request to the labeller for the label of an image region, published on label/request.
 
     stamp_ns is that of the keyframe.
     """
@@ -73,9 +73,9 @@ class LabelResult(Message, frozen=True, kw_only=True):
 
 
 class AddLabel(Message, frozen=True, kw_only=True):
-    """Request to the labeller to choose from one more name, published on label/add.
+    """Request to add a name to those that the labeller chooses from, published on label/add.
 
-    stamp_ns identifies the request.
+    stamp_ns identifies the request; the reply has the same one.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Loop closures and loop candidates: pairs of keyframes that show one place."""
+"""Loop closures and loop candidates: keyframes that show the same surfaces at different times."""
 
 from typing import Literal
 
@@ -12,8 +12,8 @@ MAX_REASON_LENGTH = 100  # Characters.
 class LoopClosure(Message, frozen=True, kw_only=True):
     """Verified pose between an old and a new keyframe, published on loop/closure.
 
-    stamp_ns is that of the new keyframe. The optimizer accepts the closure if the other
-    measurements agree with it.
+    stamp_ns is that of the new keyframe. The pose-graph optimizer accepts the closure only if the
+    other factors of the pose graph agree with it.
     """
 
     pose: MeasuredPose  # Pose of the new keyframe in the old one, `reference`.
@@ -35,7 +35,8 @@ class LoopClosure(Message, frozen=True, kw_only=True):
 class LoopCandidate(Message, frozen=True, kw_only=True):
     """Pair of similar subgraphs and the result of their verification, published on loop/candidate.
 
-    stamp_ns is that of the newest keyframe. Values of steps that did not run are 0.
+    A subgraph is a group of a few consecutive keyframes. stamp_ns is that of the newest keyframe.
+    Values of verification steps that did not run are 0.
     """
 
     keyframe: int  # Newest keyframe of the newer subgraph.
@@ -65,7 +66,7 @@ class LoopCandidate(Message, frozen=True, kw_only=True):
                 f"{MAX_REASON_LENGTH}"
             )
         if not self.rejected_reason and not self.evidence:
-            raise ValueError("a candidate without evidence cannot be accepted")
+            raise ValueError("evidence and rejected_reason are empty; at least one must be given")
 
 
 def require_fraction(name: str, value: float) -> None:

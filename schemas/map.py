@@ -1,11 +1,13 @@
 """Map of Gaussians: renderings, changes and snapshots.
 
-A map replica keeps arrays equal to the mapper's as follows:
+A map replica is a copy of the map in another process. It keeps its arrays equal to the mapper's as
+follows:
 
-1. Take all parts of a snapshot of version v.
+1. Receive all parts of a snapshot of version v.
 2. Apply every delta with `base_version >= v` in order: first `motions`, then `removed`, then
-   `changed`; `added` is appended at the end.
-3. If the `base_version` of a delta is not the version held, a delta was missed: start again.
+   `changed`; `added` is appended at the end. The replica then has the version of the delta.
+3. If the `base_version` of a delta is not the version of the replica, a delta was missed. Start
+   again with a snapshot.
 """
 
 import msgspec
@@ -34,8 +36,8 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
     byte  26      keyframes since then that should have observed it and did not
     bytes 27..31  labels of the five weights, indices into `label_names`
 
-    The weights sum to at most 1; the rest is background, label 0. The likeliest label is byte 27 if
-    the first weight is larger than that rest, else 0.
+    The weights sum to at most 1. The difference to 1 is the weight of background, label 0. The
+    likeliest label is byte 27 if the first weight is larger than that of background, else 0.
     """
 
     ids: Array  # Ids, i8 [N], unique, ascending.
@@ -84,8 +86,8 @@ class MapDelta(Message, frozen=True, kw_only=True):
         self.removed.require_ascending("removed")
         if not 0 <= self.base_version < self.version:
             raise ValueError(
-                f"delta from version {self.base_version} to {self.version} goes back; version "
-                "must be larger than base_version"
+                f"version {self.version} of a delta must be larger than its base_version "
+                f"{self.base_version}"
             )
 
 
@@ -94,10 +96,11 @@ NO_EXPOSURES = Array.of(np.zeros((0, 2, 3), np.float32))
 
 
 class MapSnapshot(Message, frozen=True, kw_only=True):
-    """Part of the whole map at `version`, published on map/snapshot; there are parts 0 .. parts-1.
+    """One of several messages that together contain the whole map at `version`.
 
-    Part 0 also has the exposure of each keyframe and the names of the labels. The camera of a
-    keyframe saw gain * color + bias per channel, for colors 0..1 of the map.
+    They are published on map/snapshot and numbered by `part`, from 0 to parts - 1. Part 0 also has
+    the exposure of each keyframe and the names of the labels. The image of a keyframe has the
+    colors gain * color + bias per channel, for colors 0..1 of the map.
     """
 
     version: int
@@ -117,7 +120,9 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
         self.exposures.require("exposures", "f4", (self.keyframes.shape[0], 2, 3))
         self.exposures.require_finite("exposures")
         if not 0 <= self.part < self.parts:
-            raise ValueError(f"part {self.part} of {self.parts} does not exist; parts count from 0")
+            raise ValueError(
+                f"part is {self.part} and parts is {self.parts}, must be 0 <= part < parts"
+            )
 
 
 class MapRendering(Message, frozen=True, kw_only=True):
@@ -147,7 +152,10 @@ MAX_ITERATIONS = 500  # Half a minute, in which no keyframe is mapped.
 
 
 class RefineMap(Message, frozen=True, kw_only=True):
-    """Request to the mapper to refit the map to its keyframes, published on map/refine."""
+    """Request to the mapper to optimize all Gaussians further, published on map/refine.
+
+    The mapper runs the given number of iterations on the images of its keyframes.
+    """
 
     iterations: int
     initial_rate: float = 1.0  # Factor on the length of the first step, in (0, 1].
@@ -183,7 +191,7 @@ def require_names(names: tuple[str, ...]) -> None:
 
 
 def require_weights(labels: Array) -> None:
-    """Raise ValueError unless the first six numbers of each row are finite and not negative."""
+    """Raise ValueError unless weights and evidence of each label row are finite and at least 0."""
     numbers = np.ascontiguousarray(labels.numpy()[:, :24]).view("<f4")
     if not (np.isfinite(numbers).all() and (numbers >= 0).all()):
         raise ValueError("labels hold negative, NaN or infinite weights")

@@ -1,9 +1,9 @@
 """Base class of every message, and the checks that msgspec does not make.
 
-msgspec checks types while it decodes. It accepts NaN and does not compare a buffer with its shape.
-Those checks run in `__post_init__`, so every message that exists is valid, built or received. A
-failed check raises ValueError when a message is built and msgspec.ValidationError when it is
-decoded.
+msgspec checks types while it decodes. It accepts NaN, and it does not compare the size of a buffer
+with its shape. These checks run in `__post_init__`, so every message object is valid, whether it
+was built or received. A failed check raises ValueError when a message is built, and
+msgspec.ValidationError when it is decoded.
 """
 
 from collections.abc import Iterable
@@ -18,7 +18,8 @@ LAST_INTEGER = 2**63 - 1  # Largest int64: most languages and array dtypes have 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
     """Base class of all messages.
 
-    stamp_ns is the time of the sensor data that the message refers to. Handlers use no other clock.
+    stamp_ns is the time of the sensor data that the message refers to. Handlers of messages use no
+    other time, so that a replay gives the same results.
     """
 
     stamp_ns: int  # Nanoseconds since the epoch of the camera's clock.
@@ -28,7 +29,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
         self.check()
 
     def check(self) -> None:
-        """Raise ValueError if a field is impossible or fields contradict each other."""
+        """Raise ValueError if a field has an invalid value or fields contradict each other."""
 
 
 T = TypeVar("T")

@@ -1,4 +1,4 @@
-"""Objects of the map, and their observations in keyframes."""
+"""Objects of the map, and observations of objects in keyframes."""
 
 import itertools
 
@@ -21,9 +21,10 @@ Distribution = tuple[tuple[str, float], ...]
 
 
 class ObjectObservation(Message, frozen=True, kw_only=True):
-    """Object that a keyframe shows or should show, published on object/observation.
+    """Observation of an object in a keyframe, or a miss, published on object/observation.
 
-    stamp_ns is that of the keyframe.
+    A miss is an object that should be visible in the keyframe and was not detected. stamp_ns is
+    that of the keyframe.
     """
 
     keyframe: int  # Id of the keyframe.
@@ -96,7 +97,7 @@ class MapObject(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapObjects(Message, frozen=True, kw_only=True):
-    """Objects of the map at `version`, published on map/objects; a message has all of them."""
+    """Complete list of the objects of the map at `version`, published on map/objects."""
 
     version: int
     graph_version: int  # Version of the keyframe poses that the objects refer to.
@@ -108,7 +109,7 @@ class MapObjects(Message, frozen=True, kw_only=True):
         if len(ids) > MAX_OBJECTS:
             raise ValueError(f"message has {len(ids)} objects, must have at most {MAX_OBJECTS}")
         if any(b <= a for a, b in itertools.pairwise(ids)):
-            raise ValueError("ids of objects must be ascending")
+            raise ValueError(f"ids of objects start with {ids[:8]}, must be ascending")
 
 
 def require_box(box_px: Box) -> None:

@@ -7,7 +7,7 @@ from ldo_service.schemas.pose import Pose
 class OdometryPrior(Message, frozen=True, kw_only=True):
     """Pose of the robot's base from another odometry, published on odometry/prior.
 
-    stamp_ns is in the clock of the frames.
+    stamp_ns is the time of the pose, by the same clock as the stamps of the frames.
     """
 
     # Pose in the source's own odometry frame; only the motion between two messages is used.

@@ -11,9 +11,9 @@ QUATERNION_TOLERANCE = 1e-6
 
 
 class Pose(msgspec.Struct, frozen=True):
-    """Rigid transform T_a_b from coordinates in b to coordinates in a.
+    """Rigid transform T_a_b from coordinates in frame b to coordinates in frame a.
 
-    The name of a field gives a and b.
+    The name of a field states the frames: T_map_odom has a = map and b = odom.
     """
 
     translation: tuple[float, float, float]  # Origin of b in a, meters.
@@ -43,8 +43,8 @@ def require_matrix6(name: str, values: Matrix6) -> None:
 class TrackedPose(Message, frozen=True, kw_only=True):
     """Camera pose at `stamp_ns`, published on pose/tracked (REP-105 frames).
 
-    WEAK: the pose is a best effort, and nothing is mapped from the frame. LOST: the pose is the
-    last one that was OK.
+    WEAK: the pose is uncertain, and the frame is not mapped. LOST: the pose of the frame is
+    unknown; the message repeats the last pose that was OK.
     """
 
     frame: int  # Frame number, as in camera/rgbd.

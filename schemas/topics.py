@@ -1,7 +1,7 @@
 """Topics on the network; their key is `ldo/<robot>/<name>`.
 
-Each topic has one producer. A state topic also answers a query with its last value, for subscribers
-that join late.
+Each topic has one producer. On a state topic, the producer also answers a query with its last
+value, for subscribers that start later.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ ROBOT_PREFIX = "ldo"
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """Topic with its message type."""
+    """Topic: its name, message type and description."""
 
     name: str
     message: type[Message]
@@ -37,7 +37,7 @@ class Topic:
 
     @property
     def subscription_key(self) -> str:
-        """Name that matches all messages of the topic."""
+        """Name to subscribe to for all messages of the topic; it may contain a wildcard."""
         return f"{self.name}/*" if self.is_per_actor else self.name
 
     def expression(self, robot: str) -> str:
