@@ -30,12 +30,12 @@ class QuadtreeCells:
 
     @property
     def u(self) -> np.ndarray:
-        """Horizontal pixel coordinate of the centers, [M], to the right."""
+        """Horizontal pixel coordinates of the cell centers, [M]; they increase to the right."""
         return self.column + (self.size - 1) / 2
 
     @property
     def v(self) -> np.ndarray:
-        """Vertical pixel coordinate of the centers, [M], down."""
+        """Vertical pixel coordinates of the cell centers, [M]; they increase downward."""
         return self.row + (self.size - 1) / 2
 
     def mean_of(self, image: np.ndarray) -> np.ndarray:
@@ -64,17 +64,17 @@ def quadtree(
     max_contrast: float,
     max_depth_step: float,
 ) -> QuadtreeCells:
-    """Split square cells into four until each is uniform.
+    """Divide an image into square cells: cells that are not uniform are split into four.
 
-    A cell is uniform if three conditions hold. The image gradient over it and a rim of one pixel
-    amounts to at most `max_contrast` in every channel. Its depth varies by at most the fraction
-    `max_depth_step`. All its pixels are wanted.
+    A cell is uniform if three conditions hold. Within the cell and a rim of one pixel, the contrast
+    is at most `max_contrast` in every channel. The depth varies by at most the fraction
+    `max_depth_step`. All pixels of the cell are in `wanted`.
 
     Args:
         color: [H, W, 3] uint8.
         depth_m: [H, W] float32, meters.
-        wanted: Pixels to cover, [H, W] bool. Each of them belongs to exactly one cell, the other
-            pixels to none.
+        wanted: Pixels to cover, [H, W] bool. Each pixel where it is true is in exactly one cell.
+            The other pixels are in no cell.
         coarsest_px: Edge of the largest cells, a power of 2.
         max_contrast: Largest contrast of a uniform cell, 0..1.
         max_depth_step: Largest depth difference in a uniform cell, as a fraction of its depth.
@@ -111,7 +111,7 @@ def _means(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def _greatest(image: np.ndarray, size: int, rim: int = 0) -> np.ndarray:
-    """Return the maximum of each block of size x size pixels and `rim` pixels around it."""
+    """Return the maximum over each block of size x size pixels, enlarged by `rim` on all sides."""
     window = np.ones((size + 2 * rim,) * 2, np.uint8)
     return cv2.dilate(image, window, anchor=(rim, rim))[::size, ::size]
 

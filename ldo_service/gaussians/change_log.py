@@ -1,4 +1,4 @@
-"""Log of the map changes that map replicas have not received yet, and the published poses."""
+"""Records of what map replicas have not received yet: changed Gaussians and keyframe poses."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ class Changes:
 
     Attributes:
         removed: Ids of removed Gaussians, [R] int64, ascending.
-        changed: Rows of the map with parameters other than the published ones, [C].
-        added: Rows of the map that were never published, [A].
+        changed: Indices of rows whose parameters differ from the published ones, [C].
+        added: Indices of rows that were never published, [A].
     """
 
     removed: np.ndarray
@@ -27,11 +27,11 @@ class Changes:
 
 
 class ChangeLog:
-    """Unpublished changes of a map; every change of the map must be marked here.
+    """Unpublished changes of a map. The caller must record every change of the map here.
 
-    New Gaussians are published at once. Parameters of old ones are published from time to time,
-    because the Gaussian optimizer changes most of what is in view at every keyframe. Replicas
-    apply the motions of anchor keyframes themselves, so these mark no row here.
+    New Gaussians are published at once. Changed parameters of published Gaussians are published
+    at intervals, because the Gaussian optimizer changes most visible Gaussians at every keyframe.
+    Replicas move Gaussians with their anchor keyframes themselves, so motions are not recorded.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class ChangeLog:
         self._is_changed = np.concatenate([self._is_changed, np.zeros(new, bool)])
 
     def changed(self, mask: np.ndarray) -> None:
-        """Record that the rows where `mask` [N] is true were written to."""
+        """Record that the rows where `mask` [N] is true have changed."""
         self._is_changed |= mask
 
     def mark_removed(self, gaussians: GaussianMap, mask: np.ndarray) -> None:
@@ -55,11 +55,11 @@ class ChangeLog:
         self._is_changed = self._is_changed[~mask]
 
     def lost(self, ids: np.ndarray) -> None:
-        """Record that offloaded Gaussians with these ids [L] are lost for good."""
+        """Record that offloaded Gaussians with these ids [L] cannot be loaded any more."""
         self._removed.append(ids[ids < self._next_untold])
 
     def mark_loaded(self, gaussians: GaussianMap, ids: np.ndarray) -> None:
-        """Record that offloaded Gaussians were loaded with the parameters that replicas hold."""
+        """Record that offloaded Gaussians were loaded, with the same parameters as published."""
         is_changed = np.zeros(len(gaussians), bool)
         is_changed[~np.isin(gaussians.ids, ids, assume_unique=True)] = self._is_changed
         self._is_changed = is_changed
@@ -69,7 +69,7 @@ class ChangeLog:
 
         Args:
             gaussians: The map.
-            with_changed: Include changed rows; otherwise they stay pending.
+            with_changed: Include changed rows. If False, they are published by a later call.
         """
         first_new = int(np.searchsorted(gaussians.ids, self._next_untold))
         changed = np.zeros(0, np.int64)
@@ -84,7 +84,7 @@ class ChangeLog:
         return Changes(removed, changed, np.arange(first_new, len(gaussians)))
 
     def mark_all_published(self, gaussians: GaussianMap) -> None:
-        """Record that replicas hold the whole map, which may be a different one than before."""
+        """Record that replicas have received the whole map, which may have been replaced."""
         newest = int(gaussians.ids[-1]) if len(gaussians) else -1
         self._next_untold = max(self._next_untold, newest + 1)
         self._is_changed = np.zeros(len(gaussians), bool)
@@ -92,11 +92,11 @@ class ChangeLog:
 
 
 class PublishedPoses:
-    """Published poses T_map_keyframe of the keyframes with images.
+    """Last published poses T_map_keyframe of the keyframes whose images are stored.
 
     Args:
-        min_m: Least translation that is published, meters.
-        min_rad: Least rotation that is published, radians.
+        min_m: A pose is published again if it has moved by at least this distance, meters.
+        min_rad: A pose is also published again after a rotation by at least this angle, radians.
     """
 
     def __init__(self, min_m: float, min_rad: float) -> None:
@@ -104,11 +104,11 @@ class PublishedPoses:
         self._min_m, self._min_rad = min_m, min_rad
 
     def add(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
-        """Record the pose [4, 4] of a new keyframe, which counts as published."""
+        """Record the pose [4, 4] of a new keyframe, which is published with the keyframe."""
         self._poses[keyframe] = T_map_keyframe
 
     def forget(self, keyframe: int) -> None:
-        """Drop a keyframe without images."""
+        """Drop a keyframe whose images are no longer stored."""
         del self._poses[keyframe]
 
     def drain(self, poses: PoseTable) -> dict[int, np.ndarray]:
@@ -126,7 +126,7 @@ class PublishedPoses:
         return moved
 
     def move(self, T_map: Mapping[int, np.ndarray]) -> None:
-        """Replace poses after a correction, which replicas apply themselves."""
+        """Replace poses after a correction of the pose graph; `drain` omits these motions."""
         self._poses.update({k: T for k, T in T_map.items() if k in self._poses})
 
     def snapshot(self) -> np.ndarray:

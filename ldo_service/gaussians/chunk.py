@@ -34,7 +34,7 @@ class Chunk:
 
     @property
     def anchors(self) -> np.ndarray:
-        """The anchor of each Gaussian as in `GaussianMap`, [M] int32."""
+        """Id of the anchor keyframe for each Gaussian, [M] int32, as in `GaussianMap.anchors`."""
         return np.full(len(self.ids), self.anchor, np.int32)
 
     def piece(self) -> GaussianBatch:
@@ -42,7 +42,7 @@ class Chunk:
         return GaussianBatch(self.ids, self.rows, self.anchors, self.labels)
 
     def moved(self, motions: Iterable[np.ndarray]) -> "Chunk":
-        """Return the chunk after motions of its anchor.
+        """Return the chunk after motions of its anchor keyframe.
 
         The result is bitwise equal to that of `GaussianMap.move_anchors`.
 
@@ -58,8 +58,8 @@ class Chunk:
 def pack(chunk: Chunk) -> bytes:
     """Compress a chunk to bytes.
 
-    Ids are stored as differences; rows and labels are stored byte by byte, because the same byte
-    of neighboring Gaussians is often equal.
+    Ids are stored as differences. For rows and labels, the first bytes of all values are stored
+    first, then all second bytes, and so on. The same byte is often equal in neighboring Gaussians.
     """
     steps = np.diff(chunk.ids, prepend=0).astype("<i8")
     planes = np.ascontiguousarray(chunk.rows, "<f4").view(np.uint8).T

@@ -10,10 +10,10 @@ from .pruning import PruningConfig
 
 
 class Confirmation:
-    """Search of hidden Gaussians, two keyframes at a time.
+    """Search for hidden Gaussians, among those of two keyframes per call.
 
     Args:
-        store: Keyframes with images.
+        store: Store of the keyframe images.
         renderer: Renderer of the map at these keyframes.
         config: Criteria.
         seed: Seed of the random choice of keyframes.
@@ -26,11 +26,12 @@ class Confirmation:
         self._config, self._seed = config, seed
 
     def hidden_mask(self, gaussians: GaussianMap, newest: int) -> np.ndarray:
-        """Return the mask [N] bool of the hidden Gaussians of two keyframes.
+        """Return the mask [N] bool of the hidden Gaussians that are anchored to two keyframes.
 
-        One of them has just received the last of its `confirm_keyframes` later keyframes. The other
-        is a random earlier one, because the map around it keeps changing. A Gaussian is hidden if
-        neither these two nor the newest keyframe show it with `min_weight_px`.
+        The first keyframe is the newest one that has `confirm_keyframes` later keyframes. The
+        second is a random older keyframe, since the map around old keyframes also changes. A
+        Gaussian is hidden if its weight is below `min_weight_px` in three images: those of these
+        two keyframes and of the newest one.
 
         Args:
             gaussians: The map.

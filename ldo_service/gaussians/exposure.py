@@ -29,11 +29,11 @@ MAX_SIGMA = 0.1  # The images show different surfaces if the deviation is larger
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Exposure:
-    """Gain and bias per channel: color_seen = gain * color_map + bias.
+    """Gain and bias per color channel: color_seen = gain * color_map + bias.
 
     Attributes:
         gain: [3] float32.
-        bias: [3] float32, fraction of the range.
+        bias: [3] float32, for colors in 0..1.
     """
 
     gain: np.ndarray = field(default_factory=lambda: np.ones(3, np.float32))
@@ -41,7 +41,7 @@ class Exposure:
 
     @classmethod
     def of(cls, matrix: np.ndarray) -> "Exposure":
-        """Return the exposure with the gains and biases of a matrix [2, 3]."""
+        """Return the exposure from a matrix [2, 3], as `matrix` returns it."""
         return cls(*np.array(matrix, np.float32))
 
     @property
@@ -50,19 +50,19 @@ class Exposure:
         return np.array([self.gain, self.bias])
 
     def applied(self, color: np.ndarray) -> np.ndarray:
-        """Return an image [H, W, 3] of the map as this camera would have exposed it, in 0..1."""
+        """Convert an image [H, W, 3] from the exposure of the map to this exposure, in 0..1."""
         return (self.gain * color + self.bias).clip(0, 1)
 
     def removed(self, color: np.ndarray) -> np.ndarray:
-        """Return an image [H, W, 3] of this camera at the brightness of the map, in 0..1."""
+        """Convert an image [H, W, 3] from this exposure to that of the map, in 0..1."""
         return ((color - self.bias) / np.maximum(self.gain, MIN_GAIN)).clip(0, 1)
 
 
 def fit_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
-    """Fit gain and bias from `rendered` to `seen` by least squares.
+    """Fit gain and bias by least squares, such that `seen` = gain * `rendered` + bias.
 
-    This is for evaluation, because it uses the image that is scored. A channel without contrast
-    gets a gain of one.
+    Use it for evaluation only: the fit uses the same image that is compared with the rendering. A
+    channel without contrast gets a gain of one.
 
     Args:
         rendered: [H, W, 3], 0..1.
@@ -80,9 +80,9 @@ def estimate_exposure(
 ) -> Exposure | None:
     """Estimate gain and bias of an image relative to the rendering of the map at its pose.
 
-    The estimate is a least-squares fit over averages of blocks of opaque, unsaturated pixels.
-    Outliers (moved objects, new surface) are removed. A prior draws the gain to 1 and, more
-    strongly, the bias to 0.
+    The estimate is a least-squares fit over mean colors of pixel blocks. Only opaque, unsaturated
+    pixels are used. Outliers, such as moved objects and new surface, are removed. A prior pulls the
+    gain towards 1 and, more strongly, the bias towards 0.
 
     Args:
         rendered: Rendered color, [3, H, W], 0..1.
@@ -91,8 +91,8 @@ def estimate_exposure(
         mask: Pixels to use, [H, W] uint8; 0 where a pixel is ignored.
 
     Returns:
-        The exposure. None if the images show different surfaces: too few blocks are comparable,
-        no camera would choose the gain, or the residual is too large.
+        The exposure. None if the two images probably show different surfaces: too few blocks are
+        comparable, the gain is implausible, or the residual is too large.
     """
     x = np.stack([_averaged(plane) for plane in rendered])
     y = np.stack([_averaged(plane) for plane in seen]) * np.float32(1 / 255)
@@ -110,7 +110,7 @@ def estimate_exposure(
 
 
 def _averaged(plane: np.ndarray) -> np.ndarray:
-    """Return the means of square blocks of [H, W]; incomplete blocks at two edges are omitted."""
+    """Return the means over square blocks of an image [H, W], without incomplete blocks."""
     block = max(MIN_BLOCK_PX, plane.shape[1] // BLOCKS_ACROSS)
     height, width = (n // block for n in plane.shape)
     plane = np.ascontiguousarray(plane[: height * block, : width * block], np.float32)
@@ -128,8 +128,8 @@ def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
         y: [M].
 
     Returns:
-        Slope a, offset b, and the deviation sigma of all points from that line, by the median
-        of the absolute residuals (MAD).
+        Slope a and offset b. Then the standard deviation of all M points from that line, estimated
+        from the median absolute deviation (MAD).
     """
     gain_weight, bias_weight = GAIN_SIGMA**-2, BIAS_SIGMA**-2
     x, y = x.astype(float), y.astype(float)

@@ -1,18 +1,19 @@
 """Files of Gaussians that other programs read: PLY, .splat and .spz.
 
-.ply    the format of 3D Gaussian splatting and its viewers
-.splat  32 bytes per Gaussian, those with the largest weight first, no header:
+.ply    The format of 3D Gaussian splatting and its viewers.
+.splat  32 bytes per Gaussian without a header, sorted by descending weight:
             position 3 float32 | scale 3 float32, meters | RGBA 4 uint8 | quaternion wxyz 4 uint8
         A byte of the quaternion is 128 (1 + q), so a rotation is accurate to about half a degree.
         Axes are those of the map. Format: https://github.com/antimatter15/splat
-.spz    quantized and compressed, about a tenth of a PLY.
+.spz    Quantized and compressed to about a tenth of the size of a PLY.
         Means are fixed point (0.24 mm, up to 2 km), log scales have steps of 1/16, opacity and
         color are bytes, and quaternions are accurate to about a tenth of a degree.
         Format: https://github.com/nianticlabs/spz
 
 An .spz file has the axes of OpenGL: x right, y up, z back. `gsply.write_spz` does not convert
-axes. This module converts the map (x right, y down, z forward) as Niantic's library converts RDF
-to RUB. (`GSData.save` writes a PLY, whatever the file name.)
+axes, so this module converts them from the axes of the map: x right, y down, z forward. Niantic's
+library calls this conversion RDF to RUB. (`GSData.save` of gsply always writes a PLY, also for
+another file extension.)
 """
 
 import logging
@@ -68,8 +69,8 @@ OPENGL_QUAT = np.array([1, 1, -1, -1], np.float32)  # The same conversion F of a
 def write_ply(path: Path, rows: np.ndarray) -> None:
     """Write Gaussian rows [N, 16] (see `gaussians.rows`) as PLY.
 
-    Means are in meters, scales are logarithms, quaternions (wxyz) have length one, opacity is a
-    logit, and color is the constant spherical harmonic.
+    Means are in meters, scales are logarithms of meters, and quaternions (wxyz) have length one.
+    The opacity is a logit, and the color is the spherical-harmonics coefficient of degree 0.
     """
     table = np.zeros((len(rows), len(PROPERTIES)), "<f4")
     for name, column in COLUMNS.items():
@@ -87,8 +88,9 @@ def write_ply(path: Path, rows: np.ndarray) -> None:
 def read_ply(path: Path) -> np.ndarray:
     """Read Gaussians from a PLY file of any program.
 
-    Properties may have any order and any type, in text or binary. Normals and other properties
-    and elements are ignored. View-dependent color (`f_rest_*`) is ignored with a warning.
+    The properties may be in any order and of any type, and the file may be text or binary. Normals
+    and other properties and elements are ignored. View-dependent color (`f_rest_*`) is ignored with
+    a warning.
 
     Returns:
         Gaussian rows [N, 16] float32 (see `gaussians.rows`).
@@ -112,7 +114,7 @@ def read_ply(path: Path) -> np.ndarray:
 
 
 def harmonics(colors: np.ndarray) -> np.ndarray:
-    """Return the coefficients [N, 3] of the constant spherical harmonic for RGB [N, 3], 0..1."""
+    """Convert RGB [N, 3], 0..1, to spherical-harmonics coefficients of degree 0, [N, 3]."""
     return (colors - 0.5) / SH_C0
 
 

@@ -10,7 +10,7 @@ from .renderer import Contributions, Rendering, RenderMemory, render
 
 
 class KeyframeRenderer:
-    """Renderer of the resident Gaussians that caches the rendering of one keyframe."""
+    """Renderer of the Gaussians in memory; it caches the last rendering at a keyframe."""
 
     def __init__(self, views: KeyframeViews, threads: int) -> None:
         """Initialize without a rendering.
@@ -24,7 +24,7 @@ class KeyframeRenderer:
         self._cached: tuple[int, Rendering] | None = None
 
     def forget(self) -> None:
-        """Drop the cached rendering, because the map changes."""
+        """Drop the cached rendering; call it whenever the map changes."""
         self._cached = None
 
     def render_from(

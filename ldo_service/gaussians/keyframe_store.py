@@ -1,4 +1,4 @@
-"""Keyframe images on disk with a cache in memory, and the training views made of them."""
+"""Store of keyframe images on disk with a cache in memory, and training views from them."""
 
 import logging
 from collections import OrderedDict
@@ -47,12 +47,12 @@ class KeyframeStoreConfig:
 
 
 class KeyframeStore:
-    """Store of keyframe images in `folder`, including those of an earlier store.
+    """Store of keyframe images in `folder`, including images that are there already.
 
-    Without a folder, the store uses a temporary one and removes it with itself. Over the quota,
-    the store drops the most redundant keyframes (see `_most_redundant`). If the disk is full, a
-    new keyframe is available only while it is in the cache. The content depends only on the calls,
-    not on time. Not thread-safe.
+    If `folder` is None, the store uses a temporary folder and removes it at the end. When the store
+    exceeds its quota, it drops the most redundant keyframes (see `_most_redundant`). If the disk is
+    full, a new keyframe is available only while it is in the cache. The content depends only on the
+    calls, not on time. Not thread-safe.
 
     Raises:
         ConfigError: The folder cannot be used.
@@ -66,14 +66,14 @@ class KeyframeStore:
         self._make_room()
 
     def put(self, images: KeyframeImages) -> None:
-        """Store copies of the images; an existing keyframe is replaced."""
+        """Store copies of the images of a keyframe; images stored earlier for it are replaced."""
         images = images.owned()
         self._remember(images)
         self._files.write(images.keyframe, pack(images))
         self._make_room()
 
     def get(self, keyframe: int) -> KeyframeImages | None:
-        """Return the read-only images, bitwise unchanged; None if the store does not have them."""
+        """Return the images of a keyframe, read-only and bitwise unchanged; None if not stored."""
         images = self._cache.get(keyframe)
         if images is not None:
             self._cache.move_to_end(keyframe)
@@ -92,7 +92,7 @@ class KeyframeStore:
         return sorted(self._files.sizes.keys() | self._cache.keys())
 
     def keep_only(self, keyframes: Iterable[int]) -> None:
-        """Drop all other keyframes: those that a restored checkpoint does not contain."""
+        """Drop all keyframes except for the given ones, which a restored checkpoint contains."""
         kept = set(keyframes)
         for keyframe in self.keyframes():
             if keyframe not in kept:
@@ -126,11 +126,11 @@ class KeyframeStore:
         try:
             images = unpack(self._files.read(keyframe))
             if images.keyframe != keyframe:
-                raise DataError(f"the file holds keyframe {images.keyframe}")
+                raise DataError(f"the file contains keyframe {images.keyframe} instead")
         except DataError as error:
             log.warning(
-                "keyframe store: images of keyframe %d cannot be read (%s); they are dropped and "
-                "the map is no longer fitted to this keyframe",
+                "keyframe store: the images of keyframe %d cannot be read (%s). They are dropped, "
+                "and the map is no longer fitted to this keyframe. Check the disk.",
                 keyframe,
                 error,
             )
@@ -155,14 +155,15 @@ class KeyframeStore:
             self._forgotten += 1
 
     def _most_redundant(self) -> int | None:
-        """Return the keyframe on disk that lies between the two closest ids.
+        """Return the keyframe on disk whose previous and next stored ids are closest to each other.
 
-        Its neighbors probably saw the same surface, and the stored keyframes stay spread over the
-        whole run. Of several, the oldest is returned. The first keyframe, which fixes the pose and
-        the brightness of the map, and the newest ones are never returned.
+        These two keyframes probably show the same surface, and the remaining keyframes stay spread
+        over the whole run. Of several such keyframes, the oldest is returned. The first keyframe is
+        never returned, since it fixes the pose and the brightness of the map. The `newest_kept`
+        newest ones are never returned either.
 
         Returns:
-            The keyframe, or None if there is no other.
+            Id of the keyframe, or None if no keyframe may be dropped.
         """
         kept = np.array(sorted(self._files.sizes), np.int64)
         gaps = (kept[2:] - kept[:-2])[: max(0, len(kept) - 1 - self.config.newest_kept)]
@@ -170,11 +171,12 @@ class KeyframeStore:
 
 
 class KeyframeViews:
-    """Training views by keyframe: poses in memory, images in the store.
+    """Training views by keyframe id, with images in a `KeyframeStore` and the rest in memory.
 
-    `poses` (T_map_camera [4, 4]) has every keyframe of the run, because Gaussians are anchored to
-    it: 136 bytes each. A view exists while its images are stored. `cameras`, `exposures` and
-    `horizons` have the same keyframes in the same order: 1.5 kB each.
+    `poses` has T_map_camera [4, 4] of every keyframe of the run, since Gaussians are anchored to
+    it; this takes 136 bytes each. A training view exists only while its images are stored.
+    `cameras`, `exposures` and `horizons` contain the keyframes with images, all in the same order.
+    Together they take 1.5 kB per keyframe.
     """
 
     def __init__(self, store: KeyframeStore) -> None:
@@ -188,7 +190,7 @@ class KeyframeViews:
         """Add the newest keyframe.
 
         Returns:
-            The keyframes that the store has dropped; only their poses remain.
+            The keyframes whose images the store has dropped; only their poses remain.
         """
         if not self.poses:
             self.store.keep_only(())  # Images of an earlier run in the folder.
@@ -219,7 +221,7 @@ class KeyframeViews:
         self.store.put(replace(images, mask=counts.astype(np.uint8)))
 
     def placed(self, keyframe: int) -> PlacedCamera:
-        """Return the camera of a keyframe at its pose, with the farthest depth it saw.
+        """Return the camera of a keyframe with its pose and the farthest depths that it measured.
 
         Raises:
             KeyError: The keyframe is unknown or its images are dropped.

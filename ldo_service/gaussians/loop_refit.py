@@ -42,15 +42,16 @@ class LoopRefitConfig:
 class LoopRefit:
     """Scheduler of the deduplication and refit iterations after pose corrections.
 
-    A keyframe that a correction moves far may overlap surface that the map already holds. It is
-    queued for deduplication.
+    Deduplication. A correction that moves a keyframe far may place its surface on surface that the
+    map contains already. Such a keyframe is queued for deduplication.
 
-    The first keyframe holds the map frame. A keyframe that moves far relative to it gets pending
-    refit iterations, because the map was fitted to the old relative poses. Half of its iterations
-    take this keyframe, half take any keyframe. Unmoved keyframes see the same surface: fitting to
-    the moved ones alone would make the map worse for them.
+    Refit. The map was fitted to the old relative poses. A keyframe that moves far relative to the
+    first keyframe therefore gets pending refit iterations. Half of them optimize against this
+    keyframe, the other half against random keyframes. Optimizing against moved keyframes alone
+    would make the map worse in keyframes that did not move and show the same surface.
 
-    The work is spread over the following keyframes, to keep the latency of new keyframes low.
+    This work is done in small amounts with each following keyframe, so that new keyframes are
+    mapped without long delays.
     """
 
     def __init__(self, map_: MapBuilder, config: LoopRefitConfig | None = None) -> None:
@@ -61,9 +62,9 @@ class LoopRefit:
         self._pending: dict[int, int] = {}  # Pending refit iterations by keyframe.
 
     def mark_moved(self, T_map: KeyframePoses) -> None:
-        """Schedule work for the keyframes that a correction moves far.
+        """Schedule deduplication and refit for the keyframes that a correction moves far.
 
-        Call it before the Gaussians move with their anchors.
+        Call it before `MapBuilder.move` applies the correction to the map.
 
         Args:
             T_map: The corrected poses of the keyframes.
@@ -96,17 +97,17 @@ class LoopRefit:
 
     @property
     def deduplication_iterations(self) -> int:
-        """Number of iterations after deduplication that run with the next keyframe."""
+        """Number of iterations that follow the deduplication done with the next new keyframe."""
         config = self.config
         return config.deduplication_iterations * min(
             config.deduplicated_per_keyframe, len(self._to_deduplicate)
         )
 
     def with_keyframe(self, *, is_behind: bool) -> None:
-        """Do the part of the work that belongs to one new keyframe.
+        """Do the deduplication and refit iterations that are due with one new keyframe.
 
         Args:
-            is_behind: More keyframes are queued; pending refit iterations then wait.
+            is_behind: More new keyframes wait to be mapped. Refit iterations are then postponed.
         """
         config = self.config
         self._deduplicate(config.deduplicated_per_keyframe, config.deduplication_iterations)
@@ -120,12 +121,12 @@ class LoopRefit:
     def at_end(self) -> None:
         """Deduplicate at the end of the run, without iterations.
 
-        Iterations could move keyframes, and no more refinements are published then.
+        Iterations could change keyframe poses, which are no longer published at the end.
         """
         self._deduplicate(self.config.deduplicated_at_end, iterations=0)
 
     def _deduplicate(self, limit: int, iterations: int) -> None:
-        """Deduplicate at most `limit` keyframes, the newest first."""
+        """Deduplicate at most `limit` keyframes, newest first, and run `iterations` after each."""
         for _ in range(min(limit, len(self._to_deduplicate))):
             self._deduplicated += self._map.deduplicate_keyframe(
                 self._to_deduplicate.pop(), iterations
@@ -134,9 +135,10 @@ class LoopRefit:
     def refine(
         self, iterations: int, rates: tuple[float, float] = (1.0, 1.0), effort: float = inf
     ) -> None:
-        """Run iterations of the Gaussian optimizer, pending refit iterations first.
+        """Run iterations of the Gaussian optimizer.
 
-        See `MapBuilder.refine` for the arguments.
+        While refit iterations are pending, they alternate with iterations on random keyframes. See
+        `MapBuilder.refine` for the arguments.
         """
         resident = self._resident_keyframes()
         visits = np.repeat(resident, [-(-self._pending[k] // 2) for k in resident]).astype(np.int64)
@@ -148,9 +150,9 @@ class LoopRefit:
         self._forget()
 
     def _resident_keyframes(self) -> list[int]:
-        """Return the keyframes with pending iterations that see no offloaded Gaussians.
+        """Return the keyframes with pending iterations in which no offloaded Gaussian is visible.
 
-        The optimizer cannot fit to the other keyframes.
+        The map cannot be fitted to the other keyframes now.
         """
         self._forget()
         return [k for k in self._pending if self._map.is_resident(k)]

@@ -34,7 +34,7 @@ class LossWeights:
 
 @dataclass(frozen=True, slots=True)
 class ImageLoss:
-    """Loss of an image and its terms, which are means over the image."""
+    """Value of the image loss, and its terms as means over the image."""
 
     total: float  # Weighted sum of l1, d_ssim and depth_m.
     l1: float  # Mean absolute error of colors in 0..1.
@@ -70,8 +70,8 @@ def image_loss(
         weights: Weights of the terms.
         by_planes: dL/dplanes, [5, H, W] float32; overwritten.
         mask: [H, W] uint8. Where it is 0, both images are black and depth is ignored.
-        tiles: [ceil(H / 16), ceil(W / 16)] uint8. Pixels of tiles where it is 0 are masked, and
-            means are over the other pixels. At least one tile must not be 0.
+        tiles: [ceil(H / 16), ceil(W / 16)] uint8. The pixels of a tile with value 0 are masked and
+            excluded from the means. At least one tile must not be 0.
         threads: Threads of the kernel.
 
     Raises:

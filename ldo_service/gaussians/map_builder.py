@@ -30,10 +30,10 @@ MAX_ITERATIONS_PER_EFFORT = 2
 
 
 class MapBuilder:
-    """The map with its keyframes, its optimizer and its change log.
+    """Builder of the map: it holds the map, its keyframes, the optimizer and the change log.
 
-    Deterministic: the same keyframes, corrections and iterations in the same order give bitwise
-    equal maps, for any number of threads and after `restore`. Not thread-safe.
+    The same calls in the same order give bitwise equal maps, for any number of threads and also
+    after `restore`. Not thread-safe.
     """
 
     def __init__(
@@ -81,17 +81,17 @@ class MapBuilder:
         iterations: int,
         dynamic_mask: np.ndarray | None = None,
     ) -> None:
-        """Add a keyframe, later than all before, and fit the map to it and some others.
+        """Add a new keyframe to the map, and fit the map to it and to some older keyframes.
 
-        The new Gaussians are anchored to the keyframe.
+        Where the map lacks surface, new Gaussians are added, which are anchored to the keyframe.
 
         Args:
             frame: Color and depth of the keyframe.
             T_map_camera: Pose of the keyframe, [4, 4].
-            keyframe: Id of the keyframe.
-            iterations: Iterations that reach the usual number of Gaussians. Fewer are run where
-                more Gaussians are in view, so a keyframe costs the same in a dense map.
-            dynamic_mask: Pixels that are neither mapped nor fitted, [H, W] bool.
+            keyframe: Id of the keyframe, larger than all ids before.
+            iterations: Number of iterations if each one reaches `usual_reach` Gaussians. If more
+                Gaussians are visible, fewer iterations run, so that the time stays the same.
+            dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool.
         """
         self._wake(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
         self._renderer.forget()
@@ -131,7 +131,8 @@ class MapBuilder:
     def _exposure(self, frame: RgbdFrame, before: Rendering, counts: np.ndarray | None) -> Exposure:
         """Estimate the exposure of a frame relative to the map.
 
-        If the map covers too little of the image, use the exposure of the previous keyframe.
+        If that fails, for example because the map covers too little of the image, the exposure of
+        the previous keyframe is returned.
         """
         rendered, seen = before.color.transpose(2, 0, 1), frame.color.transpose(2, 0, 1)
         estimated = estimate_exposure(rendered, before.opacity, seen, counts)
@@ -162,10 +163,10 @@ class MapBuilder:
         self._log.mark_added(self.gaussians)
 
     def remove_masked(self, keyframe: int, pixels: np.ndarray) -> int:
-        """Remove pixels of a keyframe from the map, because they show moving objects.
+        """Remove what some pixels of a keyframe contributed to the map: they show moving objects.
 
-        The pixels are excluded from fitting, and the Gaussians that the keyframe placed there are
-        removed.
+        The pixels are excluded from fitting. Gaussians are removed if they are anchored to the
+        keyframe and project into these pixels.
 
         Args:
             keyframe: Id of the keyframe.
@@ -199,17 +200,17 @@ class MapBuilder:
     ) -> int:
         """Fit the map to random keyframes.
 
-        Until all of `first` are taken, they alternate with random keyframes.
+        If `first` is given, its keyframes alternate with random ones until all of them are used.
 
         Args:
             iterations: Number of iterations.
-            rates: Factor of the learning rates at the first and at the last iteration.
-            first: Keyframes to take first.
-            effort: Limit of the work, in iterations that reach the usual number of Gaussians.
+            rates: Factor on the learning rates at the first and at the last iteration.
+            first: Keyframes that must be used.
+            effort: Limit of the computation; see `GaussianOptimizer.optimize`.
 
         Returns:
-            Number of iterations that were run. It is smaller if `effort` was spent, or if most
-            keyframes see offloaded Gaussians.
+            Number of iterations that were run. It is below `iterations` if `effort` was reached, or
+            if offloaded Gaussians may be visible in most keyframes.
         """
         self._renderer.forget()
         before = self._fitting.iterations
@@ -224,9 +225,10 @@ class MapBuilder:
         return touched
 
     def is_resident(self, keyframe: int) -> bool:
-        """Return whether all Gaussians that a keyframe may see are in memory.
+        """Return whether all Gaussians that may be visible in a keyframe are in memory.
 
-        Otherwise fitting to the keyframe would move the resident Gaussians to replace the others.
+        If some are offloaded, do not fit the map to this keyframe: the Gaussians in memory would
+        move to where the offloaded ones are missing.
         """
         return not self.sleeping.visible_chunks(self.views.placed(keyframe), self._reach_m)
 
@@ -234,12 +236,12 @@ class MapBuilder:
     def deduplicate_keyframe(self, keyframe: int, iterations: int) -> int:
         """Remove Gaussians of a keyframe that duplicate older ones, after a loop closure.
 
-        A few iterations then fit the map to the keyframe. The caller passes one keyframe at a time,
-        so that new keyframes do not wait long.
+        Iterations on this keyframe follow. One call takes a short time, so that the caller can map
+        new keyframes between two calls.
 
         Args:
-            keyframe: Id of the keyframe; nothing is done if its images are dropped.
-            iterations: Number of iterations.
+            keyframe: Id of the keyframe. If its images were dropped, nothing is done.
+            iterations: Number of iterations that follow.
 
         Returns:
             Number of removed Gaussians.
@@ -257,7 +259,10 @@ class MapBuilder:
 
     # --- pruning ----------------------------------------------------------------------------------
     def _prune_misshapen(self, touched: np.ndarray) -> None:
-        """Prune among the touched Gaussians only, so the cost does not grow with the map."""
+        """Remove transparent or oversized Gaussians among the rows where `touched` [N] is true.
+
+        The computing time does not grow with the map.
+        """
         among = np.flatnonzero(touched)
         mask = np.zeros(len(self.gaussians), bool)
         mask[among] = prunable_mask(self.gaussians.rows[among], self.config.pruning)
@@ -271,7 +276,7 @@ class MapBuilder:
     def visible_contributions(self, keyframe: int) -> Contributions:
         """Return the contributions of the Gaussians to the image of a keyframe.
 
-        Offloaded Gaussians that it may see are loaded first.
+        Offloaded Gaussians that may be visible in the keyframe are loaded first.
         """
         self._wake(self.views.placed(keyframe))
         shown = self.render_keyframe(keyframe, contributions=True).contributions
@@ -279,7 +284,7 @@ class MapBuilder:
         return shown
 
     def mark_relabeled(self, indices: np.ndarray) -> None:
-        """Record that the labels of these rows differ from the published ones."""
+        """Record that the labels of these rows have changed, so that they are published again."""
         mask = np.zeros(len(self.gaussians), bool)
         mask[indices] = True
         self._log.changed(mask)
@@ -299,8 +304,8 @@ class MapBuilder:
     def offload_excess(self) -> None:
         """Offload Gaussians to disk if too many are in memory.
 
-        Call it only when all changes are published, because it clears the pending ones. Replicas
-        keep the offloaded Gaussians.
+        Call it only after all changes were published, because it clears the record of unpublished
+        changes. Map replicas keep the offloaded Gaussians.
         """
         if len(self.gaussians) <= self.config.sleep.max_active:
             return
@@ -330,14 +335,14 @@ class MapBuilder:
         return self._log.drain(self.gaussians, with_changed=with_changed)
 
     def refined(self) -> dict[int, np.ndarray]:
-        """Return the keyframe poses to publish that the Gaussian optimizer moved, T_map_keyframe.
+        """Return the poses T_map_keyframe that the Gaussian optimizer has changed noticeably.
 
-        The poses count as published then.
+        The caller publishes them; the next call returns only poses that changed again.
         """
         return self._published.drain(self.views.poses)
 
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
-        """Move keyframes, their views and the Gaussians anchored to them, after a pose correction.
+        """Move keyframes and the Gaussians anchored to them, after a correction of the pose graph.
 
         Args:
             T_new_old: Transforms [4, 4] by keyframe id, see `GaussianMap.move_anchors`.
@@ -351,7 +356,7 @@ class MapBuilder:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return a copy of the state without the images in the store."""
+        """Return a copy of the state; keyframe images and offloaded Gaussians stay in files."""
         return {
             "map": self.gaussians.snapshot(),
             "sleeping": self.sleeping.snapshot(),
@@ -363,11 +368,11 @@ class MapBuilder:
         }
 
     def saved(self) -> None:
-        """Record that the last snapshot is saved, so files that it does not name can be removed."""
+        """Remove the files that the last snapshot does not refer to; call it once that is saved."""
         self.sleeping.saved()
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Restore the state of a snapshot; replicas are assumed to hold the whole map."""
+        """Restore the state of a snapshot. All of the map then counts as published."""
         self.gaussians = GaussianMap.restore(state["map"])
         self._fitting.restore(state["optimizer"], state["iterations"])
         self.views.restore(state["views"])

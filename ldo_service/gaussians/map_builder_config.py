@@ -1,4 +1,4 @@
-"""Settings of the map builder, from densification to offloading."""
+"""Settings of the map builder: densification, optimization, pruning and offloading."""
 
 from dataclasses import dataclass, field
 
@@ -14,7 +14,7 @@ from .visibility import OffloadConfig
 
 @dataclass(frozen=True, slots=True)
 class MapBuilderConfig:
-    """Settings of the map builder and of its parts."""
+    """Settings of the map builder and of all its steps."""
 
     insertion: DensificationConfig = field(default_factory=DensificationConfig)
     optimizer: GaussianOptimizerConfig = field(default_factory=GaussianOptimizerConfig)

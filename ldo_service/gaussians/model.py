@@ -1,4 +1,7 @@
-"""Map model: Gaussians in rows of one cache line, with ids, anchor keyframes and labels."""
+"""Map model: arrays of Gaussians, with ids, anchor keyframes and labels.
+
+The parameters of a Gaussian are one row of 16 float32, which fill one cache line.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -17,7 +20,7 @@ _CHUNK = 65536  # Gaussians that are moved at a time, to stay in cache.
 
 
 class GaussianBatch(NamedTuple):
-    """Batch of Gaussians of a map, in order.
+    """Some Gaussians of a map as arrays.
 
     Attributes:
         ids: [M] int64.
@@ -32,26 +35,27 @@ class GaussianBatch(NamedTuple):
     labels: np.ndarray
 
     def at(self, where: np.ndarray | slice) -> "GaussianBatch":
-        """Return the Gaussians at some indices, a mask or a slice."""
+        """Return the batch of the Gaussians that an index array, a mask or a slice selects."""
         return GaussianBatch(*(array[where] for array in self))
 
 
 def new_labels(n: int) -> np.ndarray:
-    """Return the labels [n, 32] of Gaussians without observations."""
+    """Return the labels [n, 32] of n Gaussians whose class has never been observed."""
     return np.zeros((n, LABEL_BYTES), np.uint8)
 
 
 class GaussianMap:
-    """Gaussians in the map frame, in order of insertion.
+    """Gaussians in memory, in the map frame and in the order of their ids.
 
-    `rows`, its columns (`means`, ...), `ids`, `anchors` and `labels` are views without a copy,
-    valid until Gaussians are added or removed. After writing through `rows`, call `touch` before
-    the next rendering. A Gaussian takes 108 bytes, 32 of them for its labels.
+    `rows`, its columns (`means`, ...), `ids`, `anchors` and `labels` are NumPy views, valid until
+    Gaussians are added or removed. After writing through one of them, call `touch` before the next
+    rendering. A Gaussian takes 108 bytes, 32 of them for its labels.
 
     Attributes:
-        version: Grows with every change except changes of labels, which no rendering shows.
-        membership: Grows when Gaussians may have been added or removed.
-        bounds: Bounds of the rows in space. `render` uses them to read only the rows in view.
+        version: Counter that increases with every change, except for changes of labels, which do
+            not affect renderings.
+        membership: Counter that increases when Gaussians may have been added or removed.
+        bounds: Bounding volumes of the rows. `render` uses them to read only visible rows.
     """
 
     def __init__(self, capacity: int = 4096) -> None:
@@ -70,7 +74,7 @@ class GaussianMap:
 
     @property
     def rows(self) -> np.ndarray:
-        """Rows as `render` takes them, [N, 16] float32."""
+        """Parameters of all Gaussians, [N, 16] float32; see `render` for the columns."""
         return self._rows[: self._size]
 
     @property
@@ -85,7 +89,7 @@ class GaussianMap:
 
     @property
     def quats(self) -> np.ndarray:
-        """Rotations from the axes of the Gaussians to the map frame, [N, 4] wxyz."""
+        """Rotations from the principal axes of each Gaussian to the map frame, [N, 4] wxyz."""
         return self.rows[:, 6:10]
 
     @property
@@ -105,7 +109,7 @@ class GaussianMap:
 
     @property
     def anchors(self) -> np.ndarray:
-        """Ids of the anchor keyframes that the Gaussians move with, [N] int32."""
+        """Id of each Gaussian's anchor keyframe, with which it moves, [N] int32."""
         return self._anchors[: self._size]
 
     @property
@@ -115,15 +119,15 @@ class GaussianMap:
 
     @property
     def _arrays(self) -> GaussianBatch:
-        """Arrays of all fields with their spare capacity."""
+        """Allocated arrays of all fields, which are longer than the N Gaussians in use."""
         return GaussianBatch(self._ids, self._rows, self._anchors, self._labels)
 
     def touch(self, rows: np.ndarray | slice | None = None) -> None:
         """Record that rows were written through a view.
 
         Args:
-            rows: Indices (uint32) or a slice without a step. None means that anything may have
-                changed, which is always safe.
+            rows: Indices (uint32) or slice without a step, of the rows that were written. None
+                means all rows.
         """
         self.version += 1
         if rows is None:
@@ -140,10 +144,10 @@ class GaussianMap:
 
         Args:
             rows: [M, 16].
-            anchor: Id of their anchor keyframe.
+            anchor: Id of the anchor keyframe of the new Gaussians.
 
         Returns:
-            Their ids [M].
+            Ids [M] of the new Gaussians.
 
         Raises:
             ValueError: The rows have another shape, or hold NaN or infinity.
@@ -159,7 +163,7 @@ class GaussianMap:
         anchors: np.ndarray,
         labels: np.ndarray | None = None,
     ) -> None:
-        """Append Gaussians with ids of another map, to replicate it.
+        """Append Gaussians with given ids, as a replica of another map does.
 
         Args:
             ids: [M], ascending and greater than all ids that this map ever had.
@@ -173,7 +177,9 @@ class GaussianMap:
         """
         new = _piece(ids, rows, anchors, labels)
         if len(ids) and (ids[0] < self._next_id or np.any(np.diff(ids) <= 0)):
-            raise ValueError(f"ids must ascend from {self._next_id}.")
+            raise ValueError(
+                f"ids must ascend and be at least {self._next_id}, the next unused id of this map."
+            )
         start, stop = self._size, self._size + len(rows)
         self._reserve(stop)
         for array, values in zip(self._arrays, new, strict=True):
@@ -227,19 +233,19 @@ class GaussianMap:
         anchors: np.ndarray,
         labels: np.ndarray | None = None,
     ) -> None:
-        """Insert Gaussians that were extracted from this map, so that ids ascend again.
+        """Insert Gaussians that were extracted from this map before, sorted by id.
 
-        The cost is linear in N.
+        The computing time is linear in the size N of the map.
 
         Args:
-            ids: [M], in any order, assigned by this map and absent now.
+            ids: [M], in any order. This map assigned them earlier, and they are absent now.
             rows: [M, 16].
             anchors: [M].
             labels: [M, 32]; None for Gaussians without observations.
 
         Raises:
-            ValueError: An array has another shape, or the rows hold NaN or infinity. Or an id is
-                present already, is given twice, or was never assigned by this map.
+            ValueError: An array has another shape, or the rows hold NaN or infinity. It is also
+                raised for an id that is present, is given twice, or was never assigned here.
         """
         returned = _piece(ids, rows, anchors, labels).at(np.argsort(ids, kind="stable"))
         before = np.searchsorted(self.ids, returned.ids)  # Number of present rows before each.
@@ -261,11 +267,12 @@ class GaussianMap:
     def move_anchors(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move the Gaussians of some anchor keyframes: mean <- T mean, quat <- q(T) quat.
 
-        The cost is linear in N. The computation uses float64.
+        The computing time is linear in the size N of the map. The computation uses float64.
 
         Args:
-            T_new_old: Transform [4, 4] from the old place in the map to the new one, by keyframe
-                id: T_map_keyframe(new) @ inverse(T_map_keyframe(old)). Other Gaussians stay.
+            T_new_old: Motion T [4, 4] in the map frame by id of the anchor keyframe:
+                T_map_keyframe(new) @ inverse(T_map_keyframe(old)). Gaussians of other anchor
+                keyframes do not move.
 
         Raises:
             ValueError: A transform is not [4, 4] and finite.
@@ -275,7 +282,9 @@ class GaussianMap:
             return
         T = np.stack([np.asarray(T_new_old[int(k)], float) for k in keyframes])
         if T.shape[1:] != (4, 4) or not np.all(np.isfinite(T)):
-            raise ValueError("transforms must be [4, 4] and finite.")
+            raise ValueError(
+                "T_new_old must have finite transforms of shape [4, 4]; at least one is not."
+            )
         q = se3.quaternion(T[:, :3, :3])
         for start in range(0, self._size, _CHUNK):
             chunk = slice(start, min(start + _CHUNK, self._size))
@@ -302,7 +311,7 @@ class GaussianMap:
         """
         if "labels" not in state:
             raise DataError(
-                "the saved state has no labels of Gaussians, because an earlier version saved it. "
+                "the saved state has no labels of Gaussians: an earlier version saved it. "
                 "Start with another state folder."
             )
         size = len(state["rows"])
@@ -319,7 +328,7 @@ class GaussianMap:
 
     def _require_absent(self, ids: np.ndarray, before: np.ndarray) -> None:
         if np.any(np.diff(ids) <= 0):
-            raise ValueError("an id is given twice.")
+            raise ValueError("each id may be given only once; at least one is given twice.")
         if len(ids) and not (ids[0] >= 0 and ids[-1] < self._next_id):
             raise ValueError(
                 f"ids {ids[0]} to {ids[-1]} must lie in the ids of this map, 0 to "

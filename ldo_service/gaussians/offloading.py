@@ -1,4 +1,7 @@
-"""Gaussians offloaded to disk, in chunks of one anchor keyframe, until a camera comes near."""
+"""Offloading of Gaussians to disk, in chunks, until a camera may see them again.
+
+The Gaussians of a chunk have the same anchor keyframe.
+"""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
@@ -26,9 +29,9 @@ SETTLED_AT_ONCE = 16  # Chunks rewritten per call of `move`: 2 ms each.
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Entry:
-    """Entry of the table of chunks in memory, stored by the number of the chunk's file.
+    """Table entry of one offloaded chunk, which stays in memory.
 
-    The chunk holds `count` of the ids from the first to the last.
+    The chunk has `count` Gaussians, whose ids lie between `first_id` and `last_id`.
     """
 
     anchor: int
@@ -47,22 +50,26 @@ class _Entry:
 
 @dataclass(frozen=True, slots=True)
 class LostIdRange:
-    """Range of ids, inclusive; those of them that exist nowhere else are lost."""
+    """Range of ids, both ends included, in which the Gaussians of a damaged chunk lie.
+
+    Ids of this range that are neither in memory nor in another chunk are lost.
+    """
 
     first_id: int
     last_id: int
 
 
 class OffloadedGaussians:
-    """Chunks of Gaussians in `folder`, loaded as if they had never left the map.
+    """Store of offloaded chunks in `folder`.
 
-    Loaded Gaussians are bitwise equal to Gaussians that stayed in memory and moved with their
-    anchors. A chunk takes less than 1 kB of memory. Without a folder, a temporary one is used
-    and removed with this object. Not thread-safe.
+    Loading restores Gaussians exactly: they are bitwise equal to Gaussians that stayed in memory
+    and moved with their anchor keyframes. A chunk on disk takes less than 1 kB of memory. If
+    `folder` is None, a temporary folder is used and removed at the end. Not thread-safe.
 
-    The folder belongs to one state: `restore` and, without it, the first `put` remove chunks that
-    the state does not contain. Files of loaded chunks stay until a `snapshot` without them is
-    `saved`, because a restored process needs them.
+    The folder contains the chunks of one state only. `restore` removes all other files; without
+    `restore`, the first `put` removes them. When a chunk is loaded, its file stays: a process
+    restored from the last snapshot would need it. The file is removed once a later snapshot, which
+    does not contain the chunk, has been saved (`saved`).
 
     Raises:
         ConfigError: The folder cannot be used.
@@ -91,7 +98,8 @@ class OffloadedGaussians:
         """Write a chunk to disk.
 
         Returns:
-            The number of the chunk, or None if the disk rejects it; it must then stay in memory.
+            The number of the chunk. None if it cannot be written to disk; the caller must then keep
+            it in memory.
 
         Raises:
             ValueError: The chunk has no Gaussians, or its ids do not ascend.
@@ -112,8 +120,8 @@ class OffloadedGaussians:
     def load(self, number: int) -> Chunk:
         """Remove a chunk from the store and return it at the current pose of its anchor.
 
-        The chunk is empty if its file is damaged. Its Gaussians are then lost, which is counted and
-        logged.
+        If its file is damaged, an empty chunk is returned. Its Gaussians are lost; this is counted
+        and logged.
 
         Raises:
             KeyError: There is no such chunk.
@@ -130,15 +138,17 @@ class OffloadedGaussians:
     ) -> list[int]:
         """Offload the Gaussians of some chunks from the map.
 
-        The cost is linear in the size of the map. Gaussians that the disk rejects stay in memory.
+        The computing time is linear in the size of the map. Gaussians that cannot be written to
+        disk stay in memory.
 
         Args:
             gaussians: The map.
-            clumps: Chunk number of each Gaussian, [N] int; a chunk has one anchor.
+            clumps: Chunk number of each Gaussian, [N] int, from `chunk_numbers`. Gaussians with the
+                same number must have the same anchor keyframe.
             chosen: Chunk numbers to offload.
 
         Returns:
-            The file numbers of the chunks written.
+            Numbers of the written files, as `put` returns them.
         """
         mask = np.isin(clumps, np.array(sorted(chosen), np.int64))
         of_clump = clumps[mask]
@@ -154,13 +164,13 @@ class OffloadedGaussians:
         return numbers
 
     def load_into(self, gaussians: GaussianMap, numbers: Iterable[int]) -> np.ndarray:
-        """Load chunks into the map that they came from.
+        """Load chunks back into the map that they were offloaded from.
 
-        The cost is linear in the size of the map.
+        The computing time is linear in the size of the map.
 
         Args:
             gaussians: The map.
-            numbers: File numbers of the chunks.
+            numbers: Numbers of the chunk files, as `put` returned them.
 
         Returns:
             Ids [M] of the loaded Gaussians, ascending.
@@ -174,13 +184,13 @@ class OffloadedGaussians:
 
     # --- access without loading -------------------------------------------------------------------
     def visible_chunks(self, camera: PlacedCamera, reach_m: float = inf) -> list[int]:
-        """Return the numbers of the chunks that a camera may see, ascending.
+        """Return the file numbers of the chunks that a camera may see, ascending.
 
-        No file is read.
+        The decision uses bounding spheres in memory; no file is read.
 
         Args:
             camera: The camera.
-            reach_m: Largest distance of a visible chunk.
+            reach_m: Distance beyond which chunks count as invisible.
         """
         if self._spheres is None:
             self._spheres = self._all_spheres()
@@ -199,9 +209,9 @@ class OffloadedGaussians:
             self._rewrite_chunk(number)
 
     def chunks(self) -> Iterator[Chunk]:
-        """Yield all offloaded Gaussians by anchor, in order of their ids.
+        """Yield all offloaded Gaussians, one anchor keyframe after the other; ids ascend.
 
-        Only those of one anchor are in memory at a time.
+        Only the Gaussians of one anchor keyframe are in memory at a time.
         """
         by_anchor: dict[int, list[int]] = {}
         for number in sorted(self._entries, key=lambda n: self._entries[n].first_id):
@@ -223,10 +233,10 @@ class OffloadedGaussians:
 
     # --- damage -----------------------------------------------------------------------------------
     def pop_lost_ids(self, gaussians: GaussianMap) -> np.ndarray:
-        """Return ids [L], ascending, from the ranges that lost Gaussians since the last call.
+        """Return the ids [L], ascending, of Gaussians lost to damaged files since the last call.
 
-        The result excludes ids that still exist, in memory or on disk. It may include ids of
-        Gaussians that were removed before.
+        Only the id range of a damaged chunk is known. The result contains all ids of this range
+        that exist neither in memory nor on disk, also those of Gaussians removed earlier.
 
         Args:
             gaussians: The map with the resident Gaussians.
@@ -263,15 +273,15 @@ class OffloadedGaussians:
         }
 
     def saved(self) -> None:
-        """Remove the files that the last snapshot does not name, because it is now saved."""
+        """Remove the files that the last snapshot does not refer to; call it once that is saved."""
         for number in self._retired_before:
             self._files.remove(number)
         self._retired_before = []
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restore the table of a snapshot, with the files in this folder.
+        """Restore the table of chunks from a snapshot; the folder must contain their files.
 
-        Chunks with missing files are dropped, counted and logged.
+        A chunk whose file is missing is dropped, counted and logged.
         """
         names = ("anchors", "first_ids", "last_ids", "counts", "centers", "radii_m")
         columns = [state[name] if name == "centers" else state[name].tolist() for name in names]
@@ -310,7 +320,7 @@ class OffloadedGaussians:
         return number
 
     def _read(self, number: int) -> Chunk:
-        """Return the chunk at the current pose of its anchor.
+        """Read a chunk, moved to the current pose of its anchor keyframe.
 
         If its file is damaged, drop the entry and return an empty chunk.
         """
@@ -329,7 +339,7 @@ class OffloadedGaussians:
         return chunk.moved(entry.motions)
 
     def _rewrite_chunk(self, number: int) -> None:
-        """Write a chunk at its current pose and drop its pending motions."""
+        """Write a chunk again at the current pose of its anchor, so that no motions are pending."""
         chunk, entry = self._read(number), self._entries.get(number)
         if entry is not None and self._write(chunk, replace(entry, motions=())) is not None:
             self._slept -= entry.count
@@ -364,7 +374,7 @@ class OffloadedGaussians:
 
 
 def _members(labels: np.ndarray) -> list[np.ndarray]:
-    """Return the indices of each label in labels [N], ascending, label by label."""
+    """Return the positions of each distinct value in `labels` [N], by ascending value."""
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(labels) else []
 
@@ -382,8 +392,8 @@ def iter_all_gaussians(
 ) -> Iterator[GaussianBatch]:
     """Yield all Gaussians, resident and offloaded, in batches; ids ascend throughout.
 
-    The ids of one anchor are consecutive. Only the offloaded Gaussians of one anchor are in
-    memory at a time.
+    This relies on consecutive ids of the Gaussians of one anchor keyframe. Only the offloaded
+    Gaussians of one anchor keyframe are in memory at a time.
     """
     awake, start = gaussians.all(), 0
     for chunk in sleeping.chunks():

@@ -29,7 +29,7 @@ class PoseAdam:
         self._moments: dict[int, np.ndarray] = {}  # [m, v, steps][WIDTH].
 
     def direction(self, keyframe: int, gradient: np.ndarray) -> np.ndarray:
-        """Update the moments of a keyframe and return Adam's step of unit rate, [6]."""
+        """Update the moments of a keyframe, and return Adam's step for the learning rate 1, [6]."""
         mean, square, steps = self._moments.setdefault(keyframe, np.zeros((3, WIDTH)))
         steps += 1
         mean += (1 - BETA1) * (gradient - mean)
@@ -105,7 +105,7 @@ class GaussianOptimizerConfig:
 
     @property
     def refines_poses(self) -> bool:
-        """Switch of the pose optimization: true if one of its rates is not 0."""
+        """True if keyframe poses are optimized too: one of their learning rates is above 0."""
         return self.rotation_rate_rad > 0 or self.translation_rate_m > 0
 
 
@@ -115,7 +115,7 @@ class IterationResult:
 
     Attributes:
         loss: Loss before the step.
-        view: View with its exposure and pose after the step.
+        view: The training view with exposure and pose after the step.
         reached: Number of Gaussians that may touch the image.
     """
 
@@ -125,7 +125,7 @@ class IterationResult:
 
 
 class Views(Protocol):
-    """Views by keyframe, which the optimizer reads and updates with new exposures and poses."""
+    """Interface to training views by keyframe; the optimizer writes new exposures and poses."""
 
     def __getitem__(self, keyframe: int) -> TrainingView: ...
 
@@ -133,10 +133,10 @@ class Views(Protocol):
 
 
 class GaussianOptimizer:
-    """Optimizer of Gaussians, exposures and poses; it keeps all moments between calls.
+    """Optimizer of Gaussians, exposures and keyframe poses; moments persist between calls.
 
-    Deterministic: the same map, views and plan give bitwise equal results for any number of
-    threads. Not thread-safe.
+    The same map, training views and plan give bitwise equal results for any number of threads. Not
+    thread-safe.
     """
 
     def __init__(self, config: GaussianOptimizerConfig | None = None, *, threads: int = 1) -> None:
@@ -157,20 +157,21 @@ class GaussianOptimizer:
         fixed: int | None = None,
         effort: float = inf,
     ) -> list[ImageLoss]:
-        """Take one step against each view of a plan.
+        """Run one iteration for each training view of a plan.
 
         `gaussians` changes in place. Views with new exposures and poses are written to `views`.
 
         Args:
             gaussians: The map.
-            views: Views by keyframe.
+            views: Training views by keyframe.
             plan: Keyframes, in the order of the iterations.
-            rates: Factor on all steps of the first and the last iteration, geometric between: 1
-                while the map grows, less to converge at the end.
-            fixed: Keyframe with constant pose and exposure, which fix the pose and the brightness
-                of the map.
-            effort: Limit of the work. An iteration counts as (1 + r) / 2, where r is the number of
-                Gaussians that it reaches over `usual_reach`.
+            rates: Factors on the learning rates at the first and at the last iteration; they change
+                geometrically in between. Use 1 while the map grows, less to converge at the end.
+            fixed: Keyframe whose pose and exposure stay constant. They fix the pose and the
+                brightness of the map.
+            effort: Limit of the computation: iterations stop when their sum of (1 + r) / 2 reaches
+                it. r is the number of Gaussians that may touch the image, divided by
+                `usual_reach`.
 
         Returns:
             Losses before each step.
@@ -195,13 +196,13 @@ class GaussianOptimizer:
         rate: float = 1.0,
         is_fixed: bool = False,
     ) -> IterationResult:
-        """Run one iteration against one view.
+        """Run one iteration against one training view.
 
         Args:
             gaussians: The map.
-            view: The view.
-            rate: Factor on all steps.
-            is_fixed: Keep exposure and pose.
+            view: The training view.
+            rate: Factor on all learning rates.
+            is_fixed: Keep the exposure and the pose of the view constant.
         """
         config = self.config
         # Render and compute the loss.
@@ -263,7 +264,7 @@ class GaussianOptimizer:
     def steps(self, gaussians: GaussianMap) -> np.ndarray:
         """Return the number of steps of each Gaussian, [N] int32.
 
-        A Gaussian changed if its number grew.
+        A Gaussian has changed between two calls if its number has increased.
         """
         return self._adam.steps(gaussians)
 

@@ -1,6 +1,7 @@
 """Pruning of Gaussians that are transparent, oversized, hidden or duplicates.
 
-Surface is duplicated when a correction moves one pass of the camera over an earlier one.
+Duplicates arise if the same surface was mapped twice at different poses. A correction of the pose
+graph then moves both copies to the same pose.
 """
 
 from dataclasses import dataclass
@@ -44,9 +45,9 @@ class PruningConfig:
 
 
 def prunable_mask(rows: np.ndarray, config: PruningConfig | None = None) -> np.ndarray:
-    """Return the mask of Gaussians to prune.
+    """Return the mask of Gaussians that are nearly transparent, oversized or not finite.
 
-    They are nearly transparent, far larger than those around them, or not finite.
+    Oversized means far larger than the mean of the Gaussians around.
 
     Args:
         rows: [N, 16].
@@ -64,9 +65,9 @@ def prunable_mask(rows: np.ndarray, config: PruningConfig | None = None) -> np.n
 
 
 def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.ndarray:
-    """Return the mean [N] of the values of the other Gaussians in the same cube.
+    """Return, for each Gaussian, the mean value of the other Gaussians in the same cube, [N].
 
-    It is infinite if there is no other.
+    It is infinite if there is no other Gaussian. Space is divided into cubes of edge `edge_m`.
     """
     cube = np.floor(np.nan_to_num(means.astype(float)) / edge_m).astype(np.int64)
     cube -= cube.min(axis=0, initial=0)
@@ -81,14 +82,14 @@ def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.nda
 def weights(rows: np.ndarray) -> np.ndarray:
     """Return the approximate contribution of each of the rows [N, 16] to an image, [N].
 
-    It is the opacity times the largest section in m^2, the product of the two larger scales.
+    It is the opacity times an area in m^2: the product of the two larger standard deviations.
     """
     log_scales = rows[:, 3:6]
     return _opacities(rows) * np.exp(log_scales.sum(axis=1) - log_scales.min(axis=1))
 
 
 def weightiest(rows: np.ndarray, most: int) -> np.ndarray:
-    """Return the mask [N] bool of the `most` rows with the largest weight, or of all rows."""
+    """Return the mask [N] bool of the `most` rows with the largest weight; all if N <= `most`."""
     mask = np.ones(len(rows), bool)
     if len(rows) > most:
         mask[np.argsort(weights(rows), kind="stable")[: len(rows) - most]] = False
@@ -133,16 +134,16 @@ def find_duplicates(
 ) -> np.ndarray:
     """Return the mask of Gaussians of a keyframe that duplicate much older ones.
 
-    A duplicate lies within `off_m` of an older Gaussian's plane and within `reach_sigmas` of it in
-    that plane, and has a similar normal and color. The older Gaussian is kept: it was optimized
-    longer together with its neighbors, and the loop closure moved the newer ones.
+    A duplicate lies within `off_m` of the plane of an older, flat Gaussian, and within
+    `reach_sigmas` of its center along that plane. Its normal and color are similar. The older
+    Gaussian is kept, since it was optimized longer together with its neighbors.
 
-    Only the other Gaussians around those of the keyframe are compared. So the cost does not grow
-    with the map, except for one pass over the means.
+    Only Gaussians near those of the keyframe are compared. Apart from one pass over all means, the
+    computing time does not grow with the map.
 
     Args:
         rows: [N, 16], see `GaussianMap`.
-        anchors: [N].
+        anchors: Ids of the anchor keyframes, [N].
         keyframe: Id of the keyframe.
         config: Criteria.
 
@@ -165,9 +166,9 @@ def find_duplicates(
 
 
 def _within(rows: np.ndarray, among: np.ndarray, points: np.ndarray, reach_m: float) -> np.ndarray:
-    """Return the indices of those `among` [N] near some points.
+    """Return the indices of the rows near some points, out of the mask `among` [N] bool.
 
-    Near is in the bounding box of the points [M, 3], enlarged by `reach_m` on all sides.
+    Near means inside the bounding box of the points [M, 3], enlarged by `reach_m` on all sides.
     """
     if not len(points):
         return np.zeros(0, np.intp)
@@ -178,7 +179,7 @@ def _within(rows: np.ndarray, among: np.ndarray, points: np.ndarray, reach_m: fl
 
 
 def _is_duplicate(older: np.ndarray, newer: np.ndarray, config: DeduplicationConfig) -> np.ndarray:
-    """Return the mask [M] of the pairs of rows [M, 16] that are duplicates."""
+    """Return which pairs are duplicates, [M] bool; pair m is row m of `older` and `newer`."""
     normals, others = _normals(older), _normals(newer)
     apart = newer[:, :3] - older[:, :3]
     off_m = np.abs(np.sum(apart * normals, axis=1))
@@ -192,7 +193,7 @@ def _is_duplicate(older: np.ndarray, newer: np.ndarray, config: DeduplicationCon
 
 
 def _normals(rows: np.ndarray) -> np.ndarray:
-    """Return the shortest axis of each Gaussian, [M, 3]."""
+    """Return the unit vector along the shortest axis of each Gaussian, [M, 3]."""
     axes = se3.rotation(rows[:, 6:10])
     shortest = np.argmin(rows[:, 3:6], axis=1)
     return np.take_along_axis(axes, shortest[:, None, None], axis=2)[:, :, 0]

@@ -22,7 +22,7 @@ WEIGHT = 14  # Field of the summed weight in a row of gradients.
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AdamStep:
-    """Parameters, moments and rates of a step of Adam, for `Rasterizer.descend`.
+    """Arguments of one step of Adam, for `Rasterizer.descend`.
 
     Attributes:
         rows: Parameters, [N, 16] float32; changed in place.
@@ -47,12 +47,14 @@ class AdamStep:
 
 @dataclass(frozen=True, slots=True)
 class RowGradients:
-    """Derivatives of a scalar L at the last rendering; views, valid until the next rendering.
+    """Derivatives of a scalar L at the last rendering.
+
+    The arrays are views of reused memory, valid until the next rendering.
 
     Attributes:
         indices: Rows that may touch the image, [V] uint32, ascending.
-        rows: dL/drow, [V, 16] float32. Field 14 holds the Gaussian's weights summed over the
-            pixels (px), field 15 is zero. A hidden Gaussian has zeros only.
+        rows: dL/drow, [V, 16] float32. Column 14 is no derivative: it is the blending weight of the
+            Gaussian summed over the pixels. Column 15 is zero. A hidden Gaussian has only zeros.
         xi: dL/dxi at xi = 0 of T_map_camera exp(xi), [6] float64: rotation rad, translation m.
     """
 
@@ -63,12 +65,14 @@ class RowGradients:
 
 @dataclass(frozen=True, slots=True)
 class VisibleGaussians:
-    """Gaussians that a step of the optimizer reached; views, valid until the next rendering.
+    """Gaussians that may touch the last rendered image, after a step of the optimizer.
+
+    The arrays are views of reused memory, valid until the next rendering.
 
     Attributes:
         indices: Rows that may touch the image, [V] uint32, ascending.
-        weights: Weights of each Gaussian summed over the pixels (px), [V] float32. Hidden
-            Gaussians have 0 and are not moved.
+        weights: Blending weight of each Gaussian summed over the pixels, [V] float32. It is 0 for
+            hidden Gaussians, which the step does not change.
         xi: dL/dxi at xi = 0 of T_map_camera exp(xi), [6] float64: rotation rad, translation m.
     """
 
@@ -78,9 +82,9 @@ class VisibleGaussians:
 
 
 class Rasterizer:
-    """Renderer of one view after the other for the optimizer, which reuses its memory.
+    """Renderer for the optimizer, which reuses its memory from image to image.
 
-    Its images have no median depth; otherwise they equal those of `render`. Not thread-safe.
+    Its images equal those of `render`, but have no median depth. Not thread-safe.
     """
 
     def __init__(self, *, threads: int = 1) -> None:
@@ -102,20 +106,19 @@ class Rasterizer:
         bounds: _rasterize.Bounds | None = None,
         tiles: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Render the planes that the loss reads.
+        """Render the image planes that the loss needs.
 
         Args:
             rows: See `render`.
             camera: See `render`.
             T_camera_map: See `render`.
             bounds: See `render`.
-            tiles: [ceil(H / 16), ceil(W / 16)] uint8. Where it is 0, the planes are zero and are
-                not computed. Pass the same tiles to `image_loss`, and the gradients are those of
-                the other tiles alone.
+            tiles: [ceil(H / 16), ceil(W / 16)] uint8. Tiles with value 0 are not rendered, and
+                their pixels are zero. Pass the same array to `image_loss`, which then ignores them.
 
         Returns:
-            Planes [5, H, W] float32: red, green, blue, depth sum w_i z_i (m), opacity. The next
-            rendering overwrites them.
+            Planes [5, H, W] float32: red, green, blue, weighted depth sum w_i z_i in meters, and
+            opacity. The next rendering overwrites them.
 
         Raises:
             DataError: The camera has lens distortion.
@@ -138,16 +141,20 @@ class Rasterizer:
     def gradients(
         self, by_planes: np.ndarray, *, needle_weight: float = 0.0, needle_ratio: float = 1.0
     ) -> RowGradients:
-        """Compute the derivatives of L at the last rendering.
+        """Compute the derivatives of the loss L at the last rendering.
 
-        L has an additional term needle_weight * mean over pixels of sum_i w_i max(0, log(longest /
-        middle axis of i) - log needle_ratio), with w_i held fixed. The rows must not have changed
-        since the rendering. The result is bitwise equal for any number of threads.
+        An additional term in L penalizes needle-shaped Gaussians:
+
+            needle_weight * mean over pixels of
+                sum_i w_i max(0, log(longest / middle axis of Gaussian i) - log needle_ratio)
+
+        The blending weights w_i count as constants in it. The rows must not have changed since the
+        rendering. The result is bitwise equal for any number of threads.
 
         Args:
-            by_planes: dL/dplanes, [5, H, W].
+            by_planes: dL/dplanes without the additional term, [5, H, W].
             needle_weight: Weight of the additional term.
-            needle_ratio: Ratio of axes from which the term counts.
+            needle_ratio: Ratio of the longest to the middle axis above which the term is positive.
         """
         indices = self._room_for_indices()
         if len(self._gradients) < self._visible:
@@ -175,22 +182,23 @@ class Rasterizer:
         needle_ratio: float = 1.0,
         max_sigma_px: float = inf,
     ) -> VisibleGaussians:
-        """Compute the gradients and take a step of Adam in one pass, bitwise equal to two passes.
+        """Compute the gradients and take a step of Adam in one pass.
 
-        The rendered rows and the moments change in place. The gradients stay in cache, which saves
-        a sixth of an iteration.
+        The result is bitwise equal to that of two passes. One pass takes a sixth less time per
+        iteration, since gradients stay in the CPU cache. The rendered rows and the moments change
+        in place.
 
         Args:
             by_planes: dL/dplanes, [5, H, W].
             step: Parameters, moments and rates.
             needle_weight: See `gradients`.
             needle_ratio: See `gradients`.
-            max_sigma_px: Limit of the standard deviations of moved Gaussians in this view, at the
-                depth of the mean.
+            max_sigma_px: The step limits the standard deviations of a Gaussian to this size in the
+                image, computed at the depth of its mean.
 
         Raises:
-            ValueError: `step` is for other rows than the last rendering, or a step has changed them
-                since.
+            ValueError: `step.rows` are not the rows of the last rendering, or an earlier step has
+                changed them since the rendering.
         """
         indices = self._room_for_indices()
         if len(self._weights) < self._visible:
@@ -224,7 +232,10 @@ class Rasterizer:
 
 
 def _new_planes(height: int, width: int) -> np.ndarray:
-    """Return planes [5, H, W] on a cache line; if 16 divides W, no two tiles share a line."""
+    """Return planes [5, H, W] that start at a cache line.
+
+    If W is a multiple of 16, no cache line contains pixels of two tiles.
+    """
     size = PLANES * height * width
     return aligned_rows(-(-size // ROW)).reshape(-1)[:size].reshape(PLANES, height, width)
 
@@ -238,9 +249,10 @@ class Contributions:
 
     Attributes:
         indices: Rows with a weight above 0, [V] uint32, ascending.
-        weights: w_i summed over the pixels (px), [V] float32.
-        top: Row with the largest w_i of each pixel, [H, W] int32; the nearest of equal ones, -1
-            without any. `np.where(top >= 0, labels[top], nothing)` is an image of labels.
+        weights: Blending weight w_i summed over the pixels, [V] float32.
+        top: Row with the largest w_i at each pixel, [H, W] int32. Of equal ones it is the nearest;
+            -1 if no Gaussian touches the pixel. An image of labels is
+            `np.where(top >= 0, labels[top], nothing)`.
     """
 
     indices: np.ndarray
@@ -255,8 +267,8 @@ class Rendering:
     Attributes:
         color: sum w_i c_i, [H, W, 3] float32; the background is black.
         weighted_depth_m: sum w_i z_i, [H, W] float32; not divided by the opacity.
-        median_depth_m: z where the transmittance first falls below one half, else 0, [H, W]
-            float32. It lies on a surface, while the mean may lie between two.
+        median_depth_m: z at which the transmittance falls below one half, [H, W] float32; 0 if it
+            does not. The median lies on a surface, while the mean may lie between two surfaces.
         opacity: sum w_i = 1 - transmittance, [H, W] float32.
         contributions: Contributions of the Gaussians, if requested.
     """
@@ -269,7 +281,7 @@ class Rendering:
 
     @property
     def depth_m(self) -> np.ndarray:
-        """Mean depth [H, W] where the opacity exceeds one half, else 0; computed on each access."""
+        """Mean depth [H, W] in meters, 0 where the opacity is at most 0.5; not cached."""
         covered = self.opacity > 0.5
         return np.where(covered, self.weighted_depth_m / np.where(covered, self.opacity, 1), 0)
 
@@ -298,16 +310,16 @@ def render(
     Args:
         rows: [N, 16] float32, contiguous: mean [3] in meters (map), log scale [3] in log meters,
             quaternion wxyz [4] of any length, opacity logit, rgb [3], 2 unused. Rows that hold NaN
-            or infinity are not drawn.
+            or infinity are not rendered.
         camera: Intrinsics without distortion.
         T_camera_map: [4, 4].
         threads: Threads of the kernel.
-        bounds: Bounds of these rows (`GaussianMap.bounds`). Rows out of view are then not read,
-            which changes no bit of the result.
-        memory: Scratch memory for this call and the next, which saves the time of fresh pages. One
-            call may use it at a time.
-        contributions: Also compute the contributions of the Gaussians, which takes about half as
-            much time again.
+        bounds: Bounds of these rows (`GaussianMap.bounds`). They save reading invisible rows and do
+            not change the result.
+        memory: Scratch memory to reuse in several calls, which saves the time of its allocation.
+            Only one call may use it at a time.
+        contributions: Also compute the contributions of the Gaussians, which takes about 50 % more
+            time.
 
     Raises:
         DataError: The camera has lens distortion.

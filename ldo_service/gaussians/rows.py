@@ -1,4 +1,4 @@
-"""Rows of Gaussians: their layout in memory, and their motion with the anchor keyframes."""
+"""Rows of Gaussian parameters: their layout in memory, and motion with the anchor keyframes."""
 
 import numpy as np
 
@@ -30,14 +30,15 @@ def move_rows(
 ) -> None:
     """Move rows in place by the transforms of their anchors.
 
-    It works by columns: a product of many small matrices takes NumPy five times as long.
+    The computation runs column by column, since NumPy needs five times as long for a product of
+    many small matrices.
 
     Args:
         rows: [M, 16].
         anchors: Anchor keyframe of each row, [M].
         keyframes: Ids of the moved keyframes, [K], ascending. Rows of other anchors stay.
         T: Transforms T_new_old of these keyframes, [K, 4, 4].
-        q: Their rotations, [K, 4] wxyz.
+        q: Rotations of these transforms, [K, 4] wxyz.
     """
     which = np.minimum(np.searchsorted(keyframes, anchors), len(keyframes) - 1)
     moved = np.flatnonzero(keyframes[which] == anchors)
@@ -50,7 +51,7 @@ def move_rows(
 
 
 def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the Hamilton product [M, 4] of quaternions wxyz: the rotation q, then p."""
+    """Return the Hamilton product p q [M, 4] of quaternions wxyz: rotation q, followed by p."""
     pw, px, py, pz = p.T
     qw, qx, qy, qz = q.T
     return np.stack(

@@ -1,6 +1,6 @@
-"""Training views: keyframes to optimize the map against, and their choice for the iterations.
+"""Training views: keyframes that the map is optimized against, and their choice per iteration.
 
-The images of a view, which never change, are stored as bytes.
+The images of a training view never change and are stored as compressed bytes.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _QUANTIZED = 0.25
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TrainingView:
-    """A keyframe as the loss reads it.
+    """A keyframe with everything that the image loss needs.
 
     Attributes:
         keyframe: Id of the keyframe.
@@ -31,7 +31,7 @@ class TrainingView:
         color: [3, H, W] uint8.
         depth_m: [H, W] float32, meters; 0 where not measured.
         T_map_camera: Pose, [4, 4].
-        exposure: Gain and bias of its image relative to the map.
+        exposure: Gain and bias of the image relative to the map.
         mask: [H, W] uint8, 0 where the pixel is ignored; None to use all pixels.
     """
 
@@ -45,13 +45,13 @@ class TrainingView:
 
     @classmethod
     def of(cls, frame: RgbdFrame, T_map_camera: np.ndarray, keyframe: int) -> "TrainingView":
-        """Return the view of a frame, with neutral exposure and without a mask."""
+        """Return the training view of a frame, with gain 1, bias 0 and without a mask."""
         planes = np.ascontiguousarray(frame.color.transpose(2, 0, 1))
         return cls(keyframe, frame.camera, planes, frame.depth_m, T_map_camera)
 
 
 def sampled_surface(view: TrainingView, *, step_px: int = 32) -> np.ndarray:
-    """Return the surface that a view measured: map points [M, 3] of every `step_px`-th pixel."""
+    """Return the measured 3D points of every `step_px`-th row and column, in the map, [M, 3]."""
     coarse = slice(step_px // 2, None, step_px)
     z = view.depth_m[coarse, coarse]
     points = view.camera.rays()[coarse, coarse][z > 0] * z[z > 0][:, None]
@@ -59,9 +59,9 @@ def sampled_surface(view: TrainingView, *, step_px: int = 32) -> np.ndarray:
 
 
 def covisibility_ratio(p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray) -> float:
-    """Return the fraction of points in the image of a camera and in front of it.
+    """Return the fraction of points that are in front of a camera and inside its image, 0..1.
 
-    Occlusion is ignored. The result is 0 without points.
+    Occlusion is ignored. If there are no points, the result is 0.
 
     Args:
         p_map: Points in the map frame, [M, 3].
@@ -109,11 +109,11 @@ def sample_training_views(
 ) -> list[int]:
     """Choose the keyframe of each iteration at random.
 
-    The newest keyframe replaces a choice from an empty list.
+    Where a choice would be from an empty list, the newest keyframe is taken.
 
     Args:
-        newest: The newest keyframe; the first iteration takes it unless `newest_share` is 0.
-        covisible: Keyframes covisible with it.
+        newest: The newest keyframe. The first iteration takes it unless `newest_share` is 0.
+        covisible: Keyframes covisible with the newest one.
         others: All other keyframes.
         iterations: Number of iterations.
         rng: Random generator.
@@ -137,7 +137,7 @@ def sample_training_views(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KeyframeImages:
-    """The part of a training view that never changes.
+    """Images and camera of a training view, which never change.
 
     Attributes:
         keyframe: Id of the keyframe.
@@ -172,7 +172,7 @@ class KeyframeImages:
 
     @classmethod
     def of(cls, view: TrainingView) -> "KeyframeImages":
-        """Return the images of a view."""
+        """Return the images of a training view."""
         return cls(view.keyframe, view.camera, view.color, view.depth_m, view.mask)
 
     def view(self, T_map_camera: np.ndarray, exposure: Exposure | None = None) -> TrainingView:
@@ -194,7 +194,10 @@ class KeyframeImages:
         return sum(image.nbytes for image in images if image is not None)
 
     def owned(self) -> "KeyframeImages":
-        """Return read-only copies of the images, so that no received message stays in memory."""
+        """Return read-only copies of the images.
+
+        The originals may be views of a received message, which would stay in memory as a whole.
+        """
         mask = None if self.mask is None else _own(self.mask)
         return replace(self, color=_own(self.color), depth_m=_own(self.depth_m), mask=mask)
 
@@ -251,7 +254,10 @@ def unpack(body: bytes | memoryview) -> KeyframeImages:
 
 
 def _color_differences(color: np.ndarray) -> np.ndarray:
-    """Return red and blue minus green, then each row minus the one above it; modulo 256."""
+    """Return color as small differences, which compress better; all are modulo 256.
+
+    Green is subtracted from red and blue, then from each row the row above it.
+    """
     out = color.copy()
     out[0::2] -= color[1]
     out[:, 1:] = np.subtract(out[:, 1:], out[:, :-1])
@@ -259,7 +265,7 @@ def _color_differences(color: np.ndarray) -> np.ndarray:
 
 
 def _color_of(differences: np.ndarray) -> np.ndarray:
-    """Invert `_color_differences` in place: fresh memory would take longer than the sums."""
+    """Invert `_color_differences` in place, which is faster than allocating a new array."""
     for plane in differences:
         np.add.accumulate(plane, axis=0, dtype=np.uint8, out=plane)
     differences[0::2] += differences[1]
@@ -269,11 +275,11 @@ def _color_of(differences: np.ndarray) -> np.ndarray:
 def _packed_depth(depth_m: np.ndarray) -> tuple[bytes, bool]:
     """Compress depth [H, W].
 
-    Quantized depth is stored as it is. Other depth is stored as differences of rows, byte by
-    byte, which halves its size.
+    Quantized depth is stored unchanged. Other depth is stored as differences between rows, with the
+    first bytes of all values first, then the second bytes and so on. This halves its size.
 
     Returns:
-        The bytes, and whether they are differences.
+        The bytes, and whether they contain differences.
     """
     plain = _compressed(depth_m)
     if len(plain) < _QUANTIZED * depth_m.nbytes:

@@ -1,4 +1,7 @@
-"""Bounds on which cameras may see Gaussians, and the choice of Gaussians to offload."""
+"""Conservative visibility of Gaussians from cameras, and the choice of Gaussians to offload.
+
+Bounding spheres and a coarse depth grid decide whether Gaussians may be visible.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,10 +32,10 @@ _ROUNDING = 1.000_01  # Margin for the float32 sums of the renderer.
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MaxDepthGrid:
-    """The farthest depth in each block of an image.
+    """Farthest depth in each of 12 x 16 blocks of an image.
 
     Attributes:
-        farthest_m: [12, 16] float32; infinite where a block was not measured completely.
+        farthest_m: [12, 16] float32, meters; infinite if a block has pixels without depth.
     """
 
     farthest_m: np.ndarray
@@ -49,10 +52,11 @@ class MaxDepthGrid:
     def occludes(
         self, camera: Camera, centers_camera: np.ndarray, radii_m: np.ndarray
     ) -> np.ndarray:
-        """Return which spheres lie wholly behind the measured surface.
+        """Return which spheres lie completely behind the measured surface.
 
-        A sphere is behind it in every block where it may be visible. The result is conservative:
-        never True for a visible sphere, but False for some hidden ones and for all that hold NaN.
+        The result is True if the sphere is behind the surface in every block that it may touch. It
+        is conservative: never True for a visible sphere, but False for some hidden spheres. It is
+        False for spheres with NaN.
 
         Args:
             camera: Intrinsics.
@@ -71,7 +75,10 @@ class MaxDepthGrid:
 
 
 def _edges(shape: tuple[int, ...]) -> list[np.ndarray]:
-    """Return the first pixel of each block and one past the last, downward and to the right."""
+    """Return the block boundaries in pixels: vertical positions, then horizontal positions.
+
+    Each is the first pixel of every block and the number of pixels.
+    """
     return [
         np.linspace(0, pixels, blocks + 1).astype(int)
         for pixels, blocks in zip(shape, BLOCKS, strict=True)
@@ -81,14 +88,16 @@ def _edges(shape: tuple[int, ...]) -> list[np.ndarray]:
 def _between(
     centers: np.ndarray, radii_m: np.ndarray, edges: np.ndarray, focal_px: float, center_px: float
 ) -> np.ndarray:
-    """Return whether each sphere touches each wedge between two neighboring edges.
+    """Return whether each sphere may touch each of the B rows (or columns) of blocks.
+
+    The camera and two neighboring block boundaries form a wedge in space, which is tested.
 
     Args:
-        centers: Coordinate across the edges and z, [K, 2].
+        centers: Coordinates (y, z) of the centers for rows, (x, z) for columns, [K, 2].
         radii_m: Radii, [K].
-        edges: Pixels of the edges, [B + 1].
-        focal_px: Focal length across the edges.
-        center_px: Principal point across the edges.
+        edges: Block boundaries from `_edges`, in pixels, [B + 1].
+        focal_px: Focal length fy for rows, fx for columns.
+        center_px: Principal point cy for rows, cx for columns.
 
     Returns:
         Mask [K, B] bool.
@@ -104,12 +113,12 @@ def _between(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlacedCamera:
-    """A camera at a pose, with the farthest depth that it measured.
+    """A camera with its pose and the farthest depths that it measured.
 
     Attributes:
         camera: Intrinsics without distortion.
         T_map_camera: Pose, [4, 4].
-        horizon: Farthest depth in the blocks of its image; None if unknown.
+        horizon: Farthest depth in each block of the image; None if unknown.
     """
 
     camera: Camera
@@ -117,7 +126,7 @@ class PlacedCamera:
     horizon: MaxDepthGrid | None = None
 
     def distances_m(self, centers_map: np.ndarray, radii_m: np.ndarray) -> np.ndarray:
-        """Return the distance to the nearest point of each sphere, [K]; negative inside."""
+        """Return the distance in meters to the surface of each sphere, [K]; negative inside it."""
         return np.linalg.norm(centers_map - self.T_map_camera[:3, 3], axis=1) - radii_m
 
     def may_see(
@@ -125,14 +134,14 @@ class PlacedCamera:
     ) -> np.ndarray:
         """Return which spheres the camera may see.
 
-        They touch its view volume and are not hidden behind its horizon. The result is
-        conservative: never False for a visible sphere, but True for some just outside and for all
-        that hold NaN.
+        These are the spheres that touch the view frustum and do not lie behind `horizon`. The
+        result is conservative: never False for a visible sphere, but True for some spheres just
+        outside. It is True for spheres with NaN.
 
         Args:
             centers_map: Centers in the map frame, [K, 3].
             radii_m: Radii, [K].
-            reach_m: Largest distance of a visible sphere.
+            reach_m: Distance beyond which spheres count as invisible.
 
         Returns:
             Mask [K] bool.
@@ -147,7 +156,7 @@ class PlacedCamera:
         return seen
 
     def _sides(self) -> np.ndarray:
-        """Return the inward normals [4, 3] of the planes through the camera and the image rim."""
+        """Return the inward normals [4, 3] of the four side planes of the view frustum."""
         camera, rim = self.camera, 0.5 + LOW_PASS_PX
         left, right = -rim - camera.cx, camera.width - 1 + rim - camera.cx
         top, bottom = -rim - camera.cy, camera.height - 1 + rim - camera.cy
@@ -164,11 +173,11 @@ class PlacedCamera:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoundingSpheres:
-    """Bounding spheres of groups of Gaussians as drawn; each group has one anchor.
+    """Bounding spheres of K chunks of Gaussians, at the extent to which Gaussians are rendered.
 
     Attributes:
-        anchors: Anchor of each group, [K]; one anchor may have several groups.
-        counts: Number of Gaussians, [K].
+        anchors: Id of the anchor keyframe of each chunk, [K]; several chunks may have the same.
+        counts: Number of Gaussians in each chunk, [K].
         centers: Centers in the map frame, [K, 3].
         radii_m: Radii, [K].
     """
@@ -187,7 +196,8 @@ class BoundingSpheres:
         Args:
             rows: [N, 16].
             anchors: [N].
-            clumps: Chunk numbers [N], see `chunk_numbers`; None for one chunk per anchor.
+            clumps: Chunk numbers [N], see `chunk_numbers`. None makes one chunk for each anchor
+                keyframe.
         """
         clumps = anchors if clumps is None else clumps
         order = np.argsort(clumps, kind="stable")
@@ -203,13 +213,14 @@ class BoundingSpheres:
 def chunk_numbers(means: np.ndarray, anchors: np.ndarray, edge_m: float) -> np.ndarray:
     """Return the chunk number of each Gaussian, [N].
 
-    A chunk holds the Gaussians of one anchor in one cube of the map. Numbers ascend with the
-    anchors. Cubes 1024 edges apart count as one.
+    A chunk contains the Gaussians of one anchor keyframe in one cube of the map. Chunk numbers
+    ascend with the ids of the anchor keyframes. Cubes that are a multiple of 1024 cubes apart on an
+    axis are not distinguished.
 
     Args:
-        means: [N, 3].
-        anchors: [N].
-        edge_m: Edge of the cubes.
+        means: [N, 3], meters.
+        anchors: Ids of the anchor keyframes, [N].
+        edge_m: Edge of the cubes, meters.
     """
     cubes = np.floor(np.nan_to_num(means.astype(float)) / edge_m).astype(np.int64) & 1023
     keys = ((anchors.astype(np.int64) << 10 | cubes[:, 0]) << 10 | cubes[:, 1]) << 10 | cubes[:, 2]
@@ -219,7 +230,7 @@ def chunk_numbers(means: np.ndarray, anchors: np.ndarray, edge_m: float) -> np.n
 def _spheres(
     rows: np.ndarray, starts: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounding spheres of consecutive rows as drawn.
+    """Return the bounding spheres of groups of consecutive rows, at their rendered extent.
 
     Args:
         rows: Means and log scales, [N, 6].
@@ -242,7 +253,7 @@ def _spheres(
 
 @dataclass(frozen=True, slots=True)
 class OffloadConfig:
-    """Limits of the Gaussians in memory."""
+    """Settings of offloading: when Gaussians leave the memory, and which of them."""
 
     # Gaussians in memory (ALGORITHMS, The map): 300 MB with moments. The limit is checked every
     # mapper.publish.update_interval_keyframes; new and loaded Gaussians exceed it until then.
@@ -273,8 +284,9 @@ class OffloadPlan:
     """Choice of the chunks to offload.
 
     Attributes:
-        clumps: Chunk numbers to offload, the farthest first.
-        excess: Number of Gaussians over max_active that stay because a camera may see them.
+        clumps: Numbers of the chunks to offload, the farthest first.
+        excess: Number of Gaussians in memory beyond `max_active` after offloading. They stay
+            because recent cameras may see them.
     """
 
     clumps: list[int]
@@ -288,13 +300,14 @@ def plan_offload(
 ) -> OffloadPlan:
     """Choose the chunks to offload if more than `max_active` Gaussians are in memory.
 
-    Chunks are offloaded until `low_water` of the limit is left. Only chunks that no recent camera
-    may see are chosen, the farthest from the current camera first. At the same distance, older
-    chunks are chosen first. Chunks of the newest anchor always stay. Deterministic.
+    Chunks are chosen until the fraction `low_water` of `max_active` stays in memory. Only chunks
+    that no recent camera may see are chosen, the farthest from the current camera first. At the
+    same distance, chunks of older anchor keyframes are chosen first. Chunks of the newest anchor
+    keyframe always stay. The choice is deterministic.
 
     Args:
         resident: Bounding spheres of all Gaussians in memory, by chunk.
-        recent: Cameras of the last keyframes; the current one is last, and required.
+        recent: Cameras of the last keyframes, at least one; the last one is the current camera.
         config: Limits.
     """
     active = int(resident.counts.sum())
