@@ -1,8 +1,9 @@
-"""Bridge edges: the measurements that connect merged components.
+"""Bridge edges: loop closures that merged two components of the pose graph.
 
-The first measurement between two components is accepted, since there is nothing to check it
-against. Later closures are checked against it and rejected if they contradict it. A rejected one is
-kept. It replaces the bridge edge once more closures agree with it than with the bridge edge.
+A component is a set of keyframes connected by measurements. The first loop closure between two
+components is accepted as the bridge edge, since nothing exists to check it against. Later closures
+that contradict the bridge edge are rejected but stored. A rejected closure replaces the bridge edge
+as soon as more closures agree with the rejected one than with the bridge edge.
 """
 
 from collections import defaultdict
@@ -27,29 +28,32 @@ class BridgeEdge:
     """Bridge edge between two merged components.
 
     Attributes:
-        pair: Keyframes of the edge.
-        connected_keyframes: Keyframes that only this edge connects to the first keyframe of their
-            component.
+        pair: Ids of the two keyframes that the edge connects.
+        connected_keyframes: Keyframes on the far side: without the edge, they would not be
+            connected to the first keyframe of the component.
     """
 
     pair: Pair
     connected_keyframes: Set[int]
 
     def is_across(self, pair: Pair) -> bool:
-        """Return whether the bridge edge separates the two keyframes."""
+        """Return whether the two keyframes of `pair` lie on different sides of the bridge edge."""
         return (pair[0] in self.connected_keyframes) != (pair[1] in self.connected_keyframes)
 
 
 def check_against_bridge(
     known: FactorStore, closure: RelativePose, start: Variables, initial: Variables
 ) -> tuple[ClosureDecision, Variables]:
-    """Return the decision on a closure and the variables of the resulting solution.
+    """Check a loop closure against all other measurements, bridge edges included.
 
     Args:
-        known: Measurements to check the closure against.
-        closure: Closure between keyframes of one component.
+        known: The other measurements.
+        closure: Loop closure between keyframes of one component.
         start: Variables that the batch solver starts from.
-        initial: Values that the variables were inserted with.
+        initial: Values with which the variables were added to the graph.
+
+    Returns:
+        The decision, and the variables of the resulting solution.
     """
     return known.closures.check(
         closure,
@@ -61,24 +65,28 @@ def check_against_bridge(
 def T_new_old(measured: RelativePose, pose: Pose, *, moves_b: bool) -> np.ndarray:
     """Return the motion [4, 4] that brings two keyframes to their measured relative pose.
 
-    It is T_map_a T_a_b T_map_b^-1, which moves b; if not `moves_b`, it is the inverse, which moves
-    a.
+    Args:
+        measured: Measured relative pose of the keyframes a and b.
+        pose: Function that returns T_map_keyframe [4, 4].
+        moves_b: True: return T_map_a T_a_b T_map_b^-1, which moves b. False: return its inverse,
+            which moves a.
     """
     T = pose(measured.a) @ measured.T_a_b @ se3.inverse(pose(measured.b))
     return se3.orthonormalize(T if moves_b else se3.inverse(T))
 
 
 def conflicting_bridges(known: FactorStore, closure: RelativePose) -> list[BridgeEdge]:
-    """Return the bridge edges that alone determine the relative pose of a closure's keyframes.
+    """Return the bridge edges that lie between the two keyframes of a closure.
 
-    There are several if the components are merged in a row; one of them may be wrong.
+    If several components were merged one after the other, several edges lie between the keyframes.
+    Any of them may be wrong.
     """
     joins = (BridgeEdge(pair, _hanging_on(known, pair)) for pair in known.joins)
     return [joined for joined in joins if joined.is_across(pair_of(closure))]
 
 
 def _hanging_on(known: FactorStore, join: Pair) -> Set[int]:
-    """Return the keyframes that only this bridge edge connects to the first of their component."""
+    """Return the keyframes on the far side of a bridge edge; see `BridgeEdge`."""
     first, links = known.first_of[join[0]], defaultdict[int, list[int]](list)
     for m in known.relative(without=join):
         links[m.a].append(m.b)
@@ -99,10 +107,13 @@ def best_bridge_removal(
     variables: Variables,
     initial: Variables,
 ) -> tuple[BridgeEdge, FactorStore, Variables] | None:
-    """Return the bridge edge to remove, with the factors and variables after its replacement.
+    """Choose the bridge edge that a rejected closure should replace, and replace it.
 
-    Of several candidates it is the one that leaves the most accepted closures. Return None if there
-    is no candidate or two are equally good.
+    Of all bridge edges that can be replaced, the choice leaves the most accepted closures.
+
+    Returns:
+        The replaced bridge edge, then the factors and variables after the replacement. None if no
+        edge can be replaced, or if two choices leave equally many closures.
     """
     found = [
         (joined, *other)
@@ -123,19 +134,19 @@ def replace_bridge_by_consensus(
     variables: Variables,
     initial: Variables,
 ) -> tuple[FactorStore, Variables] | None:
-    """Return the factors and variables with a bridge edge replaced by a closure.
+    """Replace a bridge edge by a rejected closure if more closures agree with the latter.
 
     Args:
-        known: All measurements; they stay unchanged.
+        known: Store of all measurements, which is not changed.
         joined: Bridge edge to replace.
-        closure: Rejected closure that would replace it.
-        pose: Current poses T_map_keyframe [4, 4].
+        closure: Rejected closure that would become the bridge edge.
+        pose: Function that returns the current T_map_keyframe [4, 4].
         variables: Current values of the variables.
-        initial: Values that the variables were inserted with.
+        initial: Values with which the variables were added to the graph.
 
     Returns:
-        The new factors and variables, or None unless more closures agree with the new bridge edge
-        than with the old one.
+        The factors and variables after the replacement. None if the number of agreeing closures is
+        not larger than for the old bridge edge.
     """
     across = [c for pair, c in known.closures.accepted.items() if joined.is_across(pair)]
     doubts = [c for pair, c in known.doubts.items() if joined.is_across(pair)]
@@ -158,7 +169,7 @@ def replace_bridge_by_consensus(
 def _exchanged(known: FactorStore, joined: BridgeEdge, closure: RelativePose) -> FactorStore:
     """Return the factors with a closure in place of a bridge edge.
 
-    Closures between the two sides are neither accepted nor rejected in them.
+    The other closures between the two sides of the edge are removed; the caller checks them again.
     """
     other, pair = copy(known), pair_of(closure)
     across = [p for p in known.closures.accepted if joined.is_across(p)]

@@ -1,4 +1,4 @@
-"""Condensation of ten keyframes into one variable and a relative measurement to the next one.
+"""Condensation: ten keyframes become one variable and a relative measurement to the next variable.
 
 After Grisetti, Kuemmerle and Ni, Robust Optimization of Factor Graphs by using Condensed
 Measurements (2012). The poses of condensed keyframes are interpolated between two variables.
@@ -26,7 +26,10 @@ from .solver import graph_of, values_of, variables_of
 
 @dataclass(frozen=True, slots=True)
 class CondensedKeyframes:
-    """F condensed keyframes, each between two variables: its head and its tail.
+    """F condensed keyframes as arrays.
+
+    The head of a condensed keyframe is the last variable before it, and the tail is the first
+    variable after it. Keyframes with the same head and tail form a group.
 
     Attributes:
         keyframes: Ids, [F], ascending within a group.
@@ -34,8 +37,8 @@ class CondensedKeyframes:
         end_variables: Ids of the tails, [F].
         T_head: Measured T_head_keyframe, [F, 4, 4].
         T_tail: Measured T_tail_keyframe, [F, 4, 4].
-        fractions: Position between head (0) and tail (1), [F]. A change of the relative pose of
-            head and tail is distributed by these fractions.
+        fractions: Position between head (0) and tail (1), [F]. If the relative pose of head and
+            tail changes, a condensed keyframe moves by this fraction of the change.
     """
 
     keyframes: np.ndarray
@@ -52,35 +55,39 @@ class CondensedKeyframes:
         return CondensedKeyframes(ids, ids, ids, transforms, transforms, np.zeros(0))
 
     def joined_by(self, more: "CondensedKeyframes") -> "CondensedKeyframes":
-        """Return these keyframes with others appended."""
+        """Return these condensed keyframes with others appended."""
         columns = (getattr(self, name) for name in self.__slots__)
         others = (getattr(more, name) for name in self.__slots__)
         return CondensedKeyframes(*map(np.concatenate, zip(columns, others, strict=True)))
 
     def only(self, row: int) -> "CondensedKeyframes":
-        """Return the keyframe of one row."""
+        """Return the condensed keyframe of one row, as arrays of length 1."""
         return CondensedKeyframes(*(getattr(self, name)[row : row + 1] for name in self.__slots__))
 
     def index(self) -> dict[int, int]:
-        """Return the row of each keyframe."""
+        """Return the row of each condensed keyframe, by id."""
         return {int(k): row for row, k in enumerate(self.keyframes)}
 
     def interpolated_poses(self, T_heads: np.ndarray, T_tails: np.ndarray) -> np.ndarray:
-        """Return T_map_keyframe [F, 4, 4], given T_map of the heads and tails, [F, 4, 4]."""
+        """Return T_map_keyframe [F, 4, 4] from the poses of heads and tails in the map.
+
+        Args:
+            T_heads: T_map_head of each condensed keyframe, [F, 4, 4].
+            T_tails: T_map_tail of each condensed keyframe, [F, 4, 4].
+        """
         return interpolate(T_heads @ self.T_head, T_tails @ self.T_tail, self.fractions)
 
     def moved(self, row: int, T_head_keyframe: np.ndarray) -> "CondensedKeyframes":
-        """Return the keyframes with a new measured pose for one row."""
+        """Return the condensed keyframes with a new measured pose [4, 4] in one row."""
         T_tail_head = self.T_tail[row] @ np.linalg.inv(self.T_head[row])
         T_head, T_tail = self.T_head.copy(), self.T_tail.copy()
         T_head[row], T_tail[row] = T_head_keyframe, T_tail_head @ T_head_keyframe
         return replace(self, T_head=T_head, T_tail=T_tail)
 
     def without_split(self, row: int) -> "CondensedKeyframes":
-        """Return the keyframes without one that becomes a variable again.
+        """Return the condensed keyframes after the one of a row became a variable again.
 
-        The others of its group then lie between the head and the new variable, or between it and
-        the tail.
+        This divides its group: one part ends at the new variable, and the other part starts there.
         """
         of_group = (self.start_variables == self.start_variables[row]) & (
             self.end_variables == self.end_variables[row]
@@ -104,7 +111,7 @@ class CondensedKeyframes:
         return parted.without(row)
 
     def without(self, row: int) -> "CondensedKeyframes":
-        """Return the keyframes without one row."""
+        """Return the condensed keyframes without one row."""
         return CondensedKeyframes(
             *(np.delete(getattr(self, name), row, 0) for name in self.__slots__)
         )
@@ -121,12 +128,12 @@ def condense_between(
     T_head: np.ndarray,
     T_head_tail: np.ndarray,
 ) -> CondensedKeyframes:
-    """Return the condensed keyframes between two variables, evenly spaced.
+    """Return the condensed keyframes between two variables, with evenly spaced fractions.
 
     Args:
         head: Id of the first variable.
         tail: Id of the second variable.
-        keyframes: Ids of the n keyframes between them, in order.
+        keyframes: Ids of the n keyframes between both variables, in order.
         T_head: Measured T_head_keyframe, [n, 4, 4].
         T_head_tail: Measured pose of the tail in the head, [4, 4].
     """
@@ -143,7 +150,7 @@ def condense_between(
 
 @dataclass(frozen=True, slots=True)
 class Condensed:
-    """Condensed group: the measurement from its head to its tail, and the keyframes between."""
+    """Condensed group: the measurement from its head to its tail, and its condensed keyframes."""
 
     edge: RelativePose
     followers: CondensedKeyframes
@@ -156,21 +163,23 @@ def group_to_condense(
     size: int,
     window: int,
 ) -> list[int]:
-    """Return the next group to condense, with its tail, or an empty list.
+    """Choose the next keyframes to condense: the oldest chain of enough active keyframes.
 
-    The group has the oldest `size` active keyframes that odometry connects one after another. The
-    tail is the next keyframe, which starts the next group. A head of another group can only be the
-    first of a group, as it must stay a variable.
+    The result is a head, the keyframes to condense and a tail, or an empty list. The tail is the
+    head of the next group. Each keyframe of the group has an odometry measurement from an earlier
+    one of the group. The head or tail of an existing group must stay a variable, so it can only be
+    the head of a new group.
 
-    The keyframe after a group should be measured from its last keyframe. Otherwise the group
-    becomes longer, up to twice the size. A keyframe measured from inside the group would depend on
-    one end of the group alone. A correction would then move it like that end.
+    The keyframe that follows the tail should be measured from the tail. If it is measured only from
+    keyframes inside the group, that measurement would be transferred to one end of the group. A
+    correction would then move the keyframe with that end alone. To avoid this, the group grows up
+    to twice the size.
 
     Args:
         active: Variables that are not condensed, ascending.
         measured: Pairs of variables with an odometry measurement.
-        heads: Heads and tails of existing groups.
-        size: Number of keyframes in a group.
+        heads: Ids of the heads and tails of existing groups.
+        size: Number of keyframes in a group, without the tail.
         window: Number of newest keyframes that are never condensed.
     """
     linked = {frozenset(pair) for pair in measured}
@@ -198,20 +207,21 @@ def condense(
     T_map: Mapping[int, np.ndarray],
     noise: NoiseConfig,
 ) -> Condensed:
-    """Return the condensed form of a group: its head, the keyframes between, and its tail.
+    """Condense a group: compute one measurement from its head to its tail.
 
-    Only the measurements and closures within the group are solved, with the head fixed. So the
-    result does not count the effect of other loops twice, and it can be undone.
+    The solution uses only the measurements and loop closures within the group, with the head fixed.
+    Therefore the result contains no information from outside, which would then count twice.
 
     Args:
         group: Ids of the keyframes, in order; the last one is the tail.
         measured: Odometry measurements by pair of variables.
         closures: Accepted loop closures within the group.
-        T_map: Present pose T_map_keyframe [4, 4] of each keyframe of the group.
+        T_map: Current pose T_map_keyframe [4, 4] of each keyframe of the group.
         noise: Noise of the measurements.
 
     Returns:
-        The condensed group; the covariance of its edge is the marginal covariance of the tail.
+        The condensed group. The covariance of its measurement is the marginal covariance of the
+        tail.
     """
     head, *others, tail = group
     inside = set(group)
@@ -238,11 +248,13 @@ def condense(
 def connecting_measurements(
     gone: Iterable[RelativePose], stays: Iterable[tuple[int, int]]
 ) -> list[RelativePose]:
-    """Return the first of the measurements `gone` that are needed to keep the variables connected.
+    """Return the removed measurements that must be kept, so that all variables stay connected.
+
+    Of several possible measurements, the first one is kept.
 
     Args:
         gone: Measurements that are about to be removed.
-        stays: Pairs of variables that remain connected.
+        stays: Pairs of variables between which another measurement remains.
     """
     root: dict[int, int] = {}
 
@@ -264,16 +276,18 @@ def connecting_measurements(
 def transfer_measurement(
     measured: RelativePose, T_a_new: np.ndarray, T_b_new: np.ndarray, new: tuple[int, int]
 ) -> RelativePose:
-    """Return the same measurement between other keyframes, which move rigidly with its own.
+    """Convert a measurement between keyframes a and b to one between two other keyframes.
+
+    The first new keyframe is treated as rigidly attached to a, the second one to b.
 
     Args:
-        measured: Measurement of b in a.
+        measured: Measured pose of b in a.
         T_a_new: Pose of the first new keyframe in a, [4, 4].
         T_b_new: Pose of the second new keyframe in b, [4, 4].
         new: Ids of the new keyframes.
 
     Returns:
-        The measurement; its information is for a perturbation at the second new keyframe.
+        The measurement. Its information matrix is for perturbations at the second new keyframe.
     """
     T = se3.inverse(T_a_new) @ measured.T_a_b @ T_b_new
     adjoint = se3.adjoint(T_b_new)

@@ -1,4 +1,4 @@
-"""Store of all measurements of keyframes and landmarks, and their factors."""
+"""Store of all measurements of keyframes and landmarks, which builds their factors."""
 
 from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Any
@@ -34,10 +34,10 @@ from .solver import Name, Variables, point_key
 
 
 class FactorStore:
-    """Measurements by kind, between keyframes that are variables.
+    """Store of measurements by kind, all of them between variables.
 
-    A condensed keyframe is no variable. Its measurements are transferred to the nearer of the two
-    variables that it is interpolated between.
+    A condensed keyframe is not a variable. A measurement of it is transferred to its head or its
+    tail, whichever is nearer (see `condensation.CondensedKeyframes`).
     """
 
     def __init__(self, noise: NoiseConfig, closures: LoopClosureConfig) -> None:
@@ -60,8 +60,8 @@ class FactorStore:
     def add_measurement(self, m: RelativePose) -> Name:
         """Store an odometry measurement and return the name of its factor.
 
-        It replaces one between the same variables. A measurement transferred from condensed
-        keyframes replaces none.
+        It replaces an older measurement between the same variables. If it was transferred from
+        condensed keyframes, it does not replace an older one.
         """
         between = self.between_variables(m)
         pair = between.a, between.b
@@ -74,8 +74,8 @@ class FactorStore:
     ) -> Name | None:
         """Replace a measurement and return the name of the factor that changed.
 
-        A condensed keyframe only gets a new pose between its variables; then there is no factor to
-        change.
+        If the measured keyframe is condensed, only its pose relative to its head and tail changes,
+        and no factor does.
 
         Args:
             m: New measurement.
@@ -100,19 +100,23 @@ class FactorStore:
         return ("condensed", *pair)
 
     def _in_head_of_b(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> np.ndarray:
-        """Return the measured pose of b in the head of its group, [4, 4]."""
+        """Return the pose of keyframe b in the head of its group by a measurement, [4, 4]."""
         (head_a, T_a), (head_b, _) = self.relative_to_start(m.a), self.relative_to_start(m.b)
         if head_a == head_b:
             return T_a @ m.T_a_b
         return se3.inverse(pose(head_b)) @ pose(m.a) @ m.T_a_b
 
     def condense(self, group: list[int], T_map: Mapping[int, np.ndarray]) -> None:
-        """Keep only the first and the last keyframe of a group as variables.
+        """Condense a group of keyframes: only the first and the last one remain variables.
 
-        The edge from the first to the last one includes all measurements and closures within the
-        group. Measurements between a condensed keyframe and one outside the group are dropped,
-        except where nothing else connects the latter. Later keyframes usually have other
-        measurements too.
+        One measurement from the first to the last keyframe replaces all measurements and closures
+        within the group. Measurements from condensed keyframes to keyframes outside the group are
+        dropped, since these usually have other measurements. Only measurements without which the
+        graph would fall apart are kept.
+
+        Args:
+            group: Ids of the keyframes, in order.
+            T_map: Current poses T_map_keyframe [4, 4] of the group.
         """
         followers = set(group[1:-1])
         closed = {
@@ -135,8 +139,9 @@ class FactorStore:
     def restore_variable(self, keyframe: int) -> None:
         """Make a condensed keyframe a variable again, between its head and its tail.
 
-        The information of the edge from head to tail is split over the two parts by their
-        fractions.
+        Two measurements replace the one from head to tail: from the head to the keyframe, and from
+        the keyframe to the tail. Its covariance is divided between them by the fraction of the
+        keyframe.
         """
         row = self.rows[keyframe]
         head, tail = (
@@ -155,10 +160,10 @@ class FactorStore:
         self.rows = self.followers.index()
 
     def interpolation_error_sigmas(self, keyframe: int, variables: Variables) -> float:
-        """Return the pose difference of a condensed keyframe as seen from its two ends.
+        """Return by how much the pose of a condensed keyframe differs, computed from its two ends.
 
-        The unit is sigmas of a loop closure, weighted by the distance to the nearer end; 0 for a
-        variable.
+        The ends are its head and its tail. The difference is in standard deviations of a loop
+        closure, times the fraction of the way to the nearer end. It is 0 for a variable.
         """
         row = self.rows.get(keyframe)
         if row is None:
@@ -174,7 +179,11 @@ class FactorStore:
         return min(share, 1 - share) * float((off / sigmas).max())
 
     def relative(self, without: Pair | None = None) -> Iterable[RelativePose]:
-        """Yield all permanent measurements between variables, or all but one bridge edge."""
+        """Yield all measurements between variables, except for loop closures and one bridge edge.
+
+        Args:
+            without: Keyframes of the bridge edge to omit; None omits none.
+        """
         yield from self.odometry.values()
         yield from self.condensed.values()
         joins = (m for pair, m in self.joins.items() if pair != without)
@@ -182,9 +191,9 @@ class FactorStore:
 
     # --- condensed keyframes ----------------------------------------------------------------------
     def relative_to_start(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """Return the head of a keyframe's group and T_head_keyframe [4, 4].
+        """Return the head of a condensed keyframe and T_head_keyframe [4, 4].
 
-        A keyframe that is a variable is its own head.
+        For a keyframe that is a variable, return the keyframe itself and the identity.
         """
         row = self.rows.get(keyframe)
         if row is None:
@@ -192,9 +201,9 @@ class FactorStore:
         return int(self.followers.start_variables[row]), self.followers.T_head[row]
 
     def relative_to_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """Return the variable nearest to a keyframe and T_variable_keyframe [4, 4].
+        """Return the nearer one of head and tail of a keyframe, and T_variable_keyframe [4, 4].
 
-        For a condensed keyframe this is the nearer one of its head and its tail.
+        For a keyframe that is a variable, return the keyframe itself and the identity.
         """
         row = self.rows.get(keyframe)
         if row is None or self.followers.fractions[row] <= 0.5:
@@ -202,9 +211,13 @@ class FactorStore:
         return int(self.followers.end_variables[row]), self.followers.T_tail[row]
 
     def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
-        """Return the variables for both ends of a measurement, with the poses of the ends in them.
+        """Return the variables to which a measurement is transferred, one for each keyframe.
 
-        If both nearest variables are the same, the heads are used instead.
+        These are the nearest variables of its two keyframes. If both are the same variable, the
+        heads of the keyframes are used instead.
+
+        Returns:
+            For a, then for b: the id of the variable, and T_variable_keyframe [4, 4].
         """
         a, b = self.relative_to_variable(m.a), self.relative_to_variable(m.b)
         return (
@@ -212,17 +225,17 @@ class FactorStore:
         )
 
     def between_variables(self, m: RelativePose) -> RelativePose:
-        """Return a measurement transferred to variables; unchanged if its ends are variables."""
+        """Return a measurement transferred to variables; unchanged if a and b are variables."""
         (a, T_a), (b, T_b) = self.ends(m)
         if (a, b) == (m.a, m.b):
             return m
         return transfer_measurement(m, se3.inverse(T_a), se3.inverse(T_b), (a, b))
 
     def _ends_covariance(self, m: RelativePose) -> np.ndarray:
-        """Return the covariance [6, 6] at b that the interpolation of condensed ends adds.
+        """Return the additional covariance [6, 6] of a measurement of condensed keyframes, at b.
 
-        Each condensed end adds a fraction of its group's covariance, by its distance from the
-        variable.
+        The pose of a condensed keyframe in its variable is uncertain. It adds the covariance of its
+        group, times the fraction of the way from that variable.
         """
         total = np.zeros((6, 6))
         T_b_end = se3.inverse(m.T_a_b), np.eye(4)
@@ -248,7 +261,12 @@ class FactorStore:
         yield from (("sight", *pair) for pair in self.sights)
 
     def factor(self, name: Name, initial: Variables) -> gtsam.NonlinearFactor:
-        """Return the factor of a name; `initial` has the initial values of the variables."""
+        """Return the factor of a name.
+
+        Args:
+            name: Name of the factor, as `names` yields it.
+            initial: Values with which the variables were added to the graph.
+        """
         kind, pair = name[0], name[1:]
         match kind:
             case "first":
@@ -270,7 +288,7 @@ class FactorStore:
     ) -> list[gtsam.NonlinearFactor]:
         """Return all factors, with these closures instead of the accepted ones.
 
-        The closures have no robust kernel, so that their costs can be compared.
+        The closures get no robust kernel, so that costs of different solutions can be compared.
         """
         others = [self.factor(name, initial) for name in self.names() if name[0] != "closure"]
         return [*others, *(self._closure_factor(closure, 0.0) for closure in closures)]
@@ -289,7 +307,7 @@ class FactorStore:
         return between_factor(m.a, m.b, m.T_a_b, m.information, robust_sigmas)
 
     def _closure(self, m: RelativePose) -> RelativePose:
-        """Return a closure transferred to variables; its information accounts for all noise."""
+        """Return a closure transferred to variables, with the noise of this transfer included."""
         own = closure_information(m, self._noise, self._ends_covariance(m))
         return self.between_variables(RelativePose(m.a, m.b, m.T_a_b, own))
 
@@ -297,16 +315,19 @@ class FactorStore:
     def move_component(
         self, younger: int, older: int, T_new_old: np.ndarray, variables: Variables
     ) -> Variables:
-        """Merge a component into an older one, and return the variables after its motion.
+        """Merge the younger of two components into the older one.
 
-        The motion applies to all keyframes of the younger component and their landmarks.
+        All keyframes of the younger component and their landmarks move by `T_new_old`.
+
+        Returns:
+            The variables after this motion.
         """
         theirs = {k for k, first in self.first_of.items() if first == younger}
         self.first_of.update(dict.fromkeys(theirs, older))
         return self.moved(theirs, T_new_old, variables)
 
     def moved(self, theirs: Set[int], T_new_old: np.ndarray, variables: Variables) -> Variables:
-        """Return the variables with some keyframes and their observed landmarks moved."""
+        """Return the variables after some keyframes and the landmarks observed there were moved."""
         points = {point_key(s.landmark) for s in self.sights.values() if s.keyframe in theirs}
         moved = {k: T_new_old @ variables[k] for k in variables.keys() & theirs}
         moved |= {k: se3.transform(T_new_old, variables[k]) for k in variables.keys() & points}

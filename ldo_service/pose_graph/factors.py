@@ -1,6 +1,6 @@
-"""Factors of the pose graph, their noise, and arrays of measurements for saved states.
+"""Factors of the pose graph and their noise; packing of measurements as arrays for checkpoints.
 
-Unpacked measurements are bit-identical to the packed ones.
+Packing and unpacking a measurement does not change a bit of it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,7 +18,7 @@ from .solver import point_key
 
 @dataclass(frozen=True, slots=True)
 class NoiseConfig:
-    """Noise of measurements in addition to the information that they bring along."""
+    """Noise of measurements, in addition to the information matrix that a measurement contains."""
 
     first_sigma: float = 1e-6  # rad and m; the first keyframe is the origin of its component.
     # Upper bounds of the sigma in a degenerate direction, or the linear system becomes singular.
@@ -64,7 +64,10 @@ class NoiseConfig:
         return information(self.sigma_rotation_max_rad, self.sigma_translation_max_m)
 
     def drift(self, T: np.ndarray) -> np.ndarray:
-        """Return the covariance [6, 6] of a random walk over a relative pose T [4, 4]."""
+        """Return the covariance [6, 6] of odometry drift over a relative pose T [4, 4].
+
+        Drift is modeled as a random walk along the path.
+        """
         path_m = np.linalg.norm(T[:3, 3]) + self.turn_m_per_rad * se3.rotation_angle(T)
         rates = [self.drift_rad_per_sqrt_m] * 3 + [self.drift_m_per_sqrt_m] * 3
         return np.diag(np.array(rates) ** 2 * path_m)
@@ -83,12 +86,12 @@ class BoxObservation:
 
 
 def information(sigma_rad: float, sigma_m: float) -> np.ndarray:
-    """Return a diagonal information matrix [6, 6], rotation before translation."""
+    """Return the diagonal information matrix [6, 6] of two standard deviations, rotation first."""
     return np.diag([sigma_rad**-2] * 3 + [sigma_m**-2] * 3)
 
 
 def odometry_information(measured: RelativePose, noise: NoiseConfig) -> np.ndarray:
-    """Return the information [6, 6] of an odometry measurement, including drift and the minimum."""
+    """Return the information [6, 6] of an odometry measurement, with drift and the lower bound."""
     own = 0.5 * (measured.information + measured.information.T) + noise.floor
     return np.linalg.inv(np.linalg.inv(own) + noise.drift(measured.T_a_b))
 
@@ -101,7 +104,7 @@ def closure_information(
     Args:
         measured: The closure.
         noise: Noise of the measurements.
-        covariance: Uncertainty [6, 6] of the ends in the variables that they are transferred to.
+        covariance: Additional covariance [6, 6] if a keyframe of the closure is condensed.
     """
     own = 0.5 * (measured.information + measured.information.T) + noise.floor
     least = np.linalg.inv(information(noise.sigma_loop_rad, noise.sigma_loop_m))
@@ -109,7 +112,7 @@ def closure_information(
 
 
 def prior_factor(keyframe: int, T_map: np.ndarray, sigma: float) -> gtsam.NonlinearFactor:
-    """Return a factor that holds a keyframe at T_map [4, 4]; `sigma` in rad and m."""
+    """Return a prior factor that fixes a keyframe at T_map [4, 4]; `sigma` is in rad and m."""
     noise = gtsam.noiseModel.Isotropic.Sigma(6, sigma)
     return gtsam.PriorFactorPose3(keyframe, gtsam.Pose3(T_map), noise)
 
@@ -132,7 +135,7 @@ def box_factor(
 
     Args:
         sight: The observation.
-        variable: The keyframe, or the variable that a condensed keyframe is transferred to.
+        variable: Id of the keyframe; if it is condensed, the id of its head or tail.
         T_variable_keyframe: Pose of the keyframe in that variable, [4, 4].
         noise: Noise of the measurements.
     """
@@ -158,7 +161,7 @@ def _robust(noise: gtsam.noiseModel.Base, robust_sigmas: float) -> gtsam.noiseMo
 
 
 def closure_residual(T_a: np.ndarray, T_b: np.ndarray, measured: RelativePose) -> np.ndarray:
-    """Return log(T_ab^-1 T_a^-1 T_b), [6]."""
+    """Return the residual log(T_ab^-1 T_a^-1 T_b) of a closure, [6]: rotation, then translation."""
     return se3.log(se3.inverse(measured.T_a_b) @ se3.inverse(T_a) @ T_b)
 
 

@@ -1,4 +1,7 @@
-"""Fusion of the observed labels of landmarks: min G(p) of `ldo_service.pose_graph`."""
+"""Fusion of the observed class distributions of landmarks.
+
+It minimizes G(p), which `ldo_service.pose_graph` defines.
+"""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -13,7 +16,7 @@ NEWTON_STEPS = 60  # It takes 5 to 15; the iteration is monotone, so it cannot c
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Sum of all observations of a landmark; G depends on them through these values alone.
+    """Sums over all observations of a landmark. G depends on the observations only through them:
 
     sum_k w_k KL(p || q_k) = W sum_c p_c log p_c - sum_c p_c L_c,  W = sum w_k, L = sum w_k log q_k
     """
@@ -30,7 +33,7 @@ class Evidence:
         """Return the evidence with one more observation.
 
         Args:
-            q: Distribution [C] that sums to one; classes below 1e-6 are raised to it.
+            q: Distribution [C] that sums to one. Probabilities below 1e-6 are raised to 1e-6.
             weight: Weight w_k of the observation.
         """
         floored = np.maximum(q, FLOOR)
@@ -54,16 +57,18 @@ def fuse_labels(
         min_p  lambda sum_lk w_k KL(p_l || q_lk)
              + w_sem / 2 sum_ij (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j]
 
-    Before each sweep over the landmarks, the pairs with equal argmax are determined again. The
-    result is deterministic: Gauss-Seidel in the order of the ids. Paper, III.C.
+    The method is Gauss-Seidel (paper, III.C): each sweep minimizes over one landmark after the
+    other, in the order of their ids. Before each sweep, the pairs with equal argmax are determined
+    again. The result is deterministic.
 
     Args:
         evidence: Observations of each landmark.
-        covisible: Pairs of landmarks that a keyframe shows together; each pair counts once.
+        covisible: Pairs of landmarks that are observed in the same keyframe; each pair counts once.
         lambda_sem: Weight of the observations.
         w_sem: Weight of the similarity.
-        start: Earlier estimates; the default are the geometric means.
-        only: Landmarks to optimize; the others keep their start values. None: all of them.
+        start: Start values by landmark. A landmark without one starts at the geometric mean of its
+            observations.
+        only: Landmarks to optimize; the others keep their start values. None optimizes all.
         sweeps: Maximum number of sweeps.
         tolerance: Sweeps end when no probability changes by more than this.
     """
@@ -98,7 +103,7 @@ def objective(
     lambda_sem: float = 0.5,
     w_sem: float = 0.1,
 ) -> float:
-    """Return G(p) up to a constant, with the similarity of `pairs` whatever their argmax."""
+    """Return G(p) up to a constant; all `pairs` count as similar, even with different argmax."""
     observed = sum(
         evidence[k].weight * np.sum(p_k * np.log(p_k)) - p_k @ evidence[k].log_sum
         for k, p_k in p.items()
@@ -121,9 +126,10 @@ def _neighbors(
 def _minimum(
     evidence: Evidence, alike: list[np.ndarray], lambda_sem: float, w_sem: float
 ) -> np.ndarray:
-    """Return the minimum of one landmark's terms, with its neighbors [C] fixed.
+    """Return the distribution [C] of one landmark that minimizes G while all others are fixed.
 
-    With half of the similarity in each direction, n neighbors and the multiplier nu,
+    `alike` has the distributions of the n neighbors with the same argmax. The condition with the
+    Lagrange multiplier nu,
 
         a (log p_c + 1) - g_c - b_c / p_c + nu = 0,    a = lambda W + n w / 2,
         g = lambda L + w / 2 sum_j log p_j,            b = w / 2 sum_j p_j

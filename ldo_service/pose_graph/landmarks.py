@@ -1,4 +1,4 @@
-"""Object landmarks: observations enter the pose graph as variables and factors, and leave it."""
+"""Object landmarks: their observations are added to the pose graph, and lost ones removed."""
 
 import itertools
 from collections.abc import Iterable, Mapping
@@ -39,7 +39,7 @@ def triangulate(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, floa
 
 @dataclass(frozen=True, slots=True)
 class ObjectLandmarkConfig:
-    """Parameters of object landmarks; III.C refers to the paper."""
+    """Settings of object landmarks; III.C is a section of the paper."""
 
     lambda_sem: float = 0.5  # Weight of the observed labels (III.C).
     w_sem: float = 0.1  # Weight of the similarity (III.C).
@@ -85,7 +85,7 @@ class ObjectLandmarkConfig:
 
 @dataclass(frozen=True, slots=True)
 class LandmarkObservation:
-    """Observation or miss of an object in a keyframe."""
+    """Observation of an object in a keyframe, or a miss: not found where it should be visible."""
 
     keyframe: int
     landmark: int
@@ -97,7 +97,7 @@ class LandmarkObservation:
 
     @property
     def is_whole(self) -> bool:
-        """True if the border of the image does not cut the box, which would move its center."""
+        """True if the box does not touch the image border, so that its center is reliable."""
         x0, y0, x1, y1 = self.box_px
         width, height = self.camera[:2]
         right, below = width - 1 - BORDER_PX, height - 1 - BORDER_PX
@@ -106,7 +106,7 @@ class LandmarkObservation:
     def pack(self) -> dict[str, Any]:
         """Return the fields as plain values.
 
-        Of the distribution it has only the few nonzero of 256 entries.
+        The distribution is stored sparsely: few of its 256 entries are not zero.
         """
         values = {name: getattr(self, name) for name in self.__slots__}
         labels = np.flatnonzero(self.distribution)
@@ -123,7 +123,7 @@ class LandmarkObservation:
 
 @dataclass(frozen=True, slots=True)
 class Landmark:
-    """State of a landmark except its position, which is a variable of the pose graph."""
+    """State of a landmark without its position, which is a variable of the pose graph."""
 
     evidence: Evidence
     distribution: np.ndarray  # Fused class distribution, [C].
@@ -143,10 +143,10 @@ class Landmark:
 
 
 class ObjectLandmarks:
-    """Landmarks of the pose graph, with their observations and fused labels.
+    """Landmarks of the pose graph, with their observations and fused class distributions.
 
-    The result is deterministic. Memory is bounded by `most` landmarks, each with 4 kB and its
-    observations, and by the pairs of them that a keyframe showed together.
+    The result is deterministic. There are at most `most` landmarks, each with 4 kB and at most
+    `max_sights` observations. Pairs of landmarks observed in the same keyframe take memory too.
     """
 
     def __init__(self, config: ObjectLandmarkConfig, noise: NoiseConfig) -> None:
@@ -168,7 +168,7 @@ class ObjectLandmarks:
 
     # --- into the graph ---------------------------------------------------------------------------
     def needs_update(self) -> bool:
-        """Return whether the graph should take in observations now; call once per keyframe."""
+        """Return whether to call `update_graph` now; call this once per keyframe."""
         config = self._config
         if not self._waiting:
             return False
@@ -180,7 +180,7 @@ class ObjectLandmarks:
         return False
 
     def update_graph(self, graph: PoseGraph) -> None:
-        """Add the waiting observations, remove lost landmarks and fuse the distributions."""
+        """Add stored observations to the graph, fuse distributions, and remove lost landmarks."""
         waiting, self._waiting, self._saved = self._waiting, [], {}
         for seen in waiting:
             self._take(seen)
@@ -217,7 +217,7 @@ class ObjectLandmarks:
         )
 
     def _pair(self, waiting: Iterable[LandmarkObservation]) -> None:
-        """Add the pairs of landmarks that a keyframe shows together."""
+        """Store the pairs of landmarks that are observed in the same keyframe."""
         shown: dict[int, set[int]] = {}
         for seen in waiting:
             if not seen.is_miss:
@@ -226,7 +226,12 @@ class ObjectLandmarks:
             self._pairs |= set(itertools.combinations(sorted(together), 2))
 
     def _see(self, graph: PoseGraph, waiting: set[Pair]) -> None:
-        """Add observations of landmarks in the graph, and landmarks that can be placed now."""
+        """Add observations to the graph, and new landmarks whose position can be triangulated.
+
+        Args:
+            graph: The pose graph.
+            waiting: Keyframe and landmark of each new observation.
+        """
         new, placed, gone = [], {}, []
         for k in sorted({landmark for _, landmark in waiting}):
             sights = [s for s in self.known[k].sights if s.keyframe in graph]
@@ -244,7 +249,10 @@ class ObjectLandmarks:
         graph.remove_observations(gone)
 
     def _thinned(self, sights: list[BoxObservation]) -> tuple[BoxObservation, ...]:
-        """Return the first observations, which limit drift, and the newest."""
+        """Return at most `max_sights` observations: the first ones and the newest ones.
+
+        The first ones limit the drift of the landmark.
+        """
         half = self._config.max_sights // 2
         excess = len(sights) - self._config.max_sights
         return tuple(sights if excess <= 0 else sights[:half] + sights[half + excess :])
@@ -252,10 +260,10 @@ class ObjectLandmarks:
     def _triangulated(
         self, sights: Iterable[BoxObservation], graph: PoseGraph
     ) -> np.ndarray | None:
-        """Return the point [3] where the rays through the box centers meet, or None.
+        """Triangulate the point [3] in the map where the rays through the box centers meet.
 
-        None means too few observations, too little parallax, a point behind a camera or one outside
-        the boxes.
+        Return None in these cases: too few observations, too little parallax, a point behind a
+        camera, or a point projected too far from the center of a box.
         """
         sights = list(sights)
         if len(sights) < self._config.min_sights:
@@ -279,7 +287,7 @@ class ObjectLandmarks:
 
     # --- labels -----------------------------------------------------------------------------------
     def _fuse(self, touched: set[int]) -> None:
-        """Compute the distributions of landmarks with new observations; others do not change."""
+        """Fuse the distributions of the landmarks with new observations; others stay unchanged."""
         pairs = [pair for pair in self._pairs if touched & set(pair)]
         near = touched | {k for pair in pairs for k in pair if k in self.known}
         p = fuse_labels(
@@ -296,8 +304,9 @@ class ObjectLandmarks:
     def _remove_lost(self, graph: PoseGraph) -> None:
         """Remove lost landmarks with their observations.
 
-        A dense factor among all keyframes that observed one would cost more than its information is
-        worth. It would also hold these keyframes at their present poses.
+        They are not marginalized. That would leave a dense factor between all keyframes that
+        observed the landmark. It would take much time for little information, and it would be
+        linearized at the current poses.
         """
         newest = graph.newest or 0
         gone = [k for k, landmark in self.known.items() if self._is_gone(landmark, newest)]
@@ -317,7 +326,7 @@ class ObjectLandmarks:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return the state; `known` is the same object until the next `update_graph`."""
+        """Return the state; the entry `known` is the same object until `update_graph` is called."""
         self._saved = self._saved or self._packed()
         waiting = [seen.pack() for seen in self._waiting]
         return {"known": self._saved, "waiting": waiting, "skipped": self.skipped}

@@ -1,4 +1,7 @@
-"""Acceptance of loop closures; a false closure costs more than a missed one."""
+"""Acceptance of loop closures.
+
+A false loop closure damages the map more than a missed one, so the criteria are strict.
+"""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -70,16 +73,20 @@ class LoopClosureSet:
     def check(
         self, closure: RelativePose, solve: Solve, sigmas: Sigmas
     ) -> tuple[ClosureDecision, Variables]:
-        """Return the decision on a new closure, and the variables after it.
+        """Check a new closure against the accepted ones.
 
-        A new closure that costs too much is rejected, unless the solution costs less without an
-        earlier one: then the earlier one was false. In the end, closures with too large a residual
-        are removed.
+        The new closure is rejected if it increases the cost of the solution by more than
+        `max_cost`. There is one exception: an earlier closure was false if the cost is lower with
+        the new closure instead of it. The earlier one is then removed. At the end, all closures
+        with a residual above `max_sigmas` are removed.
 
         Args:
             closure: New closure.
             solve: Function that returns the solution with some closures, and its sum of squares.
             sigmas: Function that returns the largest whitened residual of a closure in a solution.
+
+        Returns:
+            The decision, and the variables of the last solution.
         """
         before = [c for pair, c in self.accepted.items() if pair != pair_of(closure)]
         _, cost_before = solve(before)
@@ -111,7 +118,10 @@ class LoopClosureSet:
         variables: Variables,
         sigmas: Sigmas,
     ) -> RelativePose | None:
-        """Return the earlier closure without which the new one fits at the smallest total cost."""
+        """Return the earlier closure to remove, so that the new closure fits at the lowest cost.
+
+        Return None if the new closure fits with none of them removed.
+        """
         fitting = sorted(before, key=lambda c: sigmas(variables, c), reverse=True)
         best, best_cost = None, cost_before
         for rival in fitting[: self.config.rivals]:
@@ -123,9 +133,10 @@ class LoopClosureSet:
         return best
 
     def with_decision(self, closure: RelativePose, verdict: ClosureDecision) -> "LoopClosureSet":
-        """Return the set after a decision; each pair stays only in its latest group.
+        """Return the set after a decision.
 
-        The groups are the accepted, the rejected and the removed closures.
+        A pair of keyframes is listed only once, by its latest decision: as accepted, rejected or
+        removed.
         """
         pair = pair_of(closure)
         accepted = {p: c for p, c in self.accepted.items() if p not in verdict.dropped}
@@ -144,7 +155,8 @@ class LoopClosureSet:
     def _thinned(self, accepted: Mapping[Pair, RelativePose]) -> Mapping[Pair, RelativePose]:
         """Return at most `most` closures.
 
-        Beyond, the older of the two between the nearest keyframes is removed.
+        If there is one more, the two closures with the most similar keyframe ids are redundant. The
+        older one of them is removed.
         """
         if len(accepted) <= self.config.most:
             return accepted
@@ -155,17 +167,22 @@ class LoopClosureSet:
         return {p: c for place, (p, c) in enumerate(accepted.items()) if place != older}
 
     def without(self, pairs: Collection[Pair]) -> "LoopClosureSet":
-        """Return the set without some closures; other measurements now hold their information."""
+        """Return the set without some closures, which were condensed into other measurements."""
         return replace(self, accepted={p: c for p, c in self.accepted.items() if p not in pairs})
 
     def with_replaced_bridge(self, join: Pair, closure: Pair) -> "LoopClosureSet":
-        """Return the set after a closure replaced a bridge edge, which counts as removed."""
+        """Return the set after a closure replaced a bridge edge; the old edge is listed as removed.
+
+        Args:
+            join: Keyframes of the old bridge edge.
+            closure: Keyframes of the closure that replaced it.
+        """
         refused = tuple(pair for pair in self.rejected if pair != closure)
         left = self._remembered((*(pair for pair in self.removed if pair != closure), join))
         return replace(self, rejected=refused, removed=left)
 
     def _remembered(self, pairs: Iterable[Pair]) -> tuple[Pair, ...]:
-        """Return the newest pairs."""
+        """Return the newest pairs, at most `remembered`."""
         return tuple(dict.fromkeys(pairs))[-self.config.remembered :]
 
     def pack(self) -> dict[str, Any]:

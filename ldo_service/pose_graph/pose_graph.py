@@ -59,16 +59,17 @@ class PoseGraphConfig:
 
 
 class PoseGraph:
-    """Minimizer of F(T, mu) of `ldo_service.pose_graph` over the keyframes that are variables.
+    """Pose graph of keyframes and landmarks, solved incrementally by iSAM2.
 
-    Keyframes that measurements connect are a component; its first keyframe fixes its frame. A
-    measurement between two components merges them into the frame of the older one.
+    It minimizes F(T, mu), which `ldo_service.pose_graph` defines, over all variables. Keyframes
+    that are connected by measurements form a component, whose first keyframe stays fixed. A
+    measurement between two components merges them into the coordinate frame of the older one.
 
-    iSAM2 relinearizes variables that moved. It cannot be saved, and a new one with the same
-    measurements differs in the last digits. So the saved state is the last rebuild and the changes
-    since then. A restored graph repeats them and continues bit by bit. The graph is also rebuilt
-    every few keyframes, when old ones are condensed, and when an update throws, which leaves iSAM2
-    changed. Deterministic: equal measurements in equal order give equal bits.
+    The state of iSAM2 cannot be saved, and a new solver with the same measurements differs in the
+    last digits. Therefore a snapshot has the values at the last rebuild of the solver and all
+    changes since. A restored graph repeats these changes and gives bitwise equal results. The
+    solver is rebuilt when keyframes are condensed, after `max_changes` changes, and when an update
+    of iSAM2 fails. The same calls in the same order give bitwise equal results.
     """
 
     def __init__(self, config: PoseGraphConfig = PoseGraphConfig()) -> None:
@@ -101,12 +102,12 @@ class PoseGraph:
 
     @property
     def closures(self) -> LoopClosureSet:
-        """Accepted, rejected and removed loop closures."""
+        """The set of accepted, rejected and removed loop closures."""
         return self._known.closures
 
     # --- keyframes --------------------------------------------------------------------------------
     def add_first(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
-        """Add the first keyframe of a new component, which fixes its frame."""
+        """Add the first keyframe of a new component, fixed at T_map_keyframe [4, 4]."""
         self._log_change("first", keyframe=keyframe, T_map=T_map_keyframe)
         self._initial[keyframe] = np.array(T_map_keyframe, float)
         self._known.first_of[keyframe] = keyframe
@@ -114,7 +115,11 @@ class PoseGraph:
         self._update([("first", keyframe)], [keyframe])
 
     def component_root(self, keyframe: int) -> int:
-        """Return the first keyframe of a component; raise KeyError for an unknown keyframe."""
+        """Return the first keyframe of the component that contains a keyframe.
+
+        Raises:
+            KeyError: The keyframe is unknown.
+        """
         return self._known.first_of[keyframe]
 
     def add(self, measured: RelativePose, *more: RelativePose) -> None:
@@ -122,13 +127,13 @@ class PoseGraph:
 
         Raises:
             KeyError: A keyframe `a` is unknown.
-            ValueError: The measurements are of several keyframes.
+            ValueError: The measurements have different keyframes `b`.
         """
         every = (measured, *more)
         if any(m.b != measured.b for m in every):
             raise ValueError(
-                f"keyframes {sorted({m.b for m in every})} cannot be added at once: all "
-                "measurements must be of one keyframe."
+                f"the measurements have several keyframes b, {sorted({m.b for m in every})}. One "
+                "call adds one keyframe, so all measurements must have the same b."
             )
         self._require(m.a for m in every)
         self._log_change("add", measured=pack_relative(every))
@@ -139,7 +144,7 @@ class PoseGraph:
         self._condense()
 
     def replace(self, measured: Sequence[RelativePose]) -> None:
-        """Replace earlier measurements of the same keyframes; condensed ones move accordingly.
+        """Replace earlier measurements between the same keyframes by new ones.
 
         Raises:
             KeyError: A keyframe is unknown.
@@ -150,7 +155,10 @@ class PoseGraph:
         self._update([name for name in names if name], [])
 
     def odometry_fallback(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
-        """Return odometry over missed keyframes as a measurement with little information."""
+        """Return a measurement from odometry poses, for keyframes between which others are missing.
+
+        Its noise is larger than that of an alignment; see `NoiseConfig.sigma_odometry_m`.
+        """
         noise = self._config.noise
         own = information(noise.sigma_odometry_rad, noise.sigma_odometry_m)
         return RelativePose(a, b, T_a_b, own)
@@ -162,11 +170,14 @@ class PoseGraph:
 
     # --- components and loops ---------------------------------------------------------------------
     def add_loop_closure(self, closure: RelativePose) -> ClosureDecision:
-        """Check a closure between known keyframes; return the decision and the closures it removes.
+        """Check a loop closure between known keyframes, and add it if it is accepted.
 
-        A rejected closure affects no pose (see `loop_closures`). Between two components there is no
-        way to check it: it merges them. It is replaced once more of the closures that it
-        contradicts agree with each other than with it.
+        A rejected closure does not change any pose (see `loop_closures`). A closure between two
+        components cannot be checked. It is accepted and merges the components, but later closures
+        may replace it (see `component_merging`).
+
+        Returns:
+            The decision, with the earlier closures that are removed.
 
         Raises:
             KeyError: A keyframe is unknown.
@@ -188,7 +199,13 @@ class PoseGraph:
         return verdict
 
     def _with_ends(self, closure: RelativePose, variables: Variables) -> Variables:
-        """Return the variables; condensed ends that a closure changes too much become variables."""
+        """Make condensed keyframes of a closure variables again if they move too far.
+
+        The limit is `max_bent`, in standard deviations of a loop closure.
+
+        Returns:
+            The variables, with these keyframes included.
+        """
         known, config = self._known, self._config
         for keyframe in (closure.a, closure.b):
             is_room = len(known.condensed) * config.keyframes_each < len(self)
@@ -201,7 +218,10 @@ class PoseGraph:
         return variables
 
     def _merge_components(self, measured: RelativePose) -> None:
-        """Move the younger component into the frame of the older one, and solve again."""
+        """Merge the two components of a measurement, and solve the graph again.
+
+        The younger component moves into the coordinate frame of the older one.
+        """
         first_a, first_b = self.component_root(measured.a), self.component_root(measured.b)
         moves = T_new_old(measured, self.pose, moves_b=first_a < first_b)
         younger, older = max(first_a, first_b), min(first_a, first_b)
@@ -212,8 +232,7 @@ class PoseGraph:
     def _reject(self, closure: RelativePose) -> ClosureDecision:
         """Reject a closure, unless more closures agree with it than with a bridge edge.
 
-        Of several such bridge edges, the one is replaced that leaves the most closures accepted. If
-        two are equal, all stay.
+        In that case the closure replaces the bridge edge; see `best_bridge_removal`.
         """
         known, variables = self._known, self._solver.variables()
         known.closures = known.closures.with_decision(closure, ClosureDecision(False))
@@ -234,7 +253,11 @@ class PoseGraph:
     def add_observations(
         self, sights: Sequence[BoxObservation], placed: Mapping[int, np.ndarray]
     ) -> None:
-        """Add observations in known keyframes; `placed` are map points [3] of new landmarks.
+        """Add observations of landmarks in known keyframes.
+
+        Args:
+            sights: The observations.
+            placed: Positions [3] in the map of the new landmarks among them, by id.
 
         Raises:
             KeyError: A keyframe is unknown.
@@ -249,7 +272,11 @@ class PoseGraph:
         self._update(names, [point_key(k) for k in placed])
 
     def remove_observations(self, pairs: Iterable[Pair]) -> None:
-        """Remove observations by keyframe and landmark, and landmarks with their last one."""
+        """Remove observations, and landmarks that have none left.
+
+        Args:
+            pairs: Keyframe and landmark of each observation; unknown pairs are ignored.
+        """
         known = [pair for pair in pairs if pair in self._known.sights]
         if not known:
             return
@@ -266,7 +293,7 @@ class PoseGraph:
         return point_key(landmark) in self._initial
 
     def landmarks(self) -> dict[int, np.ndarray]:
-        """Return the positions mu [3] in the map by landmark id."""
+        """Return the positions [3] of all landmarks in the map, by id."""
         variables = self._solver.variables()
         return {k: variables[point_key(k)] for k in sorted({k for _, k in self._known.sights})}
 
@@ -282,7 +309,7 @@ class PoseGraph:
         return follower.interpolated_poses(T_head, T_tail)[0]
 
     def poses(self) -> dict[int, np.ndarray]:
-        """Return T_map_keyframe of every keyframe, ascending by id."""
+        """Return T_map_keyframe [4, 4] of every keyframe, by id, ascending."""
         keyframes, T_map = self.all_poses()
         return dict(zip(keyframes.tolist(), T_map, strict=True))
 
@@ -314,7 +341,10 @@ class PoseGraph:
             self._rebuild_or_forget_landmarks()
 
     def _rebuild_or_forget_landmarks(self) -> None:
-        """Rebuild; without landmarks if that fails, as one may lie where its rays hardly cross."""
+        """Rebuild the solver; if that fails, remove all landmarks and rebuild it again.
+
+        A landmark with nearly parallel rays can make the equations singular.
+        """
         try:
             self._rebuild()
         except RuntimeError:
@@ -323,14 +353,21 @@ class PoseGraph:
             self._rebuild()
 
     def _rebuild(self) -> None:
-        """Solve all measurements in a new solver; raise RuntimeError if that fails."""
+        """Solve all measurements in a new solver.
+
+        Raises:
+            RuntimeError: The measurements do not determine all variables.
+        """
         factors = {name: self._known.factor(name, self._initial) for name in self._known.names()}
         self._solver = Solver()
         if factors:
             self._solver.update(factors, self._initial)
 
     def _condense(self) -> None:
-        """Condense the next group if there is one; rebuild after that or after many changes."""
+        """Condense the next group, if there is one.
+
+        The solver is rebuilt after a condensation, and after `max_changes` changes.
+        """
         config, known = self._config, self._known
         heads = {k for pair in known.condensed for k in pair}
         group = group_to_condense(
@@ -344,7 +381,7 @@ class PoseGraph:
             self._restart_solver({k: v for k, v in variables.items() if k not in followers})
 
     def _restart_solver(self, variables: Variables) -> None:
-        """Rebuild from these values and clear the changes."""
+        """Rebuild the solver from the given values, and start a new list of changes."""
         self._initial, self._changes = variables, []
         self._base = self._packed()
         self._rebuild_or_forget_landmarks()
@@ -358,11 +395,11 @@ class PoseGraph:
         return {"keys": initial[0], "values": initial[1], "known": self._known.pack()}
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state; `base` is the same object until the next rebuild."""
+        """Return the state; the entry `base` is the same object until the next rebuild."""
         return {"base": self._base, "changes": list(self._changes)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a snapshot with bit-identical results."""
+        """Continue from a snapshot with bitwise equal results."""
         self._base, self._changes = state["base"], []
         values = [v.reshape(4, 4) if v.size == 16 else v for v in self._base["values"]]
         self._initial = dict(zip(self._base["keys"], values, strict=True))

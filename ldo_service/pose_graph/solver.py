@@ -1,4 +1,7 @@
-"""iSAM2 over named factors, and a batch solver; deterministic to the bit for equal calls."""
+"""Incremental solver (iSAM2) for named factors, and a batch solver.
+
+Equal calls give bitwise equal results.
+"""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -12,7 +15,10 @@ Variables = dict[int, np.ndarray]
 
 
 class Solver:
-    """Incremental minimization of a sum of named factors; moved variables are relinearized."""
+    """Incremental minimization of a sum of named factors by iSAM2.
+
+    Variables that have moved are relinearized.
+    """
 
     def __init__(self) -> None:
         """Create a solver without variables."""
@@ -34,10 +40,12 @@ class Solver:
     ) -> None:
         """Add factors and variables, and remove the factors named in `gone`.
 
-        A factor with a known name replaces the old one. A variable is removed with its last factor.
+        A factor replaces an existing one with the same name. A variable is removed together with
+        its last factor.
 
         Raises:
-            RuntimeError: The factors do not determine all variables; the solver is unusable then.
+            RuntimeError: The factors do not determine all variables. The solver cannot be used any
+                more.
         """
         out = {*gone, *factors} & self._places.keys()
         places = sorted(self._places.pop(name) for name in out)
@@ -56,9 +64,10 @@ class Solver:
 def solve_batch(
     factors: Iterable[gtsam.NonlinearFactor], start: Variables
 ) -> tuple[Variables, float]:
-    """Return the variables and sum |error / sigma|^2 of a batch solution.
+    """Minimize the sum of factors by Levenberg-Marquardt from `start`.
 
-    It is computed by Levenberg-Marquardt from `start`.
+    Returns:
+        The variables, and the remaining sum of |error / sigma|^2.
 
     Raises:
         RuntimeError: The factors do not determine all variables.
