@@ -46,7 +46,7 @@ def camera_from_message(model: CameraModel) -> Camera:
 
 
 def frame_to_message(frame: RgbdFrame) -> FrameRgbd:
-    """Return the message of a rectified frame."""
+    """Convert a rectified frame to its message."""
     return FrameRgbd(
         stamp_ns=frame.stamp_ns,
         frame=frame.index,
@@ -57,7 +57,7 @@ def frame_to_message(frame: RgbdFrame) -> FrameRgbd:
 
 
 def frame_from_message(message: FrameRgbd | Keyframe) -> RgbdFrame:
-    """Return the rectified frame of a message; its arrays are read-only views."""
+    """Convert a message to a rectified frame, whose arrays are read-only views of the message."""
     return RgbdFrame(
         color=message.color.numpy(),
         depth_m=message.depth_m.numpy(),
@@ -140,7 +140,7 @@ def keyframe_measurements_message(keyframe: Keyframe) -> KeyframeMeasurements:
 
 
 def keyframe_from_message(message: Keyframe, config: PyramidConfig) -> ReferenceKeyframe:
-    """Return the keyframe of a message for alignment, with its dynamic pixels masked."""
+    """Convert a message to a keyframe that frames can be aligned to; dynamic pixels are masked."""
     view = pyramid_of(frame_from_message(message), config)
     return ReferenceKeyframe(
         view,
@@ -152,7 +152,7 @@ def keyframe_from_message(message: Keyframe, config: PyramidConfig) -> Reference
 
 
 def mask_to_array(mask: np.ndarray | None, camera: Camera) -> Array:
-    """Return the array of a mask [h, w] bool, resized to the image of a camera.
+    """Convert a mask [h, w] bool to a message array, resized to the image size of a camera.
 
     Returns:
         [H, W] u1, or the empty array `NO_MASK` if no pixel is set.
@@ -172,13 +172,16 @@ def crops_from_request(request: LabelRequest) -> list[np.ndarray]:
     """Return the decoded crops of a label request, [h, w, 3] uint8 RGB each.
 
     Raises:
-        FrameError: A crop is not an image of its encoding and size.
+        FrameError: The data of a crop do not match its stated encoding and size.
     """
     return [codecs.decode_color(c.encoding, c.width, c.height, c.data) for c in request.crops]
 
 
 def raw_frame_to_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgbd:
-    """Return the message of a camera's frame; color is raw, depth optionally zstd-compressed."""
+    """Convert a frame as the camera delivered it to its message.
+
+    Color stays uncompressed. Depth is compressed by zstd unless `compress_depth` is False.
+    """
     height, width = raw.depth.shape
     depth = np.asarray(raw.depth, np.float32) if raw.depth.dtype == np.float64 else raw.depth
     encoding: ImageEncoding = "z16" if depth.dtype == np.uint16 else "f32"
@@ -198,7 +201,7 @@ def raw_frame_to_message(raw: RawFrame, compress_depth: bool = True) -> CameraRg
 
 
 def raw_frame_from_message(message: CameraRgbd, index: int) -> RawFrame:
-    """Return the decompressed frame of a message, as the camera delivered it.
+    """Convert a message to the frame as the camera delivered it, decompressed.
 
     Args:
         message: The message.

@@ -10,15 +10,15 @@ from .poses import relative_pose_to_message
 
 
 def loop_closure_to_message(finding: LoopCandidateResult) -> LoopClosure:
-    """Return the message of the loop closure of an accepted candidate.
+    """Return the loop-closure message of an accepted loop candidate.
 
     Raises:
         ValueError: The candidate was rejected.
     """
     if finding.closure is None:
         raise ValueError(
-            "the loop candidate was rejected and has no closure: "
-            f"rejected_reason={finding.check.rejected_reason!r}."
+            "a rejected loop candidate has no loop closure to convert: "
+            f"rejected_reason={finding.check.rejected_reason!r} must be empty."
         )
     return LoopClosure(
         stamp_ns=finding.check.proposal.new.stamp_ns,

@@ -56,7 +56,7 @@ def detections_to_message(
 
 
 def detections_from_message(message: DetectionBoxes, vocabulary: Vocabulary) -> RegionDetections:
-    """Return the detections of a message; labels new to the vocabulary are added to it."""
+    """Return the detections of a message, and add their unknown labels to the vocabulary."""
     found = message.detections
     return RegionDetections.of_detector(
         np.array([one.box_px for one in found], np.float32).reshape(-1, 4),
@@ -70,7 +70,7 @@ def label_request_to_message(region: Region, stamp_ns: int) -> LabelRequest:
 
     Args:
         region: The region.
-        stamp_ns: Stamp of its newest keyframe.
+        stamp_ns: Stamp of the newest keyframe in which the region was observed.
     """
     crops = (
         Image(encoding="jpeg", width=v.width, height=v.height, data=memoryview(v.jpeg))
@@ -94,9 +94,9 @@ def landmark_to_message(
 
     Args:
         landmark: Id of the object.
-        centroid: Its centroid in the map, [3] meters.
-        p: Distribution over the classes, [C]; the message contains those with a name only.
-        names: Names of the classes that have been observed, at most C.
+        centroid: Centroid of the object in the map, [3] meters.
+        p: Distribution over the classes, [C]. Only classes that have a name are in the message.
+        names: Names of the first classes, at most C. The other classes were never observed.
     """
     return GraphLandmark(
         object=landmark,
@@ -112,7 +112,8 @@ def dense_distribution(
     """Return the distribution of a message as a vector [C] that sums to 1.
 
     Args:
-        distribution: Pairs of label and weight. What their sum lacks to 1 goes to `other`.
+        distribution: Pairs of label and probability. If their sum is below 1, the rest is assigned
+            to the class `other`.
         index: Function from a label to its class.
         classes: Number of classes C.
     """
@@ -123,7 +124,7 @@ def dense_distribution(
 
 
 def map_objects(table: np.ndarray, names: Sequence[str]) -> tuple[MapObject, ...]:
-    """Return the messages of landmarks [K], in their order."""
+    """Convert a table of K objects to messages, in the same order."""
     p = distributions(table)
     columns = zip(table, labels_of(table).tolist(), p, entropy(p).tolist(), strict=True)
     return tuple(_object_to_message(*column, names) for column in columns)
@@ -189,7 +190,12 @@ def _box(box: np.ndarray) -> Box:
 
 
 def scale_boxes(detections: Sequence[Detection], times: float) -> list[MovableBox]:
-    """Return the boxes of detections in pixel-edge coordinates of an image `times` smaller."""
+    """Return the boxes of detections in a smaller image.
+
+    Args:
+        detections: Detections, in pixels of the original image.
+        times: Factor by which the image is smaller. The boxes are in its pixel-edge coordinates.
+    """
     return [
         MovableBox(one.label, *((edge + 0.5) / times for edge in one.box_px)) for one in detections
     ]

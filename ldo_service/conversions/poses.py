@@ -32,7 +32,7 @@ def pose_from_message(pose: Pose) -> np.ndarray:
 
 
 def matrix6_to_message(matrix: np.ndarray) -> tuple[float, ...]:
-    """Return the 36 numbers of a matrix [6, 6] by rows."""
+    """Return the 36 numbers of a matrix [6, 6], row by row."""
     return tuple(float(v) for v in np.asarray(matrix).ravel())
 
 
@@ -57,9 +57,9 @@ def relative_pose_from_message(message: MeasuredPose) -> RelativePose:
 
 
 def measurements_from_message(keyframe: Keyframe | KeyframeMeasurements) -> list[RelativePose]:
-    """Return all relative-pose measurements of a keyframe, the one from its reference first.
+    """Return all relative-pose measurements in the message of a keyframe.
 
-    A keyframe without a reference has none from it.
+    If the keyframe has a reference keyframe, the measurement relative to it is the first one.
     """
     window = [relative_pose_from_message(pose) for pose in keyframe.window_measurements]
     if keyframe.reference is None:
@@ -87,8 +87,8 @@ def correction_to_message(
         stamp_ns: Stamp of the correction.
         graph_version: Version of the pose graph.
         T_map_keyframe: Corrected poses [4, 4] by id of the keyframe.
-        refinements: Number of the last `keyframe/refinement` message in the correction.
-        joined: Oldest merged submap, by submap.
+        refinements: Number of the last `keyframe/refinement` message that the correction includes.
+        joined: For each merged submap, the oldest submap that it is merged with.
         closures: Accepted loop closures, as pairs of keyframes.
         not_believed: Rejected loop closures, as pairs of keyframes.
         landmarks: Objects of the pose graph.
@@ -111,11 +111,12 @@ def correction_to_message(
 def keyframe_poses_from_correction(
     correction: GraphCorrection, only: Iterable[int] | None = None
 ) -> dict[int, np.ndarray]:
-    """Return T_map_keyframe [4, 4] of a correction, by id of the keyframe.
+    """Return T_map_keyframe [4, 4] of the keyframes in a correction, by id.
 
     Args:
         correction: The message.
-        only: Ids to return in addition to the newest keyframe; None for all keyframes.
+        only: Ids of the keyframes to return; the newest keyframe is always returned too. None
+            returns all keyframes.
     """
     keyframes = correction.keyframes.numpy()
     rows = correction.T_map_keyframe.numpy()
@@ -129,7 +130,7 @@ def keyframe_poses_from_correction(
 
 
 def map_correction_of(correction: GraphCorrection) -> MapCorrection:
-    """Return the correction for tracking; its poses are decoded on demand."""
+    """Convert a correction message for tracking; poses are decoded only when they are read."""
     return MapCorrection(
         version=correction.graph_version,
         roots=dict(correction.merged_submaps),
