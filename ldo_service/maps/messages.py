@@ -1,4 +1,7 @@
-"""Map messages of bounded size; `replica` assembles the map from them."""
+"""Conversion of Gaussians to map messages of bounded size, and back.
+
+The module `replica` builds a copy of the map from these messages.
+"""
 
 from collections.abc import Iterable, Iterator
 
@@ -16,7 +19,7 @@ NOTHING = GaussianBatch(
 
 
 def gaussians_message(piece: GaussianBatch) -> Gaussians:
-    """Return the message of a batch; its labels are empty if no Gaussian has observations."""
+    """Convert a batch to a message; `labels` is empty if no Gaussian has an observed class."""
     labels = piece.labels if piece.labels.any() else new_labels(0)
     return Gaussians(
         ids=Array.of(piece.ids),
@@ -30,9 +33,9 @@ NO_GAUSSIANS = gaussians_message(NOTHING)
 
 
 def piece_of(message: Gaussians) -> GaussianBatch:
-    """Return the batch of a message.
+    """Convert a message to a batch.
 
-    Its arrays are read-only views, except for labels that were not sent.
+    The arrays are read-only views of the message. If its `labels` is empty, a new array is made.
     """
     ids, labels = message.ids.numpy(), message.labels.numpy()
     labels = labels if len(labels) else new_labels(len(ids))
@@ -40,7 +43,10 @@ def piece_of(message: Gaussians) -> GaussianBatch:
 
 
 def rechunk(pieces: Iterable[GaussianBatch], parts: int, size: int) -> Iterator[Gaussians]:
-    """Yield batches as `parts` messages of `size` Gaussians; the last ones have the rest."""
+    """Regroup batches into exactly `parts` messages of at most `size` Gaussians.
+
+    All messages have `size` Gaussians except for the last ones, which may be smaller or empty.
+    """
     waiting, made = NOTHING, 0
     for piece in pieces:
         waiting = GaussianBatch(*map(np.concatenate, zip(waiting, piece, strict=True)))
@@ -54,10 +60,10 @@ def rechunk(pieces: Iterable[GaussianBatch], parts: int, size: int) -> Iterator[
 
 
 def split_changes(changes: Changes, size: int) -> Iterator[Changes]:
-    """Yield the changes in parts of at most `size` Gaussians.
+    """Divide changes into parts of at most `size` changed or added Gaussians.
 
-    Removed Gaussians come first, in one part, then changed ones, then added ones. There is no
-    part without changes.
+    The first part has all removed ids, which may be more than `size`. Parts with changed Gaussians
+    follow, then parts with added ones. Empty parts are omitted.
     """
     if len(changes.removed):
         yield Changes(changes.removed, NO_IDS, NO_IDS)

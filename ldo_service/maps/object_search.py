@@ -11,7 +11,7 @@ from ldo_service.semantics.text_search import Encode, TextComparisonError, searc
 
 @dataclass(frozen=True, slots=True)
 class ObjectMatch:
-    """An object that matches a text, in the map frame; lengths in meters."""
+    """Object that matches a text query, with positions in the map frame; lengths in meters."""
 
     id: int
     name: str
@@ -25,16 +25,16 @@ class ObjectMatch:
 def find_objects(
     text: str, found: MapObjects, eye: np.ndarray | None, encode: Encode | None = None
 ) -> list[ObjectMatch]:
-    """Return the objects that match a text, the best first.
+    """Return the objects that match a text, the best match first.
 
-    Of equally good ones, the nearest comes first. `encode` is used only if no object matches by
-    its name or a synonym. It then finds names of similar meaning.
+    Of equally good matches, the nearest object comes first. If no object matches by its name or a
+    synonym, `encode` is used to find names of similar meaning.
 
     Args:
         text: The text.
         found: The objects of the map.
         eye: Camera position in the map frame, [3], or None if unknown.
-        encode: Text encoder, or None to compare words only.
+        encode: Text encoder; None compares names and synonyms only.
 
     Raises:
         DataError: No object matches.
@@ -46,7 +46,7 @@ def find_objects(
         try:
             hits = search(text, named, encode)
         except TextComparisonError as error:
-            why_not = f" Words were not compared by what they mean: {error}"
+            why_not = f" Names of similar meaning were not searched: {error}"
     if not hits:
         raise DataError(_nothing(text, [one.name for one in objects]) + why_not)
     answers = []

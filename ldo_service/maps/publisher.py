@@ -1,6 +1,6 @@
 """Publication of the map and its objects, in messages of bounded size.
 
-`replica` is the receiving side. Unchanged objects are not encoded again.
+Receivers build a copy of the map by the module `replica`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -62,7 +62,7 @@ class PublishConfig:
 
 @dataclass(frozen=True, slots=True)
 class MessageContext:
-    """Context of a map message.
+    """Values that the caller supplies for every map message.
 
     Attributes:
         stamp_ns: Stamp of the newest keyframe.
@@ -76,10 +76,10 @@ class MessageContext:
 
 
 class MapPublisher:
-    """Publisher of the map of a MapBuilder; every delta has its own version.
+    """Publisher of the map of a MapBuilder, as map deltas and map snapshots.
 
-    New Gaussians are published with each keyframe, changes of old ones less often, and snapshots
-    of the whole map rarely.
+    Each delta increases the version of the map. New Gaussians are published with each keyframe,
+    changes of published Gaussians less often, and snapshots of the whole map rarely.
     """
 
     def __init__(self, map_: MapBuilder, config: PublishConfig | None = None) -> None:
@@ -103,7 +103,8 @@ class MapPublisher:
 
         Args:
             now: Context of the messages.
-            with_changed: Include changes of old Gaussians, and offload Gaussians afterwards.
+            with_changed: Include changes of published Gaussians. Excess Gaussians are offloaded
+                afterwards (`MapBuilder.offload_excess`).
         """
         changes = self._map.changes(with_changed=with_changed)
         for part in split_changes(changes, self.config.max_gaussians_per_message):
@@ -166,7 +167,7 @@ class MapPublisher:
         )
 
     def _new_names(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return all names if some of them are unpublished, else none."""
+        """Return all label names if at least one of them is unpublished, else an empty tuple."""
         is_news, self._names_told = len(names) > self._names_told, len(names)
         return names if is_news else ()
 
@@ -177,7 +178,8 @@ class MapPublisher:
     def snapshot_if_due(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
         """Yield a snapshot if enough keyframes have passed since the last one.
 
-        The required number is smaller if the map has grown much. Call it once per keyframe.
+        Call it once per keyframe. A snapshot is due after `snapshot_keyframes` keyframes if the map
+        has grown by the fraction `snapshot_growth`, else after `snapshot_keyframes_max`.
         """
         self._since_snapshot += 1
         config, growth = self.config, self._map.size() - self._in_snapshot
@@ -189,9 +191,9 @@ class MapPublisher:
             yield from self.publish_snapshot(now)
 
     def publish_snapshot(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
-        """Yield a snapshot of the whole map.
+        """Yield the deltas with all unpublished changes, then a snapshot of the whole map.
 
-        All unpublished changes are published first, so that existing and new replicas are equal.
+        Replicas that applied the deltas then equal new replicas that start from the snapshot.
         """
         yield from self.deltas(now, with_changed=True)
         self._since_snapshot, self._in_snapshot = 0, self._map.size()
@@ -234,8 +236,8 @@ class MapPublisher:
 class ObjectPublisher:
     """Publisher of the topic map/objects.
 
-    It caches the message of each object: a thousand objects take 50 ms to encode, and few change
-    at a time.
+    It caches the message of each object and converts only objects that have changed. Converting a
+    thousand objects would take 50 ms.
     """
 
     def __init__(self) -> None:

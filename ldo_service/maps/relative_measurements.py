@@ -1,4 +1,4 @@
-"""Relative-pose measurements of keyframes, recomputed after refinement."""
+"""Relative-pose measurements of keyframes, recomputed after the Gaussian optimizer moved poses."""
 
 from collections.abc import Iterator, KeysView, Mapping
 from typing import Any
@@ -17,11 +17,11 @@ LINK = np.dtype([("id", np.int64), ("reference", np.int64), ("information", np.f
 
 
 class RelativeMeasurements:
-    """Table of the keyframe pairs with a relative-pose measurement.
+    """Table of the relative-pose measurements that tracking made, by pair of keyframes.
 
-    The newest `recent` keyframes keep all their measurements. Older ones keep the measurement to
-    their reference keyframe, in 100 bytes. The pose-graph optimizer dropped their other
-    measurements when it condensed them.
+    All measurements of the newest `recent` keyframes are stored. For an older keyframe, only the
+    measurement relative to its reference keyframe is stored, in 100 bytes. The pose-graph optimizer
+    has dropped the other measurements by then, since it has condensed the keyframe.
     """
 
     def __init__(self, poses: KeyframePoses, recent: int) -> None:
@@ -49,14 +49,14 @@ class RelativeMeasurements:
     def refined(self, moved: Mapping[int, np.ndarray], stamp_ns: int) -> KeyframeRefinement | None:
         """Recompute the measurements of keyframes that the Gaussian optimizer moved.
 
-        The result has all measurements with a moved keyframe at either end.
+        These are all measurements in which at least one of the two keyframes moved.
 
         Args:
             moved: New poses T_map_keyframe, by keyframe.
             stamp_ns: Stamp of the message.
 
         Returns:
-            The message, or None without measurements.
+            The message for the pose-graph optimizer, or None if there are no such measurements.
         """
         for keyframe, T_map_keyframe in moved.items():
             self._poses.place(keyframe, T_map_keyframe)
@@ -72,9 +72,10 @@ class RelativeMeasurements:
         return KeyframeRefinement(stamp_ns=stamp_ns, poses=poses, number=self._refinements)
 
     def _between(self, moved: Mapping[int, np.ndarray]) -> Iterator[tuple[int, int, Matrix6]]:
-        """Yield the measurements with a moved keyframe at either end, the oldest first.
+        """Yield the measurements in which at least one keyframe moved, the oldest first.
 
-        Each is a keyframe, a reference and the information.
+        Yields:
+            The measured keyframe, the keyframe that it was measured from, and the information.
         """
         older, keyframes = self._older.all, list(moved)
         at_an_end = np.isin(older["id"], keyframes) | np.isin(older["reference"], keyframes)
@@ -86,9 +87,9 @@ class RelativeMeasurements:
                     yield keyframe, reference, information
 
     def _measured(self, keyframe: int, reference: int, information: Matrix6) -> MeasuredPose:
-        """Return the measurement at the current poses, with the information of the tracker.
+        """Return the relative pose of two keyframes at their current poses, as a measurement.
 
-        The image loss does not give an information matrix.
+        It keeps the information matrix of the tracker, since the image loss yields none.
         """
         T_reference_keyframe = se3.inverse(self._poses[reference]) @ self._poses[keyframe]
         return MeasuredPose(
@@ -99,10 +100,10 @@ class RelativeMeasurements:
         )
 
     def acknowledged(self, refinements: int) -> KeysView[int]:
-        """Return the keyframes with refinements that a pose correction does not include yet.
+        """Return the keyframes with refined poses that a pose correction does not include yet.
 
         Args:
-            refinements: Number of refinements that the correction includes.
+            refinements: Number of the last refinement message that the correction includes.
         """
         self._unacknowledged = {
             k: number for k, number in self._unacknowledged.items() if number > refinements

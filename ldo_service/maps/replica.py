@@ -1,4 +1,4 @@
-"""A replica of the mapper's map, kept from its messages."""
+"""Map replica: a copy of the mapper's map, updated by the messages of the mapper."""
 
 import numpy as np
 
@@ -14,15 +14,15 @@ SLACK = 1.25  # Size relative to the limit at which a bounded replica is cut to 
 
 
 class MapReplica:
-    """Replica of a map, updated by passing every map/delta and map/snapshot to `apply`.
+    """Replica of a map. Pass every message of map/delta and map/snapshot to `apply`.
 
-    Without a limit the replica is exact: `map` equals the mapper's at `version`. After a missed
-    delta it sets `is_behind` and waits for the next complete snapshot.
+    An exact replica has no limit: `map` equals the map of the mapper at `version`. After a missed
+    delta, it sets `is_behind` and does not change until it has received a complete snapshot.
 
-    With a limit the replica is bounded. After a missed delta it continues with errors until the
-    next snapshot, and applies each part of it on arrival. A part removes all Gaussians between
-    its first and last id that it does not contain. If there are more than `max_gaussians`, the
-    replica keeps those with the largest weight. It may exceed the limit by a quarter.
+    A bounded replica has at most `max_gaussians`, plus up to a quarter more for a short time. It
+    keeps the Gaussians with the largest weight. After a missed delta it applies further deltas, so
+    it may have errors until the next snapshot. It applies each part of a snapshot on arrival: the
+    Gaussians of the part replace all Gaussians in the same range of ids.
 
     Args:
         max_gaussians: Limit of a bounded replica; None for an exact one.
@@ -33,7 +33,7 @@ class MapReplica:
         self.reset()
 
     def reset(self) -> None:
-        """Start with an empty map, as at the mapper's start."""
+        """Start again with an empty map."""
         self.map = GaussianMap()
         self.version = 0
         self.is_behind = False
@@ -47,9 +47,9 @@ class MapReplica:
         self._applied_version = 0  # Version of these parts.
 
     def exposure(self, keyframe: int) -> np.ndarray:
-        """Return gains and biases [2, 3] of a keyframe's camera from the last snapshot.
+        """Return the gains and biases [2, 3] of a keyframe's image, from the last snapshot.
 
-        They are 1 and 0 for a keyframe that the snapshot does not contain.
+        For a keyframe that the snapshot does not contain, all gains are 1 and all biases 0.
         """
         return self._exposures.get(keyframe, NEUTRAL)
 
@@ -99,7 +99,7 @@ class MapReplica:
         self.map.touch(where.astype(np.uint32))
 
     def _add(self, added: GaussianBatch) -> None:
-        """Append the Gaussians that no snapshot has added already."""
+        """Append new Gaussians; those that a snapshot has added before are skipped."""
         new = added.at(added.ids >= self._next_id)
         self.map.append(*new)
         self._next_id = max(self._next_id, int(new.ids[-1]) + 1 if len(new.ids) else 0)
@@ -111,7 +111,7 @@ class MapReplica:
 
     # --- snapshots --------------------------------------------------------------------------------
     def _collect_part(self, part: MapSnapshot) -> bool:
-        """Keep a part until the snapshot is complete, then replace the map by the snapshot."""
+        """Store a part of a snapshot; once all parts are there, replace the map by the snapshot."""
         self._note_exposures(part)
         if part.version < self.version or (part.version == self.version and not self.is_behind):
             return False
@@ -150,7 +150,7 @@ class MapReplica:
         return True
 
     def _span(self, part: MapSnapshot, ids: np.ndarray) -> tuple[float, float]:
-        """Return the first and the last id of the range that a part replaces."""
+        """Return the first and the last id of the range that a part of a snapshot replaces."""
         if not len(ids):
             return (0, np.inf) if part.parts == 1 else (0, -1)
         follows = part.part == 0 or part.part - 1 in self._last_ids
