@@ -1,9 +1,9 @@
 """Volumes for planners, computed from the map: a triangle mesh and an occupancy grid.
 
-viewpoints      renderings of the map at the poses of its keyframes
-tsdf            truncated signed distances, fused from depth images
-marching_cubes  the surface of distances on a lattice, and its PLY file
-occupancy       free, occupied and unknown voxels, and a floor plan for ROS' map_server
+viewpoints      Renderings of the map at the poses of its keyframes.
+tsdf            Truncated signed distance field, fused from rendered depth images.
+marching_cubes  Triangle mesh of the zero level of a distance field, and its PLY file.
+occupancy       Free, occupied and unknown voxels, and a floor plan for map_server of ROS.
 """
 
 from .marching_cubes import Mesh, write_mesh

@@ -1,7 +1,8 @@
-"""Marching cubes: the surface where a function on a lattice changes its sign.
+"""Marching cubes: the surface where a function on a grid changes its sign.
 
-scikit-image computes it block by block. Its tables (Lorensen and Cline) resolve an ambiguous face
-by the corners of that face alone. So cells and blocks on both sides of the face agree.
+scikit-image computes the surface block by block. Its tables (Lorensen and Cline) resolve an
+ambiguous cell face by the corners of that face alone. Therefore the triangles of neighboring cells
+and blocks fit together.
 
 Lorensen and Cline, Marching cubes, 1987.
 """
@@ -20,14 +21,15 @@ STEPS = np.array([1 << 40, 1 << 20, 1])  # Step of a packed triple along each ax
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LatticeBlock:
-    """A cube of S^3 cells of a lattice, with the values at their corners.
+    """Block of S x S x S grid cells, with the function values at the cell corners.
 
     Attributes:
-        origin: Lower corner, [3] integers.
-        values: [S + 1, S + 1, S + 1] float32, finite, equal where blocks share a corner.
-        attributes: Attributes of the corners, [S + 1, S + 1, S + 1, C].
-        is_used: Cells to process, [S, S, S] bool. At least one of them is crossed: it has a
-            corner of value < 0 and one of value >= 0.
+        origin: Grid coordinates of the lower corner, [3] integers.
+        values: Function values, [S + 1, S + 1, S + 1] float32, finite. Neighboring blocks must have
+            equal values at common corners.
+        attributes: C further values at each corner, such as colors, [S + 1, S + 1, S + 1, C].
+        is_used: Cells to process, [S, S, S] bool. At least one of them must contain the surface: it
+            has a corner with a value < 0 and one with a value >= 0.
     """
 
     origin: np.ndarray
@@ -38,12 +40,13 @@ class LatticeBlock:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Triangles of a surface, in lattice units.
+    """Triangles of a surface, in grid coordinates.
 
     Attributes:
         points: [V, 3].
-        attributes: Attributes of the points, [V, C].
-        triangles: Indices of points, [M, 3]; counterclockwise when seen from the positive side.
+        attributes: Interpolated attributes of the points, [V, C].
+        triangles: Indices of points, [M, 3]; counterclockwise when seen from the side where the
+            function is positive.
     """
 
     points: np.ndarray
@@ -52,11 +55,13 @@ class Surface:
 
 
 def marching_cubes(blocks: Iterable[LatticeBlock], attributes: int) -> Surface:
-    """Return the surface value = 0 in blocks of a lattice, linear along the edges of its cells.
+    """Return the surface where a function on a grid is zero.
+
+    Values are interpolated linearly along the edges of grid cells.
 
     Args:
-        blocks: Blocks, which may share faces, edges and corners.
-        attributes: Count C of attributes, also for a surface without points.
+        blocks: Blocks of the grid.
+        attributes: Number C of attributes, which is needed if there are no blocks.
     """
     points, values, triangles = [np.zeros((0, 3))], [np.zeros((0, attributes))], []
     count = 0
@@ -81,7 +86,7 @@ def marching_cubes(blocks: Iterable[LatticeBlock], attributes: int) -> Surface:
 
 
 def _interpolated(attributes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return attributes [V, C] at points [V, 3] on edges of the lattice."""
+    """Interpolate attributes [V, C] at points [V, 3] on edges of grid cells."""
     lower = np.floor(points).astype(int)
     upper = np.ceil(points).astype(int)
     share = (points - lower).sum(axis=1)[:, None]
@@ -89,14 +94,15 @@ def _interpolated(attributes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def pack(lattice: np.ndarray) -> np.ndarray:
-    """Return one int64 [...] for each integer triple [..., 3], in the same order; below 2^60.
+    """Pack integer triples [..., 3] into one int64 each, [...], below 2^60; order is preserved.
 
     Raises:
         ConfigError: A coordinate is 2^19 or more from the origin: 10 km with voxels of 2 cm.
     """
     if len(lattice) and max(lattice.max(), -lattice.min()) >= 1 << 19:
         raise ConfigError(
-            "the map extends more than 524,288 voxels from its origin: choose larger voxels."
+            "the map extends more than 524,288 voxels from its origin. Choose larger voxels with "
+            "--voxel."
         )
     return lattice.astype(np.int64) @ STEPS + (1 << 19) * STEPS.sum()
 
@@ -108,7 +114,7 @@ class Mesh:
     Attributes:
         vertices_m: [V, 3] float32.
         colors: RGB of the vertices, [V, 3] uint8.
-        triangles: Indices of vertices, [M, 3] int32; counterclockwise when seen from the free side.
+        triangles: Indices of vertices, [M, 3] int32; counterclockwise when seen from free space.
     """
 
     vertices_m: np.ndarray
@@ -123,7 +129,7 @@ class Mesh:
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a binary PLY with `vertex` (x y z red green blue) and `face` (vertex_indices)."""
+    """Write a mesh as binary PLY: elements `vertex` (x y z red green blue) and `face`."""
     vertices = np.zeros(len(mesh.vertices_m), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     vertices["xyz"], vertices["rgb"] = mesh.vertices_m, mesh.colors
     faces = np.zeros(len(mesh.triangles), [("count", "u1"), ("vertices", "<i4", 3)])

@@ -1,6 +1,6 @@
-"""Occupancy: free, occupied and unknown voxels, and a slice of them as a floor plan.
+"""Occupancy grid with free, occupied and unknown voxels, and a floor plan made from it.
 
-The floor plan is a PGM image and a YAML file in the format of ROS' map_server.
+The floor plan is a PGM image and a YAML file in the format of map_server of ROS.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -85,16 +85,16 @@ def occupancy(
 ) -> OccupancyGrid:
     """Compute the occupancy grid of Gaussians.
 
-    A voxel is occupied if opaque Gaussians cover it. It is free if a viewpoint sees a surface
-    behind it. Otherwise it is unknown. An occupied voxel stays occupied even if a viewpoint sees
-    through it. The grid contains all occupied voxels and all viewpoints.
+    A voxel is occupied if opaque Gaussians cover it, even if a camera sees a surface behind it. Any
+    other voxel is free if a camera sees a surface behind it, and unknown otherwise. The grid
+    contains all occupied voxels and all cameras.
 
     Args:
         rows: Gaussians, [N, 16].
-        viewpoints: Viewpoints that free voxels.
+        viewpoints: Cameras from which the map is rendered to find free voxels.
         config: Settings.
         threads: Threads of the renderer.
-        advance: Called with the number of viewpoints done.
+        advance: Called with the number of finished viewpoints, to show progress.
 
     Raises:
         DataError: No voxel is occupied.
@@ -103,7 +103,7 @@ def occupancy(
     config = config or OccupancyConfig()
     occupied = occupied_voxels(rows, config)
     if not len(occupied):
-        raise DataError("no voxel is occupied: the map holds no opaque surface.")
+        raise DataError("no voxel is occupied: the map contains no opaque surface.")
     stood = [np.floor(v.T_map_camera[:3, 3] / config.voxel_m).astype(int) for v in viewpoints]
     lowest, states = _grid(np.concatenate([occupied, np.reshape(stood, (-1, 3))]), config)
     for done, viewpoint in enumerate(viewpoints, 1):
@@ -115,9 +115,10 @@ def occupancy(
 
 
 def occupied_voxels(rows: np.ndarray, config: OccupancyConfig) -> np.ndarray:
-    """Return the voxels that opaque Gaussians cover, [V, 3] (position over side, rounded down).
+    """Return the integer coordinates of the voxels that opaque Gaussians cover, [V, 3].
 
-    A Gaussian covers its opacity times the integral of its two longer axes, 2 pi s1 s2.
+    They are positions divided by the voxel size and rounded down. The area that a Gaussian covers
+    is its opacity times 2 pi s1 s2, with the standard deviations s1 and s2 of its two longer axes.
     """
     sigmas_m, opacities = np.exp(rows[:, 3:6]), 1 / (1 + np.exp(-rows[:, 10]))
     matter = (opacities >= config.min_opacity) & (
@@ -139,15 +140,16 @@ def _split(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Split Gaussians into parts until no axis is longer than `max_sigma_m`.
 
-    A Gaussian becomes two of half the length, at +- sqrt(3)/2 of its longest axis; together they
-    have its variance. The parts of a large Gaussian are evenly spread, at most
-    2 sqrt(3) `max_sigma_m` apart.
+    A Gaussian with the longest standard deviation s becomes two Gaussians with s / 2 along that
+    axis. Their means lie at +- sqrt(3)/2 s on the axis, so that both together have the original
+    variance. The parts of a large Gaussian are evenly spaced, at most 2 sqrt(3) `max_sigma_m`
+    apart.
 
     Args:
         means: [N, 3].
         axes: Axes scaled by their standard deviations, [N, axis, 3].
         cover: Covered areas, [N].
-        max_sigma_m: Limit of the length of an axis.
+        max_sigma_m: Maximum standard deviation along any axis, meters.
 
     Returns:
         Means and covered areas of the parts.
@@ -168,7 +170,11 @@ def _split(
 
 
 def _grid(voxels: np.ndarray, config: OccupancyConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest voxel [3] and unknown states [X, Y, Z] of a grid around voxels [V, 3]."""
+    """Make a grid that contains the voxels [V, 3].
+
+    Returns:
+        Coordinates [3] of the lowest voxel of the grid, and states [X, Y, Z], all unknown.
+    """
     lowest = voxels.min(axis=0) - 1
     size = voxels.max(axis=0) + 2 - lowest
     if size.astype(float).prod() > config.max_voxels:
@@ -187,10 +193,10 @@ def _carve(
     viewpoint: Viewpoint,
     voxel_m: float,
 ) -> None:
-    """Mark free the voxels that a viewpoint sees through.
+    """Mark voxels as free that are visible from a camera and lie in front of a surface.
 
-    These are the voxel of the camera and all voxels with a measured surface at least one voxel
-    behind their center.
+    These are the voxel with the camera, and all voxels whose center lies at least one voxel in
+    front of the rendered surface.
     """
     stood = np.floor(viewpoint.T_map_camera[:3, 3] / voxel_m).astype(int)
     states[tuple(stood - lowest)] = FREE
@@ -203,15 +209,23 @@ def _carve(
 
 
 def _frustum_m(depth_m: np.ndarray, viewpoint: Viewpoint) -> np.ndarray:
-    """Return the corners [5, 3] of a view frustum in the map: the camera and four at full depth."""
+    """Return the corners [5, 3] of a view frustum in the map.
+
+    They are the camera position and the four image corners at the largest depth.
+    """
     ends = viewpoint.camera.rays()[[0, 0, -1, -1], [0, -1, 0, -1]] * depth_m.max(initial=0)
     return se3.transform(viewpoint.T_map_camera, np.vstack([np.zeros(3), ends]))
 
 
 def _slabs(shape: tuple[int, ...], corners: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the indices [V, 3] of a grid in the bounding box of points [P, 3], by slabs.
+    """Yield the indices of all voxels in the bounding box of some points, in several arrays.
 
-    A slab has at most `SLAB` voxels, or one layer.
+    Args:
+        shape: Shape of the grid.
+        corners: The points, [P, 3], in voxels.
+
+    Yields:
+        Indices [V, 3] of some layers, with at most `SLAB` voxels unless it is a single layer.
     """
     start = np.maximum(np.floor(corners.min(axis=0)).astype(int), 0)
     stop = np.minimum(np.ceil(corners.max(axis=0)).astype(int), shape)
@@ -224,7 +238,7 @@ def _slabs(shape: tuple[int, ...], corners: np.ndarray) -> Iterator[np.ndarray]:
 
 @dataclass(frozen=True, slots=True)
 class FloorPlan:
-    """Floor plan: a slice of an occupancy grid, seen from above.
+    """Floor plan: the voxels of an occupancy grid in a range of heights, seen from above.
 
     Attributes:
         states: [X, Y] uint8: 0 unknown, 1 free, 2 occupied.
@@ -248,9 +262,10 @@ class FloorPlan:
 def floor_plan(
     grid: OccupancyGrid, up: str = "-y", heights_m: tuple[float, float] = (-0.5, 0.5)
 ) -> FloorPlan:
-    """Return the floor plan of the voxels with their center in a range of heights.
+    """Make a floor plan of the voxels whose center lies in a range of heights.
 
-    A cell is occupied if one of its voxels is, else free if one is free, else unknown.
+    A cell is occupied if at least one voxel above it is occupied. Otherwise it is free if at least
+    one voxel is free, and unknown if none is.
 
     Args:
         grid: The occupancy grid.

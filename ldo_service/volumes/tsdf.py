@@ -1,4 +1,4 @@
-"""Truncated signed distances, fused from depth images as a running mean in sparse voxel blocks.
+"""Truncated signed distance field (TSDF) in sparse voxel blocks, fused from depth images.
 
 Curless and Levoy, A volumetric method for building complex models from range images, 1996; blocks
 as in Niessner et al., Real-time 3D reconstruction at scale using voxel hashing, 2013.
@@ -29,7 +29,7 @@ CHUNK = 512  # Blocks processed at a time: a quarter of a million voxels.
 
 @dataclass(frozen=True, slots=True)
 class TsdfConfig:
-    """Settings of the fusion."""
+    """Settings of the fusion of depth images into a TSDF."""
 
     voxel_m: float = 0.02
     # Smaller values leave holes in noisy walls, larger ones in thin objects seen from both sides.
@@ -63,14 +63,14 @@ def fuse(
     threads: int = 1,
     advance: Callable[[int], None] = lambda _done: None,
 ) -> "Tsdf":
-    """Fuse renderings of the map from viewpoints.
+    """Fuse renderings of the map at some viewpoints into a TSDF.
 
     Args:
         rows: Gaussians, [N, 16].
         viewpoints: The viewpoints.
         config: Settings.
         threads: Threads of the renderer.
-        advance: Called with the number of viewpoints done.
+        advance: Called with the number of finished viewpoints, to show progress.
 
     Raises:
         ConfigError: The voxels would exceed `max_memory_mb`.
@@ -85,10 +85,10 @@ def fuse(
 
 
 class Tsdf:
-    """Truncated signed distances to the surface, in meters along the viewing axis.
+    """Truncated signed distances from voxels to the surface, in meters along the viewing axis.
 
-    They are positive in front of the surface. Voxel (i, j, k) has its center at
-    `voxel_m (i, j, k)` in the map. Only blocks of 8x8x8 voxels near a surface take memory.
+    Distances are positive in front of the surface. The center of voxel (i, j, k) is at
+    `voxel_m` * (i, j, k) in the map. Only blocks of 8x8x8 voxels near a surface are stored.
     """
 
     def __init__(self, config: TsdfConfig | None = None) -> None:
@@ -114,8 +114,8 @@ class Tsdf:
     def integrate(self, depth_m: np.ndarray, color: np.ndarray, viewpoint: Viewpoint) -> None:
         """Fuse a depth image.
 
-        Each voxel near the surface has the mean over all images. Weights are the inverse square of
-        depth, as the density of a camera's pixels on the surface is.
+        Each voxel near the surface has the weighted mean of distance and color over all images. The
+        weight is the inverse square of the depth, like the density of pixels on the surface.
 
         Args:
             depth_m: [H, W]; 0 where unknown.
@@ -132,7 +132,7 @@ class Tsdf:
             self._update(slots[start : start + CHUNK], depth_m, color, viewpoint)
 
     def _touched(self, depth_m: np.ndarray, viewpoint: Viewpoint) -> np.ndarray:
-        """Return the blocks [B, 3] within the truncation of the surface, along each ray."""
+        """Return the blocks [B, 3] within the truncation distance of the surface on any ray."""
         seen, reach = depth_m > 0, self.config.truncation_m
         block_m, origin_m = SIDE * self.config.voxel_m, viewpoint.T_map_camera[:3, 3]
         rays_map = viewpoint.camera.rays()[seen] @ viewpoint.T_map_camera[:3, :3].T
@@ -159,7 +159,7 @@ class Tsdf:
         self._color = _grown(self._color, total)
 
     def _find(self, blocks: np.ndarray) -> np.ndarray:
-        """Return the slots [B] of blocks [B, 3]; -1 for a block that does not exist."""
+        """Return the storage index (slot) of each block [B, 3], as [B]; -1 if it is not stored."""
         if not len(self._keys):
             return np.full(len(blocks), -1)
         keys = pack(blocks)
@@ -188,10 +188,11 @@ class Tsdf:
 
     # --- surface ----------------------------------------------------------------------------------
     def mesh(self) -> Mesh:
-        """Return the surface as triangles, in cells with all corners observed.
+        """Return the surface as a triangle mesh.
 
-        Cells with distances that jump by more than the truncation are skipped. They are no surface
-        but the outline of one, in front of the surface behind it.
+        Only cells with eight observed corners are used. Cells whose distances differ by more than
+        the truncation distance are skipped. They lie at the outline of an object, where no surface
+        connects the object and the background.
         """
         surface = marching_cubes(self._crossed_blocks(), attributes=3)
         return Mesh(
@@ -201,7 +202,7 @@ class Tsdf:
         )
 
     def _crossed_blocks(self) -> Iterator[LatticeBlock]:
-        """Yield the blocks that a surface crosses; their attributes are colors."""
+        """Yield the blocks that contain surface, with colors as attributes."""
         for start in range(0, len(self._blocks), CHUNK):
             chunk = np.arange(start, min(start + CHUNK, len(self._blocks)))
             slots, voxels = self._corners(chunk)
@@ -216,13 +217,16 @@ class Tsdf:
                 yield LatticeBlock(origin, values[k], colors[k], is_used[k])
 
     def _corners(self, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the location of the corners of the cells of some blocks.
+        """Return where the values at all cell corners of some blocks are stored.
+
+        The outermost corners are voxels of neighboring blocks.
 
         Args:
             slots: Slots of the blocks, [B].
 
         Returns:
-            Slots [B, 9, 9, 9], -1 for a missing block, and voxels [9, 9, 9] in them.
+            Slot [B, 9, 9, 9] of each corner, -1 if that block is not stored; and the index
+            [9, 9, 9] of the voxel within its block.
         """
         neighbors = np.stack([self._find(self._blocks[slots] + step) for step in CORNERS], -1)
         over = GRID // SIDE @ [1, 2, 4]
@@ -231,7 +235,15 @@ class Tsdf:
 
 
 def _over_cells(reduce: np.ufunc, values: np.ndarray) -> np.ndarray:
-    """Reduce values [B, 9, 9, 9] over the eight corners of each cell, to [B, 8, 8, 8]."""
+    """Apply a ufunc such as np.minimum over the eight corners of each cell.
+
+    Args:
+        reduce: The ufunc.
+        values: Values at the corners, [B, 9, 9, 9].
+
+    Returns:
+        One value for each cell, [B, 8, 8, 8].
+    """
     return reduce.reduce(
         [values[:, x : SIDE + x, y : SIDE + y, z : SIDE + z] for x, y, z in CORNERS]
     )

@@ -12,11 +12,12 @@ NEAR_M = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Lookup:
-    """Values of a depth image at the pixels where points project.
+    """Values of a depth image at the pixels into which some points project.
 
     Attributes:
-        z_m: Depth of the points in the camera, [...].
-        seen_m: Depth of the nearest pixel, [...]; 0 outside the image and where unknown.
+        z_m: Depth of the points themselves in the camera frame, [...].
+        seen_m: Value of the depth image at the nearest pixel, [...]; 0 outside the image and where
+            the depth is unknown.
         row: Row of that pixel, [...].
         column: Column of that pixel, [...].
     """
@@ -52,9 +53,9 @@ class Viewpoint:
 def surface_depth_m(rendering: Rendering, tolerance_m: float) -> np.ndarray:
     """Return the depth [H, W] of the rendered surface; 0 where it is missing or ambiguous.
 
-    The mean depth is smoother than the median. But at the outline of a surface it lies in the air
-    between that surface and the one behind. So the mean is used where it is within `tolerance_m`
-    of the median.
+    The result is the mean depth, which is smoother than the median. At the outline of an object the
+    mean lies between object and background, far from the median. Pixels where both differ by more
+    than `tolerance_m` are therefore 0.
     """
     mean_m, median_m = rendering.depth_m, rendering.median_depth_m
     return np.where(np.abs(mean_m - median_m) <= tolerance_m, mean_m, 0).astype(np.float32)
