@@ -16,9 +16,10 @@ class FramePose:
 
     Attributes:
         stamp_ns: Stamp of the frame.
-        reference: Keyframe that the frame was tracked against; None if there was none.
+        reference: Id of the reference keyframe, to which the frame was aligned; None if there was
+            none.
         T_reference_camera: Camera pose in the reference keyframe, [4, 4].
-        T_map_camera_online: Camera pose in the map as it was published, [4, 4].
+        T_map_camera_online: Camera pose in the map as it was published during the run, [4, 4].
         submap: Submap of the frame.
     """
 
@@ -31,7 +32,7 @@ class FramePose:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredKeyframe:
-    """Keyframe with its pose in the reference keyframe that it was tracked against."""
+    """Keyframe with its pose in the reference keyframe to which it was aligned."""
 
     stamp_ns: int
     keyframe: int
@@ -39,15 +40,17 @@ class MeasuredKeyframe:
 
 
 class FinalPoses:
-    """Final poses T_map_camera of frames, from T_map_keyframe of the keyframes around each frame.
+    """Final poses T_map_camera of frames, computed from the final poses of keyframes.
 
-    A frame at time t was tracked against keyframe r. So were the keyframes a before it and b after
-    it. Each of the two gives a pose of the camera:
+    A frame was aligned to keyframe r. Keyframe a is the last one before the frame that was aligned
+    to r as well, or r itself. Keyframe b is the first such keyframe after the frame. Each of the
+    two gives a pose of the camera:
 
         T_a = T_map_a T_r_a^-1 T_r_camera,    T_b = T_map_b T_r_b^-1 T_r_camera.
 
-    Without corrections both poses are equal. The change that corrections make between a and b is
-    distributed evenly over the time between them. a may be r. If there is no b, the pose is T_a.
+    Both poses are equal if no correction has moved a relative to b. Otherwise the result is
+    interpolated from T_a to T_b by the time of the frame between a and b. If there is no b, the
+    result is T_a.
     """
 
     def __init__(self) -> None:
@@ -59,7 +62,7 @@ class FinalPoses:
 
         Args:
             measured: The keyframe.
-            reference: Keyframe that it was tracked against; None if there was none.
+            reference: Keyframe to which it was aligned; None if there was none.
         """
         itself = MeasuredKeyframe(measured.stamp_ns, measured.keyframe, np.eye(4))
         self._measured[measured.keyframe] = [itself]
@@ -88,7 +91,7 @@ class FinalPoses:
     def _around(
         self, frame: FramePose
     ) -> tuple[MeasuredKeyframe | None, MeasuredKeyframe | None, float]:
-        """Return the keyframes around a frame, and its fraction of the time between them."""
+        """Return the keyframes a and b of a frame, and the time of the frame between them, 0..1."""
         measured = self._measured.get(frame.reference, []) if frame.reference is not None else []
         if not measured:
             return None, None, 0.0

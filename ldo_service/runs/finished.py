@@ -1,4 +1,4 @@
-"""Reading of the folder of a finished run; `runs.folder` lists its files.
+"""Reading of the folder of a finished run. The module `runs.folder` lists its files.
 
 Every function raises DataError for a file that is missing or has an invalid format.
 """
@@ -25,7 +25,7 @@ from .records import read_loops
 
 
 def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
-    """Return all data of a run that are evaluated.
+    """Read all data of a run that the evaluation needs.
 
     Args:
         folder: Folder of the run.
@@ -48,7 +48,7 @@ def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
 
 
 def vlm_calls(folder: Path) -> int | None:
-    """Return the number of requests to the labeller; None if summary.json does not have it."""
+    """Return the number of requests to the labeller; None if summary.json lacks the number."""
     path = folder / "summary.json"
     try:
         found = json.loads(path.read_text())["labeller_requests"] if path.is_file() else None
@@ -58,14 +58,14 @@ def vlm_calls(folder: Path) -> int | None:
 
 
 def newest_map(folder: Path) -> "MapFolder":
-    """Return the refined map of a run, or its own map if it was not refined."""
+    """Return the refined map of a run, or the map at the end of the stream if there is none."""
     return MapFolder(folder / REFINED if has_refined(folder) else folder)
 
 
 def has_refined(folder: Path) -> bool:
-    """Return whether the run has a refined map.
+    """Return whether the run has a complete refined map.
 
-    The map is the last file that a refinement writes.
+    A refinement writes the map file last, so its existence shows that all files are complete.
     """
     return (folder / REFINED / "map.ply").is_file()
 
@@ -93,8 +93,8 @@ class MapFolder:
     def __post_init__(self) -> None:
         if not (self.folder / "map.ply").is_file():
             raise DataError(
-                f"{self.folder} has no map.ply: name the folder of a finished `ldo run`. With "
-                "--localize a run makes no map."
+                f"{self.folder} has no map.ply. Give the folder of a finished `ldo run`. A run "
+                "with --localize makes no map."
             )
 
     def gaussians(self) -> np.ndarray:
@@ -148,7 +148,10 @@ def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:
 
 
 def _submap(keyframe: dict[str, Any]) -> int:
-    """Return the submap of a keyframe; version 0.1 wrote `segment`, earlier ones neither."""
+    """Return the submap of a keyframe in keyframes.json; 0 if an old version wrote none.
+
+    Version 0.1 wrote `segment` instead of `submap`.
+    """
     return next((keyframe[name] for name in ("submap", "segment") if name in keyframe), 0)
 
 
@@ -156,8 +159,10 @@ def _submap(keyframe: dict[str, Any]) -> int:
 def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
     """Open a context with the path and the content of keyframes.json.
 
+    Errors of the code inside the context are reported as errors of the file.
+
     Raises:
-        DataError: The file cannot be read, or the code in the context fails on its content.
+        DataError: The file cannot be read, or its content is invalid.
     """
     path = require_file(folder, "keyframes.json")
     try:

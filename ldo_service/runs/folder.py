@@ -109,9 +109,9 @@ COLUMNS = (
 
 
 class DatabaseWriter:
-    """Writer of the keyframe database with the keyframes that it receives.
+    """Writer of the keyframe database of a run.
 
-    It keeps at most `places.count` keyframes, 0.13 MB each.
+    It keeps at most `places.count` keyframe records in memory, 0.13 MB each.
     """
 
     def __init__(self, config: OdometryConfig) -> None:
@@ -132,7 +132,7 @@ class DatabaseWriter:
         Args:
             path: File to write.
             poses: Final poses T_map_keyframe, which replace T_odom_keyframe.
-            joined: Older submap with which each merged submap was merged.
+            joined: For each merged submap, the older submap that it was merged with.
         """
         places = [
             replace(place, submap=0, T_odom_keyframe=np.array(poses[place.id]))
@@ -147,7 +147,8 @@ def prepare(folder: Path, overwrite: bool) -> None:
 
     Args:
         folder: The folder.
-        overwrite: Delete the files of an earlier run, if there is nothing else in the folder.
+        overwrite: Delete the files of an earlier run. If the folder has other files too, nothing is
+            deleted and ConfigError is raised.
 
     Raises:
         ConfigError: The folder is not empty or cannot be written.
@@ -173,8 +174,8 @@ def prepare(folder: Path, overwrite: bool) -> None:
 class RunWriter:
     """Writer of the folder of a run from the outputs of its actors.
 
-    config.yaml and frames.csv are written from the start of the run, the map and the summary by
-    `close`.
+    config.yaml is written at the start and frames.csv during the run. `close` writes the map, the
+    summary and all other files.
     """
 
     def __init__(self, folder: Path, config_text: str, tracker: TrackerConfig) -> None:
@@ -278,7 +279,7 @@ class RunWriter:
 
     # --- at the end -------------------------------------------------------------------------------
     def close(self, summary: dict[str, Any]) -> None:
-        """Write all files that are complete only at the end of the run."""
+        """Write all files whose content is known only at the end of the run."""
         self._csv_file.close()
         self.summary = summary
         self.online().save(self.folder / "trajectory_online.txt")
@@ -331,13 +332,13 @@ class RunWriter:
         return _trajectory(frames, [frame.T_map_camera_online for frame in frames])
 
     def final(self) -> Trajectory:
-        """Return T_map_camera of each frame from the final poses of the keyframes around it."""
+        """Return T_map_camera of each frame, computed from final keyframe poses (`FinalPoses`)."""
         frames = [frame for frame in self._tracked if self._root(frame.submap) == 0]
         T_map = {keyframe: self._poses[keyframe] for keyframe in self._poses}
         return _trajectory(frames, self._final_poses.of(frames, T_map))
 
     def _root(self, submap: int) -> int:
-        """Return the oldest submap that a submap is merged with, or the submap itself."""
+        """Return the oldest submap merged with `submap`, or `submap` itself if there is none."""
         return self._joined.get(submap, submap)
 
     def _placed_keyframes(self) -> list[dict[str, Any]]:

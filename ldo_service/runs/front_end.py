@@ -1,12 +1,13 @@
-"""Recorded front end of a run, for runs of other back ends on the same poses and keyframes.
+"""Recorded front end of a run, which other runs can use instead of their own front end.
 
 The front end consists of the actors that process every frame: frame source, tracker and detector. A
-run can replace them by their recorded outputs, each at its original tick. With the same settings,
-the other actors then reproduce the recorded run bit by bit. With different settings, the results
-show the effect of these settings with equal odometry.
+run can replace them by their recorded outputs. Each output is replayed at its original tick of the
+logical clock. With the same settings, the other actors then reproduce the recorded run bit by bit.
+With different settings, the results show the effect of these settings with equal odometry.
 
-The tracker received its corrections in the recorded run. So the published poses and the reused
-keyframes are those of the recorded run too.
+The recorded tracker received the pose-graph corrections of its own run. Therefore the published
+poses and the reused keyframes remain those of the recorded run, even if the new run corrects
+keyframes differently.
 """
 
 import json
@@ -57,10 +58,10 @@ DETECTOR_LATENCY = "offline.latency_frames.detector"
 
 
 class FrontEndRecord:
-    """Recording of the front end, as a context.
+    """Recorder of the front end of a run, used as a context manager.
 
-    The recording is deleted if the run fails, if it exceeds `recording.max_gb` or if the disk is
-    full, because an incomplete one is useless.
+    An incomplete recording is useless. It is deleted if the run fails, if it exceeds
+    `recording.max_gb` or if the disk is full.
     """
 
     def __init__(
@@ -84,8 +85,9 @@ class FrontEndRecord:
         self._file.add(topic.name, topic.message, body, tick, message.stamp_ns)
         if self._file.is_open and self._file.is_over_limit():
             log.error(
-                "front end: %s exceeds recording.max_gb or leaves less than recording.min_free_gb; "
-                "the run continues without this recording.",
+                "front end: %s exceeds recording.max_gb or leaves less than recording.min_free_gb. "
+                "It is deleted, and the run continues without it. Raise recording.max_gb or free "
+                "disk space.",
                 self._file.path,
             )
             self._drop()
@@ -128,7 +130,7 @@ class FrontEnd:
             selection: Selected frames of the new run.
 
         Raises:
-            DataError: There is no recording, it is incomplete, or it has other frames.
+            DataError: There is no recording, it is incomplete, or it has different frames.
             ConfigError: A setting of the front end differs from the recorded one.
         """
         path = run.expanduser() / FRONT_END
@@ -155,7 +157,7 @@ class FrontEnd:
         return cls(frames - len(stamps_ns), index)
 
     def __iter__(self) -> Iterator[tuple[Message, ...]]:
-        """Yield the messages of each tick, from the first tick to the last one with messages."""
+        """Yield the messages of each tick of the logical clock, up to the last recorded message."""
         tick = 0
         for number, places in groupby(self._index.places, lambda place: place.number):
             while tick < number:
@@ -190,17 +192,20 @@ def _require_settings(path: Path, about: Mapping[str, str], config: Config) -> N
     try:
         was = dict(json.loads(about.get("settings", "")))
     except (ValueError, TypeError) as error:
-        raise DataError(f"{path} has no settings of its run: {error}. Repeat that run.") from error
+        raise DataError(
+            f"{path} lacks the settings of the run that recorded it ({error}). Repeat that run."
+        ) from error
     asked = json.loads(json.dumps(front_end_settings(config)))
     if was.keys() != asked.keys():
         made_by, ours = about.get("ldo", "an unknown version"), versions()["ldo-slam"]
         raise DataError(
-            f"{path} is of LDO-SLAM {made_by}, which had other settings than this, {ours}. "
-            "Repeat that run."
+            f"{path} was recorded by LDO-SLAM {made_by}, whose settings differ from those of "
+            f"this version, {ours}. Repeat that run."
         )
     for name, value in asked.items():
         if was[name] != value:
             raise ConfigError(
-                f"{name}={value} was {was[name]} when {path} was recorded, and the front end does "
-                "not run again. Restore that value, or remove --reuse-front-end."
+                f"{name}={value} was {was[name]} when {path} was recorded. With "
+                "--reuse-front-end it must be the same, since the front end does not run again. "
+                "Restore that value, or remove --reuse-front-end."
             )

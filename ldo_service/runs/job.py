@@ -16,10 +16,12 @@ REFINE_ITERATIONS = 25  # Maximum iterations per request to the mapper, about a 
 
 
 class Advance(Protocol):
-    """Callback for progress.
+    """Callback that reports progress.
 
-    It takes the number of finished frames and refinement requests. It also takes their total, which
-    grows if corrections require a refit.
+    Args:
+        done: Number of finished frames and refinement requests.
+        total: Number of all of them, or None if it has not changed. It grows if corrections of the
+            pose graph require a refit.
     """
 
     def __call__(self, done: int, total: int | None = None, /) -> None: ...
@@ -35,9 +37,10 @@ class RunOptions:
         config: Configuration.
         selection: Selected frames of the sequence.
         warn: Receives warnings for the user.
-        refine: Iterations of the refinement after the last frame.
+        refine: Number of iterations of the Gaussian optimizer after the last frame.
         prior: Poses T_odom_base of the robot's base from another odometry, in its own frame.
-        front_end: Recorded front end that replaces frame source, tracker and detector.
+        front_end: Recorded outputs that replace frame source, tracker and detector; None to run
+            these actors.
         keep_front_end: Record the front end of this run.
     """
 
@@ -64,5 +67,5 @@ class RunOptions:
 
 
 def requests(iterations: int) -> int:
-    """Return the number of requests to the mapper for so many iterations."""
+    """Return the number of refinement requests into which `iterations` are divided."""
     return -(-iterations // REFINE_ITERATIONS)

@@ -1,4 +1,4 @@
-"""Offline run over a sequence, on the logical clock."""
+"""Offline run over a sequence: actors run on a logical clock, not in real time."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -24,12 +24,12 @@ LAST_RATE = 0.05
 
 
 def run_offline(job: RunOptions, advance: Advance) -> RunWriter:
-    """Run every actor over the selected frames, refit and refine the map, and write the folder.
+    """Run every actor over the selected frames, and write the results to the folder.
 
-    The refit covers keyframes that corrections have moved. The refinement runs only if it is
-    requested. The result does not depend on the load of the machine, see `runtime.logical_clock`.
-    An interrupted or failed run leaves its partial results, and its summary marks them as
-    interrupted.
+    After the last frame, the map is refitted to keyframes that corrections have moved. It is then
+    refined if `job.refine` is not 0. The result does not depend on the load of the machine; see
+    `runtime.logical_clock`. An interrupted or failed run leaves partial results, which its summary
+    marks as interrupted.
 
     Args:
         job: Options of the run.
@@ -37,7 +37,7 @@ def run_offline(job: RunOptions, advance: Advance) -> RunWriter:
 
     Raises:
         DataError: Too few frames can be read.
-        StageError: An actor fails.
+        StageError: An actor failed.
     """
     with OfflineRun(job, advance) as run:
         try:
@@ -52,7 +52,10 @@ def run_offline(job: RunOptions, advance: Advance) -> RunWriter:
 
 
 class OfflineRun:
-    """Offline run as a context, with its phases `stream`, `repair`, `close` and `refine`."""
+    """Offline run as a context manager.
+
+    The caller calls its phases in this order: `stream`, `repair`, `close`, and optionally `refine`.
+    """
 
     def __init__(self, job: RunOptions, advance: Advance) -> None:
         self._job, self._advance, self._work = job, advance, job.work
@@ -137,15 +140,15 @@ class OfflineRun:
         return self._reader.rejected + by_source
 
     def _step_percentiles(self) -> dict[str, Percentiles]:
-        """Return percentiles of the step durations of each actor so far."""
+        """Return percentiles of the durations of all steps so far, by actor."""
         steps_of = self._clock.step_ms()
         return {name: percentiles(steps) for name, steps in steps_of.items() if steps}
 
 
 def with_all_cores(config: Config) -> Config:
-    """Return the configuration with a renderer that may use every core.
+    """Return the configuration with a renderer that may use every CPU core.
 
-    No live frame waits for the tracker in an offline run.
+    A live service leaves one core to the tracker. An offline run need not, since no frame is late.
     """
     threads = config.mapper.threads or os.cpu_count() or 1
     return replace(config, mapper=replace(config.mapper, threads=threads))
@@ -183,6 +186,7 @@ def require_usable(record: RunWriter, max_rejected: float) -> None:
     frames, rejected = record.summary["frames"], record.summary["frames_rejected"]
     if rejected > max_rejected * frames:
         raise DataError(
-            f"{rejected} of {frames} frames could not be used. The results of the others are in "
-            f"{record.folder}. Check the data, or raise offline.max_rejected_ratio."
+            f"{rejected} of {frames} frames could not be used, more than "
+            f"offline.max_rejected_ratio={max_rejected:g} allows. The results of the other frames "
+            f"are in {record.folder}. Check the data, or raise the setting."
         )

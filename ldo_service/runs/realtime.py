@@ -25,10 +25,11 @@ from .summary import Usage, summarize
 
 
 def run_realtime(job: RunOptions, advance: Advance) -> RunWriter:
-    """Run like `run_offline`, but with the stages and policies of the service in this process.
+    """Run every actor over the selected frames in real time, as the live service does.
 
-    A frame that arrives before the tracker has finished the previous one is dropped and counted. So
-    the result depends on the speed and the load of the machine.
+    All actors run in this process. Frames arrive at the times of their stamps. A frame that arrives
+    before the tracker has finished the previous one is dropped and counted. Therefore the result
+    depends on the speed and the load of the machine.
 
     Args:
         job: Options of the run.
@@ -97,7 +98,7 @@ class _RealTimeRun:
         )
 
     async def _feed(self, transport: MemoryTransport) -> None:
-        """Send each frame at its time, after the poses of the odometry prior up to it."""
+        """Send each frame at the time of its stamp, after the earlier poses of the odometry prior."""
         camera = transport.publisher(data_key(CAMERA_RGBD.name))
         odometry = transport.publisher(data_key(ODOMETRY_PRIOR.name))
         first_ns = int(self._sequence.stamps_ns[self._indices[0]])

@@ -1,9 +1,9 @@
 """Records of a run: its loops and objects as JSON.
 
-loops.json has every pair of places that was compared, and the loop closures.
+loops.json has every loop candidate that was compared, and the loop closures.
 
 candidates   fields of the message `loop/candidate`; rejected_reason is "" if the candidate became a
-             closure, and ms is the time of its comparison, null if it was not measured
+             closure, and ms is the duration of its comparison, null if it was not measured
 closures     fields of `loop/closure`: keyframe, reference, T_reference_keyframe [4, 4], information
              [6, 6], overlap, rmse_m, entropy; is_believed is true if the pose graph accepted the
              closure and kept it until the end
@@ -55,7 +55,7 @@ class LoopRecord:
 
         Args:
             message: Output of the loop closer or the optimizer.
-            step_ms: Duration of the step that produced it.
+            step_ms: Duration of the step that produced the message, milliseconds.
         """
         match message:
             case GraphCorrection():
@@ -119,7 +119,7 @@ def _closure(message: LoopClosure) -> dict[str, Any]:
 
 
 def read_loops(folder: Path) -> FoundLoops | None:
-    """Return the loops of a run; None if the run wrote none.
+    """Read the loop candidates and closures of a run; return None if there is no loops.json.
 
     Raises:
         DataError: The file cannot be read or has an invalid format.
@@ -151,7 +151,7 @@ def _closed(row: dict[str, Any]) -> LoopClosed:
 
 
 def write_objects(folder: Path, objects: MapObjects) -> None:
-    """Write objects to a folder, with equal bytes for equal objects."""
+    """Write objects to objects.json in a folder; equal objects give equal bytes."""
     text = msgspec.json.format(msgspec.json.encode(objects), indent=1)
     (folder / OBJECTS).write_bytes(text + b"\n")
 
@@ -160,7 +160,7 @@ def refuse_state(folder: Path) -> None:
     """Check that a folder is not the state folder of a service.
 
     Raises:
-        DataError: It is a state folder.
+        DataError: The folder is a state folder.
     """
     if (folder / "state").is_dir():
         raise DataError(
@@ -173,7 +173,7 @@ def read_objects(folder: Path) -> MapObjects:
     """Return the objects of a run.
 
     Raises:
-        DataError: There is no such file, or it has an invalid format.
+        DataError: The folder has no objects.json, or the file has an invalid format.
     """
     path = folder / OBJECTS
     if not folder.is_dir():

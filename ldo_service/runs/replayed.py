@@ -1,4 +1,4 @@
-"""Replay of a recording by new actors, one after the other."""
+"""Replay of a recording: each recorded actor runs again on its recorded inputs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from ldo_service.storage.yaml_io import load_yaml
 
 @dataclass(frozen=True, slots=True)
 class RecordedActor:
-    """Recorded journals of one actor, one per process."""
+    """Recording of one actor: one journal for each process in which the actor ran."""
 
     name: str
     files: tuple[JournalFile, ...]
@@ -54,7 +54,7 @@ class RecordedActor:
         return replayed
 
     def _make(self, folder: Path, about: Mapping[str, str]) -> Actor:
-        """Return an actor as it was recorded, but with its files in another folder."""
+        """Return a new actor with the recorded configuration and its files in `folder`."""
         make = actor_spec(self.name).make
         assert make is not None
         config = _config_of(about)
@@ -62,7 +62,7 @@ class RecordedActor:
         return make(actor_parameters(replace(config, mapper=mapper)))
 
     def caveats(self) -> list[str]:
-        """Return the reasons for which the last bits may differ on this machine."""
+        """Return reasons why results may differ in the last bits on this machine."""
         return [line for file in self.files[:1] for line in _caveats(file.about)]
 
 
@@ -70,7 +70,7 @@ def _config_of(about: Mapping[str, str]) -> Config:
     """Return the configuration of the recorded actor.
 
     Raises:
-        DataError: It cannot be read.
+        DataError: The configuration cannot be read.
     """
     try:
         return config_of(load_yaml(about.get("config", "")) or {})
@@ -79,10 +79,10 @@ def _config_of(about: Mapping[str, str]) -> Config:
 
 
 def _versions_of(about: Mapping[str, str]) -> dict[str, str]:
-    """Return the recorded versions of libraries, by name.
+    """Return the versions of the libraries at the time of the recording, by name.
 
     Raises:
-        DataError: They cannot be read.
+        DataError: The versions cannot be read.
     """
     try:
         return msgspec.json.decode(about.get("versions", "{}"), type=dict[str, str])
@@ -113,7 +113,8 @@ def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedAct
         only: Names of actors to return; empty returns all.
 
     Raises:
-        DataError: The folder has no recording, no step, or a recording of another version.
+        DataError: The folder has no recording, a recording without steps, or one of another format
+            version.
         ConfigError: An actor is not in the recording.
     """
     found = recorded_actors(folder)

@@ -1,4 +1,4 @@
-"""Run of all actors on the logical clock, reduced to a digest of the outputs of each one."""
+"""Run of all actors on the logical clock, which computes a digest of each actor's outputs."""
 
 import hashlib
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class ActorDigest:
 
 
 class Digests:
-    """Digests of the outputs of actors."""
+    """Digests of the outputs of all actors, updated with each output."""
 
     def __init__(self, actors: list[str]) -> None:
         self._counts = dict.fromkeys(actors, 0)

@@ -1,4 +1,4 @@
-"""Frames of a run: selected from a sequence or a recording, read ahead, with an odometry prior."""
+"""Frames of a run: selection from a sequence or a recording, reading, and odometry prior."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -64,9 +64,9 @@ class Selection:
 
 
 class FrameReader:
-    """Reader of frames as camera messages, ahead of time in a thread.
+    """Reader of frames as camera messages.
 
-    It skips and counts frames that cannot be read.
+    A thread reads frames in advance. Frames that cannot be read are skipped and counted.
     """
 
     def __init__(self, sequence: Sequence, indices: range, warn: Warn) -> None:
@@ -97,9 +97,10 @@ class FrameReader:
 def interleave_prior(
     frames: Iterable[CameraRgbd], prior: Trajectory | None
 ) -> Iterator[tuple[Message, ...]]:
-    """Yield each frame after the poses of the prior that arrive before it in a live service.
+    """Yield the frames together with the poses of the odometry prior.
 
-    These are all poses up to the first one that is not older than the frame.
+    Each frame follows the poses that a live service would receive before it. These are all poses up
+    to the first one that is not older than the frame.
 
     Args:
         frames: The frames.
@@ -120,10 +121,10 @@ def _prior_message(stamp_s: float, T_odom_base: np.ndarray) -> OdometryPrior:
 
 
 def require_overlap(prior: Trajectory, sequence: Sequence, indices: range) -> None:
-    """Check that the prior covers the time of the frames.
+    """Check that the odometry prior has poses at the time of the frames.
 
     Raises:
-        DataError: No pose is from that time.
+        DataError: The prior has no pose in that time.
     """
     first_s, last_s = (1e-9 * float(sequence.stamps_ns[indices[end]]) for end in (0, -1))
     if not np.any((prior.stamps_s >= first_s) & (prior.stamps_s <= last_s)):
@@ -134,7 +135,7 @@ def require_overlap(prior: Trajectory, sequence: Sequence, indices: range) -> No
 
 
 def open_source(source: str, options: SequenceOptions | None = None) -> Sequence:
-    """Return the frames of a recording, or of a data set that `open_sequence` knows.
+    """Open a recording, or a data set that `open_sequence` supports, as a sequence of frames.
 
     Raises:
         DataError: The source cannot be read.
@@ -168,7 +169,7 @@ class RecordedMessage:
 
 @dataclass(frozen=True, slots=True)
 class RecordedFrame:
-    """Frame in a recording; `depth` is None if `color` is a message with both images."""
+    """Frame in a recording; `depth` is None if the message `color` contains both images."""
 
     color: RecordedMessage
     depth: RecordedMessage | None = None
@@ -188,8 +189,8 @@ class RecordingSequence(Sequence):
     """Recording as a sequence of frames.
 
     Color and depth images are paired as in the service with default settings. Frames whose stamp is
-    not later than that of the previous one are skipped. If the camera was restarted, the data set
-    is the part before the restart.
+    not later than that of the previous frame are skipped. If the camera was restarted during the
+    recording, only the frames before the restart are used.
     """
 
     def __init__(self, folder: Path) -> None:

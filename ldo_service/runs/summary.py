@@ -42,17 +42,17 @@ def summarize(
 ) -> dict[str, Any]:
     """Return the summary of a finished run.
 
-    FPS counts all time from the first read to the last step, and the refit at the end. Nothing is
-    excluded as warm-up.
+    The frame rate (FPS) is the number of frames divided by the time from the first read to the last
+    step. This time includes the refit at the end and the first, slower frames.
 
     Args:
         record: The finished run.
-        used: Time that the run took.
+        used: Time that the process has used for the run.
         frames: Number of selected frames.
         rejected: Number of frames that could not be used.
         stage_ms: Percentiles of the step durations of each actor.
-        drops: Dropped messages by "actor topic".
-        facts: Metrics of optimizer and mapper.
+        drops: Number of dropped messages, by key "actor topic".
+        facts: Metrics of the pose-graph optimizer and the mapper.
     """
     in_map = record.in_map()
     return {

@@ -182,7 +182,7 @@ def test_damaged_run_is_bad_data_and_names_the_file(
 
 def test_folder_without_a_run_is_bad_data(tmp_path: Path) -> None:
     code, message = ldo_export(tmp_path, "--format", "tum")
-    assert (code, "name the folder of a finished `ldo run`" in message) == (3, True)
+    assert (code, "Give the folder of a finished `ldo run`" in message) == (3, True)
 
 
 def test_missing_output_folder_is_reported(run: Path) -> None:

@@ -183,5 +183,5 @@ def test_front_end_of_a_version_with_other_settings_is_refused(
     options = load_config(settings=(ROUGH, *SETTINGS))
     more = front_end_settings(options) | {"tracker.clairvoyance": True}
     monkeypatch.setattr("ldo_service.runs.front_end.front_end_settings", lambda _: more)
-    with pytest.raises(DataError, match=r"is of LDO-SLAM .*had other settings than this"):
+    with pytest.raises(DataError, match=r"was recorded by LDO-SLAM .*whose settings differ"):
         FrontEnd.open(full_run, options, walk, Selection())
