@@ -1,8 +1,8 @@
-"""Suites: lists of runs, sources x variants x seeds, each evaluated and compared in a table.
+"""Suites: runs of several sequences, variants and seeds, evaluated and compared in a table.
 
-The YAML files of this package are the tables of the paper that LDO-SLAM implements, its sensitivity
-analysis and its ablation. `published` in them has the values that the paper prints for its own
-method and for others.
+The YAML files of this package are built-in suites. They reproduce the tables of the paper that
+LDO-SLAM implements, with its sensitivity analysis and its ablation. The key `published` has the
+values from the paper, for its own method and for others.
 """
 
 from .runner import Outcome, SuiteRunner

@@ -1,7 +1,7 @@
 """Execution of the runs of a suite, one after the other, each in its own process.
 
-Finished runs are kept: an interrupted suite resumes where it stopped. A run that fails is missing
-in the table and does not stop the others.
+Finished runs are not repeated, so an interrupted suite resumes where it stopped. A failed run is
+marked as failed in the table and does not stop the other runs.
 """
 
 import json
@@ -30,8 +30,8 @@ class Outcome:
 
     Attributes:
         entry: The run.
-        judged: Its results; None if there are none.
-        missing: Reason for missing results, as printed in the table.
+        judged: Results of the run; None if there are none.
+        missing: Reason why there are no results, as printed in the table.
     """
 
     entry: SuiteRun
@@ -89,7 +89,7 @@ class SuiteRunner:
             return Outcome(entry, None, "failed")
 
     def _told(self, entry: SuiteRun) -> str:
-        """Return all inputs of a run that its results depend on, as JSON."""
+        """Return everything that the results of a run depend on, as JSON."""
         told = {
             **asdict(entry),
             "settings": (*self.settings, *entry.settings),
@@ -108,7 +108,7 @@ class SuiteRunner:
         return is_kept and told.is_file() and told.read_text() == self._told(entry)
 
     def _run(self, entry: SuiteRun, folder: Path) -> str:
-        """Make and evaluate a run; return the reason of a failure, empty on success."""
+        """Execute and evaluate a run; return the reason if it fails, else an empty string."""
         settings = [
             word for setting in (*self.settings, *entry.settings) for word in ("--set", setting)
         ]
@@ -151,7 +151,7 @@ def _ldo(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def _reason(done: subprocess.CompletedProcess[str]) -> str:
-    """Return the error message of `ldo`."""
+    """Return the error message that a failed `ldo` process has printed."""
     lines = [line for line in done.stderr.strip().splitlines() if line.strip()]
     return lines[-1].removeprefix("ldo: ") if lines else f"exit code {done.returncode}."
 

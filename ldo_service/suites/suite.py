@@ -38,7 +38,7 @@ class Judged:
         return self.results["trajectory"][name]
 
     def rendering(self, protocol: str, figure: str, newest: bool = True) -> float | None:
-        """Return the mean over all frames of a rendering metric.
+        """Return the mean of a rendering metric over all frames.
 
         Args:
             protocol: Protocol of the evaluation, HELD_OUT or TRAINING.
@@ -130,7 +130,7 @@ FIGURES: dict[str, Score] = {
 
 @dataclass(frozen=True, slots=True)
 class SuiteRun:
-    """Run of a suite: names of its sequence and variant, and the options of `ldo run`."""
+    """One run of a suite: the names of its sequence and variant, its source and its settings."""
 
     sequence: str
     variant: str
@@ -142,12 +142,12 @@ class SuiteRun:
 
     @property
     def folder(self) -> Path:
-        """Path within the folder of the suite's results."""
+        """Folder of this run, relative to the result folder of the suite."""
         return self._folder_of(self.variant)
 
     @property
     def front_end_folder(self) -> Path | None:
-        """Path of the run that provides the recorded front end; None without one."""
+        """Folder of the run whose recorded front end this run uses; None if it uses none."""
         return self._folder_of(self.front_end) if self.front_end else None
 
     def _folder_of(self, variant: str) -> Path:
@@ -159,7 +159,8 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Content of a suite file.
 
     Raises:
-        ConfigError: A name cannot be that of a folder, or a metric is unknown.
+        ConfigError: A name of a sequence or variant is not usable as a folder name, or a metric is
+            unknown, or `front_end` is invalid.
     """
 
     title: str
@@ -182,29 +183,38 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     def __post_init__(self) -> None:
         if not self.sequences or not self.variants or not self.figures or not self.seeds:
-            raise ConfigError("a suite needs at least one sequence, variant, figure and seed.")
+            raise ConfigError(
+                "sequences, variants, figures and seeds of a suite must each have at least one entry."
+            )
         for name in (*self.sequences, *self.variants):
             if not NAME.fullmatch(name):
                 raise ConfigError(
-                    f"{name!r} cannot be the name of a folder: use letters, digits, spaces, ._+-."
+                    f"{name!r} must be usable as the name of a folder: use letters, digits, spaces "
+                    "and the characters ._+-"
                 )
         if self.front_end not in (None, next(iter(self.variants))):
-            raise ConfigError(f"front_end is {self.front_end!r}: it must be the first variant.")
+            raise ConfigError(
+                f"front_end={self.front_end!r} must be the first variant, "
+                f"{next(iter(self.variants))!r}."
+            )
         unknown = sorted(set(self.figures) - FIGURES.keys())
         if unknown:
-            raise ConfigError(f"unknown figure {', '.join(unknown)}. Known: {', '.join(FIGURES)}.")
+            raise ConfigError(
+                f"figures has the unknown metric {', '.join(unknown)}. Use some of: "
+                f"{', '.join(FIGURES)}."
+            )
         of_front_end = sorted(OF_FRONT_END.intersection(self.figures))
         if self.front_end and of_front_end:
             raise ConfigError(
-                f"{of_front_end[0]} depends on the front end, which all variants share with "
-                f"{self.front_end!r}. Remove the figure or front_end."
+                f"{of_front_end[0]} depends on the front end, and all variants use the one of "
+                f"{self.front_end!r}. Remove {of_front_end[0]} from figures, or remove front_end."
             )
 
     def entries(self, data: Path) -> Iterator[SuiteRun]:
-        """Yield all runs, sequence by sequence.
+        """Yield all runs, ordered by sequence.
 
         Args:
-            data: Folder with the sources.
+            data: Folder with the data sets.
         """
         for sequence, source in self.sequences.items():
             for variant, settings in self.variants.items():
@@ -218,7 +228,7 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                     yield SuiteRun(sequence, variant, where, settings, seed, front_end)
 
     def front_end_settings(self) -> tuple[str, ...] | None:
-        """Return the settings of the variant that provides the front end; None without one."""
+        """Return the settings of the variant whose front end others reuse; None without one."""
         return None if self.front_end is None else self.variants[self.front_end]
 
     def options(self) -> list[str]:

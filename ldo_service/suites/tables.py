@@ -11,11 +11,11 @@ Cells = dict[str, str]  # Texts by column.
 
 
 def markdown(suite: Suite, outcomes: Sequence[Outcome]) -> str:
-    """Return the outcomes of a suite as Markdown.
+    """Return the outcomes of a suite as tables in Markdown.
 
-    With a single sequence, one table shows all metrics. With several, each metric has a table of
-    all sequences. Cells have the mean and the standard deviation over the seeds. Published values
-    of other methods stand above.
+    If the suite has one sequence, one table shows all metrics. Otherwise there is one table for
+    each metric, with a column for each sequence. A cell has the mean and the standard deviation
+    over the seeds. The first rows are published values.
     """
     parts = [f"# {suite.title}", suite.about.strip()]
     if len(suite.sequences) == 1:
@@ -71,7 +71,7 @@ def _cell(figure: Score, outcomes: Sequence[Outcome]) -> str:
 def _average(suite: Suite, figure: Score, outcomes: Sequence[Outcome]) -> str:
     """Return the mean over all sequences as text.
 
-    It is "-" if a sequence is missing, because the mean of the others is not comparable.
+    If a sequence has no result, return "-": a mean over the other sequences is not comparable.
     """
     means = [
         _values(figure, [o for o in outcomes if o.entry.sequence == sequence])

@@ -134,11 +134,11 @@ def test_score_that_was_not_evaluated_is_none(name: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"figures": ["beauty"]}, "unknown figure beauty. Known: ate_cm"),
+        ({"figures": ["beauty"]}, "unknown metric beauty. Use some of: ate_cm"),
         ({"figures": []}, "at least one"),
-        ({"variants": {"../up": []}}, "cannot be the name of a folder"),
-        ({"sequences": {"": "x"}}, "cannot be the name of a folder"),
-        ({"front_end": "default"}, "front_end is 'default': it must be the first variant"),
+        ({"variants": {"../up": []}}, "must be usable as the name of a folder"),
+        ({"sequences": {"": "x"}}, "must be usable as the name of a folder"),
+        ({"front_end": "default"}, "front_end='default' must be the first variant"),
         (
             {"front_end": "whole", "variants": {"whole": []}, "figures": ["miou", "fps"]},
             "fps depends on the front end",
