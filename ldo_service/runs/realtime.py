@@ -98,7 +98,7 @@ class _RealTimeRun:
         )
 
     async def _feed(self, transport: MemoryTransport) -> None:
-        """Send each frame at the time of its stamp, after the earlier poses of the odometry prior."""
+        """Send each frame at the time of its stamp, after the earlier odometry-prior poses."""
         camera = transport.publisher(data_key(CAMERA_RGBD.name))
         odometry = transport.publisher(data_key(ODOMETRY_PRIOR.name))
         first_ns = int(self._sequence.stamps_ns[self._indices[0]])

@@ -184,7 +184,7 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     def __post_init__(self) -> None:
         if not self.sequences or not self.variants or not self.figures or not self.seeds:
             raise ConfigError(
-                "sequences, variants, figures and seeds of a suite must each have at least one entry."
+                "sequences, variants, figures and seeds of a suite each need at least one entry."
             )
         for name in (*self.sequences, *self.variants):
             if not NAME.fullmatch(name):
