@@ -1,4 +1,4 @@
-"""Views of objects and flights of the camera to them."""
+"""Camera views of objects, and smooth motion of the browser's camera to them."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ HALF_VIEW_RAD = 0.65  # Half the vertical field of view of the browser: viser ha
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """View of a camera.
+    """Position and direction of the browser's camera.
 
     Attributes:
         position: Position of the camera in the map frame, [3], meters.
@@ -27,15 +27,15 @@ class CameraView:
 
 
 def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray) -> CameraView:
-    """Return a close view of the whole object along an unobstructed line of sight.
+    """Return a close view of a whole object, from a direction where nothing hides it.
 
-    The view is from the direction of the keyframe that shows the object best. Without a known
-    keyframe it is from the direction of `eye`.
+    This is the direction of the keyframe that shows the object best. If its pose is unknown, the
+    direction of `eye` is used.
 
     Args:
         one: The object.
         keyframes: T_map_camera of each keyframe, [4, 4], by id.
-        eye: Present position of the viewer, [3], meters.
+        eye: Current position of the browser's camera, [3], meters.
     """
     center = np.array(one.T_map_object.translation)
     known = [view.keyframe for view in one.views if view.keyframe in keyframes]
@@ -63,12 +63,12 @@ def overview(T_map_camera: np.ndarray, back_m: float = 0.6, ahead_m: float = 2.0
 def estimate_up(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
     """Return the up direction of the map for a level horizon, [3].
 
-    A handheld camera is tilted more than it is rolled. With the axes x (right) and y (down) of the
-    cameras, up is the unit vector u that minimizes
+    A handheld camera is tilted more than it is rolled. x (right) and y (down) are the axes of each
+    keyframe's camera. Up is the unit vector u that minimizes
 
         mean (x . u)^2 + TILT (1 - mean (y . u)^2)
 
-    on the side of -y. Without keyframes it is the up direction of the first camera.
+    and points opposite to y on average. Without keyframes, it is -y of the first camera.
 
     Args:
         keyframes: T_map_camera of each keyframe, [4, 4], by id.

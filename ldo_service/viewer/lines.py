@@ -49,7 +49,7 @@ class Lines:
 
     @classmethod
     def together(cls, many: Iterable["Lines"]) -> "Lines":
-        """Return all segments of many lines."""
+        """Concatenate the segments of several `Lines`."""
         lines = [cls.of(np.zeros((0, 2, 3)), FOUND), *many]
         return cls(
             np.concatenate([one.points for one in lines]),
@@ -58,10 +58,10 @@ class Lines:
 
 
 def path_lines(positions: np.ndarray, color: Color) -> Lines:
-    """Return the path through positions, without its jumps.
+    """Return the path through camera positions, with gaps where the position jumps.
 
-    A jump is a step that is much longer than most. The limit is relative, because a long path is
-    drawn with fewer poses.
+    A jump is a step that is much longer than most steps. The limit is relative to the other steps,
+    because a long path is drawn with fewer positions.
 
     Args:
         positions: Positions of the camera, [K, 3], meters; NaN where unknown.
@@ -78,11 +78,11 @@ def path_lines(positions: np.ndarray, color: Color) -> Lines:
 def keyframe_lines(
     keyframes: Iterable[np.ndarray], camera: Camera | None, color: Color = KEYFRAME
 ) -> Lines:
-    """Return the outline of the image of each camera, and the rays to its corners.
+    """Return the view frustum of each camera: the image outline and the lines to its corners.
 
     Args:
         keyframes: T_map_camera of each camera, [4, 4].
-        camera: Intrinsics; None draws UNKNOWN_CAMERA.
+        camera: Intrinsics; None uses UNKNOWN_CAMERA.
         color: Color of the lines.
     """
     camera = camera or UNKNOWN_CAMERA
@@ -98,7 +98,7 @@ def sight_lines(
     camera: Camera | None,
     sights: Mapping[int, Iterable[ObjectBox]],
 ) -> Lines:
-    """Return the boxes of detections in the drawn images of their keyframes.
+    """Return the boxes of detections, drawn in the image outlines of their keyframes.
 
     Args:
         keyframes: T_map_camera of each keyframe, [4, 4], by id.
@@ -145,9 +145,9 @@ def loop_lines(loops: Iterable[tuple[int, int]], keyframes: Mapping[int, np.ndar
 
 @lru_cache(maxsize=1024)
 def color_of(name: str) -> Color:
-    """Return the color of a name.
+    """Return the color of an object name.
 
-    The color is saturated, because browsers draw lines paler.
+    The color is saturated, because browsers draw thin lines in paler colors.
     """
     hue = zlib.crc32(name.encode()) % 360 / 360
     red, green, blue = (round(255 * value) for value in colorsys.hls_to_rgb(hue, 0.45, 1.0))
@@ -155,7 +155,7 @@ def color_of(name: str) -> Color:
 
 
 def _outlines(camera: Camera, boxes_px: np.ndarray) -> np.ndarray:
-    """Return the sides of boxes in the image, FRUSTUM_M in front of the camera.
+    """Return the sides of image boxes as lines in space, FRUSTUM_M in front of the camera.
 
     Args:
         camera: Intrinsics.

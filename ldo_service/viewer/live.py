@@ -1,4 +1,4 @@
-"""Scene of a running service, with limits on what it may publish."""
+"""Scene of a running service, built from its messages and limited in size."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -82,7 +82,7 @@ class LiveScene:
         self.reset()
 
     def reset(self) -> None:
-        """Start with an empty map, because the service has a new one."""
+        """Clear the scene, because the service has started a new map."""
         self._gaussians = MapReplica(self._config.max_gaussians)
         self.scene = Scene(camera=self.scene.camera)
         self._keyframes, self._path = LiveKeyframes(), LivePath(self._config.max_poses)
@@ -202,7 +202,7 @@ class LiveScene:
         return changed
 
     def _agreed_loops(self) -> tuple[tuple[int, int], ...]:
-        """Return all loop closures that are not rejected by the newest correction."""
+        """Return all loop closures that the newest pose-graph correction does not reject."""
         if self._correction is None:
             return tuple(self._loops)
         named = dict.fromkeys((*self._loops, *self._correction.accepted_closures))
@@ -228,7 +228,7 @@ class LiveScene:
 
 
 class LiveSource:
-    """Source of the scene of a running service; `live` makes it."""
+    """Source of the scene of a running service; create it with `live`."""
 
     def __init__(self, service: Client, config: ViewerConfig, stack: ExitStack) -> None:
         self._service = service
@@ -245,7 +245,7 @@ class LiveSource:
         self._ask()
 
     def _ask(self) -> None:
-        """Request the last values of all states."""
+        """Request the last message of each topic in STATES."""
         for topic in STATES:
             for message in self._service.latest(topic):
                 self._live.take(message)
@@ -275,8 +275,8 @@ class LiveSource:
     def _note_epoch(self, health: Health) -> None:
         """Reset the scene if the service was restarted or reset.
 
-        The versions of its messages may then start again from the beginning and cannot be compared
-        with earlier ones.
+        The versions in its messages may then restart at zero, so they cannot be compared with
+        earlier versions.
         """
         if health.actor not in RESTARTED_TOGETHER:
             return
@@ -290,9 +290,9 @@ class LiveSource:
             self._ask()
 
     def _learn_camera(self) -> None:
-        """Take the camera from one keyframe and unsubscribe.
+        """Read the camera intrinsics from one keyframe message, then unsubscribe from keyframes.
 
-        Keyframe messages are large, and all have the same camera.
+        Keyframe messages are large, and all of them have the same intrinsics.
         """
         for keyframe in self._keyframes():
             self._live.take(keyframe)
@@ -301,6 +301,6 @@ class LiveSource:
 
 @contextmanager
 def live(service: Client, config: ViewerConfig) -> Iterator[LiveSource]:
-    """Open a context with the scene of a service, subscribed to all topics that are shown."""
+    """Open a context with a source of the scene, subscribed to all topics that it needs."""
     with ExitStack() as stack:
         yield LiveSource(service, config, stack)

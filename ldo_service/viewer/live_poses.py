@@ -12,8 +12,8 @@ NOWHERE = np.full(3, np.nan)
 class LiveKeyframes:
     """Poses T_map_keyframe of the keyframes, [4, 4], by id.
 
-    A correction has the poses of all keyframes at its time. Newer keyframes keep their poses
-    relative to their reference keyframes.
+    A pose-graph correction contains all keyframes that existed when it was computed. Newer
+    keyframes keep their poses relative to their reference keyframes.
     """
 
     def __init__(self) -> None:
@@ -41,11 +41,11 @@ class LiveKeyframes:
 
 
 class LivePath:
-    """Positions of the camera, as published and after corrections.
+    """Positions of the camera, as published and after pose-graph corrections.
 
-    The corrected positions follow the keyframes that the frames were tracked against. When there
-    are more than `most` positions, every second one is dropped, and from then on every second new
-    one.
+    A corrected position moves with the reference keyframe of its frame. Each time that there are
+    more than `most` positions, every second one is dropped, and only half as many new ones are
+    stored from then on.
     """
 
     def __init__(self, most: int) -> None:
@@ -65,7 +65,8 @@ class LivePath:
 
         Args:
             pose: Tracked pose of the frame.
-            T_map_camera: Pose of the camera, [4, 4]. Its online position is known only in submap 0.
+            T_map_camera: Pose of the camera, [4, 4]. Outside submap 0, the published position is
+                stored as unknown.
         """
         self._heard += 1
         if self._heard % self._every:

@@ -1,4 +1,4 @@
-"""Texts of the panel in Markdown."""
+"""Texts of the side panel of the window, in Markdown."""
 
 import re
 from collections import deque
@@ -14,9 +14,9 @@ MAX_NAME = 40  # Maximum characters of a name, because the panel is narrow.
 
 
 def escaped(text: str) -> str:
-    """Return plain text as Markdown without markup.
+    """Escape plain text for Markdown.
 
-    Names come from messages and must not become markup.
+    Names come from messages and must not be interpreted as markup.
     """
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(text.split()))
 
@@ -66,7 +66,7 @@ class Rate:
     _counts: deque[tuple[float, int]] = field(default_factory=deque)  # Times and counts.
 
     def add(self, now_s: float, count: int) -> None:
-        """Add the present count."""
+        """Add the current value of the counter."""
         if self._counts and count < self._counts[-1][1]:
             self._counts.clear()  # The counter was reset.
         self._counts.append((now_s, count))
@@ -75,7 +75,7 @@ class Rate:
 
     @property
     def hz(self) -> float:
-        """Rate per second; 0 until there are two counts."""
+        """Rate of the counter per second; 0 until two values were added."""
         (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
         return (last - first) / (last_s - first_s) if last_s > first_s else 0.0
 

@@ -88,7 +88,7 @@ class RunFolder:
         return True
 
     def _path(self, name: str) -> Path:
-        """Return the path of a file, of the refined one if it exists."""
+        """Return the path of a file of the run; the refined file if there is one."""
         refined = self._folder / REFINED / name
         return refined if has_refined(self._folder) and refined.is_file() else self._folder / name
 
@@ -146,7 +146,7 @@ class RunFolder:
         self.scene.rows = rows[weightiest(rows, self._config.max_gaussians)]
 
     def read_objects(self, path: Path) -> None:
-        """Read the objects with their views, which are the detections that a run keeps."""
+        """Read the objects, and the detections of each object in some keyframes."""
         self.scene.objects = read_objects(path.parent)
         self.scene.sights = sights_of(self.scene.objects)
 
@@ -169,7 +169,7 @@ PARTS: dict[str, tuple[tuple[Layer, ...], Callable[[RunFolder, Path], None]]] = 
 
 
 def _signature(path: Path) -> Signature | None:
-    """Return the signature of a file; None if the file does not exist."""
+    """Return a signature that changes with the file; None if the file does not exist."""
     try:
         stat = path.stat()
     except OSError:

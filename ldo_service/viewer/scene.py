@@ -1,4 +1,4 @@
-"""Scene of map and camera, and its Gaussians in the format of a browser.
+"""Scene of map and camera, and conversion of its Gaussians for the browser.
 
 The conventions are those of `ldo_service.geometry`.
 """
@@ -32,7 +32,7 @@ class ObjectBox:
 class Scene:
     """Content of the window, in the map frame and in meters.
 
-    Other threads read `keyframes` and `objects`. So these are replaced and never modified.
+    Other threads read `keyframes` and `objects`. Therefore these are replaced, never modified.
     """
 
     # Gaussians, [N, 16], see `gaussians.rows`; valid until the next update.
@@ -52,7 +52,7 @@ class Scene:
 
 
 class Source(Protocol):
-    """Source of a scene."""
+    """Interface of a source that builds a scene and keeps it up to date."""
 
     @property
     def scene(self) -> Scene: ...
@@ -70,7 +70,7 @@ class Source(Protocol):
 
 
 def sights_of(objects: MapObjects) -> dict[int, tuple[ObjectBox, ...]]:
-    """Return the views of all objects as detections, by keyframe."""
+    """Return the detections of all objects, by keyframe."""
     sights: dict[int, tuple[ObjectBox, ...]] = {}
     for one in objects.objects:
         for view in one.views:

@@ -1,4 +1,4 @@
-"""Limits of the browser window."""
+"""Limits of what `ldo view` draws in the browser."""
 
 from dataclasses import dataclass
 

@@ -49,7 +49,7 @@ LEGEND = {  # Checkboxes of layers that can be hidden.
 
 
 class Server(viser.ViserServer):
-    """Viser server that refuses public URLs, so that the map stays on this machine."""
+    """Viser server without public share URLs, so that the map is not sent to other machines."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
         return None
@@ -78,7 +78,7 @@ class Window:
         self._build_panel(title)
 
     def _begin(self) -> None:
-        """Start with another map."""
+        """Clear the window, because the scene was replaced."""
         self._shown = self._scene
         self._leveled_by = 0  # Keyframes that set the up direction; 0 until the first view is set.
         self._found: int | None = None  # Object that was searched for.
@@ -90,7 +90,7 @@ class Window:
 
     @property
     def is_watched(self) -> bool:
-        """Presence of a connected browser."""
+        """True if at least one browser is connected."""
         return bool(self._server.get_clients())
 
     @property
@@ -254,18 +254,15 @@ class Window:
 
     # --- camera of the browser --------------------------------------------------------------------
     def _level(self) -> None:
-        """Set the up direction from the keyframes so far.
+        """Set the up direction of the browser, estimated from the keyframes so far.
 
-        It is repeated later, because the first keyframe alone may be tilted.
+        It is called again with more keyframes, because the first one alone may be tilted.
         """
         self._leveled_by = max(1, len(self._scene.keyframes))
         self._server.scene.set_up_direction(estimate_up(self._scene.keyframes))
 
     def _look_along(self, T_map_camera: np.ndarray) -> None:
-        """Set the view of all present and future browsers once.
-
-        From then on each user controls the view.
-        """
+        """Set the initial view of all current and future browsers; users then control it."""
         view = overview(T_map_camera)
         initial = self._server.initial_camera
         initial.position, initial.look_at = view.position, view.look_at
@@ -278,7 +275,7 @@ class Window:
         return [CameraView(camera.position, camera.look_at) for camera in cameras]
 
     def _fly_to_answer(self, event: viser.GuiEvent[Any]) -> None:
-        """Search an object and move the view of the browser to it.
+        """Search for the object that the user typed, and move the browser's camera to it.
 
         Viser calls this method in its own thread.
         """
@@ -320,10 +317,12 @@ def _line(one: ObjectMatch) -> str:
 
 
 def _require_own(address: str) -> None:
-    """Check that this machine has the address; viser would try ports without end otherwise.
+    """Check that an address belongs to this machine.
+
+    Otherwise viser would try one port after the other without end.
 
     Raises:
-        ConfigError: The machine does not have it.
+        ConfigError: The machine does not have the address.
     """
     try:
         ((family, *_, where), *_) = socket.getaddrinfo(address, 0, type=socket.SOCK_STREAM)
