@@ -35,11 +35,11 @@ def bench(
     """Measure how long one iteration of the Gaussian optimizer takes on this machine.
 
     The times are medians over all repeats on a synthetic scene, in milliseconds of wall time. The
-    backward pass includes Adam. adam_ms is the difference between the backward pass with Adam and
-    without it. iteration_ms is the sum of the forward pass, the loss and the backward pass with
-    Adam.
+    backward pass includes the step of Adam. adam_ms is the difference between the backward pass
+    with and without that step. iteration_ms is the sum of the forward pass, the loss and the
+    backward pass.
 
-    LDO_ISA=avx512, avx2 or baseline chooses the instruction set.
+    Set the environment variable LDO_ISA to avx512, avx2 or baseline to choose the instruction set.
     """
     width, height = _pixels(size)
     if not min(gaussians, threads, repeats) >= 1 or gaussians_out_of_view < 0:

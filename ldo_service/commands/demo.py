@@ -39,13 +39,13 @@ def demo(
 ) -> None:
     """Track, map and label a built-in synthetic room, and evaluate the result by ground truth.
 
-    The command prints a table and writes three pictures. The frames are ray cast, not rendered from
-    Gaussians, with the blur and the depth noise of a Kinect. Every fifth frame is tracked but not
-    mapped, and the PSNR is measured on these held-out frames.
+    The command prints a table and writes three pictures. The frames are made by ray casting, with
+    the blur and the depth noise of a Kinect. Every fifth frame is tracked but not mapped, and the
+    PSNR is measured on these held-out frames.
 
-    Small networks that come with the package label the objects. They know only rooms like this one
-    and were trained on others. The rules that separate objects by depth were chosen with this room
-    in view.
+    Small networks that come with the package label the objects. They were trained on other rooms of
+    this kind and recognize objects in such rooms only. The settings that separate objects by depth
+    were tuned on this room.
     """
     console = Console(stderr=True)
     sequence = FlatSequence.named("flat")

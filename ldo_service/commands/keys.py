@@ -80,9 +80,9 @@ class ListKeys:
 
 @dataclass(frozen=True)
 class RevokeKeys:
-    """Revoke keys, and delete their folder here.
+    """Revoke keys, and delete their folder on this machine.
 
-    The revocation takes effect when a router has the new `access.yaml` and was restarted.
+    Copy the new `access.yaml` to each router and restart it; only then the revocation takes effect.
     """
 
     folder: Folder

@@ -55,8 +55,8 @@ def query(
 ) -> None:
     """Find objects by name: print their boxes in the map, best match first.
 
-    Synonyms are understood, and so are kinds: "sofa" finds couches. Words that are in no table are
-    compared by the text encoder of an encoder pair, if there is one.
+    Synonyms, broader and narrower terms are found too: "sofa" finds couches. Other words are
+    compared with the object names by the text encoder of an encoder pair, if there is one.
 
       ldo query DIR "potted plant"
       ldo query live chair --json

@@ -25,8 +25,8 @@ def replay(
 ) -> None:
     """Replay a recording with new actors, and compare their outputs with the recorded ones.
 
-    The replay includes restarts, failures and the send credit at each step. Nothing is published.
-    Without --verify, a difference is printed but is no error.
+    The replay also repeats restarts, failures and the recorded send credit at each step. Nothing is
+    published. Without --verify, differences are printed, and the exit code is still 0.
 
       ldo replay recordings/desk --verify
     """

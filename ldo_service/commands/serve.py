@@ -104,8 +104,8 @@ def record(
 ) -> None:
     """Run the service as `ldo serve` does, and record the inputs of every actor.
 
-    A service that already runs cannot start a recording, because the present state of its actors
-    would be missing. Stop the service, then record with its --state: the map is kept.
+    A running service cannot start a recording, because the recording would lack the state of its
+    actors. Stop the service, then run `ldo record` with the same --state folder to keep the map.
 
     640x480 at 30 Hz takes 100 MB per second; recording.max_gb limits the size. `ldo replay DIR
     --verify` replays the recording. Every verb that takes a SOURCE accepts DIR as a data set.

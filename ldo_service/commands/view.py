@@ -37,8 +37,9 @@ def view(
 ) -> None:
     """Show a map in a browser: Gaussians, paths, keyframes, objects, loops, and a search box.
 
-    For a run in progress the window shows the files so far, and further ones as they are written.
-    The window is served on this machine only and needs no keys, see docs/viewer.md. Ctrl-C ends it.
+    For a run in progress, the window shows the files written so far and updates as more are
+    written. By default only browsers on this machine can open it; see docs/viewer.md. Ctrl-C
+    ends it.
 
       ldo view runs/desk
       ldo view live --endpoint tls/mule.local:7447 --keys keys/desk
