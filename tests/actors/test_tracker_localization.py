@@ -75,5 +75,5 @@ def test_invalid_keyframe_database_is_refused(tmp_path: Path, body: bytes) -> No
 
 def test_keyframe_database_without_records_is_refused(tmp_path: Path) -> None:
     (tmp_path / DATABASE_FILE).write_bytes(encode_state({"places": []}))
-    with pytest.raises(DataError, match="no keyframe record"):
+    with pytest.raises(DataError, match="contains no keyframe"):
         load_keyframe_database(tmp_path)
