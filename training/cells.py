@@ -15,10 +15,10 @@ THINGS = tuple(name for name in CLASS_NAMES if name in CATALOG)
 NAMES = tuple(name for name in CLASS_NAMES[:COCO_COUNT] if name in CATALOG)  # The first of THINGS.
 NOTHING = len(THINGS)  # Index of the background.
 
-SIDES_PX = ((0, 56), (40, 130), (96, 1000))  # Square root of the box area that each grid predicts.
+SIDES_PX = ((0, 56), (40, 130), (96, 1000))  # Range of sqrt(box area) by grid.
 BOXES_CELLS = 1.5  # Initial distance from the center of a cell to each side of its box, in cells.
-# A cell belongs to an object that covers this fraction of the cell, or if the cell contains this
-# fraction of the object.
+# A cell can predict an object if the object covers the fraction COVERED of the cell, or if the
+# fraction OF_OBJECT of the object's pixels lies in the cell.
 COVERED, OF_OBJECT = 0.4, 0.25
 # A cell without an object has weight 0 if objects cover more than this fraction of it.
 UNCLEAR = 0.3
@@ -68,8 +68,8 @@ def visible(plane: np.ndarray, names: np.ndarray) -> Visible:
 def make_targets(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
     """Return the training targets of all N cells.
 
-    A cell predicts the smallest object that covers enough of the cell, or that the cell covers
-    enough of.
+    A cell predicts the smallest object that covers the fraction COVERED of the cell, or of which
+    the fraction OF_OBJECT lies in the cell.
 
     Args:
         plane: Instance ids [H, W].
@@ -111,7 +111,11 @@ def _counts(plane: np.ndarray, kinds: int) -> list[np.ndarray]:
 def _of_grid(
     counts: np.ndarray, stride_px: int, pixels: np.ndarray, is_for: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Return the object (M for none), the weight and whether to predict a box, of each cell."""
+    """Return the owner, the weight and the use of the box of each cell of one grid.
+
+    The owner is the index of the object that the cell predicts, or M for none. The third result
+    is True if the cell predicts a box.
+    """
     things = counts[:, :-1]
     is_owned = (things >= COVERED * stride_px**2) | (things >= OF_OBJECT * pixels)
     is_owned = np.column_stack((is_owned, np.ones(len(counts), bool)))

@@ -1,8 +1,9 @@
 """Proposal network of the detector: every cell of three grids predicts the object that covers it.
 
-The names are dense, as in semantic segmentation. In addition, a cell predicts the box of its object
-and how well the box fits. Every cell therefore has a target in every frame, so that few frames are
-enough. The network learns all names of the catalog.
+Each cell predicts the name of its object, as each pixel does in semantic segmentation. It also
+predicts the box of the object and the fit, which is the IoU of this box with the true one. Every
+cell has a training target in every frame, so that few frames are enough. The network learns all
+names of the catalog, not only those of COCO.
 """
 
 from collections.abc import Sequence
@@ -52,7 +53,7 @@ def _trunk(net: JaxNetwork | Graph, image) -> tuple:
 
 
 def _neck(net: JaxNetwork | Graph, fine, middle, coarse) -> list:
-    """Add pooled and enlarged features of coarse grids to those of finer grids."""
+    """Combine features of all grids: pool the coarsest, then add coarse ones to finer ones."""
     x = net.conv(coarse, "pool.in", WIDE, size=1)
     wide = net.widest(x)
     c = net.conv(net.join([x, wide, net.widest(wide)]), "pool.out", WIDE, size=1)

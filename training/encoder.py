@@ -67,7 +67,7 @@ def network(net: JaxNetwork | Graph, image) -> list:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Trained dual encoder: an image encoder and a table of the names' vectors."""
+    """Trained dual encoder: an image encoder and a table with a vector for each name."""
 
     weights: Weights
     statistics: Statistics  # Means and variances of the normalized layers.
@@ -156,7 +156,7 @@ def batches(
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """Part of a frame around one object."""
+    """Crop of a frame around one object."""
 
     color: np.ndarray  # RGB [h, w, 3].
     plane: np.ndarray  # Instance ids [h, w].

@@ -28,10 +28,10 @@ from ldo_service.synthetic.flat.scene_object import Heading, Placement, SceneObj
 
 Point = tuple[float, float, float]
 
-GAP_M = 0.015  # Maximum overlap of two objects; objects stand on rugs.
+GAP_M = 0.015  # Maximum overlap of two objects, so that objects may stand on rugs.
 TRIES = 12  # Number of positions to try before an object is omitted.
 HEADROOM_M = 0.6  # Free height above tables and seats.
-# Maximum number of chairs at a table, and range of their distance under it.
+# Maximum number of chairs at a table, and range of the distance that they stand under it.
 CHAIRS_MOST, PUSHED_M = 4, (-0.15, 0.3)
 
 # Headings by the direction that the front faces. In this order, they suit objects at the back wall,
@@ -126,7 +126,7 @@ def furnish(builder: Builder) -> None:
 
 
 def _place(builder: Builder, thing: SceneObject, places: Iterable[Point]) -> None:
-    """Place an object together with chairs at it and objects on it, where it takes any."""
+    """Place an object, with chairs at a dining table and objects on tables, seats and shelves."""
     placed = builder.put(thing, places)
     if placed is not None:
         if placed.label == "dining table":

@@ -1,4 +1,4 @@
-"""Objects per kind of place in a room; large objects come first because they are placed first."""
+"""Classes of objects by location in a room; large ones come first, as they are placed first."""
 
 SHAPES = {  # Number of shapes of each class; one for classes that are not listed.
     "chair": 3, "couch": 2, "dining table": 3, "shelf": 2, "cabinet": 2, "cushion": 2, "rug": 2,

@@ -70,7 +70,7 @@ def _with_no_name(texts: np.ndarray) -> np.ndarray:
 def growing(
     source: Callable[[int], Iterator[tuple]], sides: Sequence[tuple[int, float]], steps: int
 ) -> Iterator[tuple]:
-    """Yield batches of growing crops.
+    """Yield batches whose crops become larger during the round.
 
     Args:
         source: Function that returns batches of crops with a side in pixels.
@@ -83,7 +83,7 @@ def growing(
 
 
 def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) -> Iterator[tuple]:
-    """Yield batches like those of `encoder`, with regions in place of half of the crops."""
+    """Yield batches like `encoder.batches`, in which half of the crops show regions."""
     regions, names = named(material.regions)
     odds, count = _odds(names), round(REGIONS_SHARE * BATCH)
     for crops, told in encoder.batches(material, rng, side_px, BATCH - count):

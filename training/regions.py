@@ -20,7 +20,7 @@ TRIGGER = RegionProposalConfig(min_side_px=12)
 BLUR_PX = 4.0
 NO_THING = -1  # Class of a region that shows no object.
 OWN = 0.7  # Minimum fraction of a region that one object covers.
-# Minimum fraction of the visible object in the region; a smaller piece cannot be recognized.
+# Minimum fraction of the visible object that lies in the region; a smaller piece is omitted.
 SHOWN = 0.1
 
 

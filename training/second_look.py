@@ -7,9 +7,9 @@ Output:
     output0: Array [1, 4 + C, 1680] of cx, cy, w, h in pixels of the input, then a score per class
         of COCO.
 
-The proposal network (`detector`) predicts boxes, and the image encoder of the pair classifies the
-best of them. A score is the class probability from both, times the fit of the box. Boxes that are
-not rescored have score 0.
+The proposal network (`detector`) predicts boxes. The image encoder of the dual encoder classifies
+the LOOKS most likely boxes again. The score of a box is the class probability from both networks
+times the predicted IoU of the box. Boxes that are not rescored have score 0.
 
 This follows two-step detectors (Ren et al., NeurIPS 2015). Here, however, the second step is a
 separate network that was trained on crops, which takes far fewer training steps.

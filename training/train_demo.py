@@ -9,7 +9,7 @@ The program runs these steps:
 3. Calibrate the confidences on separate rooms, and write the ONNX files.
 4. Score the files on a third set of rooms and, at the very end, on the flat.
 
-The final scores select nothing. Two runs on one machine write the same bytes.
+No choice depends on the final scores. Two runs on one machine write the same bytes.
 """
 
 import argparse
@@ -49,8 +49,8 @@ TRAINING = Rooms(range(200, 488), 8)
 CALIBRATION = Rooms(range(160, 172), 12)
 HELD_OUT = Rooms(range(172, 190), 12)
 SEED = 0
-# Maximum difference of scores between the graph and its reference. The graph samples its crops at
-# other pixels.
+# Maximum difference of the scores of detector.onnx from `second_look.output`. Both resize crops in
+# different ways, so the scores are not equal.
 APART = 0.2
 STEPS = {"detector": (1900, 1400), "encoder": (5500, 6500)}  # Steps of two rounds each.
 FLAT_STRIDE = 8  # Every 8th frame of the flat is scored.
@@ -130,7 +130,7 @@ def train_encoder(work: Path, steps: Sequence[int]) -> Pair:
 
 
 def export(first: FirstStage, both: Pair, work: Path, out: Path) -> None:
-    """Calibrate the networks, write the files, and compare their outputs with the trained ones.
+    """Calibrate and write the networks, and compare the files with the trained networks.
 
     Raises:
         SystemExit: If the outputs differ by more than the tolerance.
@@ -167,7 +167,8 @@ def _require_equal(what: str, mine: np.ndarray, theirs: np.ndarray, tolerance: f
     apart = float(np.abs(mine - theirs).max())
     if apart > tolerance:
         raise SystemExit(
-            f"{what}: differ from the trained network by {apart:g}; at most {tolerance:g} expected."
+            f"{what}: output differs from the trained network by {apart:g}; expected at most "
+            f"{tolerance:g}. Check the export in training/layers.py."
         )
     log.info("%s: equal to the trained network within %.2g", what, apart)
 

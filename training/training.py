@@ -1,11 +1,12 @@
 """Gradient descent with Muon and a learning rate with linear warm-up and decay.
 
-The step of a kernel is its momentum with equal singular values (Jordan et al., Muon, 2024). It is
-scaled to the size of an Adam step (Liu et al., Muon is scalable, 2025). Muon treats each tap of a
-convolution separately, which takes half the time and learns as much. Parameters other than kernels
-use Adam.
+Muon updates a kernel by its momentum matrix with all singular values made equal (Jordan et al.,
+Muon, 2024). The update is scaled to the size of an Adam step (Liu et al., Muon is scalable, 2025).
+Each tap of a convolution kernel is a matrix of its own here, which takes half the time and gives
+equal results. Parameters other than kernels use Adam.
 
-After 1000 steps, 41 % of the crops of held-out rooms get the correct name; with Adam, 33 %.
+After 1000 steps with Muon, the encoder names 41 % of the crops of held-out rooms correctly; with
+Adam, 33 %.
 """
 
 import logging
@@ -128,7 +129,7 @@ def statistics(
 
 
 def ahead(batches: Iterable) -> Iterator:
-    """Yield batches that a thread prepares during the training steps."""
+    """Yield the batches; a thread prepares up to four of them in advance."""
     queue: Queue = Queue(maxsize=4)
 
     def fill() -> None:

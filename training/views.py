@@ -26,7 +26,7 @@ WALL_AHEAD_M = 1.3  # Minimum distance to the wall in front of the camera.
 GLANCES, NEAR_M = 2, 3.0
 SHARE_MIN = 3.9e-4  # Minimum size of an object, as a fraction of the image: 30 pixels.
 WINDOWS = 6  # Random windows per frame that may show the building.
-PURITY = 0.8  # Minimum fraction of one surface in such a window.
+PURITY = 0.8  # Minimum fraction of such a window that one surface covers.
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +45,11 @@ class VisibleBoxes:
         return len(self.frames)
 
     def chosen(self, which: np.ndarray) -> "VisibleBoxes":
-        """Return the boxes of a mask or of indices."""
+        """Return the boxes that a mask or an array of indices selects."""
         return VisibleBoxes(*(getattr(self, name)[which] for name in self.__slots__))
 
     def scaled(self, scale: float) -> "VisibleBoxes":
-        """Return the boxes in frames of another size."""
+        """Return the boxes in pixels of frames that are `scale` times as large."""
         return replace(self, boxes_px=self.boxes_px * scale, pixels=self.pixels * scale**2)
 
     def table(self) -> np.ndarray:
