@@ -122,7 +122,7 @@ class Actor:
     # The actor queries an external server, whose answers no journal records. A replay skips the
     # actor and feeds its consumers from their own recorded inputs.
     talks_outside = False
-    # No other actor waits for the outputs, so a step may take minutes.
+    # True if no other actor waits for the outputs. A step may then take minutes.
     is_backend = False
     # A robot waits for the outputs, so this actor's thread has priority over other actors' threads.
     is_prompt = False

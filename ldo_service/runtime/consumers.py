@@ -20,8 +20,8 @@ class Consumer:
     repeated_from: int = -1  # Offset at which the last retransmission began; -1: none.
     repeated_at_s: float = 0.0  # Event-loop time of the last retransmission.
     shut_since_s: float | None = None  # Event-loop time at which its window became full.
-    # Only for a consumer with a backlog: offset after the last message that was sent to it, and the
-    # event-loop time at which it was sent.
+    # Offset after the last message sent to a consumer with a backlog, and the event-loop time at
+    # which it was sent.
     pushed: int = 0
     pushed_at_s: float = 0.0
 

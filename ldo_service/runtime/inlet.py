@@ -146,7 +146,7 @@ class LosslessInlet(Inlet):
             return False
         self.gap = header.seq > self.arrived or len(self.waiting) >= self.window
         if self.gap:
-            # With a backlog, the producer publishes while the window is full: that is no gap.
+            # The producer of a backlog publishes while the window is full: that is no gap.
             self.gaps += not isinstance(self.port.policy, Backlog)
             return False
         self.arrived += 1

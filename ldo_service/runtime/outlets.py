@@ -1,4 +1,4 @@
-"""All outlets of one actor."""
+"""Set of all outlets of one actor."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

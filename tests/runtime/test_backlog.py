@@ -51,7 +51,7 @@ async def send_saved(source: Outlet, values: Iterable[int]) -> None:
     """Send numbers as a stage does: each is stored before it is sent."""
     for value in values:
         source.stage_message(number(value), b"")
-        source.rollback()  # As after a failed step: the number is used again.
+        source.rollback()  # A failed step does so; the number is used again.
         source.stage_message(number(value), encode(number(value)))
         source.store()
         await source.commit()
