@@ -103,7 +103,7 @@ class LoopCloser(Actor):
         self._vocabulary = Vocabulary()
         self.poses = KeyframePoses()  # Poses of the stored keyframes and the newest ones.
         # Merged submaps, each with the older one that it is merged into.
-        self._joined: dict[int, int] = {}
+        self._merged_submaps: dict[int, int] = {}
         self._waiting: dict[int, PendingKeyframe] = {}  # Pending keyframes by id.
         # Detections by keyframe that came before their keyframe or wait with it.
         self._boxes: dict[int, DetectionBoxes] = {}
@@ -127,7 +127,7 @@ class LoopCloser(Actor):
             T_map = keyframe_poses_from_correction(message, only=self.poses)
             self.poses.correct(message.graph_version, T_map)
             self._saved_poses = None
-            self._joined = dict(message.merged_submaps)
+            self._merged_submaps = dict(message.merged_submaps)
             return
         if isinstance(message, Keyframe):
             self._take(message)
@@ -151,7 +151,7 @@ class LoopCloser(Actor):
         )
         loops = self.config.loops
         place = make_keyframe_record(
-            keyframe_from_message(message, loops.pyramid), loops.features, loops.places
+            keyframe_from_message(message, loops.pyramid), loops.features, loops.keyframe_database
         )
         width_px = message.camera.width
         self._waiting[message.keyframe] = PendingKeyframe(
@@ -176,10 +176,10 @@ class LoopCloser(Actor):
         self._boxes = {k: b for k, b in self._boxes.items() if k > keyframe}
         self._without_boxes += boxes is None
         place, sightings = self._masked_keyframe(waiting, boxes)
-        findings = self.recognizer.add(
-            place, waiting.frame, waiting.stamp_ns, sightings, self.poses, self._joined
+        results = self.recognizer.add(
+            place, waiting.frame, waiting.stamp_ns, sightings, self.poses, self._merged_submaps
         )
-        yield from self._to_messages(findings)
+        yield from self._to_messages(results)
         if not self.recognizer.is_open or keyframe % RECENT_KEYFRAMES == 0:
             self.poses.keep_only(self._needed())
             self._saved_poses = None
@@ -214,10 +214,10 @@ class LoopCloser(Actor):
         )
 
     def _to_messages(
-        self, findings: Iterable[LoopCandidateResult]
+        self, results: Iterable[LoopCandidateResult]
     ) -> Iterator[LoopClosure | LoopCandidate]:
-        for finding in findings:
-            closure = finding.closure
+        for result in results:
+            closure = result.closure
             if closure is None:
                 self._refused += 1
             else:
@@ -225,15 +225,15 @@ class LoopCloser(Actor):
                 log.info(
                     "loop_closer: keyframe %d closes a loop with keyframe %d", closure.b, closure.a
                 )
-                yield loop_closure_to_message(finding)
-            yield loop_candidate_to_message(finding)
+                yield loop_closure_to_message(result)
+            yield loop_candidate_to_message(result)
 
     def on_stop(self) -> Iterator[LoopClosure | LoopCandidate]:
         """Search loops for the pending keyframes and for the unfinished subgraph."""
         self._parts = None
         for keyframe in list(self._waiting):
             yield from self._recognize(keyframe)
-        yield from self._to_messages(self.recognizer.flush(self.poses, self._joined))
+        yield from self._to_messages(self.recognizer.flush(self.poses, self._merged_submaps))
 
     def _needed(self) -> list[int]:
         """Return the keyframes whose poses must be kept.
@@ -266,7 +266,7 @@ class LoopCloser(Actor):
             "waiting": {k: w.facts for k, w in self._waiting.items()},
             "boxes": [encode(boxes) for boxes in self._boxes.values()],
             "newest": self._newest,
-            "joined": list(self._joined.items()),
+            "joined": list(self._merged_submaps.items()),
             "vocabulary": self._vocabulary.pack(),
         }
         return {**subgraphs, **views, **waiting, **words, **self._poses_part(), "now": now}
@@ -297,7 +297,7 @@ class LoopCloser(Actor):
         }
         boxes = [decode(body, DetectionBoxes) for body in now["boxes"]]
         self._boxes = {one.keyframe: one for one in boxes}
-        self._newest, self._joined = now["newest"], dict(map(tuple, now["joined"]))
+        self._newest, self._merged_submaps = now["newest"], dict(map(tuple, now["joined"]))
         self._vocabulary = Vocabulary.unpack(now["vocabulary"])
         self.poses = KeyframePoses()
         self.poses.restore(state["poses"])

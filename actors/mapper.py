@@ -146,7 +146,7 @@ class Mapper(Actor):
         self._semantics = SemanticMap(
             self._map, self.config.semantics, has_labeller=has_labeller, threads=threads
         )
-        self._objects_teller = ObjectPublisher()
+        self._object_publisher = ObjectPublisher()
         self._poses = KeyframePoses()
         self._links = RelativeMeasurements(self._poses, self.config.measured_keyframes)
         self._publisher = MapPublisher(self._map, self.config.publish)
@@ -186,7 +186,7 @@ class Mapper(Actor):
         frame = frame_from_message(message)
         moving = mask_from_array(message.dynamic_mask)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
-        learnt = self._semantics.on_keyframe_mapped(message.keyframe)
+        fused = self._semantics.on_keyframe_mapped(message.keyframe)
         self._refit.with_keyframe(is_behind=self._waiting() > 0)
         yield from self._refinement()
         yield from self._publisher.on_keyframe(self._message_context())
@@ -194,7 +194,7 @@ class Mapper(Actor):
             message, self._message_context(), contributions=self._semantics.is_used
         )
         yield from self._publisher.snapshot_if_due(self._message_context())
-        yield from self._publish_semantics(learnt, message.stamp_ns)
+        yield from self._publish_semantics(fused, message.stamp_ns)
 
     def _iterations(self) -> int:
         """Return the number of optimization iterations for the next keyframe.
@@ -232,9 +232,9 @@ class Mapper(Actor):
         If no network ran, the keyframe does not count as a miss of any object.
         """
         vocabulary = self._semantics.vocabulary
-        claims = detections_from_message(message, vocabulary) if message.network else None
-        learnt = self._semantics.add_detections(message.keyframe, claims)
-        yield from self._publish_semantics(learnt, message.stamp_ns)
+        detections = detections_from_message(message, vocabulary) if message.network else None
+        fused = self._semantics.add_detections(message.keyframe, detections)
+        yield from self._publish_semantics(fused, message.stamp_ns)
 
     def _take_label(self, message: LabelResult) -> Iterator[Output]:
         answer = RegionLabelResult(message.label, message.confidence, message.alternatives)
@@ -242,12 +242,12 @@ class Mapper(Actor):
             yield from self._objects()
 
     def _publish_semantics(
-        self, learnt: KeyframeSemantics | None, stamp_ns: int
+        self, fused: KeyframeSemantics | None, stamp_ns: int
     ) -> Iterator[Output]:
-        if learnt is not None:
+        if fused is not None:
             names = self._semantics.names
-            yield from observations_to_messages(learnt.observed, names, learnt.keyframe, stamp_ns)
-            yield from (label_request_to_message(region, stamp_ns) for region in learnt.asked)
+            yield from observations_to_messages(fused.observed, names, fused.keyframe, stamp_ns)
+            yield from (label_request_to_message(region, stamp_ns) for region in fused.requested)
             yield from self._objects()
 
     def _objects(self) -> Iterator[MapObjects]:
@@ -255,7 +255,7 @@ class Mapper(Actor):
         semantics = self._semantics
         if semantics.is_used:
             now = self._publisher.version, self._poses.version, self._newest[0]
-            yield self._objects_teller.message(semantics.objects, semantics.names, *now)
+            yield self._object_publisher.message(semantics.objects, semantics.names, *now)
 
     # --- corrections ------------------------------------------------------------------------------
     def _correct(self, message: GraphCorrection) -> Iterator[Output]:
@@ -271,7 +271,7 @@ class Mapper(Actor):
         motions = tuple(self._motion(keyframe) for keyframe in self._moved_keyframes())
         if motions:
             T_new_old = {m.keyframe: pose_from_message(m.T_new_old) for m in motions}
-            self._map.move(T_new_old)
+            self._map.move_keyframes(T_new_old)
             self._semantics.objects.move(T_new_old)
             yield self._publisher.delta(self._message_context(), motions=motions)
             yield from self._objects()
@@ -326,7 +326,7 @@ class Mapper(Actor):
         saved = self._checkpoint["newest"][1] if self._checkpoint else None
         is_due = saved is None or newest - saved >= self.config.checkpoint_keyframes
         if newest >= 0 and is_due:
-            self._put_away()
+            self._take_checkpoint()
         return {"map": self._checkpoint} if self._checkpoint else {}
 
     def checkpoint(self) -> dict[str, Any]:
@@ -336,7 +336,7 @@ class Mapper(Actor):
     def on_saved(self) -> None:
         self._map.saved()
 
-    def _put_away(self) -> None:
+    def _take_checkpoint(self) -> None:
         self._checkpoint = {
             "newest": self._newest,
             "map": self._map.snapshot(),

@@ -156,9 +156,9 @@ class Optimizer(Actor):
             self._version,
             self._graph.poses(),
             self._refinements,
-            self._joined(),
+            self._merged_submaps(),
             closures=closures.accepted,
-            not_believed=sorted({*closures.rejected, *closures.removed}),
+            rejected=sorted({*closures.rejected, *closures.removed}),
             landmarks=self._placed_landmarks(),
         )
 
@@ -180,10 +180,10 @@ class Optimizer(Actor):
 
         Measurements of a keyframe that has not arrived are stored until it arrives.
         """
-        asked = self._early | {(p.reference, p.keyframe): p for p in poses}
-        known = {pair: p for pair, p in asked.items() if set(pair) <= self._graph.keyframes}
+        pending = self._early | {(p.reference, p.keyframe): p for p in poses}
+        known = {pair: p for pair, p in pending.items() if set(pair) <= self._graph.keyframes}
         newest = max(self._graph.keyframes, default=-1)
-        self._early = {pair: p for pair, p in asked.items() if p.keyframe > newest}
+        self._early = {pair: p for pair, p in pending.items() if p.keyframe > newest}
         if known:
             self._refined += len(known)
             self._graph.replace([relative_pose_from_message(pose) for pose in known.values()])
@@ -200,7 +200,7 @@ class Optimizer(Actor):
             self._add_odometry_fallback(newest, message.keyframe, T_odom_keyframe)
         self._newest[message.submap] = (message.keyframe, T_odom_keyframe)
         for pose in message.submap_measurements:
-            self._join(pose)
+            self._merge_submap(pose)
 
     def _add_first_keyframe(
         self, message: KeyframeMeasurements, T_odom_keyframe: np.ndarray
@@ -234,7 +234,7 @@ class Optimizer(Actor):
         T_known_keyframe = se3.inverse(T_odom_known) @ T_odom_keyframe
         self._graph.add(self._graph.odometry_fallback(known, keyframe, T_known_keyframe))
 
-    def _join(self, pose: MeasuredPose) -> None:
+    def _merge_submap(self, pose: MeasuredPose) -> None:
         """Add the relative pose between keyframes of two submaps, which merges the submaps.
 
         If they are merged already, the relative pose is checked like a loop closure.
@@ -247,12 +247,12 @@ class Optimizer(Actor):
                 pose.reference,
             )
             return
-        before = self._joined()
+        before = self._merged_submaps()
         self._graph.add_loop_closure(relative_pose_from_message(pose))
         self._log_merged(before)
 
     def _log_merged(self, before: dict[int, int]) -> None:
-        for submap, older in self._joined().items() - before.items():
+        for submap, older in self._merged_submaps().items() - before.items():
             log.info("optimizer: submap %d merged into submap %d", submap, older)
 
     # --- loops and objects ------------------------------------------------------------------------
@@ -269,19 +269,19 @@ class Optimizer(Actor):
         return pose.reference in self._graph and pose.keyframe in self._graph
 
     def _check_closure(self, closure: LoopClosure) -> None:
-        before = self._joined()
+        before = self._merged_submaps()
         weight = self._landmarks.weight(closure.entropy)
         measured = relative_pose_from_message(closure.pose)
-        verdict = self._graph.add_loop_closure(
+        decision = self._graph.add_loop_closure(
             replace(measured, information=weight * measured.information)
         )
         pair = closure.pose.reference, closure.pose.keyframe
         log.info(
             "optimizer: loop closure %d-%d %s",
             *pair,
-            "accepted" if verdict.is_accepted else "rejected",
+            "accepted" if decision.is_accepted else "rejected",
         )
-        for reference, keyframe in verdict.dropped:
+        for reference, keyframe in decision.dropped:
             log.info(
                 "optimizer: loop closure %d-%d removed; later closures contradict it",
                 reference,
@@ -336,7 +336,7 @@ class Optimizer(Actor):
         ]
 
     # --- submaps ---------------------------------------------------------------------------------
-    def _joined(self) -> dict[int, int]:
+    def _merged_submaps(self) -> dict[int, int]:
         """Return, for each merged submap, the older submap that it was merged into."""
         submaps = {first: submap for submap, first in self._first.items()}
         placed = {s: submaps[self._graph.component_root(first)] for s, first in self._first.items()}
@@ -402,5 +402,5 @@ class Optimizer(Actor):
             "early_messages_discarded": self._too_early,
             # Intrinsics of their keyframe were no longer kept.
             "late_observations_discarded": self._too_late,
-            "submaps_unmerged": len(self._first) - len(self._joined()),
+            "submaps_unmerged": len(self._first) - len(self._merged_submaps()),
         }

@@ -147,7 +147,7 @@ class Tracker(Actor):
         self._prior = OdometryPriorBuffer()
         self._made = self._without_room = self._reused = 0  # Numbers of keyframes.
         # Numbers of prior poses by outcome of their check.
-        self._verdicts: Counter[PriorCheck] = Counter()
+        self._prior_checks: Counter[PriorCheck] = Counter()
         # Numbers of frames since the first pose of the prior.
         self._with_prior = self._without_prior = 0
         self._missed = 0  # Consecutive frames without a prior.
@@ -205,12 +205,12 @@ class Tracker(Actor):
     def _take_prior(self, message: OdometryPrior) -> None:
         T_odom_base = pose_from_message(message.T_prior_base)
         config = self.config.odometry.prior
-        self._prior, verdict = self._prior.added(message.stamp_ns, T_odom_base, config)
-        self._verdicts[verdict] += 1
-        if verdict is not PriorCheck.FOLLOWS and self._verdicts[verdict] == 1:
+        self._prior, check = self._prior.added(message.stamp_ns, T_odom_base, config)
+        self._prior_checks[check] += 1
+        if check is not PriorCheck.FOLLOWS and self._prior_checks[check] == 1:
             log.warning(
                 "tracker: the odometry/prior of stamp %d %s. Further such poses are only counted.",
-                message.stamp_ns, verdict,
+                message.stamp_ns, check,
             )  # fmt: skip
 
     def _correct(self, message: GraphCorrection) -> None:
@@ -231,13 +231,13 @@ class Tracker(Actor):
     def _tracked_parts(self) -> dict[str, Any]:
         """Return all parts as of the last frame, correction or detection."""
         state = self._odometry.snapshot()
-        places = {place["id"]: place for place in state.pop("places")}
-        state["order"] = [*places]  # The keyframe used last is the last one.
+        records = {record["id"]: record for record in state.pop("places")}
+        state["order"] = [*records]  # The keyframe used last is the last one.
         own = {name: state.pop(name) for name in OWN_PARTS}
         fix = {"fix": state.pop("fix")} if "fix" in state else {}
         poses, localize = state.pop("poses"), self.config.localize
         return {
-            **{f"place_{number}": place for number, place in places.items()},
+            **{f"place_{number}": record for number, record in records.items()},
             **own,
             "graph_correction": self._correction,
             "now": {"odometry": state, "poses": poses, "localize": localize},
@@ -258,20 +258,20 @@ class Tracker(Actor):
                 f"but this service has --localize {self.config.localize or '(none)'}. Choose "
                 "another folder with --state."
             )
-        places = [state[f"place_{number}"] for number in now["odometry"]["order"]]
+        records = [state[f"place_{number}"] for number in now["odometry"]["order"]]
         own = {name: state[name] for name in (*OWN_PARTS, "fix") if name in state}
         self._correction = state["graph_correction"]
         correction = decode(self._correction, GraphCorrection) if self._correction else None
         self._odometry.restore(
-            {**now["odometry"], **own, "places": places, "poses": now["poses"]},
+            {**now["odometry"], **own, "places": records, "poses": now["poses"]},
             None if correction is None else map_correction_of(correction),
         )
         self._prior, self._parts = OdometryPriorBuffer.unpack(state["prior"]), None
 
     def metrics(self) -> dict[str, float]:
         """Return counters of keyframes, frames and prior poses."""
-        refused = self._verdicts[PriorCheck.LATE] + self._verdicts[PriorCheck.BROKEN]
-        restarts = self._verdicts[PriorCheck.RESTARTED] + self._verdicts[PriorCheck.JUMPED]
+        refused = self._prior_checks[PriorCheck.LATE] + self._prior_checks[PriorCheck.BROKEN]
+        restarts = self._prior_checks[PriorCheck.RESTARTED] + self._prior_checks[PriorCheck.JUMPED]
         return {
             "keyframes": self._made,
             "keyframes_without_credit": self._without_room,

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ldo_service.conversions.frames import crops_from_request
-from ldo_service.detection.labellers import Labeller, Opinion
+from ldo_service.detection.labellers import Labeller, ScoredLabel
 from ldo_service.detection.labellers.chat_completion import HttpConfig, HttpLabeller
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
 from ldo_service.detection.model_registry import open_labeller
@@ -96,8 +96,8 @@ class VlmLabeller(Actor):
                 yield self._add(message)
 
     def _answer(self, request: LabelRequest) -> LabelResult:
-        opinions = self._label_region(request)
-        (label, confidence), *others = opinions or [("", 0.0)]
+        scored_labels = self._label_region(request)
+        (label, confidence), *others = scored_labels or [("", 0.0)]
         self._named += bool(label)
         self._unnamed += not label
         return LabelResult(
@@ -106,11 +106,13 @@ class VlmLabeller(Actor):
             keyframe=request.keyframe,
             label=label,
             confidence=min(confidence, 1.0) if label else 0.0,
-            labeller=self._labeller.identity if self._labeller and opinions is not None else "",
+            labeller=self._labeller.identity
+            if self._labeller and scored_labels is not None
+            else "",
             alternatives=tuple((name, min(sure, 1.0)) for name, sure in others[:MAX_ALTERNATIVES]),
         )
 
-    def _label_region(self, request: LabelRequest) -> list[Opinion] | None:
+    def _label_region(self, request: LabelRequest) -> list[ScoredLabel] | None:
         """Return the labels of a region, the most likely first, or None if no labeller answered.
 
         The first failure is logged; further ones are logged only after a success.
@@ -118,7 +120,7 @@ class VlmLabeller(Actor):
         if self._labeller is None:
             return None
         try:
-            opinions = self._labeller.label(crops_from_request(request))
+            scored_labels = self._labeller.label(crops_from_request(request))
         except (ModelError, EndpointError, FrameError) as error:
             if not self._is_failing:
                 log.error(
@@ -133,7 +135,7 @@ class VlmLabeller(Actor):
         if self._is_failing:
             log.info("vlm_labeller: %s labels regions again", self._labeller.identity)
         self._is_failing = False
-        return opinions
+        return scored_labels
 
     def _add(self, message: AddLabel) -> LabelNames:
         refused = self._try_to_add(message.name)

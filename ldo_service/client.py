@@ -66,7 +66,7 @@ class Client:
         self._network = network
         self._sender = MessageSender(session, network)
         self._reader = MessageReader(session, network)
-        self._sent = self._asked = self._priors = 0
+        self._sent = self._sent_requests = self._priors = 0
         self._numbers: Counter[type[Message]] = Counter()  # Messages sent, by type.
 
     def publish(
@@ -305,7 +305,7 @@ class Client:
             final_rate=last_rate,
         )
         message.check()
-        self._ask(MAP_REFINE, message, timeout_s)
+        self._send_request(MAP_REFINE, message, timeout_s)
 
     def add_label(self, name: str, timeout_s: float = 60.0) -> tuple[str, ...]:
         """Add a name to the vocabulary of the labeller.
@@ -328,7 +328,7 @@ class Client:
             raise ConfigError(f"{name[:40]!r} cannot be added: {error}.") from error
         until_s = time.monotonic() + timeout_s
         with self.poller(LABEL_NAMES.name, LabelNames) as inbox:
-            self._ask(LABEL_ADD, message, min(timeout_s, 3.0))
+            self._send_request(LABEL_ADD, message, min(timeout_s, 3.0))
             while time.monotonic() < until_s:
                 for answer in inbox():
                     if answer.stamp_ns == message.stamp_ns:
@@ -336,7 +336,7 @@ class Client:
                 time.sleep(0.02)
         raise self._nobody("replies", LABEL_ADD)
 
-    def _ask(self, topic: Topic, message: RefineMap | AddLabel, timeout_s: float) -> None:
+    def _send_request(self, topic: Topic, message: RefineMap | AddLabel, timeout_s: float) -> None:
         """Publish a request once it has a subscriber.
 
         Raises:
@@ -344,8 +344,8 @@ class Client:
         """
         if not self._sender.wait_for_subscriber(type(message), timeout_s):
             raise self._nobody("listens", topic)
-        self._sender.send(message, "operator", self._asked)
-        self._asked += 1
+        self._sender.send(message, "operator", self._sent_requests)
+        self._sent_requests += 1
 
     def _nobody(self, does: str, topic: Topic) -> ConfigError:
         return ConfigError(

@@ -33,7 +33,7 @@ PAIR_BUFFER = 8  # Maximum images that wait for their counterpart: 0.27 s at 30 
 RESTARTED_AFTER_NS = 1_000_000_000  # A stamp this much earlier is not jitter.
 SILENT_AFTER_S = 5.0  # Interval of messages about silent topics.
 MAX_REASONS = 20  # Maximum reported reasons; a stream of garbage has a new one for each message.
-Say = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,22 +108,22 @@ class RosCamera:
     Unusable messages are counted, and each reason is reported once.
     """
 
-    def __init__(self, topics: RosTopics, say: Say) -> None:
+    def __init__(self, topics: RosTopics, notify: Notify) -> None:
         """Prepare to receive frames.
 
         Args:
             topics: The topics.
-            say: Function that reports a message to the user.
+            notify: Function that reports a message to the user.
         """
         typestore()
-        self._topics, self._say = topics, say
+        self._topics, self._notify = topics, notify
         self._inbox = Inbox()
         self._pairing = self._new_pairing()
         self._newest_ns = 0
         self._camera: CameraModel | None = None
         self._reasons: set[str] = set()
         self._last_s = dict.fromkeys((topics.color, topics.depth, topics.camera_info), 0.0)
-        self._said_s = time.monotonic()
+        self._notified_s = time.monotonic()
         self.frames_made = self.rejected = 0
 
     @property
@@ -156,7 +156,7 @@ class RosCamera:
             self.rejected += 1
             reason = f"{topic}: {str(error)[:30]}"
             if reason not in self._reasons and len(self._reasons) < MAX_REASONS:
-                self._say(f"{topic}: {error} Further ones are only counted.")
+                self._notify(f"{topic}: {error} Further ones are only counted.")
                 self._reasons.add(reason)
 
     def _pairs(self, topic: str, body: bytes) -> Iterator[tuple[RosImage, RosImage]]:
@@ -176,7 +176,7 @@ class RosCamera:
         the bag was restarted.
         """
         if stamp_ns < self._newest_ns - RESTARTED_AFTER_NS:
-            self._say("The stamps went back: the camera has restarted. No action needed.")
+            self._notify("The stamps went back: the camera has restarted. No action needed.")
             self._pairing, self._newest_ns = self._new_pairing(), 0
         self._newest_ns = max(self._newest_ns, stamp_ns)
         return self._pairing
@@ -193,13 +193,13 @@ class RosCamera:
 
     def _notice_silence(self) -> None:
         now_s = time.monotonic()
-        if now_s - self._said_s < SILENT_AFTER_S:
+        if now_s - self._notified_s < SILENT_AFTER_S:
             return
-        self._said_s = now_s
+        self._notified_s = now_s
         since_s = now_s - SILENT_AFTER_S
         silent = [topic for topic, last_s in self._last_s.items() if last_s < since_s]
         if silent:
-            self._say(
+            self._notify(
                 f"No messages on {', '.join(silent)} for {SILENT_AFTER_S:g} s. Check that `ros2 "
                 "topic hz` shows them and that the bridge is connected to this network."
             )

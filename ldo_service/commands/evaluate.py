@@ -123,8 +123,8 @@ def evaluate(
     with progress("eval", work(run, sequence), Console(stderr=True)) as advance:
         results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)
     if json_:
-        told = {"lpips": lpips and str(lpips), "labelled_by": labelled_by(config)}
-        print(json.dumps({**to_json(results), **told}, indent=1))
+        about = {"lpips": lpips and str(lpips), "labelled_by": labelled_by(config)}
+        print(json.dumps({**to_json(results), **about}, indent=1))
     else:
         print_results(results, lpips, config)
 
@@ -167,7 +167,7 @@ def print_results(results: Results, lpips: Path | None, config: Config) -> None:
 
 def _print_renderings(console: Console, results: Results, lpips: Path | None) -> None:
     console.print(views.PROTOCOL, style="dim")
-    console.print(results.judged.counts(), style="dim")
+    console.print(results.evaluated.counts(), style="dim")
     console.print(f"LPIPS by {lpips}." if lpips else NO_LPIPS, style="dim")
     if results.renderings:
         console.print(rendering_table(results.renderings, has_lpips=lpips is not None))

@@ -19,7 +19,7 @@ from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 
 REALSENSE, ROS2 = "realsense", "ros2"
-Say = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -95,14 +95,14 @@ class RosOptions:
 
 
 def frames_of_ros(
-    options: RosOptions, service: Endpoint, say: Say
+    options: RosOptions, service: Endpoint, notify: Notify
 ) -> Generator[CameraRgbd, None, None]:
     """Return the frames that a Zenoh bridge forwards from ROS 2.
 
     Args:
         options: Topics and options.
         service: Endpoint of the service; the bridge uses it too unless `options.bridge` is given.
-        say: Receives notes for the user.
+        notify: Receives notes for the user.
 
     Raises:
         ConfigError: The router has keys and lets no topics of a bridge through.
@@ -112,19 +112,19 @@ def frames_of_ros(
             "the router of the service uses keys and forwards only the service's own topics. Run "
             "the bridge with its own router, and give that router's address with --bridge."
         )
-    camera = RosCamera(options.topics(), say)
+    camera = RosCamera(options.topics(), notify)
     bridge = Endpoint(service.robot, options.bridge or service.endpoint)
-    return _report_at_end(camera, bridge, say)
+    return _report_at_end(camera, bridge, notify)
 
 
 def _report_at_end(
-    camera: RosCamera, bridge: Endpoint, say: Say
+    camera: RosCamera, bridge: Endpoint, notify: Notify
 ) -> Generator[CameraRgbd, None, None]:
     with open_session(bridge) as session:
         try:
             yield from camera.frames(session)
         finally:
-            say(camera.statistics)
+            notify(camera.statistics)
 
 
 def require_no_sequence(source: str, **options: object) -> None:
@@ -141,7 +141,7 @@ def require_no_sequence(source: str, **options: object) -> None:
 
 
 def relay(
-    service: Client, frames: Iterable[CameraRgbd], chosen: Selection, restamp: bool, say: Say
+    service: Client, frames: Iterable[CameraRgbd], chosen: Selection, restamp: bool, notify: Notify
 ) -> None:
     """Send every n-th frame until `chosen.max_frames` are sent or the user presses Ctrl-C.
 
@@ -150,10 +150,10 @@ def relay(
         frames: Frames of a live camera.
         chosen: Stride and maximum number of frames.
         restamp: Replace the stamp of each frame by the time of sending.
-        say: Receives notes for the user.
+        notify: Receives notes for the user.
     """
     if not service.wait_for_subscriber():
-        say("camera/rgbd has no subscriber yet: is the service of this robot running?")
+        notify("camera/rgbd has no subscriber yet: is the service of this robot running?")
     sent = 0
     try:
         for frame in islice(frames, 0, None, chosen.stride):
@@ -162,7 +162,7 @@ def relay(
             if sent == chosen.max_frames:
                 break
     finally:
-        say(f"{sent} frames published")
+        notify(f"{sent} frames published")
 
 
 def _stamped_now(frame: CameraRgbd) -> CameraRgbd:

@@ -137,14 +137,14 @@ def progress(title: str, total: int, console: Console) -> Iterator[Advance]:
 
 
 def _plain(title: str, total: int, console: Console) -> Advance:
-    said = 0
+    reported = 0
 
     def advance(done: int, grown: int | None = None, /) -> None:
-        nonlocal said, total
+        nonlocal reported, total
         if grown not in (None, total):
-            said, total = 0, grown
-        if done * LINES // total > said:
-            said = done * LINES // total
+            reported, total = 0, grown
+        if done * LINES // total > reported:
+            reported = done * LINES // total
             console.print(f"{title}: {done} of {total}", highlight=False)
 
     return advance

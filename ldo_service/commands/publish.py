@@ -105,7 +105,7 @@ def publish(
             camera.send(index)
             advance(done)
     console.print(
-        f"{camera.sent} frames published, {camera.bad} bad, {camera.unheard} without subscriber"
+        f"{camera.sent} frames published, {camera.bad} bad, {camera.unreceived} without subscriber"
     )
     if camera.bad > MAX_BAD * len(indices):
         raise DataError(f"{camera.bad} of {len(indices)} frames could not be read.")
@@ -118,11 +118,16 @@ class SequencePublisher:
     """
 
     def __init__(
-        self, service: Client, sequence: Sequence, restamp: bool, say: Callable[[str], None]
+        self, service: Client, sequence: Sequence, restamp: bool, notify: Callable[[str], None]
     ) -> None:
-        self._service, self._sequence, self._restamp, self._say = service, sequence, restamp, say
-        self._was_heard = True
-        self.sent = self.bad = self.unheard = 0
+        self._service, self._sequence, self._restamp, self._notify = (
+            service,
+            sequence,
+            restamp,
+            notify,
+        )
+        self._had_subscriber = True
+        self.sent = self.bad = self.unreceived = 0
 
     def send(self, index: int) -> None:
         """Send one frame, or count it as bad if it cannot be read."""
@@ -131,20 +136,20 @@ class SequencePublisher:
             message = raw_frame_to_message(self._sequence.read(index))
         except FrameError as error:
             if self.bad == 0:
-                self._say(f"{error} The frame is skipped; further bad frames are only counted.")
+                self._notify(f"{error} The frame is skipped; further bad frames are only counted.")
             self.bad += 1
             return
         if self._restamp:
             message = msgspec.structs.replace(message, stamp_ns=time.time_ns())
         self._service.send(message)
         self.sent += 1
-        self.unheard += not self._was_heard
+        self.unreceived += not self._had_subscriber
 
     def _notice_listeners(self) -> None:
-        is_heard = self._service.has_subscriber
-        if self._was_heard and not is_heard:
-            self._say("camera/rgbd has no subscriber any more: is the service still running?")
-        self._was_heard = is_heard
+        has_subscriber = self._service.has_subscriber
+        if self._had_subscriber and not has_subscriber:
+            self._notify("camera/rgbd has no subscriber any more: is the service still running?")
+        self._had_subscriber = has_subscriber
 
 
 def paced(sequence: Sequence, indices: range, rate: float | None) -> Iterator[int]:

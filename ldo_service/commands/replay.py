@@ -58,11 +58,11 @@ def _table(rows: list[ReplayReport]) -> Table:
     for row in rows:
         same = "yes" if row.difference is None else f"until\n{row.difference.step}"
         took, made = _counts(row.taken), _counts(row.made)
-        table.add_row("\n".join(_life(row)), str(row.steps), took, made, same)
+        table.add_row("\n".join(_first_column(row)), str(row.steps), took, made, same)
     return table
 
 
-def _life(row: ReplayReport) -> Iterator[str]:
+def _first_column(row: ReplayReport) -> Iterator[str]:
     """Yield the name of the actor, then its restarts and failures."""
     yield row.actor
     if row.starts != 1:

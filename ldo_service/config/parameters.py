@@ -133,7 +133,7 @@ def _align(config: Config) -> AlignConfig:
     )
 
 
-def _places(config: Config) -> KeyframeDatabaseConfig:
+def _keyframe_database(config: Config) -> KeyframeDatabaseConfig:
     return KeyframeDatabaseConfig(count=config.tracker.relocalization.max_keyframes)
 
 
@@ -149,12 +149,12 @@ def _tracker(config: Config) -> TrackerConfig:
             features=FeatureConfig(count=tracker.features.max_features),
             keyframes=_keyframes(config),
             window=WindowConfig(measurements=tracker.window.max_measurements),
-            places=_places(config),
+            keyframe_database=_keyframe_database(config),
             relocalization=RelocalizationConfig(
-                alike=tracker.relocalization.appearance_candidates,
+                appearance_candidates=tracker.relocalization.appearance_candidates,
                 across_scales=tracker.relocalization.sift_candidates,
             ),
-            returning=KeyframeReuseConfig(after=tracker.keyframes.reuse_after),
+            keyframe_reuse=KeyframeReuseConfig(after=tracker.keyframes.reuse_after),
             submaps=SubmapConfig(begin_after_s=tracker.submaps.start_after_lost_s),
             tracking_quality=TrackingQualityConfig(
                 min_overlap=tracker.quality.weak_overlap,
@@ -166,7 +166,7 @@ def _tracker(config: Config) -> TrackerConfig:
             movable=_dynamic_classes(config),
             prior=PriorConfig(
                 max_gap_s=tracker.odometry_prior.max_gap_s,
-                max_carried_s=tracker.odometry_prior.max_dead_reckoning_s,
+                max_dead_reckoning_s=tracker.odometry_prior.max_dead_reckoning_s,
             ),
         ),
         localize=tracker.localization_map,
@@ -182,7 +182,7 @@ def _keyframes(config: Config) -> KeyframeConfig:
         max_translation=keyframes.max_translation_ratio,
         min_frames=keyframes.min_interval_frames,
         max_frames=keyframes.max_interval_frames,
-        supporting=keyframes.mapping_only_ratio,
+        mapping_only_ratio=keyframes.mapping_only_ratio,
     )
 
 
@@ -232,9 +232,9 @@ def _map_builder(config: Config) -> MapBuilderConfig:
         store=KeyframeStoreConfig(
             cache_mb=mapper.keyframe_images.memory_mb,
             quota_mb=mapper.keyframe_images.disk_mb,
-            most=mapper.keyframe_images.max_keyframes,
+            max_keyframes=mapper.keyframe_images.max_keyframes,
         ),
-        sleep=OffloadConfig(max_active=mapper.offload.max_resident_gaussians),
+        offload=OffloadConfig(max_active=mapper.offload.max_resident_gaussians),
         prune_keyframes=mapper.prune.interval_keyframes,
         seed=mapper.seed,
     )
@@ -308,7 +308,8 @@ def _loop_closer(config: Config) -> LoopCloserConfig:
         loops=LoopsConfig(
             stages=closer.retrieval.mode,
             subgraphs=SubgraphConfig(
-                least=paper.subgraph_min_keyframes, most=paper.subgraph_max_keyframes
+                min_keyframes=paper.subgraph_min_keyframes,
+                max_keyframes=paper.subgraph_max_keyframes,
             ),
             retrieval=RetrievalConfig(
                 exclude_frames=closer.retrieval.min_gap_frames,
@@ -329,7 +330,7 @@ def _loop_closer(config: Config) -> LoopCloserConfig:
             plausibility=ConsistencyCheckConfig(
                 drift_m=closer.drift_gate.max_drift_m, drift=closer.drift_gate.max_drift_ratio
             ),
-            places=_places(config),
+            keyframe_database=_keyframe_database(config),
             pyramid=_pyramid(config),
             features=FeatureConfig(
                 count=config.tracker.features.max_features, min_inliers=LOOP_MIN_INLIERS
@@ -352,14 +353,14 @@ def _optimizer(config: Config) -> OptimizerConfig:
             ),
             closures=LoopClosureConfig(
                 max_sigmas=optimizer.loop_closures.max_residual_sigmas,
-                most=optimizer.loop_closures.max_closures,
+                max_closures=optimizer.loop_closures.max_closures,
             ),
             condense_keyframes=paper.marginalization_interval_keyframes,
         ),
         landmarks=ObjectLandmarkConfig(
             lambda_sem=paper.lambda_sem,
             w_sem=paper.w_sem,
-            most=optimizer.landmarks.max_landmarks,
+            max_landmarks=optimizer.landmarks.max_landmarks,
             schedule=optimizer.landmarks.schedule,
         ),
         uses_objects=optimizer.landmarks.enabled,

@@ -9,29 +9,29 @@ from ldo_service.schemas import (
 from .poses import relative_pose_to_message
 
 
-def loop_closure_to_message(finding: LoopCandidateResult) -> LoopClosure:
+def loop_closure_to_message(result: LoopCandidateResult) -> LoopClosure:
     """Return the loop-closure message of an accepted loop candidate.
 
     Raises:
         ValueError: The candidate was rejected.
     """
-    if finding.closure is None:
+    if result.closure is None:
         raise ValueError(
             "a rejected loop candidate has no loop closure to convert: "
-            f"rejected_reason={finding.check.rejected_reason!r} must be empty."
+            f"rejected_reason={result.check.rejected_reason!r} must be empty."
         )
     return LoopClosure(
-        stamp_ns=finding.check.proposal.new.stamp_ns,
-        pose=relative_pose_to_message(finding.closure),
-        overlap=finding.check.overlap,
-        rmse_m=finding.check.rmse_m,
-        entropy=finding.check.proposal.semantics.entropy,
+        stamp_ns=result.check.proposal.new.stamp_ns,
+        pose=relative_pose_to_message(result.closure),
+        overlap=result.check.overlap,
+        rmse_m=result.check.rmse_m,
+        entropy=result.check.proposal.semantics.entropy,
     )
 
 
-def loop_candidate_to_message(finding: LoopCandidateResult) -> LoopCandidate:
+def loop_candidate_to_message(result: LoopCandidateResult) -> LoopCandidate:
     """Return the message of a loop candidate, accepted or rejected."""
-    check, old, new = finding.check, finding.likeness.subgraph, finding.new
+    check, old, new = result.check, result.match.subgraph, result.new
     proposal = check.proposal
     return LoopCandidate(
         stamp_ns=new.stamp_ns,
@@ -39,8 +39,8 @@ def loop_candidate_to_message(finding: LoopCandidateResult) -> LoopCandidate:
         reference=old.keyframes[-1],
         keyframes=new.keyframes,
         reference_keyframes=old.keyframes,
-        similarity=finding.likeness.similarity,
-        appearance=finding.likeness.appearance,
+        similarity=result.match.similarity,
+        appearance=result.match.appearance,
         evidence=proposal.evidence,
         inliers=proposal.inliers,
         divergence=proposal.semantics.divergence,

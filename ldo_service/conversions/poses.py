@@ -75,10 +75,10 @@ def correction_to_message(
     graph_version: int,
     T_map_keyframe: dict[int, np.ndarray],
     refinements: int = 0,
-    joined: Mapping[int, int] | None = None,
+    merged: Mapping[int, int] | None = None,
     *,
     closures: Iterable[tuple[int, int]] = (),
-    not_believed: Iterable[tuple[int, int]] = (),
+    rejected: Iterable[tuple[int, int]] = (),
     landmarks: Iterable[GraphLandmark] = (),
 ) -> GraphCorrection:
     """Return the message of a correction of the pose graph.
@@ -88,9 +88,9 @@ def correction_to_message(
         graph_version: Version of the pose graph.
         T_map_keyframe: Corrected poses [4, 4] by id of the keyframe.
         refinements: Number of the last `keyframe/refinement` message that the correction includes.
-        joined: For each merged submap, the oldest submap that it is merged with.
+        merged: For each merged submap, the oldest submap that it is merged with.
         closures: Accepted loop closures, as pairs of keyframes.
-        not_believed: Rejected loop closures, as pairs of keyframes.
+        rejected: Rejected loop closures, as pairs of keyframes.
         landmarks: Objects of the pose graph.
     """
     T = np.array(list(T_map_keyframe.values())).reshape(-1, 4, 4)
@@ -101,9 +101,9 @@ def correction_to_message(
         keyframes=Array.of(np.array(list(T_map_keyframe), np.int64)),
         T_map_keyframe=Array.of(rows),
         last_refinement=refinements,
-        merged_submaps=tuple(sorted((joined or {}).items())),
+        merged_submaps=tuple(sorted((merged or {}).items())),
         accepted_closures=tuple(closures),
-        rejected_closures=tuple(not_believed),
+        rejected_closures=tuple(rejected),
         landmarks=tuple(landmarks),
     )
 

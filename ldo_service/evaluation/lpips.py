@@ -40,13 +40,13 @@ class Lpips:
             raise ConfigError(f"--lpips {path} cannot be opened: {_first_line(error)}.") from error
         self._names = [node.name for node in self._session.get_inputs()]
         self._require_layout()
-        self._is_judged = False
+        self._is_checked = False
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
         """Return the distance of two images [H, W, 3] in 0..1."""
-        if not self._is_judged:
+        if not self._is_checked:
             self._require_distance(a)
-            self._is_judged = True
+            self._is_checked = True
         return self._distance(a, b)
 
     def _distance(self, a: np.ndarray, b: np.ndarray) -> float:

@@ -30,7 +30,7 @@ class Results:
     """Scores and pictures of a run."""
 
     trajectories: dict[str, TrajectoryErrors] | None  # Missing without ground truth.
-    judged: EvaluatedFrames
+    evaluated: EvaluatedFrames
     renderings: list[RenderingErrors]
     labels: list[LabelErrors]  # Errors of maps with labels, if the source has true labels.
     unlabelled: str  # Reason why labels are not evaluated, or empty.
@@ -61,8 +61,8 @@ def evaluate_run(
         DataError: A file of the run does not fit the sequence, or nothing can be evaluated.
         ConfigError: A picture cannot be written.
     """
-    judged, truth = EvaluatedFrames.of(run.frames), sequence.truth()
-    if truth is None and not (judged.posed and run.maps):
+    evaluated, truth = EvaluatedFrames.of(run.frames), sequence.truth()
+    if truth is None and not (evaluated.posed and run.maps):
         missing = "pose to render from" if run.maps else "map"
         raise DataError(
             f"{sequence.name} has no ground truth and {run.folder} no {missing}, so there is "
@@ -70,11 +70,11 @@ def evaluate_run(
         )
     trajectories = None if truth is None else compare(run, truth)
     renderings = views.evaluate_rendering(
-        sequence, judged, run.maps, advance, distance=distance, threads=threads
+        sequence, evaluated, run.maps, advance, distance=distance, threads=threads
     )
-    rendered = len(judged.posed)
+    rendered = len(evaluated.posed)
     labels = evaluate_labels(
-        sequence, run, judged, lambda done: advance(rendered + done), threads=threads
+        sequence, run, evaluated, lambda done: advance(rendered + done), threads=threads
     )
     pictures = {"trajectory.png": trajectory_picture(run.estimates["final"], truth)}
     if renderings:
@@ -83,8 +83,8 @@ def evaluate_run(
         pictures["labels.png"] = sheet
     drawn, calls = draw(run.folder, pictures), calls_per_frame(run)
     missing = missing_labels(run, sequence)
-    judged_loops = None if truth is None else judge_loops(run, sequence, truth)
-    return Results(trajectories, judged, renderings, labels, missing, calls, drawn, judged_loops)
+    loop_errors = None if truth is None else run_loop_errors(run, sequence, truth)
+    return Results(trajectories, evaluated, renderings, labels, missing, calls, drawn, loop_errors)
 
 
 def work(run: FinishedRun, sequence: Sequence) -> int:
@@ -117,7 +117,7 @@ def calls_per_frame(run: FinishedRun) -> float | None:
     return run.vlm_calls / len(run.frames)
 
 
-def judge_loops(run: FinishedRun, sequence: Sequence, truth: Trajectory) -> LoopErrors | None:
+def run_loop_errors(run: FinishedRun, sequence: Sequence, truth: Trajectory) -> LoopErrors | None:
     """Score the loops of a run; None if loop closing was off."""
     if run.loops is None:
         return None
@@ -172,7 +172,7 @@ def to_json(results: Results) -> dict[str, Any]:
             "rendering": views.PROTOCOL,
             "loops": loops.PROTOCOL,
             "labels": semantics.PROTOCOL,
-            "frames": results.judged.counts(),
+            "frames": results.evaluated.counts(),
         },
         "trajectory": trajectories and {k: _plain_errors(v) for k, v in trajectories.items()},
         "rendering": [_plain_rendering(row) for row in results.renderings],

@@ -21,7 +21,7 @@ from .rows import ROW
 # Densification subtracts this much of the 0.3 px^2 that the renderer adds to every splat. A
 # larger value gives sharper images. Subtracting all of it leaves cracks between Gaussians of one
 # pixel when the camera comes nearer.
-LOW_PASS_TAKEN_BACK_PX2 = 0.2
+LOW_PASS_COMPENSATION_PX2 = 0.2
 
 
 def surfels(
@@ -62,7 +62,7 @@ def surfels(
     normals = normals_of(cells, rays, z, depth_m, camera)
     axes, cosines = slope_axes(normals, rays)
 
-    sigma_px = np.sqrt((sigma_per_spacing * cells.size) ** 2 - LOW_PASS_TAKEN_BACK_PX2)
+    sigma_px = np.sqrt((sigma_per_spacing * cells.size) ** 2 - LOW_PASS_COMPENSATION_PX2)
     sigma = sigma_px * z / np.sqrt(camera.fx * camera.fy)
     stretch = np.minimum(1 / np.maximum(cosines, 1e-6), max_stretch)
     rows = np.zeros((len(cells), ROW), np.float32)
@@ -192,7 +192,7 @@ class DensificationConfig:
         ):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name}={getattr(self, name)} must not be negative.")
-        if not self.sigma_per_spacing**2 > LOW_PASS_TAKEN_BACK_PX2:
+        if not self.sigma_per_spacing**2 > LOW_PASS_COMPENSATION_PX2:
             raise ConfigError(f"sigma_per_spacing={self.sigma_per_spacing} must exceed 0.45.")
         if not self.max_stretch >= 1:
             raise ConfigError(f"max_stretch={self.max_stretch} must be at least 1.")
@@ -206,7 +206,7 @@ def densify(
     config: DensificationConfig | None = None,
     *,
     before: Rendering | None = None,
-    left_out: np.ndarray | None = None,
+    ignore_mask: np.ndarray | None = None,
     threads: int = 1,
 ) -> np.ndarray:
     """Add Gaussians where a keyframe shows surface that the map lacks.
@@ -222,7 +222,7 @@ def densify(
         keyframe: Id of the keyframe, to which the new Gaussians are anchored.
         config: Settings.
         before: Rendering of the map at this pose; None to render it here.
-        left_out: Ignore mask, [H, W] bool; these pixels get no Gaussians.
+        ignore_mask: Ignore mask, [H, W] bool; these pixels get no Gaussians.
         threads: Threads of the renderer.
 
     Returns:
@@ -237,12 +237,12 @@ def densify(
 
     # Find the unexplained pixels.
     before = before or seen()
-    if left_out is not None:
-        frame = _without(frame, left_out, before)
+    if ignore_mask is not None:
+        frame = _without(frame, ignore_mask, before)
     depth_m = with_small_holes_filled(frame.depth_m, config.hole_px)
     wanted = densification_mask(frame, before, config) & (depth_m > 0)
-    if left_out is not None:
-        wanted &= ~left_out
+    if ignore_mask is not None:
+        wanted &= ~ignore_mask
 
     # Add one Gaussian per cell.
     cells = quadtree(
@@ -299,11 +299,11 @@ def densification_mask(
     return cv2.dilate(out.astype(np.uint8), window) > 0
 
 
-def _without(frame: RgbdFrame, left_out: np.ndarray, before: Rendering) -> RgbdFrame:
+def _without(frame: RgbdFrame, ignore_mask: np.ndarray, before: Rendering) -> RgbdFrame:
     """Return the frame with rendered color and no depth in the masked pixels."""
     shown = (255 * before.color.clip(0, 1) + 0.5).astype(np.uint8)
-    color = np.where(left_out[..., None], shown, frame.color)
-    return replace(frame, color=color, depth_m=frame.depth_m * ~left_out)
+    color = np.where(ignore_mask[..., None], shown, frame.color)
+    return replace(frame, color=color, depth_m=frame.depth_m * ~ignore_mask)
 
 
 def nearest_around(depth_m: np.ndarray, radius_px: int) -> np.ndarray:

@@ -56,7 +56,8 @@ class Fitting:
         config: Settings of the Gaussian optimizer.
         window: Settings of the choice after a new keyframe.
         views: Keyframes to fit the map to.
-        is_awake: Function that returns whether all Gaussians that may be visible in a keyframe are
+        is_resident: Function that returns whether all Gaussians that may be visible in a keyframe
+            are
             in memory. Other keyframes are skipped, since the Gaussians in memory would otherwise
             move to where offloaded Gaussians are missing.
         seed: Seed of the random choice of keyframes.
@@ -68,13 +69,13 @@ class Fitting:
         config: GaussianOptimizerConfig,
         window: ViewSamplingConfig,
         views: KeyframeViews,
-        is_awake: Callable[[int], bool],
+        is_resident: Callable[[int], bool],
         *,
         seed: int,
         threads: int,
     ) -> None:
         self._optimizer = GaussianOptimizer(config, threads=threads)
-        self._window, self._views, self._is_awake = window, views, is_awake
+        self._window, self._views, self._is_resident = window, views, is_resident
         self._seed = seed
         self.iterations = 0
         self.unusable = 0  # Keyframes that were chosen but skipped.
@@ -140,7 +141,7 @@ class Fitting:
             return []
         rng = random_for(self._seed, len(self._views), self.iterations)
         tried = rng.integers(len(known), size=TRIES_PER_DRAW * count)
-        return list(islice((known[i] for i in tried if self._is_awake(known[i])), count))
+        return list(islice((known[i] for i in tried if self._is_resident(known[i])), count))
 
     def fit(
         self,
@@ -176,7 +177,7 @@ class Fitting:
         return self._optimizer.steps(gaussians) != steps_before
 
     def _is_usable(self, keyframe: int) -> bool:
-        return self._is_awake(keyframe) and self._views.is_readable(keyframe)
+        return self._is_resident(keyframe) and self._views.is_readable(keyframe)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state of the Gaussian optimizer."""

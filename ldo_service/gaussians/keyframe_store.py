@@ -33,14 +33,18 @@ class KeyframeStoreConfig:
     cache_mb: float = 256.0  # Memory: 119 keyframes of 640x480 with 2.15 MB each.
     quota_mb: float = 4096.0  # Disk: about 8,000 keyframes of 640x480 with 0.5 MB each.
     # Maximum number of keyframes on disk; the view of each also takes 3 kB of memory.
-    most: int = 20_000
+    max_keyframes: int = 20_000
     # Number of newest keyframes that the quota never removes, because the map is fitted to them.
     newest_kept: int = 8
 
     def __post_init__(self) -> None:
-        if not (self.cache_mb >= 0 and self.quota_mb > 0 and min(self.newest_kept, self.most) >= 1):
+        if not (
+            self.cache_mb >= 0
+            and self.quota_mb > 0
+            and min(self.newest_kept, self.max_keyframes) >= 1
+        ):
             raise ConfigError(
-                named(self, "cache_mb", "quota_mb", "most", "newest_kept")
+                named(self, "cache_mb", "quota_mb", "max_keyframes", "newest_kept")
                 + ": cache_mb must be at least 0, quota_mb must be positive, most and newest_kept "
                 "must be at least 1."
             )
@@ -147,7 +151,7 @@ class KeyframeStore:
     # --- quota ------------------------------------------------------------------------------------
     def _make_room(self) -> None:
         sizes, config = self._files.sizes, self.config
-        while sum(sizes.values()) > 1e6 * config.quota_mb or len(sizes) > config.most:
+        while sum(sizes.values()) > 1e6 * config.quota_mb or len(sizes) > config.max_keyframes:
             keyframe = self._most_redundant()
             if keyframe is None:
                 return

@@ -52,7 +52,7 @@ class MapBuilder:
         """
         self.config = config or MapBuilderConfig()
         self.gaussians = GaussianMap()
-        self.sleeping = OffloadedGaussians(folder and folder / "gaussians")
+        self.offloaded = OffloadedGaussians(folder and folder / "gaussians")
         self.views = KeyframeViews(KeyframeStore(folder and folder / "images", self.config.store))
         self._threads = threads
         self._renderer = KeyframeRenderer(self.views, threads)
@@ -93,7 +93,7 @@ class MapBuilder:
                 Gaussians are visible, fewer iterations run, so that the time stays the same.
             dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool.
         """
-        self._wake(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
+        self._load_visible(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
         self._renderer.forget()
         before = self.render_from(frame.camera, T_map_camera)
         counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
@@ -157,7 +157,7 @@ class MapBuilder:
             keyframe,
             self.config.insertion,
             before=before,
-            left_out=dynamic_mask,
+            ignore_mask=dynamic_mask,
             threads=self._threads,
         )
         self._log.mark_added(self.gaussians)
@@ -178,7 +178,7 @@ class MapBuilder:
         Raises:
             KeyError: The images of the keyframe are dropped or unreadable.
         """
-        self._wake(self.views.placed(keyframe))
+        self._load_visible(self.views.placed(keyframe))
         self._renderer.forget()
         self.views.mask_pixels(keyframe, pixels)
         theirs = np.flatnonzero(self.gaussians.anchors == keyframe)
@@ -230,7 +230,7 @@ class MapBuilder:
         If some are offloaded, do not fit the map to this keyframe: the Gaussians in memory would
         move to where the offloaded ones are missing.
         """
-        return not self.sleeping.visible_chunks(self.views.placed(keyframe), self._reach_m)
+        return not self.offloaded.visible_chunks(self.views.placed(keyframe), self._reach_m)
 
     # --- after a correction -----------------------------------------------------------------------
     def deduplicate_keyframe(self, keyframe: int, iterations: int) -> int:
@@ -249,7 +249,7 @@ class MapBuilder:
         if keyframe not in self.views.cameras:
             return 0
         self._renderer.forget()
-        self._wake(self.views.placed(keyframe))
+        self._load_visible(self.views.placed(keyframe))
         mask = find_duplicates(
             self.gaussians.rows, self.gaussians.anchors, keyframe, self.config.merging
         )
@@ -278,7 +278,7 @@ class MapBuilder:
 
         Offloaded Gaussians that may be visible in the keyframe are loaded first.
         """
-        self._wake(self.views.placed(keyframe))
+        self._load_visible(self.views.placed(keyframe))
         shown = self.render_keyframe(keyframe, contributions=True).contributions
         assert shown is not None
         return shown
@@ -292,11 +292,11 @@ class MapBuilder:
     # --- offloading -------------------------------------------------------------------------------
     @property
     def _reach_m(self) -> float:
-        return self.config.sleep.reach_m
+        return self.config.offload.reach_m
 
-    def _wake(self, camera: PlacedCamera) -> None:
-        seen = self.sleeping.visible_chunks(camera, self._reach_m)
-        ids = self.sleeping.load_into(self.gaussians, seen)
+    def _load_visible(self, camera: PlacedCamera) -> None:
+        seen = self.offloaded.visible_chunks(camera, self._reach_m)
+        ids = self.offloaded.load_into(self.gaussians, seen)
         if len(ids):
             self._renderer.forget()
         self._log.mark_loaded(self.gaussians, ids)
@@ -307,31 +307,31 @@ class MapBuilder:
         Call it only after all changes were published, because it clears the record of unpublished
         changes. Map replicas keep the offloaded Gaussians.
         """
-        if len(self.gaussians) <= self.config.sleep.max_active:
+        if len(self.gaussians) <= self.config.offload.max_active:
             return
         keyframes = list(self.views.cameras)[-self.config.recent_cameras :]
         recent = [self.views.placed(keyframe) for keyframe in keyframes]
         rows, anchors = self.gaussians.rows, self.gaussians.anchors
-        clumps = chunk_numbers(self.gaussians.means, anchors, self.config.sleep.clump_m)
-        awake = BoundingSpheres.around(rows, anchors, clumps)
-        choice = plan_offload(awake, recent, self.config.sleep)
+        chunks = chunk_numbers(self.gaussians.means, anchors, self.config.offload.chunk_edge_m)
+        resident = BoundingSpheres.around(rows, anchors, chunks)
+        choice = plan_offload(resident, recent, self.config.offload)
         self._excess = choice.excess
-        self.sleeping.offload_from(self.gaussians, clumps, choice.clumps)
+        self.offloaded.offload_from(self.gaussians, chunks, choice.chunks)
         self._renderer.forget()
         self._log.mark_all_published(self.gaussians)
 
     def size(self) -> int:
         """Return the number of Gaussians, resident and offloaded."""
-        return len(self.gaussians) + len(self.sleeping)
+        return len(self.gaussians) + len(self.offloaded)
 
     def batches(self) -> Iterator[GaussianBatch]:
         """Yield the whole map in batches; ids ascend throughout."""
-        yield from iter_all_gaussians(self.gaussians, self.sleeping)
+        yield from iter_all_gaussians(self.gaussians, self.offloaded)
 
     # --- publication ------------------------------------------------------------------------------
     def changes(self, *, with_changed: bool) -> Changes:
         """Return the changes to publish; see `ChangeLog.drain`."""
-        self._log.lost(self.sleeping.pop_lost_ids(self.gaussians))
+        self._log.lost(self.offloaded.pop_lost_ids(self.gaussians))
         return self._log.drain(self.gaussians, with_changed=with_changed)
 
     def refined(self) -> dict[int, np.ndarray]:
@@ -341,7 +341,7 @@ class MapBuilder:
         """
         return self._published.drain(self.views.poses)
 
-    def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
+    def move_keyframes(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move keyframes and the Gaussians anchored to them, after a correction of the pose graph.
 
         Args:
@@ -350,7 +350,7 @@ class MapBuilder:
         T_map = {k: T @ self.views.poses[k] for k, T in T_new_old.items()}
         self._renderer.forget()
         self.gaussians.move_anchors(T_new_old)
-        self.sleeping.move(T_new_old)
+        self.offloaded.move_anchors(T_new_old)
         self.views.poses.update(T_map)
         self._published.move(T_map)
 
@@ -359,7 +359,7 @@ class MapBuilder:
         """Return a copy of the state; keyframe images and offloaded Gaussians stay in files."""
         return {
             "map": self.gaussians.snapshot(),
-            "sleeping": self.sleeping.snapshot(),
+            "sleeping": self.offloaded.snapshot(),
             "optimizer": self._fitting.snapshot(),
             "views": self.views.snapshot(),
             "published": self._published.snapshot(),
@@ -369,14 +369,14 @@ class MapBuilder:
 
     def saved(self) -> None:
         """Remove the files that the last snapshot does not refer to; call it once that is saved."""
-        self.sleeping.saved()
+        self.offloaded.saved()
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore the state of a snapshot. All of the map then counts as published."""
         self.gaussians = GaussianMap.restore(state["map"])
         self._fitting.restore(state["optimizer"], state["iterations"])
         self.views.restore(state["views"])
-        self.sleeping.restore(state["sleeping"])
+        self.offloaded.restore(state["sleeping"])
         self._published.restore(self.views.cameras, state["published"])
         self._newest = state["newest"]
         self._renderer.forget()
@@ -391,6 +391,6 @@ class MapBuilder:
             "keyframes_skipped": self._fitting.unusable,
             # Kept in memory beyond the limit, because recent keyframes may see them.
             "gaussians_over_limit": self._excess,
-            **self.sleeping.metrics(),
+            **self.offloaded.metrics(),
             **self.views.store.metrics(),
         }

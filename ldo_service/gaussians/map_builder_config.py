@@ -22,7 +22,7 @@ class MapBuilderConfig:
     pruning: PruningConfig = field(default_factory=PruningConfig)
     merging: DeduplicationConfig = field(default_factory=DeduplicationConfig)
     store: KeyframeStoreConfig = field(default_factory=KeyframeStoreConfig)
-    sleep: OffloadConfig = field(default_factory=OffloadConfig)
+    offload: OffloadConfig = field(default_factory=OffloadConfig)
     recent_cameras: int = 8  # Number of last keyframes whose visible Gaussians stay in memory.
     prune_keyframes: int = 5  # Keyframes between two prunings.
     # Least translation and rotation of a keyframe by the Gaussian optimizer that is published.

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 _DISK_FULL = "Gaussians stay in memory, which may run out: free some disk space."
 MAX_MOTIONS = 32  # Pending motions of a chunk; a chunk with more is rewritten.
-SETTLED_AT_ONCE = 16  # Chunks rewritten per call of `move`: 2 ms each.
+REWRITTEN_PER_CALL = 16  # Chunks rewritten per call of `move_anchors`: 2 ms each.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -134,7 +134,7 @@ class OffloadedGaussians:
 
     # --- many chunks, to and from the map ---------------------------------------------------------
     def offload_from(
-        self, gaussians: GaussianMap, clumps: np.ndarray, chosen: Iterable[int]
+        self, gaussians: GaussianMap, chunks: np.ndarray, chosen: Iterable[int]
     ) -> list[int]:
         """Offload the Gaussians of some chunks from the map.
 
@@ -143,18 +143,18 @@ class OffloadedGaussians:
 
         Args:
             gaussians: The map.
-            clumps: Chunk number of each Gaussian, [N] int, from `chunk_numbers`. Gaussians with the
+            chunks: Chunk number of each Gaussian, [N] int, from `chunk_numbers`. Gaussians with the
                 same number must have the same anchor keyframe.
             chosen: Chunk numbers to offload.
 
         Returns:
             Numbers of the written files, as `put` returns them.
         """
-        mask = np.isin(clumps, np.array(sorted(chosen), np.int64))
-        of_clump = clumps[mask]
+        mask = np.isin(chunks, np.array(sorted(chosen), np.int64))
+        chunk_of = chunks[mask]
         taken = gaussians.extract(mask)
-        numbers, refused = [], np.zeros(len(of_clump), bool)
-        for members in _members(of_clump):
+        numbers, refused = [], np.zeros(len(chunk_of), bool)
+        for members in _members(chunk_of):
             ids, rows, anchors, labels = taken.at(members)
             number = self.put(Chunk(int(anchors[0]), ids, rows, labels))
             refused[members] = number is None
@@ -178,9 +178,9 @@ class OffloadedGaussians:
         chunks = [self.load(number) for number in sorted(numbers)]
         if not chunks:
             return np.zeros(0, np.int64)
-        woken = _joined([chunk.piece() for chunk in chunks])
-        gaussians.reinsert(*woken)
-        return np.sort(woken.ids)
+        loaded = _joined([chunk.piece() for chunk in chunks])
+        gaussians.reinsert(*loaded)
+        return np.sort(loaded.ids)
 
     # --- access without loading -------------------------------------------------------------------
     def visible_chunks(self, camera: PlacedCamera, reach_m: float = inf) -> list[int]:
@@ -198,14 +198,14 @@ class OffloadedGaussians:
         numbers = self.numbers()
         return [numbers[k] for k in np.flatnonzero(seen)]
 
-    def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
+    def move_anchors(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move offloaded Gaussians as `GaussianMap.move_anchors` moves resident ones."""
         for number, entry in self._entries.items():
             if entry.anchor in T_new_old:
                 self._entries[number] = entry.moved(T_new_old[entry.anchor])
                 self._spheres = None
         moved_often = [n for n, entry in self._entries.items() if len(entry.motions) > MAX_MOTIONS]
-        for number in moved_often[:SETTLED_AT_ONCE]:
+        for number in moved_often[:REWRITTEN_PER_CALL]:
             self._rewrite_chunk(number)
 
     def chunks(self) -> Iterator[Chunk]:
@@ -245,12 +245,14 @@ class OffloadedGaussians:
             return np.zeros(0, np.int64)
         lost, self._lost = self._lost, []
         ids = np.unique(np.concatenate([np.arange(one.first_id, one.last_id + 1) for one in lost]))
-        asleep = [
+        offloaded_ids = [
             self._read(number).ids
             for number, entry in list(self._entries.items())
             if any(entry.first_id <= o.last_id and o.first_id <= entry.last_id for o in lost)
         ]
-        return np.setdiff1d(ids, np.concatenate([gaussians.ids, *asleep]), assume_unique=True)
+        return np.setdiff1d(
+            ids, np.concatenate([gaussians.ids, *offloaded_ids]), assume_unique=True
+        )
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -388,17 +390,17 @@ def _in_order(piece: GaussianBatch) -> GaussianBatch:
 
 
 def iter_all_gaussians(
-    gaussians: GaussianMap, sleeping: OffloadedGaussians
+    gaussians: GaussianMap, offloaded: OffloadedGaussians
 ) -> Iterator[GaussianBatch]:
     """Yield all Gaussians, resident and offloaded, in batches; ids ascend throughout.
 
     This relies on consecutive ids of the Gaussians of one anchor keyframe. Only the offloaded
     Gaussians of one anchor keyframe are in memory at a time.
     """
-    awake, start = gaussians.all(), 0
-    for chunk in sleeping.chunks():
-        first, last = map(int, np.searchsorted(awake.ids, chunk.ids[[0, -1]]))
-        yield awake.at(slice(start, first))
-        yield _in_order(_joined([awake.at(slice(first, last)), chunk.piece()]))
+    resident, start = gaussians.all(), 0
+    for chunk in offloaded.chunks():
+        first, last = map(int, np.searchsorted(resident.ids, chunk.ids[[0, -1]]))
+        yield resident.at(slice(start, first))
+        yield _in_order(_joined([resident.at(slice(first, last)), chunk.piece()]))
         start = last
-    yield awake.at(slice(start, None))
+    yield resident.at(slice(start, None))

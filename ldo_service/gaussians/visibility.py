@@ -70,8 +70,8 @@ class MaxDepthGrid:
         rows = _between(centers_camera[:, 1:], radii_m, downward, camera.fy, camera.cy)
         columns = _between(centers_camera[:, ::2], radii_m, rightward, camera.fx, camera.cx)
         nearest_m = centers_camera[:, 2] - radii_m
-        in_sight = ~(nearest_m[:, None, None] > (1 + BEHIND) * self.farthest_m)
-        return ~np.any(in_sight & rows[:, :, None] & columns[:, None, :], axis=(1, 2))
+        reaches_before = ~(nearest_m[:, None, None] > (1 + BEHIND) * self.farthest_m)
+        return ~np.any(reaches_before & rows[:, :, None] & columns[:, None, :], axis=(1, 2))
 
 
 def _edges(shape: tuple[int, ...]) -> list[np.ndarray]:
@@ -189,21 +189,21 @@ class BoundingSpheres:
 
     @classmethod
     def around(
-        cls, rows: np.ndarray, anchors: np.ndarray, clumps: np.ndarray | None = None
+        cls, rows: np.ndarray, anchors: np.ndarray, chunks: np.ndarray | None = None
     ) -> "BoundingSpheres":
         """Return a sphere for each chunk of Gaussians, in the order of the chunk numbers.
 
         Args:
             rows: [N, 16].
             anchors: [N].
-            clumps: Chunk numbers [N], see `chunk_numbers`. None makes one chunk for each anchor
+            chunks: Chunk numbers [N], see `chunk_numbers`. None makes one chunk for each anchor
                 keyframe.
         """
-        clumps = anchors if clumps is None else clumps
-        order = np.argsort(clumps, kind="stable")
-        rows, anchors, clumps = rows[order, :6], anchors[order], clumps[order]
-        starts = np.flatnonzero(np.diff(clumps, prepend=clumps[:1] - 1))
-        counts = np.diff(starts, append=len(clumps))
+        chunks = anchors if chunks is None else chunks
+        order = np.argsort(chunks, kind="stable")
+        rows, anchors, chunks = rows[order, :6], anchors[order], chunks[order]
+        starts = np.flatnonzero(np.diff(chunks, prepend=chunks[:1] - 1))
+        counts = np.diff(starts, append=len(chunks))
         return cls(anchors[starts], counts, *_spheres(rows, starts, counts))
 
     def __len__(self) -> int:
@@ -267,7 +267,7 @@ class OffloadConfig:
     # Edge of the cubes; the Gaussians of one keyframe in one cube form a chunk. In an
     # apartment of two rooms the last 8 keyframes may see 36 % of the map; with 0.5 m 28
     # %, with 2.0 m 54 %. It is 67 % with whole keyframes as chunks and without occlusion.
-    clump_m: float = 1.0
+    chunk_edge_m: float = 1.0
 
     def __post_init__(self) -> None:
         if not (self.max_active >= 1 and 0 < self.low_water <= 1):
@@ -275,8 +275,8 @@ class OffloadConfig:
                 named(self, "max_active", "low_water")
                 + ": max_active must be at least 1, low_water must lie in (0, 1]."
             )
-        if not (self.reach_m > 0 and self.clump_m > 0):
-            raise ConfigError(named(self, "reach_m", "clump_m") + " must be positive.")
+        if not (self.reach_m > 0 and self.chunk_edge_m > 0):
+            raise ConfigError(named(self, "reach_m", "chunk_edge_m") + " must be positive.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,12 +284,12 @@ class OffloadPlan:
     """Choice of the chunks to offload.
 
     Attributes:
-        clumps: Numbers of the chunks to offload, the farthest first.
+        chunks: Numbers of the chunks to offload, the farthest first.
         excess: Number of Gaussians in memory beyond `max_active` after offloading. They stay
             because recent cameras may see them.
     """
 
-    clumps: list[int]
+    chunks: list[int]
     excess: int
 
 
@@ -313,13 +313,13 @@ def plan_offload(
     active = int(resident.counts.sum())
     if active <= config.max_active:
         return OffloadPlan([], 0)
-    looked_at = resident.anchors == resident.anchors[-1]
+    is_visible = resident.anchors == resident.anchors[-1]
     for camera in recent:
-        looked_at |= camera.may_see(resident.centers, resident.radii_m, config.reach_m)
-    idle = np.flatnonzero(~looked_at)
-    distances_m = recent[-1].distances_m(resident.centers[idle], resident.radii_m[idle])
+        is_visible |= camera.may_see(resident.centers, resident.radii_m, config.reach_m)
+    hidden = np.flatnonzero(~is_visible)
+    distances_m = recent[-1].distances_m(resident.centers[hidden], resident.radii_m[hidden])
     chosen: list[int] = []
-    for k in idle[np.argsort(-distances_m, kind="stable")]:
+    for k in hidden[np.argsort(-distances_m, kind="stable")]:
         if active <= config.low_water * config.max_active:
             break
         chosen.append(int(k))

@@ -31,14 +31,18 @@ class ConsistencyCheckConfig:
     view_rad: float = 1.5
     view_depths: float = 2.0  # Maximum distance between them beyond the drift, in median depths.
     # A hypothesis is ambiguous if another one has this fraction of its inliers and differs by more
-    # than rival_rad: 57 degrees, or one median depth.
-    rival_inliers: float = 0.5
-    rival_rad: float = 1.0
+    # than ambiguous_rad: 57 degrees, or one median depth.
+    ambiguous_inlier_ratio: float = 0.5
+    ambiguous_rad: float = 1.0
 
     def __post_init__(self) -> None:
-        if min(getattr(self, name) for name in self.__slots__) < 0 or self.rival_inliers > 1:
+        if (
+            min(getattr(self, name) for name in self.__slots__) < 0
+            or self.ambiguous_inlier_ratio > 1
+        ):
             raise ConfigError(
-                named(self, *self.__slots__) + " must be at least 0, and rival_inliers at most 1."
+                named(self, *self.__slots__)
+                + " must be at least 0, and ambiguous_inlier_ratio at most 1."
             )
 
 
@@ -50,16 +54,16 @@ class ConsistencyChecker:
     """
 
     def __init__(
-        self, poses: KeyframePoses, joined: Mapping[int, int], config: ConsistencyCheckConfig
+        self, poses: KeyframePoses, merged: Mapping[int, int], config: ConsistencyCheckConfig
     ) -> None:
         """Create a checker.
 
         Args:
             poses: Keyframe poses in the map.
-            joined: Merged submaps, each with the older one that it is merged into.
+            merged: Merged submaps, each with the older one that it is merged into.
             config: Limits.
         """
-        self._poses, self._joined, self._config = poses, joined, config
+        self._poses, self._merged_submaps, self._config = poses, merged, config
 
     def possible_matches(
         self, old: Sequence[SubgraphKeyframe], new: SubgraphKeyframe
@@ -112,7 +116,7 @@ class ConsistencyChecker:
         """Reject ambiguous hypotheses, and return all.
 
         A hypothesis is ambiguous if another one places the new keyframe far away from it and has
-        nearly as many inliers (`rival_inliers`, `rival_rad`).
+        nearly as many inliers (`ambiguous_inlier_ratio`, `ambiguous_rad`).
         """
         return [
             replace(proposal, rejected_reason="ambiguous: another place fits as well")
@@ -123,14 +127,14 @@ class ConsistencyChecker:
         ]
 
     def _is_aliased(self, proposal: LoopHypothesis, other: LoopHypothesis) -> bool:
-        enough = self._config.rival_inliers * proposal.inliers
+        enough = self._config.ambiguous_inlier_ratio * proposal.inliers
         if other.rejected_reason or other.evidence != proposal.evidence or other.inliers < enough:
             return False
         if not self._is_known(proposal.old, other.old):
             return False
         T, T_other = (self._T_map(p, proposal.new) for p in (proposal, other))
         apart_rad = image_motion_rad(se3.inverse(T) @ T_other, proposal.new.place.median_depth_m)
-        return apart_rad > self._config.rival_rad
+        return apart_rad > self._config.ambiguous_rad
 
     def _T_map(self, proposal: LoopHypothesis, new: SubgraphKeyframe) -> np.ndarray:
         """Return T_map_keyframe [4, 4] of a new keyframe if the hypothesis is true."""
@@ -151,7 +155,7 @@ class ConsistencyChecker:
         return self._root(old.place.submap) == self._root(new.place.submap)
 
     def _root(self, submap: int) -> int:
-        return self._joined.get(submap, submap)
+        return self._merged_submaps.get(submap, submap)
 
     def _drift(
         self, old: SubgraphKeyframe, new: SubgraphKeyframe, T_old_new: np.ndarray

@@ -116,7 +116,7 @@ class LoopsConfig:
     retrieval: RetrievalConfig = field(default_factory=RetrievalConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     plausibility: ConsistencyCheckConfig = field(default_factory=ConsistencyCheckConfig)
-    places: KeyframeDatabaseConfig = field(default_factory=KeyframeDatabaseConfig)
+    keyframe_database: KeyframeDatabaseConfig = field(default_factory=KeyframeDatabaseConfig)
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     features: FeatureConfig = field(
         default_factory=lambda: FeatureConfig(min_inliers=LOOP_MIN_INLIERS)
@@ -135,7 +135,7 @@ class LoopCandidateResult:
     """Loop candidate: new subgraph, similar stored subgraph, and result of the verification."""
 
     new: Subgraph
-    likeness: RetrievalMatch
+    match: RetrievalMatch
     check: VerificationResult
 
     @property
@@ -176,7 +176,7 @@ class LoopDetector:
         stamp_ns: int,
         sightings: DetectionPoints | None,
         poses: KeyframePoses,
-        joined: Mapping[int, int],
+        merged: Mapping[int, int],
     ) -> list[LoopCandidateResult]:
         """Add a keyframe; return the loop candidates if it completes a subgraph.
 
@@ -186,36 +186,36 @@ class LoopDetector:
             stamp_ns: Stamp of the keyframe.
             sightings: Detections as points; None if no detector ran.
             poses: T_map_keyframe of the stored keyframes; unknown ones are not checked.
-            joined: Merged submaps, each with the older one that it is merged into.
+            merged: Merged submaps, each with the older one that it is merged into.
         """
-        findings: list[LoopCandidateResult] = []
+        results: list[LoopCandidateResult] = []
         if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
-            findings = self.flush(poses, joined)
+            results = self.flush(poses, merged)
             self._open = []
         self._open.append(self._view(place, frame, stamp_ns, sightings))
         if is_complete(self._open, self._config.subgraphs):
-            findings += self._completed(poses, joined)
-        return findings
+            results += self._completed(poses, merged)
+        return results
 
-    def flush(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[LoopCandidateResult]:
+    def flush(self, poses: KeyframePoses, merged: Mapping[int, int]) -> list[LoopCandidateResult]:
         """Return the loop candidates of the unfinished subgraph if it is long enough.
 
         Callers use it when no keyframe follows: at the end of a run and after a loss of tracking.
         Loops are likely then. A run often ends where it began, and the newest keyframes are near
         the place where tracking was lost.
         """
-        if len(self._open) < self._config.subgraphs.least:
+        if len(self._open) < self._config.subgraphs.min_keyframes:
             return []
-        return self._completed(poses, joined)
+        return self._completed(poses, merged)
 
     def _completed(
-        self, poses: KeyframePoses, joined: Mapping[int, int]
+        self, poses: KeyframePoses, merged: Mapping[int, int]
     ) -> list[LoopCandidateResult]:
         new, self._open = self._subgraph(self._open), []
-        findings = self._findings(new, poses, joined)
+        results = self._findings(new, poses, merged)
         kept = evenly_spaced(new.views, self._config.subgraphs.kept_views)
         self._memory.add(replace(new, views=kept))
-        return findings
+        return results
 
     # --- subgraphs --------------------------------------------------------------------------------
     def _view(
@@ -225,10 +225,12 @@ class LoopDetector:
         self._last = place.submap, place.T_odom_keyframe
         self._words.learn(place.descriptors)
         words = self._words.histogram(place.descriptors)
-        looked = sightings is not None
-        sightings = sightings if looked and self._config.stages != "geometric" else None
+        has_detections = sightings is not None
+        sightings = sightings if has_detections and self._config.stages != "geometric" else None
         sightings = sightings or DetectionPoints.none()
-        return SubgraphKeyframe(place, frame, stamp_ns, self._path_m, looked, sightings, words)
+        return SubgraphKeyframe(
+            place, frame, stamp_ns, self._path_m, has_detections, sightings, words
+        )
 
     def _step_m(self, place: KeyframeRecord) -> float:
         """Return the distance from the previous keyframe in meters.
@@ -259,14 +261,14 @@ class LoopDetector:
 
     # --- loops ------------------------------------------------------------------------------------
     def _findings(
-        self, new: Subgraph, poses: KeyframePoses, joined: Mapping[int, int]
+        self, new: Subgraph, poses: KeyframePoses, merged: Mapping[int, int]
     ) -> list[LoopCandidateResult]:
         """Return all loop candidates of a new subgraph.
 
         They are verified in the order of their inliers, most first. The first accepted one becomes
         the loop closure; the following ones are rejected.
         """
-        known = ConsistencyChecker(poses, joined, self._config.plausibility)
+        known = ConsistencyChecker(poses, merged, self._config.plausibility)
         is_possible = known.possible_matches(
             [old.views[0] for old in self.subgraphs], new.views[-1]
         )

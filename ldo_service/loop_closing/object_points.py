@@ -130,8 +130,8 @@ class SubgraphLandmarks:
     @property
     def names(self) -> np.ndarray:
         """Likeliest label of each landmark, [K] int64; background and `other` are ignored."""
-        said = np.where(self.labels < HIDDEN_NAMES, -1, self.weights).argmax(axis=1)
-        return self.labels[np.arange(len(self)), said].astype(np.int64)
+        best = np.where(self.labels < HIDDEN_NAMES, -1, self.weights).argmax(axis=1)
+        return self.labels[np.arange(len(self)), best].astype(np.int64)
 
     def pack(self) -> dict[str, Any]:
         """Return the arrays by name."""

@@ -191,16 +191,16 @@ class PlaceDatabase:
         also switch off labels or images.
         """
         config = self._config
-        looks_alike = appearance >= config.min_appearance
+        has_similar_images = appearance >= config.min_appearance
         if self._stages == "geometric":
-            return np.where(looks_alike, appearance, 0)
-        says_alike = similarity >= config.min_similarity
+            return np.where(has_similar_images, appearance, 0)
+        has_similar_labels = similarity >= config.min_similarity
         named = (similarity + layout) / 2
         if self._stages == "semantic":
-            return np.where(says_alike, named, 0)
-        tells = new.names.any() & self._names.rows.any(axis=1)
-        both = np.where(says_alike | looks_alike, (named + appearance) / 2, 0)
-        return np.where(tells, both, np.where(looks_alike, appearance, 0))
+            return np.where(has_similar_labels, named, 0)
+        both_have_labels = new.names.any() & self._names.rows.any(axis=1)
+        both = np.where(has_similar_labels | has_similar_images, (named + appearance) / 2, 0)
+        return np.where(both_have_labels, both, np.where(has_similar_images, appearance, 0))
 
     def _are_far(self, new: Subgraph) -> np.ndarray:
         """Return which subgraphs are more than `exclude_frames` before the new one, [S] bool.

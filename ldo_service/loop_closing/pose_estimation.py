@@ -57,7 +57,7 @@ def ransac_rigid(
         return None
     for _ in range(iterations):
         a, b = pairs[rng.choice(len(pairs), 3, replace=False)].T
-        if len({*a}) < 3 or len({*b}) < 3 or not _are_alike(p_a[a], p_b[b], limit_m):
+        if len({*a}) < 3 or len({*b}) < 3 or not _are_congruent(p_a[a], p_b[b], limit_m):
             continue
         motion = _supported(p_a, p_b, pairs, fit_rigid_transform(p_b[b], p_a[a]), limit_m)
         if best is None or motion.inliers.sum() > best.inliers.sum():
@@ -68,7 +68,7 @@ def ransac_rigid(
     return _supported(p_a, p_b, pairs, fit_rigid_transform(p_b[b], p_a[a]), limit_m)
 
 
-def _are_alike(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
+def _are_congruent(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
     """Return whether two triangles [3, 3] have equal sides, within 2 limit_m, and some area."""
     sides_a, sides_b = (np.linalg.norm(p - np.roll(p, 1, axis=0), axis=1) for p in (p_a, p_b))
     if np.abs(sides_a - sides_b).max() > 2 * limit_m:

@@ -19,9 +19,10 @@ from .object_points import DetectionPoints, SubgraphLandmarks
 class SubgraphConfig:
     """Size of subgraphs; III.C refers to the paper."""
 
-    least: int = 3  # Minimum keyframes (III.C).
-    most: int = 5  # Maximum keyframes (III.C).
-    # Rotation plus parallax from the first to the last keyframe that makes `least` keyframes
+    min_keyframes: int = 3  # Minimum keyframes (III.C).
+    max_keyframes: int = 5  # Maximum keyframes (III.C).
+    # Rotation plus parallax from the first to the last keyframe that makes `min_keyframes`
+    # keyframes
     # enough. Half of the view of a depth camera is new then.
     turned_rad: float = 0.5
     # Rotation plus parallax between two keyframes above which a new subgraph begins. Consecutive
@@ -32,10 +33,14 @@ class SubgraphConfig:
     kept_views: int = 2
 
     def __post_init__(self) -> None:
-        if not 1 <= self.kept_views <= self.most or not 1 <= self.least <= self.most:
+        if (
+            not 1 <= self.kept_views <= self.max_keyframes
+            or not 1 <= self.min_keyframes <= self.max_keyframes
+        ):
             raise ConfigError(
-                named(self, "least", "most", "kept_views")
-                + " must satisfy 1 <= least <= most and 1 <= kept_views <= most."
+                named(self, "min_keyframes", "max_keyframes", "kept_views")
+                + ": 1 <= min_keyframes <= max_keyframes and "
+                + "1 <= kept_views <= max_keyframes must hold."
             )
         if not (self.turned_rad > 0 and self.gap_rad > 0):
             raise ConfigError(named(self, "turned_rad", "gap_rad") + " must be positive.")
@@ -157,14 +162,15 @@ def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfi
 def is_complete(views: Sequence[SubgraphKeyframe], config: SubgraphConfig) -> bool:
     """Return whether keyframes complete a subgraph.
 
-    It is complete with `most` keyframes, or with `least` if the camera moved enough (`turned_rad`).
+    It is complete with `max_keyframes` keyframes, or with `min_keyframes` if the camera moved
+    enough (`turned_rad`).
     """
-    if len(views) < config.least:
+    if len(views) < config.min_keyframes:
         return False
     first, last = views[0].place, views[-1].place
     moved = se3.inverse(first.T_odom_keyframe) @ last.T_odom_keyframe
     return (
-        len(views) >= config.most
+        len(views) >= config.max_keyframes
         or image_motion_rad(moved, first.median_depth_m) > config.turned_rad
     )
 

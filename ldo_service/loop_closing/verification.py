@@ -55,15 +55,15 @@ class VerificationConfig:
     # Minimum feature inliers of the best pair of keyframes. A confirming keyframe of the new
     # subgraph only needs `features.min_inliers`.
     min_inliers: int = 20
-    witness_landmarks: int = 3  # Matching landmarks that confirm a pose instead of a keyframe.
+    confirming_landmarks: int = 3  # Matching landmarks that confirm a pose instead of a keyframe.
     # Maximum rotation plus parallax between a pose and its confirmation.
-    witness_rad: float = 0.08
+    confirmation_rad: float = 0.08
     pairs: int = 15  # Maximum pairs of keyframes for feature matching, 3 ms each.
     map_pairs: int = 3  # Maximum pairs of keyframes aligned at their poses in the map, 15 ms each.
     # Minimum overlap of both surfaces if the pose does not come from features.
     blind_overlap: float = 0.35
     # Maximum difference of two poses from the map: half a centimeter in a room.
-    map_witness_rad: float = 0.02
+    map_confirmation_rad: float = 0.02
     # Maximum change of a pose from features or the map by the refinement on the images.
     refined_rad: float = 0.1
     # The same for a pose from landmarks; their centers are inaccurate.
@@ -82,14 +82,14 @@ class VerificationConfig:
             )
         if not 0 <= self.blind_overlap <= 1:
             raise ConfigError(named(self, "blind_overlap") + " must be within 0..1.")
-        angles = (self.witness_rad, self.refined_rad, self.refined_landmarks_rad)
-        if min(*angles, self.map_witness_rad) <= 0 or self.map_pairs < 0:
+        angles = (self.confirmation_rad, self.refined_rad, self.refined_landmarks_rad)
+        if min(*angles, self.map_confirmation_rad) <= 0 or self.map_pairs < 0:
             raise ConfigError(
                 named(
                     self,
-                    "witness_rad",
+                    "confirmation_rad",
                     "map_pairs",
-                    "map_witness_rad",
+                    "map_confirmation_rad",
                     "refined_rad",
                     "refined_landmarks_rad",
                 )
@@ -163,7 +163,9 @@ class Verifier:
                 found.append(LoopHypothesis(a, b, T_old_new, "features", pose.inliers))
                 best = max(found, key=lambda proposal: proposal.inliers)
                 is_enough = best.inliers >= self._config.min_inliers
-                if is_enough and self._is_confirmed_by_any(best, found, self._config.witness_rad):
+                if is_enough and self._is_confirmed_by_any(
+                    best, found, self._config.confirmation_rad
+                ):
                     return self._with_semantics(best, old, new)
         return self._from_single_keyframe(found, old, new)
 
@@ -172,7 +174,8 @@ class Verifier:
     ) -> LoopHypothesis:
         """Return the pose with most inliers; it is rejected if nothing confirms it.
 
-        It is confirmed by at least `witness_landmarks` matching landmarks, or by another keyframe
+        It is confirmed by at least `confirming_landmarks` matching landmarks, or by another
+        keyframe
         of `new` whose images pass the verification at this pose.
         """
         best = max(found, key=lambda proposal: proposal.inliers, default=None)
@@ -183,7 +186,7 @@ class Verifier:
         best = self._with_semantics(best, old, new)
         if best.inliers < self._config.min_inliers:
             return replace(best, rejected_reason=f"{best.inliers} features agree")
-        if best.semantics.count >= self._config.witness_landmarks:
+        if best.semantics.count >= self._config.confirming_landmarks:
             return best
         if any(self._is_confirmed_by(best, view) for view in new.views if view is not best.new):
             return best
@@ -239,7 +242,7 @@ class Verifier:
             check = self._check_overlap(LoopHypothesis(a, b, T, "map"))
             if check is not None and check.closure is not None:
                 met = replace(check.proposal, T_old_new=check.closure.T_a_b)
-                if self._is_confirmed_by_any(met, found, self._config.map_witness_rad):
+                if self._is_confirmed_by_any(met, found, self._config.map_confirmation_rad):
                     return self._with_semantics(met, old, new)
                 found.append(met)
         refused = "not confirmed by images" if found else "no overlap at the mapped pose"

@@ -86,7 +86,7 @@ class MapPublisher:
         self.config = config or PublishConfig()
         self.version = 0
         self._map = map_
-        self._names_told = 0
+        self._names_published = 0
         # The first keyframe publishes a snapshot.
         self._since_snapshot = self.config.snapshot_interval_keyframes
         self._since_changed = 0
@@ -168,7 +168,7 @@ class MapPublisher:
 
     def _new_names(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return all label names if at least one of them is unpublished, else an empty tuple."""
-        is_news, self._names_told = len(names) > self._names_told, len(names)
+        is_news, self._names_published = len(names) > self._names_published, len(names)
         return names if is_news else ()
 
     def _gaussians(self, chosen: np.ndarray) -> Gaussians:
@@ -223,14 +223,14 @@ class MapPublisher:
             "since_changed": self._since_changed,
             "since_snapshot": self._since_snapshot,
             "in_snapshot": self._in_snapshot,
-            "names_told": self._names_told,
+            "names_told": self._names_published,
         }
 
     def restore(self, state: dict[str, int]) -> None:
         self.version = state["version"] + VERSIONS_IN_A_CHECKPOINT
         self._since_changed = state["since_changed"]
         self._since_snapshot, self._in_snapshot = state["since_snapshot"], state["in_snapshot"]
-        self._names_told = state["names_told"]
+        self._names_published = state["names_told"]
 
 
 class ObjectPublisher:

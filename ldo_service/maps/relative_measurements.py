@@ -40,9 +40,9 @@ class RelativeMeasurements:
         if links:
             self._recent[message.keyframe] = links
         while len(self._recent) > self._most_recent:
-            self._grow_old(next(iter(self._recent)))
+            self._reduce(next(iter(self._recent)))
 
-    def _grow_old(self, keyframe: int) -> None:
+    def _reduce(self, keyframe: int) -> None:
         reference, information = next(iter(self._recent.pop(keyframe).items()))
         self._older.put(keyframe, reference, np.reshape(information, (6, 6))[UPPER])
 

@@ -81,14 +81,14 @@ def conflicting_bridges(known: FactorStore, closure: RelativePose) -> list[Bridg
     If several components were merged one after the other, several edges lie between the keyframes.
     Any of them may be wrong.
     """
-    joins = (BridgeEdge(pair, _hanging_on(known, pair)) for pair in known.joins)
-    return [joined for joined in joins if joined.is_across(pair_of(closure))]
+    bridges = (BridgeEdge(pair, _connected_by(known, pair)) for pair in known.bridges)
+    return [bridge for bridge in bridges if bridge.is_across(pair_of(closure))]
 
 
-def _hanging_on(known: FactorStore, join: Pair) -> Set[int]:
+def _connected_by(known: FactorStore, bridge: Pair) -> Set[int]:
     """Return the keyframes on the far side of a bridge edge; see `BridgeEdge`."""
-    first, links = known.first_of[join[0]], defaultdict[int, list[int]](list)
-    for m in known.relative(without=join):
+    first, links = known.first_of[bridge[0]], defaultdict[int, list[int]](list)
+    for m in known.relative(without=bridge):
         links[m.a].append(m.b)
         links[m.b].append(m.a)
     held, front = set[int](), {known.relative_to_start(first)[0]}
@@ -101,7 +101,7 @@ def _hanging_on(known: FactorStore, join: Pair) -> Set[int]:
 
 def best_bridge_removal(
     known: FactorStore,
-    joins: Iterable[BridgeEdge],
+    bridges: Iterable[BridgeEdge],
     closure: RelativePose,
     pose: Pose,
     variables: Variables,
@@ -116,9 +116,9 @@ def best_bridge_removal(
         edge can be replaced, or if two choices leave equally many closures.
     """
     found = [
-        (joined, *other)
-        for joined in joins
-        if (other := replace_bridge_by_consensus(known, joined, closure, pose, variables, initial))
+        (bridge, *other)
+        for bridge in bridges
+        if (other := replace_bridge_by_consensus(known, bridge, closure, pose, variables, initial))
         is not None
     ]
     most = max((len(other.closures.accepted) for _, other, _ in found), default=0)
@@ -128,7 +128,7 @@ def best_bridge_removal(
 
 def replace_bridge_by_consensus(
     known: FactorStore,
-    joined: BridgeEdge,
+    bridge: BridgeEdge,
     closure: RelativePose,
     pose: Pose,
     variables: Variables,
@@ -138,7 +138,7 @@ def replace_bridge_by_consensus(
 
     Args:
         known: Store of all measurements, which is not changed.
-        joined: Bridge edge to replace.
+        bridge: Bridge edge to replace.
         closure: Rejected closure that would become the bridge edge.
         pose: Function that returns the current T_map_keyframe [4, 4].
         variables: Current values of the variables.
@@ -148,32 +148,37 @@ def replace_bridge_by_consensus(
         The factors and variables after the replacement. None if the number of agreeing closures is
         not larger than for the old bridge edge.
     """
-    across = [c for pair, c in known.closures.accepted.items() if joined.is_across(pair)]
-    doubts = [c for pair, c in known.doubts.items() if joined.is_across(pair)]
-    if len(doubts) <= 1 + len(across):
+    across = [c for pair, c in known.closures.accepted.items() if bridge.is_across(pair)]
+    contradicting = [c for pair, c in known.contradicting.items() if bridge.is_across(pair)]
+    if len(contradicting) <= 1 + len(across):
         return None
-    other = _exchanged(known, joined, closure)
-    moves = T_new_old(closure, pose, moves_b=closure.b in joined.connected_keyframes)
-    variables = known.moved(joined.connected_keyframes, moves, variables)
-    for one in (*(doubt for doubt in doubts if doubt is not closure), *across):
-        verdict, found = check_against_bridge(other, one, variables, initial)
-        other.closures = other.closures.with_decision(one, verdict)
-        variables = found if verdict.changes else variables
-    agreeing = [pair for pair in other.closures.accepted if joined.is_across(pair)]
+    other = _exchanged(known, bridge, closure)
+    moves = T_new_old(closure, pose, moves_b=closure.b in bridge.connected_keyframes)
+    variables = known.moved(bridge.connected_keyframes, moves, variables)
+    for one in (
+        *(other_closure for other_closure in contradicting if other_closure is not closure),
+        *across,
+    ):
+        decision, found = check_against_bridge(other, one, variables, initial)
+        other.closures = other.closures.with_decision(one, decision)
+        variables = found if decision.changes else variables
+    agreeing = [pair for pair in other.closures.accepted if bridge.is_across(pair)]
     if len(agreeing) <= len(across):
         return None
-    other.doubts = {pair: c for pair, c in other.doubts.items() if pair not in agreeing}
+    other.contradicting = {
+        pair: c for pair, c in other.contradicting.items() if pair not in agreeing
+    }
     return other, variables
 
 
-def _exchanged(known: FactorStore, joined: BridgeEdge, closure: RelativePose) -> FactorStore:
+def _exchanged(known: FactorStore, bridge: BridgeEdge, closure: RelativePose) -> FactorStore:
     """Return the factors with a closure in place of a bridge edge.
 
     The other closures between the two sides of the edge are removed; the caller checks them again.
     """
     other, pair = copy(known), pair_of(closure)
-    across = [p for p in known.closures.accepted if joined.is_across(p)]
-    other.joins = {p: m for p, m in known.joins.items() if p != joined.pair} | {pair: closure}
-    other.closures = known.closures.without(across).with_replaced_bridge(joined.pair, pair)
-    other.doubts = {p: m for p, m in known.doubts.items() if p != pair}
+    across = [p for p in known.closures.accepted if bridge.is_across(p)]
+    other.bridges = {p: m for p, m in known.bridges.items() if p != bridge.pair} | {pair: closure}
+    other.closures = known.closures.without(across).with_replaced_bridge(bridge.pair, pair)
+    other.contradicting = {p: m for p, m in known.contradicting.items() if p != pair}
     return other

@@ -54,7 +54,7 @@ class CondensedKeyframes:
         ids, transforms = np.zeros(0, np.int64), np.zeros((0, 4, 4))
         return CondensedKeyframes(ids, ids, ids, transforms, transforms, np.zeros(0))
 
-    def joined_by(self, more: "CondensedKeyframes") -> "CondensedKeyframes":
+    def merged_with(self, more: "CondensedKeyframes") -> "CondensedKeyframes":
         """Return these condensed keyframes with others appended."""
         columns = (getattr(self, name) for name in self.__slots__)
         others = (getattr(more, name) for name in self.__slots__)
@@ -153,7 +153,7 @@ class Condensed:
     """Condensed group: the measurement from its head to its tail, and its condensed keyframes."""
 
     edge: RelativePose
-    followers: CondensedKeyframes
+    interpolated: CondensedKeyframes
 
 
 def group_to_condense(

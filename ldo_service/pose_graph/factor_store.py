@@ -23,11 +23,11 @@ from .factors import (
     closure_information,
     closure_residual,
     odometry_information,
+    pack_observations,
     pack_relative,
-    pack_sights,
     prior_factor,
+    unpack_observations,
     unpack_relative,
-    unpack_sights,
 )
 from .loop_closures import LoopClosureConfig, LoopClosureSet, Pair, pair_of
 from .solver import Name, Variables, point_key
@@ -48,12 +48,12 @@ class FactorStore:
         self.odometry: dict[Pair, RelativePose] = {}  # Measurements between variables.
         # Edges, each from the head of a group to its tail.
         self.condensed: dict[Pair, RelativePose] = {}
-        self.joins: dict[Pair, RelativePose] = {}  # Bridge edges between merged components.
+        self.bridges: dict[Pair, RelativePose] = {}  # Bridge edges between merged components.
         self.closures = LoopClosureSet(closures)
         # Closures that contradict a bridge edge; the newest.
-        self.doubts: dict[Pair, RelativePose] = {}
-        self.sights: dict[Pair, BoxObservation] = {}  # Observations by keyframe and landmark.
-        self.followers = CondensedKeyframes.none()
+        self.contradicting: dict[Pair, RelativePose] = {}
+        self.observations: dict[Pair, BoxObservation] = {}  # Observations by keyframe and landmark.
+        self.interpolated = CondensedKeyframes.none()
         self.rows: dict[int, int] = {}  # Row of each condensed keyframe.
 
     # --- what changes -----------------------------------------------------------------------------
@@ -86,10 +86,10 @@ class FactorStore:
         """
         row = self.rows.get(m.b)
         if row is not None:
-            self.followers = self.followers.moved(row, self._in_head_of_b(m, pose))
+            self.interpolated = self.interpolated.moved(row, self._in_head_of_b(m, pose))
             return None
-        if (m.a, m.b) in self.joins:
-            self.joins[m.a, m.b] = m
+        if (m.a, m.b) in self.bridges:
+            self.bridges[m.a, m.b] = m
             return ("join", m.a, m.b)
         between = self.between_variables(m)
         pair = between.a, between.b
@@ -118,19 +118,19 @@ class FactorStore:
             group: Ids of the keyframes, in order.
             T_map: Current poses T_map_keyframe [4, 4] of the group.
         """
-        followers = set(group[1:-1])
+        interpolated = set(group[1:-1])
         closed = {
             pair: closure
             for pair, closure in self.closures.accepted.items()
-            if set(pair) <= set(group) and followers.intersection(pair)
+            if set(pair) <= set(group) and interpolated.intersection(pair)
         }
         one = condense(group, self.odometry, closed.values(), T_map, self._noise)
         self.closures = self.closures.without(closed)
-        gone = [self.odometry.pop(p) for p in list(self.odometry) if followers.intersection(p)]
+        gone = [self.odometry.pop(p) for p in list(self.odometry) if interpolated.intersection(p)]
         self.odometry.pop((group[0], group[-1]), None)
         self.condensed[one.edge.a, one.edge.b] = one.edge
-        self.followers = self.followers.joined_by(one.followers)
-        self.rows = self.followers.index()
+        self.interpolated = self.interpolated.merged_with(one.interpolated)
+        self.rows = self.interpolated.index()
         self.active = [k for k in self.active if k not in group[:-1]]
         outside = [self.between_variables(m) for m in gone if not {m.a, m.b} <= set(group)]
         for m in connecting_measurements(outside, [(m.a, m.b) for m in self.relative()]):
@@ -145,10 +145,10 @@ class FactorStore:
         """
         row = self.rows[keyframe]
         head, tail = (
-            int(self.followers.start_variables[row]),
-            int(self.followers.end_variables[row]),
+            int(self.interpolated.start_variables[row]),
+            int(self.interpolated.end_variables[row]),
         )
-        share, T_head = float(self.followers.fractions[row]), self.followers.T_head[row]
+        share, T_head = float(self.interpolated.fractions[row]), self.interpolated.T_head[row]
         edge = self.condensed.pop((head, tail))
         T_tail = se3.inverse(T_head) @ edge.T_a_b
         covariance, adjoint = np.linalg.inv(edge.information), se3.adjoint(T_tail)
@@ -156,8 +156,8 @@ class FactorStore:
         behind = edge.information / (1 - share)
         self.condensed[head, keyframe] = RelativePose(head, keyframe, T_head, before)
         self.condensed[keyframe, tail] = RelativePose(keyframe, tail, T_tail, behind)
-        self.followers = self.followers.without_split(row)
-        self.rows = self.followers.index()
+        self.interpolated = self.interpolated.without_split(row)
+        self.rows = self.interpolated.index()
 
     def interpolation_error_sigmas(self, keyframe: int, variables: Variables) -> float:
         """Return by how much the pose of a condensed keyframe differs, computed from its two ends.
@@ -168,13 +168,13 @@ class FactorStore:
         row = self.rows.get(keyframe)
         if row is None:
             return 0.0
-        follower = self.followers.only(row)
+        inner = self.interpolated.only(row)
         T_head, T_tail = (
-            variables[int(follower.start_variables[0])],
-            variables[int(follower.end_variables[0])],
+            variables[int(inner.start_variables[0])],
+            variables[int(inner.end_variables[0])],
         )
-        by_head, by_tail = T_head @ follower.T_head[0], T_tail @ follower.T_tail[0]
-        off, share = np.abs(se3.log(se3.inverse(by_head) @ by_tail)), float(follower.fractions[0])
+        by_head, by_tail = T_head @ inner.T_head[0], T_tail @ inner.T_tail[0]
+        off, share = np.abs(se3.log(se3.inverse(by_head) @ by_tail)), float(inner.fractions[0])
         sigmas = np.repeat([self._noise.sigma_loop_rad, self._noise.sigma_loop_m], 3)
         return min(share, 1 - share) * float((off / sigmas).max())
 
@@ -186,8 +186,8 @@ class FactorStore:
         """
         yield from self.odometry.values()
         yield from self.condensed.values()
-        joins = (m for pair, m in self.joins.items() if pair != without)
-        yield from map(self.between_variables, joins)
+        bridges = (m for pair, m in self.bridges.items() if pair != without)
+        yield from map(self.between_variables, bridges)
 
     # --- condensed keyframes ----------------------------------------------------------------------
     def relative_to_start(self, keyframe: int) -> tuple[int, np.ndarray]:
@@ -198,7 +198,7 @@ class FactorStore:
         row = self.rows.get(keyframe)
         if row is None:
             return keyframe, np.eye(4)
-        return int(self.followers.start_variables[row]), self.followers.T_head[row]
+        return int(self.interpolated.start_variables[row]), self.interpolated.T_head[row]
 
     def relative_to_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
         """Return the nearer one of head and tail of a keyframe, and T_variable_keyframe [4, 4].
@@ -206,9 +206,9 @@ class FactorStore:
         For a keyframe that is a variable, return the keyframe itself and the identity.
         """
         row = self.rows.get(keyframe)
-        if row is None or self.followers.fractions[row] <= 0.5:
+        if row is None or self.interpolated.fractions[row] <= 0.5:
             return self.relative_to_start(keyframe)
-        return int(self.followers.end_variables[row]), self.followers.T_tail[row]
+        return int(self.interpolated.end_variables[row]), self.interpolated.T_tail[row]
 
     def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
         """Return the variables to which a measurement is transferred, one for each keyframe.
@@ -242,11 +242,14 @@ class FactorStore:
         for keyframe, (variable, _), T in zip((m.a, m.b), self.ends(m), T_b_end, strict=True):
             if (row := self.rows.get(keyframe)) is None:
                 continue
-            pair = int(self.followers.start_variables[row]), int(self.followers.end_variables[row])
-            share = self.followers.fractions[row]
+            pair = (
+                int(self.interpolated.start_variables[row]),
+                int(self.interpolated.end_variables[row]),
+            )
+            share = self.interpolated.fractions[row]
             away = share if variable == pair[0] else 1 - share
             # Adjoint of T_b_tail.
-            adjoint = se3.adjoint(T @ se3.inverse(self.followers.T_tail[row]))
+            adjoint = se3.adjoint(T @ se3.inverse(self.interpolated.T_tail[row]))
             covariance = np.linalg.inv(self.condensed[pair].information)
             total += away * adjoint @ covariance @ adjoint.T
         return total
@@ -255,10 +258,11 @@ class FactorStore:
     def names(self) -> Iterable[Name]:
         """Yield the names of all factors in a fixed order."""
         yield from (("first", k) for k, first in self.first_of.items() if k == first)
-        for kind in ("odometry", "condensed", "joins"):
-            yield from ((kind.removesuffix("s"), *pair) for pair in getattr(self, kind))
+        kinds = {"odometry": self.odometry, "condensed": self.condensed, "join": self.bridges}
+        for kind, measurements in kinds.items():
+            yield from ((kind, *pair) for pair in measurements)
         yield from (("closure", *pair) for pair in self.closures.accepted)
-        yield from (("sight", *pair) for pair in self.sights)
+        yield from (("sight", *pair) for pair in self.observations)
 
     def factor(self, name: Name, initial: Variables) -> gtsam.NonlinearFactor:
         """Return the factor of a name.
@@ -277,11 +281,13 @@ class FactorStore:
                 m = self.condensed[pair]
                 return between_factor(m.a, m.b, m.T_a_b, m.information)
             case "join":
-                return self._odometry_factor(self.between_variables(self.joins[pair]))
+                return self._odometry_factor(self.between_variables(self.bridges[pair]))
             case "closure":
                 return self._closure_factor(self.closures.accepted[pair], self._noise.robust_sigmas)
-        sight = self.sights[pair]
-        return box_factor(sight, *self.relative_to_variable(sight.keyframe), self._noise)
+        observation = self.observations[pair]
+        return box_factor(
+            observation, *self.relative_to_variable(observation.keyframe), self._noise
+        )
 
     def with_closures(
         self, closures: Iterable[RelativePose], initial: Variables
@@ -328,15 +334,17 @@ class FactorStore:
 
     def moved(self, theirs: Set[int], T_new_old: np.ndarray, variables: Variables) -> Variables:
         """Return the variables after some keyframes and the landmarks observed there were moved."""
-        points = {point_key(s.landmark) for s in self.sights.values() if s.keyframe in theirs}
+        points = {point_key(s.landmark) for s in self.observations.values() if s.keyframe in theirs}
         moved = {k: T_new_old @ variables[k] for k in variables.keys() & theirs}
         moved |= {k: se3.transform(T_new_old, variables[k]) for k in variables.keys() & points}
         return {k: moved.get(k, value) for k, value in variables.items()}
 
     def keep_rejected(self, closure: RelativePose) -> None:
         """Store a rejected closure that contradicts a bridge edge; only the newest are kept."""
-        doubts = {**self.doubts, pair_of(closure): closure}
-        self.doubts = dict(list(doubts.items())[-self.closures.config.doubts :])
+        contradicting = {**self.contradicting, pair_of(closure): closure}
+        self.contradicting = dict(
+            list(contradicting.items())[-self.closures.config.max_contradicting :]
+        )
 
     # --- state ------------------------------------------------------------------------------------
     def pack(self) -> dict[str, Any]:
@@ -347,11 +355,11 @@ class FactorStore:
             "active": np.array(self.active, np.int64),
             "odometry": pack_relative(self.odometry.values()),
             "condensed": pack_relative(self.condensed.values()),
-            "joins": pack_relative(self.joins.values()),
-            "doubts": pack_relative(self.doubts.values()),
+            "joins": pack_relative(self.bridges.values()),
+            "doubts": pack_relative(self.contradicting.values()),
             "closures": self.closures.pack(),
-            "sights": pack_sights(self.sights.values()),
-            "followers": self.followers.pack(),
+            "sights": pack_observations(self.observations.values()),
+            "followers": self.interpolated.pack(),
         }
 
     def unpack(self, packed: Mapping[str, Any]) -> None:
@@ -359,9 +367,13 @@ class FactorStore:
         keyframes = packed["keyframes"].tolist()
         self.first_of = dict(zip(keyframes, packed["first_of"].tolist(), strict=True))
         self.active = packed["active"].tolist()
-        for name in ("odometry", "condensed", "joins", "doubts"):
-            setattr(self, name, {(m.a, m.b): m for m in unpack_relative(packed[name])})
+        self.odometry, self.condensed, self.bridges, self.contradicting = (
+            {(m.a, m.b): m for m in unpack_relative(packed[name])}
+            for name in ("odometry", "condensed", "joins", "doubts")
+        )
         self.closures = LoopClosureSet.unpack(self.closures.config, packed["closures"])
-        self.sights = {(s.keyframe, s.landmark): s for s in unpack_sights(packed["sights"])}
-        self.followers = CondensedKeyframes(**packed["followers"])
-        self.rows = self.followers.index()
+        self.observations = {
+            (s.keyframe, s.landmark): s for s in unpack_observations(packed["sights"])
+        }
+        self.interpolated = CondensedKeyframes(**packed["followers"])
+        self.rows = self.interpolated.index()

@@ -42,10 +42,11 @@ class NoiseConfig:
     sigma_box_px: float = 4.0
     sigma_box_share: float = 0.15
     # Observations of an object from one side share that error, so N of them have less information
-    # than N independent ones. The maximum number per landmark (`landmarks.max_sights`) counts as a
+    # than N independent ones. The maximum number per landmark (`landmarks.max_observations`)
+    # counts as a
     # tenth of one. Counted as one, they moved odometry by 3 mm that was accurate to 2 mm
     # (docs/decisions/0057-tenth-information.md).
-    independent_sights: float = 1 / 320
+    independent_observations: float = 1 / 320
     robust_sigmas: float = 2.385  # Cauchy kernel width: 95 % efficient on Gaussian noise.
 
     def __post_init__(self) -> None:
@@ -55,8 +56,8 @@ class NoiseConfig:
             raise ConfigError(named(self, *sigmas) + " must be positive.")
         if min(getattr(self, name) for name in optional) < 0:
             raise ConfigError(named(self, *optional) + " must not be negative.")
-        if self.independent_sights > 1:
-            raise ConfigError(named(self, "independent_sights") + " must be at most 1.")
+        if self.independent_observations > 1:
+            raise ConfigError(named(self, "independent_observations") + " must be at most 1.")
 
     @property
     def floor(self) -> np.ndarray:
@@ -126,28 +127,29 @@ def between_factor(
 
 
 def box_factor(
-    sight: BoxObservation, variable: int, T_variable_keyframe: np.ndarray, noise: NoiseConfig
+    observation: BoxObservation, variable: int, T_variable_keyframe: np.ndarray, noise: NoiseConfig
 ) -> gtsam.NonlinearFactor:
     """Return the reprojection factor of an observation.
 
-    Its cost is s rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2) with s = `independent_sights`. A point
+    Its cost is s rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2) with s = `independent_observations`. A
+    point
     behind the camera has a constant cost and no gradient.
 
     Args:
-        sight: The observation.
+        observation: The observation.
         variable: Id of the keyframe; if it is condensed, the id of its head or tail.
         T_variable_keyframe: Pose of the keyframe in that variable, [4, 4].
         noise: Noise of the measurements.
     """
-    share = np.sqrt(noise.independent_sights)
-    sigma = sight.sigma_px / np.sqrt(sight.weight) / share
+    share = np.sqrt(noise.independent_observations)
+    sigma = observation.sigma_px / np.sqrt(observation.weight) / share
     model = _robust(gtsam.noiseModel.Isotropic.Sigma(2, sigma), share * noise.robust_sigmas)
-    fx, fy, cx, cy = sight.intrinsics
+    fx, fy, cx, cy = observation.intrinsics
     return gtsam.GenericProjectionFactorCal3_S2(
-        sight.center_px,
+        observation.center_px,
         model,
         variable,
-        point_key(sight.landmark),
+        point_key(observation.landmark),
         gtsam.Cal3_S2(fx, fy, 0.0, cx, cy),
         gtsam.Pose3(T_variable_keyframe),
     )
@@ -188,20 +190,22 @@ def unpack_relative(packed: Mapping[str, np.ndarray]) -> list[RelativePose]:
     ]
 
 
-def pack_sights(sights: Iterable[BoxObservation]) -> Packed:
+def pack_observations(observations: Iterable[BoxObservation]) -> Packed:
     """Return observations as arrays."""
-    sights = list(sights)
+    observations = list(observations)
     return {
-        "pairs": np.array([(s.keyframe, s.landmark) for s in sights], np.int64).reshape(-1, 2),
-        "centers_px": np.array([s.center_px for s in sights], float).reshape(-1, 2),
-        "intrinsics": np.array([s.intrinsics for s in sights], float).reshape(-1, 4),
-        "sigmas_px": np.array([s.sigma_px for s in sights], float),
-        "weights": np.array([s.weight for s in sights], float),
+        "pairs": np.array([(s.keyframe, s.landmark) for s in observations], np.int64).reshape(
+            -1, 2
+        ),
+        "centers_px": np.array([s.center_px for s in observations], float).reshape(-1, 2),
+        "intrinsics": np.array([s.intrinsics for s in observations], float).reshape(-1, 4),
+        "sigmas_px": np.array([s.sigma_px for s in observations], float),
+        "weights": np.array([s.weight for s in observations], float),
     }
 
 
-def unpack_sights(packed: Mapping[str, np.ndarray]) -> list[BoxObservation]:
-    """Return the observations that `pack_sights` packed."""
+def unpack_observations(packed: Mapping[str, np.ndarray]) -> list[BoxObservation]:
+    """Return the observations that `pack_observations` packed."""
     columns = (packed[name] for name in ("centers_px", "sigmas_px", "intrinsics", "weights"))
     return [
         BoxObservation(

@@ -10,7 +10,7 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
-from .factors import BoxObservation, NoiseConfig, pack_sights, unpack_sights
+from .factors import BoxObservation, NoiseConfig, pack_observations, unpack_observations
 from .label_fusion import Evidence, fuse_labels
 from .loop_closures import Pair
 from .pose_graph import PoseGraph
@@ -46,15 +46,16 @@ class ObjectLandmarkConfig:
     # Entropy above which an observation has weight exp(-2 H) and a landmark is removed earlier
     # (III.C).
     vague_nats: float = 0.5
-    min_sights: int = 3  # Minimum observations of a landmark in the graph (III.C).
+    min_observations: int = 3  # Minimum observations of a landmark in the graph (III.C).
     # Minimum parallax, 5 deg: an error of 12 px at 2 m and 525 px focal length is 0.5 m in depth.
     min_parallax_rad: float = 0.09
     # Maximum observations of a landmark in the graph; the first half of them is never replaced.
-    max_sights: int = 32
+    max_observations: int = 32
     misses: int = 10  # Consecutive misses after which a landmark is removed (III.C).
     vague_misses: int = 5  # The same for a landmark with high entropy.
     vague_keyframes: int = 20  # Keyframes without observation after which such a one is removed.
-    most: int = 1000  # Maximum landmarks; beyond, the least recently observed ones are removed.
+    # Maximum landmarks; beyond, the least recently observed ones are removed.
+    max_landmarks: int = 1000
     # adaptive: the graph takes observations in once their total weight reaches `due_weight`;
     # fixed: at every keyframe with observations.
     schedule: Literal["adaptive", "fixed"] = "adaptive"
@@ -62,19 +63,25 @@ class ObjectLandmarkConfig:
     max_waiting: int = 256  # Maximum waiting observations, however small their weight.
 
     def __post_init__(self) -> None:
-        counts = (self.max_sights, self.misses, self.vague_misses, self.most, self.max_waiting)
-        if min(counts) < 1 or self.min_sights < 2:
+        counts = (
+            self.max_observations,
+            self.misses,
+            self.vague_misses,
+            self.max_landmarks,
+            self.max_waiting,
+        )
+        if min(counts) < 1 or self.min_observations < 2:
             raise ConfigError(
                 named(
                     self,
-                    "min_sights",
-                    "max_sights",
+                    "min_observations",
+                    "max_observations",
                     "misses",
                     "vague_misses",
-                    "most",
+                    "max_landmarks",
                     "max_waiting",
                 )
-                + " must be at least 1, and min_sights at least 2."
+                + " must be at least 1, and min_observations at least 2."
             )
         if min(self.lambda_sem, self.due_weight, self.min_parallax_rad) <= 0 or self.w_sem < 0:
             raise ConfigError(
@@ -127,13 +134,15 @@ class Landmark:
 
     evidence: Evidence
     distribution: np.ndarray  # Fused class distribution, [C].
-    sights: tuple[BoxObservation, ...] = ()
+    observations: tuple[BoxObservation, ...] = ()
     misses: int = 0  # Consecutive misses.
     last: int = -1  # Id of the last keyframe that observed it.
 
     def knows(self, keyframe: int) -> bool:
         """Return whether the landmark already has an observation in a keyframe."""
-        return keyframe == self.last or any(sight.keyframe == keyframe for sight in self.sights)
+        return keyframe == self.last or any(
+            observation.keyframe == keyframe for observation in self.observations
+        )
 
     @property
     def entropy(self) -> float:
@@ -145,8 +154,10 @@ class Landmark:
 class ObjectLandmarks:
     """Landmarks of the pose graph, with their observations and fused class distributions.
 
-    The result is deterministic. There are at most `most` landmarks, each with 4 kB and at most
-    `max_sights` observations. Pairs of landmarks observed in the same keyframe take memory too.
+    The result is deterministic. There are at most `max_landmarks` landmarks, each with 4 kB and at
+    most
+    `max_observations` observations. Pairs of landmarks observed in the same keyframe take memory
+    too.
     """
 
     def __init__(self, config: ObjectLandmarkConfig, noise: NoiseConfig) -> None:
@@ -199,12 +210,14 @@ class ObjectLandmarks:
             return  # Sent again after a restart.
         old = old or Landmark(Evidence.none(MAX_CLASSES), np.full(MAX_CLASSES, 1 / MAX_CLASSES))
         evidence = old.evidence.with_observed(seen.distribution, self.weight(seen.entropy))
-        sights = (*old.sights, self._sight(seen)) if seen.is_whole else old.sights
+        observations = (
+            (*old.observations, self._observation(seen)) if seen.is_whole else old.observations
+        )
         self.known[seen.landmark] = replace(
-            old, evidence=evidence, sights=sights, misses=0, last=seen.keyframe
+            old, evidence=evidence, observations=observations, misses=0, last=seen.keyframe
         )
 
-    def _sight(self, seen: LandmarkObservation) -> BoxObservation:
+    def _observation(self, seen: LandmarkObservation) -> BoxObservation:
         x0, y0, x1, y1 = seen.box_px
         share_px = self._noise.sigma_box_share * max(x1 - x0, y1 - y0)
         return BoxObservation(
@@ -234,12 +247,12 @@ class ObjectLandmarks:
         """
         new, placed, gone = [], {}, []
         for k in sorted({landmark for _, landmark in waiting}):
-            sights = [s for s in self.known[k].sights if s.keyframe in graph]
-            kept = self._thinned(sights)
-            self.known[k] = replace(self.known[k], sights=kept)
+            observations = [s for s in self.known[k].observations if s.keyframe in graph]
+            kept = self._thinned(observations)
+            self.known[k] = replace(self.known[k], observations=kept)
             if graph.has_landmark(k):
                 left = {s.keyframe for s in kept}
-                gone += [(s.keyframe, k) for s in sights if s.keyframe not in left]
+                gone += [(s.keyframe, k) for s in observations if s.keyframe not in left]
                 new += [s for s in kept if (s.keyframe, k) in waiting]
             elif (point := self._triangulated(kept, graph)) is not None:
                 placed[k] = point
@@ -248,30 +261,32 @@ class ObjectLandmarks:
             graph.add_observations(new, placed)
         graph.remove_observations(gone)
 
-    def _thinned(self, sights: list[BoxObservation]) -> tuple[BoxObservation, ...]:
-        """Return at most `max_sights` observations: the first ones and the newest ones.
+    def _thinned(self, observations: list[BoxObservation]) -> tuple[BoxObservation, ...]:
+        """Return at most `max_observations` observations: the first ones and the newest ones.
 
         The first ones limit the drift of the landmark.
         """
-        half = self._config.max_sights // 2
-        excess = len(sights) - self._config.max_sights
-        return tuple(sights if excess <= 0 else sights[:half] + sights[half + excess :])
+        half = self._config.max_observations // 2
+        excess = len(observations) - self._config.max_observations
+        return tuple(
+            observations if excess <= 0 else observations[:half] + observations[half + excess :]
+        )
 
     def _triangulated(
-        self, sights: Iterable[BoxObservation], graph: PoseGraph
+        self, observations: Iterable[BoxObservation], graph: PoseGraph
     ) -> np.ndarray | None:
         """Triangulate the point [3] in the map where the rays through the box centers meet.
 
         Return None in these cases: too few observations, too little parallax, a point behind a
         camera, or a point projected too far from the center of a box.
         """
-        sights = list(sights)
-        if len(sights) < self._config.min_sights:
+        observations = list(observations)
+        if len(observations) < self._config.min_observations:
             return None
-        T_map = np.array([graph.pose(s.keyframe) for s in sights])
-        fx, fy, cx, cy = np.array([s.intrinsics for s in sights]).T
-        u, v = np.array([s.center_px for s in sights]).T
-        rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(len(sights))], axis=1)
+        T_map = np.array([graph.pose(s.keyframe) for s in observations])
+        fx, fy, cx, cy = np.array([s.intrinsics for s in observations]).T
+        u, v = np.array([s.center_px for s in observations]).T
+        rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(len(observations))], axis=1)
         try:
             point, parallax_rad = triangulate(
                 T_map[:, :3, 3], (T_map[:, :3, :3] @ rays[..., None])[..., 0]
@@ -282,7 +297,7 @@ class ObjectLandmarks:
         if parallax_rad < self._config.min_parallax_rad or p[:, 2].min() <= 0.1:
             return None
         off_px = np.hypot(fx * p[:, 0] / p[:, 2] + cx - u, fy * p[:, 1] / p[:, 2] + cy - v)
-        sigmas_px = np.array([s.sigma_px for s in sights])
+        sigmas_px = np.array([s.sigma_px for s in observations])
         return point if np.all(off_px < 3 * sigmas_px) else None
 
     # --- labels -----------------------------------------------------------------------------------
@@ -309,14 +324,14 @@ class ObjectLandmarks:
         linearized at the current poses.
         """
         newest = graph.newest or 0
-        gone = [k for k, landmark in self.known.items() if self._is_gone(landmark, newest)]
+        gone = [k for k, landmark in self.known.items() if self._should_remove(landmark, newest)]
         by_age = sorted(self.known.keys() - set(gone), key=lambda k: (self.known[k].last, k))
-        gone += by_age[: max(0, len(by_age) - self._config.most)]
+        gone += by_age[: max(0, len(by_age) - self._config.max_landmarks)]
         for k in gone:
-            graph.remove_observations((s.keyframe, k) for s in self.known.pop(k).sights)
+            graph.remove_observations((s.keyframe, k) for s in self.known.pop(k).observations)
         self._pairs = {pair for pair in self._pairs if set(pair) <= self.known.keys()}
 
-    def _is_gone(self, landmark: Landmark, newest: int) -> bool:
+    def _should_remove(self, landmark: Landmark, newest: int) -> bool:
         config = self._config
         if landmark.misses >= config.misses:
             return True
@@ -339,19 +354,19 @@ class ObjectLandmarks:
             "log_sums": np.array([one.evidence.log_sum for one in known]).reshape(-1, MAX_CLASSES),
             "distributions": np.array([one.distribution for one in known]).reshape(-1, MAX_CLASSES),
             "misses": [(one.misses, one.last) for one in known],
-            "sights": pack_sights(s for one in known for s in one.sights),
+            "sights": pack_observations(s for one in known for s in one.observations),
             "pairs": sorted(self._pairs),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a snapshot."""
         packed = state["known"]
-        sights: dict[int, list[BoxObservation]] = {}
-        for sight in unpack_sights(packed["sights"]):
-            sights.setdefault(sight.landmark, []).append(sight)
+        observations: dict[int, list[BoxObservation]] = {}
+        for observation in unpack_observations(packed["sights"]):
+            observations.setdefault(observation.landmark, []).append(observation)
         columns = (packed[n] for n in ("ids", "weights", "log_sums", "distributions", "misses"))
         self.known = {
-            k: Landmark(Evidence(weight, log_sum), p, tuple(sights.get(k, ())), *misses)
+            k: Landmark(Evidence(weight, log_sum), p, tuple(observations.get(k, ())), *misses)
             for k, weight, log_sum, p, misses in zip(*columns, strict=True)
         }
         self._pairs = {(i, j) for i, j in packed["pairs"]}

@@ -30,22 +30,26 @@ class LoopClosureConfig:
     max_cost: float = 20.06
     # Maximum residual of an accepted closure in any direction, in sigmas (RTAB-Map's guard).
     max_sigmas: float = 3.0
-    rivals: int = 3  # Earlier closures to test for removal instead of a new one; worst fit first.
+    # Earlier closures to test for removal instead of a new one; worst fit first.
+    max_removal_tests: int = 3
     # Maximum accepted closures, 1 kB each and one more factor to solve. Beyond, the older of the
     # two most similar ones is removed.
-    most: int = 500
+    max_closures: int = 500
     # Rejected closures kept that contradict a bridge edge; two that agree replace it.
-    doubts: int = 16
-    remembered: int = 256  # Rejected and removed closures kept, each, for publication.
+    max_contradicting: int = 16
+    max_rejected: int = 256  # Rejected and removed closures kept, each, for publication.
 
     def __post_init__(self) -> None:
-        if min(self.max_cost, self.max_sigmas) <= 0 or self.rivals < 0:
+        if min(self.max_cost, self.max_sigmas) <= 0 or self.max_removal_tests < 0:
             raise ConfigError(
-                named(self, "max_cost", "max_sigmas", "rivals")
-                + " must be positive, except rivals, which must not be negative."
+                named(self, "max_cost", "max_sigmas", "max_removal_tests")
+                + " must be positive, except max_removal_tests, which must not be negative."
             )
-        if min(self.most, self.doubts, self.remembered) < 1:
-            raise ConfigError(named(self, "most", "doubts", "remembered") + " must be at least 1.")
+        if min(self.max_closures, self.max_contradicting, self.max_rejected) < 1:
+            raise ConfigError(
+                named(self, "max_closures", "max_contradicting", "max_rejected")
+                + " must be at least 1."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +97,12 @@ class LoopClosureSet:
         chosen = [*before, closure]
         variables, cost = solve(chosen)
         if cost - cost_before > self.config.max_cost:
-            rival = self._find_conflicting(closure, before, cost_before, solve, variables, sigmas)
-            if rival is None:
+            conflicting = self._find_conflicting(
+                closure, before, cost_before, solve, variables, sigmas
+            )
+            if conflicting is None:
                 return ClosureDecision(False), variables
-            chosen = [c for c in chosen if c is not rival]
+            chosen = [c for c in chosen if c is not conflicting]
             variables, cost = solve(chosen)
         while chosen and (worst := max(chosen, key=lambda c: sigmas(variables, c))):
             if sigmas(variables, worst) <= self.config.max_sigmas:
@@ -124,41 +130,41 @@ class LoopClosureSet:
         """
         fitting = sorted(before, key=lambda c: sigmas(variables, c), reverse=True)
         best, best_cost = None, cost_before
-        for rival in fitting[: self.config.rivals]:
-            others = [c for c in before if c is not rival]
+        for conflicting in fitting[: self.config.max_removal_tests]:
+            others = [c for c in before if c is not conflicting]
             _, cost_others = solve(others)
             _, cost = solve([*others, closure])
             if cost < best_cost and cost - cost_others <= self.config.max_cost:
-                best, best_cost = rival, cost
+                best, best_cost = conflicting, cost
         return best
 
-    def with_decision(self, closure: RelativePose, verdict: ClosureDecision) -> "LoopClosureSet":
+    def with_decision(self, closure: RelativePose, decision: ClosureDecision) -> "LoopClosureSet":
         """Return the set after a decision.
 
         A pair of keyframes is listed only once, by its latest decision: as accepted, rejected or
         removed.
         """
         pair = pair_of(closure)
-        accepted = {p: c for p, c in self.accepted.items() if p not in verdict.dropped}
-        if verdict.is_accepted:
+        accepted = {p: c for p, c in self.accepted.items() if p not in decision.dropped}
+        if decision.is_accepted:
             accepted |= {pair: closure}
         now_refused = {pair} - accepted.keys()
         refused = (p for p in (*self.rejected, *now_refused) if p not in accepted)
-        left = (p for p in (*self.removed, *verdict.dropped) if p not in accepted)
+        left = (p for p in (*self.removed, *decision.dropped) if p not in accepted)
         return replace(
             self,
             accepted=self._thinned(accepted),
-            rejected=self._remembered(p for p in refused if p not in verdict.dropped),
-            removed=self._remembered(p for p in left if p not in now_refused),
+            rejected=self._newest(p for p in refused if p not in decision.dropped),
+            removed=self._newest(p for p in left if p not in now_refused),
         )
 
     def _thinned(self, accepted: Mapping[Pair, RelativePose]) -> Mapping[Pair, RelativePose]:
-        """Return at most `most` closures.
+        """Return at most `max_closures` closures.
 
         If there is one more, the two closures with the most similar keyframe ids are redundant. The
         older one of them is removed.
         """
-        if len(accepted) <= self.config.most:
+        if len(accepted) <= self.config.max_closures:
             return accepted
         pairs = np.array(list(accepted))
         apart = np.abs(pairs[:, None] - pairs[None]).sum(axis=2)
@@ -170,20 +176,20 @@ class LoopClosureSet:
         """Return the set without some closures, which were condensed into other measurements."""
         return replace(self, accepted={p: c for p, c in self.accepted.items() if p not in pairs})
 
-    def with_replaced_bridge(self, join: Pair, closure: Pair) -> "LoopClosureSet":
+    def with_replaced_bridge(self, bridge: Pair, closure: Pair) -> "LoopClosureSet":
         """Return the set after a closure replaced a bridge edge; the old edge is listed as removed.
 
         Args:
-            join: Keyframes of the old bridge edge.
+            bridge: Keyframes of the old bridge edge.
             closure: Keyframes of the closure that replaced it.
         """
         refused = tuple(pair for pair in self.rejected if pair != closure)
-        left = self._remembered((*(pair for pair in self.removed if pair != closure), join))
+        left = self._newest((*(pair for pair in self.removed if pair != closure), bridge))
         return replace(self, rejected=refused, removed=left)
 
-    def _remembered(self, pairs: Iterable[Pair]) -> tuple[Pair, ...]:
-        """Return the newest pairs, at most `remembered`."""
-        return tuple(dict.fromkeys(pairs))[-self.config.remembered :]
+    def _newest(self, pairs: Iterable[Pair]) -> tuple[Pair, ...]:
+        """Return the newest pairs, at most `max_rejected`."""
+        return tuple(dict.fromkeys(pairs))[-self.config.max_rejected :]
 
     def pack(self) -> dict[str, Any]:
         """Return the set as arrays and plain values."""

@@ -21,10 +21,10 @@ from .factors import (
     BoxObservation,
     NoiseConfig,
     information,
+    pack_observations,
     pack_relative,
-    pack_sights,
+    unpack_observations,
     unpack_relative,
-    unpack_sights,
 )
 from .loop_closures import ClosureDecision, LoopClosureConfig, LoopClosureSet, Pair, pair_of
 from .solver import Name, Solver, Variables, point_key
@@ -41,7 +41,7 @@ class PoseGraphConfig:
     window_keyframes: int = 20  # Newest keyframes, not condensed: their measurements still change.
     # A condensed keyframe becomes a variable again if a closure changes it by more sigmas than
     # this. There is at most one group per `keyframes_each` keyframes, to bound the solver's time.
-    max_bent: float = 0.1
+    max_interpolation_sigmas: float = 0.1
     keyframes_each: int = 5
     max_changes: int = 64  # Number between two rebuilds; a restored graph repeats them bit by bit.
 
@@ -54,8 +54,8 @@ class PoseGraphConfig:
                 )
                 + " must be at least 1."
             )
-        if self.max_bent < 0:
-            raise ConfigError(named(self, "max_bent") + " must not be negative.")
+        if self.max_interpolation_sigmas < 0:
+            raise ConfigError(named(self, "max_interpolation_sigmas") + " must not be negative.")
 
 
 class PoseGraph:
@@ -185,23 +185,23 @@ class PoseGraph:
         if self.component_root(closure.a) != self.component_root(closure.b):
             self._merge_components(closure)
             return ClosureDecision(True)
-        if pair_of(closure) in self._known.joins:
+        if pair_of(closure) in self._known.bridges:
             return ClosureDecision(True)  # The same two images must not count twice.
         start, known = self._solver.variables(), self._known
         if known.relative_to_start(closure.a)[0] == known.relative_to_start(closure.b)[0]:
             return self._reject(closure)  # Too late: both have the same head now.
-        verdict, variables = check_against_bridge(known, closure, start, self._initial)
+        decision, variables = check_against_bridge(known, closure, start, self._initial)
         self.solved_times += 1
-        if not verdict.changes:
+        if not decision.changes:
             return self._reject(closure)
-        known.closures = known.closures.with_decision(closure, verdict)
+        known.closures = known.closures.with_decision(closure, decision)
         self._restart_solver(self._with_ends(closure, variables))
-        return verdict
+        return decision
 
     def _with_ends(self, closure: RelativePose, variables: Variables) -> Variables:
         """Make condensed keyframes of a closure variables again if they move too far.
 
-        The limit is `max_bent`, in standard deviations of a loop closure.
+        The limit is `max_interpolation_sigmas`, in standard deviations of a loop closure.
 
         Returns:
             The variables, with these keyframes included.
@@ -209,12 +209,13 @@ class PoseGraph:
         known, config = self._known, self._config
         for keyframe in (closure.a, closure.b):
             is_room = len(known.condensed) * config.keyframes_each < len(self)
-            if is_room and known.interpolation_error_sigmas(keyframe, variables) > config.max_bent:
-                follower = known.followers.only(known.rows[keyframe])
-                ends = int(follower.start_variables[0]), int(follower.end_variables[0])
+            error_sigmas = known.interpolation_error_sigmas(keyframe, variables)
+            if is_room and error_sigmas > config.max_interpolation_sigmas:
+                inner = known.interpolated.only(known.rows[keyframe])
+                ends = int(inner.start_variables[0]), int(inner.end_variables[0])
                 T_head, T_tail = (variables[k][None] for k in ends)
                 known.restore_variable(keyframe)
-                variables = {**variables, keyframe: follower.interpolated_poses(T_head, T_tail)[0]}
+                variables = {**variables, keyframe: inner.interpolated_poses(T_head, T_tail)[0]}
         return variables
 
     def _merge_components(self, measured: RelativePose) -> None:
@@ -226,7 +227,7 @@ class PoseGraph:
         moves = T_new_old(measured, self.pose, moves_b=first_a < first_b)
         younger, older = max(first_a, first_b), min(first_a, first_b)
         moved = self._known.move_component(younger, older, moves, self._solver.variables())
-        self._known.joins[measured.a, measured.b] = measured
+        self._known.bridges[measured.a, measured.b] = measured
         self._restart_solver(moved)
 
     def _reject(self, closure: RelativePose) -> ClosureDecision:
@@ -236,39 +237,39 @@ class PoseGraph:
         """
         known, variables = self._known, self._solver.variables()
         known.closures = known.closures.with_decision(closure, ClosureDecision(False))
-        joins = conflicting_bridges(known, closure)
-        self._log_change("refuse", measured=pack_relative([closure]), is_doubt=bool(joins))
-        if not joins:
+        bridges = conflicting_bridges(known, closure)
+        self._log_change("refuse", measured=pack_relative([closure]), is_doubt=bool(bridges))
+        if not bridges:
             return ClosureDecision(False)
         known.keep_rejected(closure)
-        better = best_bridge_removal(known, joins, closure, self.pose, variables, self._initial)
+        better = best_bridge_removal(known, bridges, closure, self.pose, variables, self._initial)
         if better is None:
             return ClosureDecision(False)
-        joined, self._known, variables = better
+        bridge, self._known, variables = better
         self._restart_solver(variables)
         gone = (p for p in known.closures.accepted if p not in self.closures.accepted)
-        return ClosureDecision(True, (joined.pair, *gone))
+        return ClosureDecision(True, (bridge.pair, *gone))
 
     # --- landmarks --------------------------------------------------------------------------------
     def add_observations(
-        self, sights: Sequence[BoxObservation], placed: Mapping[int, np.ndarray]
+        self, boxes: Sequence[BoxObservation], placed: Mapping[int, np.ndarray]
     ) -> None:
         """Add observations of landmarks in known keyframes.
 
         Args:
-            sights: The observations.
+            boxes: The observations.
             placed: Positions [3] in the map of the new landmarks among them, by id.
 
         Raises:
             KeyError: A keyframe is unknown.
         """
-        self._require(s.keyframe for s in sights)
+        self._require(s.keyframe for s in boxes)
         self._log_change(
-            "see", sights=pack_sights(sights), ids=list(placed), points=list(placed.values())
+            "see", sights=pack_observations(boxes), ids=list(placed), points=list(placed.values())
         )
         self._initial |= {point_key(k): np.array(p, float) for k, p in placed.items()}
-        self._known.sights |= {(s.keyframe, s.landmark): s for s in sights}
-        names = [("sight", s.keyframe, s.landmark) for s in sights]
+        self._known.observations |= {(s.keyframe, s.landmark): s for s in boxes}
+        names = [("sight", s.keyframe, s.landmark) for s in boxes]
         self._update(names, [point_key(k) for k in placed])
 
     def remove_observations(self, pairs: Iterable[Pair]) -> None:
@@ -277,13 +278,13 @@ class PoseGraph:
         Args:
             pairs: Keyframe and landmark of each observation; unknown pairs are ignored.
         """
-        known = [pair for pair in pairs if pair in self._known.sights]
+        known = [pair for pair in pairs if pair in self._known.observations]
         if not known:
             return
         self._log_change("unsee", pairs=[list(pair) for pair in known])
         for pair in known:
-            del self._known.sights[pair]
-        left = {landmark for _, landmark in self._known.sights}
+            del self._known.observations[pair]
+        left = {landmark for _, landmark in self._known.observations}
         for landmark in {landmark for _, landmark in known} - left:
             self._initial.pop(point_key(landmark), None)
         self._update([], [], [("sight", *pair) for pair in known])
@@ -295,7 +296,9 @@ class PoseGraph:
     def landmarks(self) -> dict[int, np.ndarray]:
         """Return the positions [3] of all landmarks in the map, by id."""
         variables = self._solver.variables()
-        return {k: variables[point_key(k)] for k in sorted({k for _, k in self._known.sights})}
+        return {
+            k: variables[point_key(k)] for k in sorted({k for _, k in self._known.observations})
+        }
 
     # --- poses ------------------------------------------------------------------------------------
     def pose(self, keyframe: int) -> np.ndarray:
@@ -303,10 +306,10 @@ class PoseGraph:
         row = self._known.rows.get(keyframe)
         if row is None:
             return self._solver.pose(keyframe)
-        follower = self._known.followers.only(row)
-        ends = int(follower.start_variables[0]), int(follower.end_variables[0])
+        inner = self._known.interpolated.only(row)
+        ends = int(inner.start_variables[0]), int(inner.end_variables[0])
         T_head, T_tail = (self._solver.pose(k)[None] for k in ends)
-        return follower.interpolated_poses(T_head, T_tail)[0]
+        return inner.interpolated_poses(T_head, T_tail)[0]
 
     def poses(self) -> dict[int, np.ndarray]:
         """Return T_map_keyframe [4, 4] of every keyframe, by id, ascending."""
@@ -315,16 +318,16 @@ class PoseGraph:
 
     def all_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the ids of all keyframes [K], ascending, and T_map_keyframe [K, 4, 4]."""
-        variables, followers = self._solver.variables(), self._known.followers
+        variables, interpolated = self._solver.variables(), self._known.interpolated
         keys = np.array([k for k in variables if k in self], np.int64)
         T_map = np.array([variables[k] for k in keys.tolist()]).reshape(-1, 4, 4)
         heads, tails = (
             np.searchsorted(keys, ids)
-            for ids in (followers.start_variables, followers.end_variables)
+            for ids in (interpolated.start_variables, interpolated.end_variables)
         )
-        keyframes = np.concatenate([keys, followers.keyframes])
+        keyframes = np.concatenate([keys, interpolated.keyframes])
         order = np.argsort(keyframes)
-        every = np.concatenate([T_map, followers.interpolated_poses(T_map[heads], T_map[tails])])
+        every = np.concatenate([T_map, interpolated.interpolated_poses(T_map[heads], T_map[tails])])
         return keyframes[order], every[order]
 
     # --- iSAM2 ------------------------------------------------------------------------------------
@@ -348,7 +351,7 @@ class PoseGraph:
         try:
             self._rebuild()
         except RuntimeError:
-            self._known.sights = {}
+            self._known.observations = {}
             self._initial = {k: v for k, v in self._initial.items() if v.ndim == 2}
             self._rebuild()
 
@@ -376,9 +379,9 @@ class PoseGraph:
         if group:
             known.condense(group, {k: self.pose(k) for k in group})
         if group or len(self._changes) > config.max_changes:
-            followers = known.rows.keys()
+            interpolated = known.rows.keys()
             variables = self._solver.variables()
-            self._restart_solver({k: v for k, v in variables.items() if k not in followers})
+            self._restart_solver({k: v for k, v in variables.items() if k not in interpolated})
 
     def _restart_solver(self, variables: Variables) -> None:
         """Rebuild the solver from the given values, and start a new list of changes."""
@@ -418,7 +421,7 @@ class PoseGraph:
                 self.replace(unpack_relative(what["measured"]))
             case "see":
                 points = dict(zip(what["ids"], what["points"], strict=True))
-                self.add_observations(unpack_sights(what["sights"]), points)
+                self.add_observations(unpack_observations(what["sights"]), points)
             case "unsee":
                 self.remove_observations(
                     [(keyframe, landmark) for keyframe, landmark in what["pairs"]]

@@ -68,7 +68,8 @@ class McapIndex:
 
     path: Path
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    places: list[MessageLocation] = field(default_factory=list)  # Sorted by position in the file.
+    # Sorted by position in the file.
+    locations: list[MessageLocation] = field(default_factory=list)
     is_whole: bool = False  # The file was closed; it was not cut off.
 
     def __post_init__(self) -> None:
@@ -121,7 +122,7 @@ class McapIndex:
             channel, number, _, stamp_ns = MESSAGE.unpack(record.read(MESSAGE.size))
             start, length = start + MESSAGE.size, length - MESSAGE.size
             place = MessageLocation(self._topics[channel], number, stamp_ns, start, length, chunk)
-            self.places.append(place)
+            self.locations.append(place)
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(ReadDataStream(record))
             self._topics[channel.id] = channel.topic

@@ -28,8 +28,8 @@ class JournalFile:
         """
         self.path = path
         self._index = McapIndex(path)
-        self._entries = [place for place in self._index.places if place.topic in ENTRIES]
-        self.messages = [place for place in self._index.places if place.topic not in ENTRIES]
+        self._entries = [place for place in self._index.locations if place.topic in ENTRIES]
+        self.messages = [place for place in self._index.locations if place.topic not in ENTRIES]
         self._by_number = {place.number: place for place in self.messages}
 
     @property
@@ -90,26 +90,28 @@ class JournalFile:
 
 def recorded_actors(folder: Path) -> dict[str, list[Path]]:
     """Return the files of each actor by name, in the order in which its processes started."""
-    return {actor: list(lives.values()) for actor, lives in sorted(_lives(folder).items())}
+    return {
+        actor: list(files.values()) for actor, files in sorted(_files_by_process(folder).items())
+    }
 
 
 def new_path(folder: Path, actor: str) -> Path:
     """Return the path of the file for the next process of an actor."""
-    last = max(_lives(folder).get(actor, ()), default=0)
+    last = max(_files_by_process(folder).get(actor, ()), default=0)
     return folder / (f"{actor}.{last + 1}.mcap" if last else f"{actor}.mcap")
 
 
-def _lives(folder: Path) -> dict[str, dict[int, Path]]:
+def _files_by_process(folder: Path) -> dict[str, dict[int, Path]]:
     """Return the files by actor, and for each actor by the number of its process.
 
     The numbers start at 1 and are in ascending order.
     """
     matches = [(NAME.fullmatch(path.name), path) for path in folder.glob("*.mcap")]
     numbered = sorted((int(m["number"] or 1), m["actor"], path) for m, path in matches if m)
-    lives: dict[str, dict[int, Path]] = {}
+    files: dict[str, dict[int, Path]] = {}
     for number, actor, path in numbered:
-        lives.setdefault(actor, {})[number] = path
-    return lives
+        files.setdefault(actor, {})[number] = path
+    return files
 
 
 def prepare_recording(folder: Path) -> None:

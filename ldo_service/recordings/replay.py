@@ -137,9 +137,9 @@ class ReplaySession:
             self._actor = self._make(self._file.about)
         else:
             self._replayed.restored += 1
-            self._actor = self._successor(start, start.state)
+            self._actor = self._restored_actor(start, start.state)
 
-    def _successor(self, start: Started, state: Mapping[str, bytes]) -> Actor:
+    def _restored_actor(self, start: Started, state: Mapping[str, bytes]) -> Actor:
         try:
             past = RestoredState.of({part: decode_state(body) for part, body in state.items()})
             about = self._file.about

@@ -9,7 +9,7 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _foreground
 
-MOST = 1e6  # Maximum of a ratio.
+MAX_RATIO = 1e6  # Maximum of a ratio.
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,10 +36,10 @@ class ForegroundConfig:
                 named(self, "max_step", "min_cosine", "min_inside", "max_gap", "near_mode")
                 + ": each must be at least 0, min_cosine and min_inside at most 1."
             )
-        if max(shares) > MOST:
+        if max(shares) > MAX_RATIO:
             raise ConfigError(
                 named(self, "max_step", "min_cosine", "min_inside", "max_gap", "near_mode")
-                + f": each must be at most {MOST:g}; larger values have no further effect."
+                + f": each must be at most {MAX_RATIO:g}; larger values have no further effect."
             )
         if not (1e-4 <= self.depth_bin <= 1 and 0 <= self.grow_px <= 64):
             raise ConfigError(
@@ -318,5 +318,5 @@ class RegionDetections:
 
     def classes(self) -> np.ndarray:
         """Return the labels of detector and labeller, [M, 2]; -1 if missing."""
-        said = (self.labels, self.confidences), (self.open_labels, self.open_confidences)
-        return np.stack([np.where(sure > 0, one.astype(int), -1) for one, sure in said], axis=1)
+        sources = (self.labels, self.confidences), (self.open_labels, self.open_confidences)
+        return np.stack([np.where(sure > 0, one.astype(int), -1) for one, sure in sources], axis=1)

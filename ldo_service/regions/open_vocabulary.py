@@ -80,27 +80,27 @@ class OpenVocabularyLabeling:
     """
 
     def __init__(
-        self, config: OpenVocabularyConfig | None = None, *, is_heard: bool = True
+        self, config: OpenVocabularyConfig | None = None, *, is_fused: bool = True
     ) -> None:
         """Create the open-vocabulary labels of a map.
 
         Args:
             config: Settings.
-            is_heard: True if labels of regions are added to the detections. If false, they are only
+            is_fused: True if labels of regions are added to the detections. If false, they are only
                 stored as votes of the regions.
         """
-        self.config, self._is_heard = config or OpenVocabularyConfig(), is_heard
+        self.config, self._is_fused = config or OpenVocabularyConfig(), is_fused
         self._regions = RegionTracker(self.config.regions)
         # Requests by region and keyframe, the oldest first.
         self._open: dict[tuple[int, int], PendingRequest] = {}
-        self._questions = self._named = self._unnamed = self._unknown = self._overdue = 0
-        self._outvoted = 0
+        self._requests = self._named = self._unnamed = self._unknown = self._overdue = 0
+        self._overruled = 0
 
     # --- label requests ---------------------------------------------------------------------------
     def observe_keyframe(
         self,
         view: TrainingView,
-        claims: RegionDetections,
+        detections: RegionDetections,
         vocabulary: Vocabulary,
         is_labelled: np.ndarray,
         T_map_keyframe: Mapping[int, np.ndarray],
@@ -109,7 +109,7 @@ class OpenVocabularyLabeling:
 
         Args:
             view: Images and pose of the keyframe.
-            claims: Detections of the keyframe.
+            detections: Detections of the keyframe.
             vocabulary: Vocabulary of the map.
             is_labelled: Pixels for which the map has a reliable label, [H, W] bool.
             T_map_keyframe: Current poses of all keyframes, [4, 4], by id.
@@ -118,31 +118,33 @@ class OpenVocabularyLabeling:
             The detections with labels of regions, and the new label requests.
         """
         config, depth_m, camera = self.config.trigger, view.depth_m, view.camera
-        labels = [vocabulary.name(int(label)) for label in claims.labels]
+        labels = [vocabulary.name(int(label)) for label in detections.labels]
         color = np.ascontiguousarray(view.color.transpose(1, 2, 0))
         shown = segment_geometry(color, depth_m, camera, config.segments)
         found = regions_of_image(shown, depth_m.shape, config)
         room = [one.part for one in shown if one.kind == "room"]
-        doubtful = propose_regions(
-            *(claims.boxes, labels, claims.confidences),
+        proposals = propose_regions(
+            *(detections.boxes, labels, detections.confidences),
             *(depth_m, camera, is_labelled, found, room, config),
         )
-        named = labeled_regions(claims.boxes, is_labelled, found, config)
-        sightings = self._regions.observe_keyframe(
-            view.keyframe, doubtful, color, depth_m, camera, T_map_keyframe, named
+        named = labeled_regions(detections.boxes, is_labelled, found, config)
+        update = self._regions.observe_keyframe(
+            view.keyframe, proposals, color, depth_m, camera, T_map_keyframe, named
         )
-        for question in sightings.questions:
-            self._remember(question)
-        claims = replace(claims, parts=match_boxes_to_regions(len(claims.boxes), doubtful))
-        opinions = sightings.opinions if self._is_heard else []
-        told = add_region_labels(claims, opinions, vocabulary, self._boxes_vote)
-        return told, sightings.questions
+        for request in update.questions:
+            self._remember(request)
+        detections = replace(
+            detections, parts=match_boxes_to_regions(len(detections.boxes), proposals)
+        )
+        region_labels = update.region_labels if self._is_fused else []
+        labelled = add_region_labels(detections, region_labels, vocabulary, self._boxes_vote)
+        return labelled, update.questions
 
-    def _remember(self, question: RegionRequest) -> None:
-        region, of = question.region, question.candidate
-        self._questions += 1
-        asked = PendingRequest(of.box_px, of.part, of.label, of.score, of.kind)
-        self._open[region.id, region.keyframe] = asked
+    def _remember(self, request: RegionRequest) -> None:
+        region, of = request.region, request.candidate
+        self._requests += 1
+        pending = PendingRequest(of.box_px, of.part, of.label, of.score, of.kind)
+        self._open[region.id, region.keyframe] = pending
         while len(self._open) > self.config.max_open:
             del self._open[next(iter(self._open))]
             self._overdue += 1
@@ -163,11 +165,11 @@ class OpenVocabularyLabeling:
             The labels. None if the result has no label or no pending request, or if the votes of
             the region give another label.
         """
-        asked = self._open.pop((region, keyframe), None)
-        if asked is None:
+        pending = self._open.pop((region, keyframe), None)
+        if pending is None:
             self._unknown += 1
             return None
-        answer = self._filter_answer(answer, asked)
+        answer = self._filter_answer(answer, pending)
         name, confidence = answer.label, answer.confidence
         before = self._regions.get(region)
         known_as = self._regions.answered(region, answer)
@@ -177,18 +179,18 @@ class OpenVocabularyLabeling:
         if not is_name:
             return None
         if known_as != name:
-            self._outvoted += 1
+            self._overruled += 1
             return None
-        said = vocabulary.index(name)
+        label_ids = vocabulary.index(name)
         return RegionDetections(
-            np.reshape(asked.box_px, (1, 4)).astype(np.float32),
-            np.array([vocabulary.index(asked.label) if asked.label else said]),
-            np.array([asked.score], np.float32),
-            np.array([said]),
+            np.reshape(pending.box_px, (1, 4)).astype(np.float32),
+            np.array([vocabulary.index(pending.label) if pending.label else label_ids]),
+            np.array([pending.score], np.float32),
+            np.array([label_ids]),
             np.array([confidence], np.float32),
-            (asked.part,),
+            (pending.part,),
             # Earlier labels of its Gaussians are those of the surface below it.
-            replaces_labels=asked.kind == "standing"
+            replaces_labels=pending.kind == "standing"
             and confidence >= self.config.regions.settled
             and before is not None
             and not before.votes
@@ -199,7 +201,7 @@ class OpenVocabularyLabeling:
         """Return the keyframes whose images are in the label request of a region."""
         return self._regions.shown_in(region)
 
-    def carried(
+    def propagated(
         self,
         region: int,
         view: TrainingView,
@@ -218,12 +220,14 @@ class OpenVocabularyLabeling:
             Detections with the label; None if the region has no label or is not visible there.
         """
         place = view.keyframe, view.depth_m, view.camera, T_map_keyframe
-        opinion = self._regions.carried(region, *place)
-        return opinion and add_region_labels(
-            RegionDetections.none(), [opinion], vocabulary, self._boxes_vote
+        region_label = self._regions.propagated(region, *place)
+        return region_label and add_region_labels(
+            RegionDetections.none(), [region_label], vocabulary, self._boxes_vote
         )
 
-    def _filter_answer(self, answer: RegionLabelResult, asked: PendingRequest) -> RegionLabelResult:
+    def _filter_answer(
+        self, answer: RegionLabelResult, pending: PendingRequest
+    ) -> RegionLabelResult:
         """Return a label result without the labels in `config.structure`.
 
         A label with a confidence below min_sure is also removed, unless the region is a box of the
@@ -232,7 +236,7 @@ class OpenVocabularyLabeling:
         others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))
         if not self._is_object(answer.label):
             return RegionLabelResult("", answer.confidence)
-        is_sure = answer.confidence >= self.config.min_sure or bool(asked.label)
+        is_sure = answer.confidence >= self.config.min_sure or bool(pending.label)
         return replace(answer, others=others) if is_sure else RegionLabelResult("", 0.0)
 
     @property
@@ -247,7 +251,7 @@ class OpenVocabularyLabeling:
         """Return plain values and arrays for a checkpoint."""
         return {
             "regions": self._regions.pack(),
-            "open": [[*key, *_packed(asked)] for key, asked in self._open.items()],
+            "open": [[*key, *_packed(pending)] for key, pending in self._open.items()],
         }
 
     @staticmethod
@@ -255,10 +259,10 @@ class OpenVocabularyLabeling:
         packed: Mapping[str, Any],
         config: OpenVocabularyConfig | None = None,
         *,
-        is_heard: bool = True,
+        is_fused: bool = True,
     ) -> "OpenVocabularyLabeling":
         """Restore the labels from `pack`."""
-        out = OpenVocabularyLabeling(config, is_heard=is_heard)
+        out = OpenVocabularyLabeling(config, is_fused=is_fused)
         out._regions = RegionTracker.unpack(packed["regions"], out.config.regions)
         out._open = {
             (region, keyframe): _unpacked(*row) for region, keyframe, *row in packed["open"]
@@ -269,14 +273,14 @@ class OpenVocabularyLabeling:
         """Return the counters of regions, label requests and label results."""
         return {
             "regions_tracked": len(self._regions),
-            "questions": self._questions,
+            "questions": self._requests,
             "label_requests_pending": len(self._open),
             "label_requests_expired": self._overdue,  # Dropped for newer requests.
             "answers_named": self._named,
             # Results without a label: no object, or no labeller available.
             "answers_unnamed": self._unnamed,
             # The votes of the region give another label.
-            "label_results_overruled": self._outvoted,
+            "label_results_overruled": self._overruled,
             # Results without a pending request: it was dropped, or the result repeated.
             "answers_unknown": self._unknown,
         }
@@ -299,8 +303,8 @@ def match_boxes_to_regions(
 
 
 def add_region_labels(
-    claims: RegionDetections,
-    opinions: Sequence[RegionLabel],
+    detections: RegionDetections,
+    region_labels: Sequence[RegionLabel],
     vocabulary: Vocabulary,
     boxes_vote: bool,
 ) -> RegionDetections:
@@ -311,48 +315,55 @@ def add_region_labels(
     it contains already.
 
     Args:
-        claims: Detections of the keyframe.
-        opinions: Labels of regions.
+        detections: Detections of the keyframe.
+        region_labels: Labels of regions.
         vocabulary: Vocabulary of the map.
         boxes_vote: True if boxes of the detector vote for region labels.
     """
-    labels, confidences = claims.open_labels.copy(), claims.open_confidences.copy()
-    by_detector, parts = claims.confidences.copy(), claims.parts or (None,) * len(claims.boxes)
-    for opinion in opinions:
-        if (number := opinion.of.number) is not None:
-            labels[number], confidences[number] = vocabulary.index(opinion.label), opinion.sure
+    labels, confidences = detections.open_labels.copy(), detections.open_confidences.copy()
+    by_detector, parts = (
+        detections.confidences.copy(),
+        detections.parts or (None,) * len(detections.boxes),
+    )
+    for region_label in region_labels:
+        if (number := region_label.of.number) is not None:
+            labels[number], confidences[number] = (
+                vocabulary.index(region_label.label),
+                region_label.sure,
+            )
             if boxes_vote:
                 by_detector[number] = 0  # The label of the region contains its vote.
     alone = [
-        opinion
-        for opinion in opinions
-        if opinion.of.number is None and not _is_part_of_one(opinion, opinions)
+        region_label
+        for region_label in region_labels
+        if region_label.of.number is None and not _is_part_of_one(region_label, region_labels)
     ]
-    said = np.array([vocabulary.index(opinion.label) for opinion in alone], np.int64)
-    boxes = np.array([opinion.of.box_px for opinion in alone], np.float32).reshape(-1, 4)
+    label_ids = np.array([vocabulary.index(region_label.label) for region_label in alone], np.int64)
+    boxes = np.array([region_label.of.box_px for region_label in alone], np.float32).reshape(-1, 4)
     return RegionDetections(
-        np.concatenate([claims.boxes, boxes]),
-        np.concatenate([claims.labels, said]),
+        np.concatenate([detections.boxes, boxes]),
+        np.concatenate([detections.labels, label_ids]),
         np.concatenate([by_detector, np.zeros(len(alone), np.float32)]),
-        np.concatenate([labels, said]),
+        np.concatenate([labels, label_ids]),
         np.concatenate([confidences, np.array([one.sure for one in alone], np.float32)]),
-        (*parts, *[opinion.of.part for opinion in alone]),
+        (*parts, *[region_label.of.part for region_label in alone]),
     )
 
 
-def _is_part_of_one(opinion: RegionLabel, opinions: Sequence[RegionLabel]) -> bool:
+def _is_part_of_one(region_label: RegionLabel, region_labels: Sequence[RegionLabel]) -> bool:
     """Return whether most of the label's box lies in the box of a larger region of that label."""
     larger = [
         other.of.box_px
-        for other in opinions
-        if other.label == opinion.label and areas(other.of.box_px) > areas(opinion.of.box_px)
+        for other in region_labels
+        if other.label == region_label.label
+        and areas(other.of.box_px) > areas(region_label.of.box_px)
     ]
-    shared_px2 = intersections(opinion.of.box_px[None], np.reshape(larger, (-1, 4)))
-    return bool(np.any(shared_px2 > 0.7 * areas(opinion.of.box_px)))
+    shared_px2 = intersections(region_label.of.box_px[None], np.reshape(larger, (-1, 4)))
+    return bool(np.any(shared_px2 > 0.7 * areas(region_label.of.box_px)))
 
 
-def _packed(asked: PendingRequest) -> list[Any]:
-    return [asked.box_px, *asked.part.pack(), asked.label, asked.score, asked.kind]
+def _packed(pending: PendingRequest) -> list[Any]:
+    return [pending.box_px, *pending.part.pack(), pending.label, pending.score, pending.kind]
 
 
 def _unpacked(

@@ -18,7 +18,7 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 
 _3X3 = np.ones((3, 3), np.uint8)
-_LEAST = np.float32(1e-6)
+_EPSILON = np.float32(1e-6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +119,7 @@ def compute_depth_features(
     n_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=fx / 8)
     n_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=fy / 8)
     normals = np.stack([n_x, n_y, smooth - n_x * rays[..., 0] - n_y * rays[..., 1]], axis=-1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), _LEAST)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), _EPSILON)
     low, high = cv2.erode(inverse, _3X3), cv2.dilate(inverse, _3X3)
     is_step = (low <= 0) | (high >= (1 + config.max_step) * low + config.step_floor)
     surfaces, sizes = _pieces(~is_step, normals, config)
@@ -180,10 +180,10 @@ def _shrunk_inverse(depth_m: np.ndarray, k: int) -> np.ndarray:
     height, width = (side // k * k for side in depth_m.shape)
     depth_m = depth_m[:height, :width]
     measured = (depth_m > 0).astype(np.float32)
-    inverse = measured / np.maximum(depth_m, _LEAST)
+    inverse = measured / np.maximum(depth_m, _EPSILON)
     size = width // k, height // k
     total, count = (cv2.resize(a, size, interpolation=cv2.INTER_AREA) for a in (inverse, measured))
-    return np.where(count > 0, total / np.maximum(count, _LEAST), 0).astype(np.float32)
+    return np.where(count > 0, total / np.maximum(count, _EPSILON), 0).astype(np.float32)
 
 
 def _blurred(inverse: np.ndarray, sigma_px: float) -> np.ndarray:

@@ -186,7 +186,7 @@ class RegionUpdate:
     """Result of tracking a keyframe: new label requests, and labels of the keyframe's regions."""
 
     questions: list[RegionRequest]
-    opinions: list[RegionLabel]
+    region_labels: list[RegionLabel]
 
 
 def observe_region(
@@ -240,8 +240,8 @@ def merge_observation(region: Region, seen: RegionObservation, max_boxes: float)
         seen: The observation.
         max_boxes: Maximum sum of the votes of boxes for a label.
     """
-    said = seen.candidate
-    surer = max(region, said, key=lambda one: one.score)
+    proposal = seen.candidate
+    surer = max(region, proposal, key=lambda one: one.score)
     is_larger = region.questions == 0 and seen.size_px > region.shape.size_px
     return replace(
         region,
@@ -250,9 +250,9 @@ def merge_observation(region: Region, seen: RegionObservation, max_boxes: float)
         shape=seen if is_larger else region.shape,
         label=surer.label,
         score=surer.score,
-        votes=with_box(region.votes, said.label, said.score, max_boxes),
+        votes=with_box(region.votes, proposal.label, proposal.score, max_boxes),
         seen=region.seen + 1,
-        is_supported=region.is_supported or said.kind == "standing",
+        is_supported=region.is_supported or proposal.kind == "standing",
     )
 
 
@@ -263,7 +263,10 @@ def pack(region: Region) -> dict[str, Any]:
     answer = region.answer and [
         getattr(region.answer, name) for name in RegionLabelResult.__slots__
     ]
-    best, shape = region.best and _packed_sighting(region.best), _packed_sighting(region.shape)
+    best, shape = (
+        region.best and _packed_observation(region.best),
+        _packed_observation(region.shape),
+    )
     return {**plain, "shape": shape, "best": best, "views": views, "answer": answer}
 
 
@@ -273,23 +276,23 @@ def unpack(row: Mapping[str, Any]) -> Region:
     changed = {
         "box_px": tuple(row["box_px"]),
         "votes": tuple(tuple(vote) for vote in row["votes"]),
-        "shape": _unpacked_sighting(*row["shape"]),
-        "best": row["best"] and _unpacked_sighting(*row["best"]),
+        "shape": _unpacked_observation(*row["shape"]),
+        "best": row["best"] and _unpacked_observation(*row["best"]),
         "answer": row["answer"] and RegionLabelResult(*row["answer"]),
     }
     return Region(**{**row, **changed, "views": views})
 
 
-def _packed_sighting(seen: RegionObservation) -> list[Any]:
+def _packed_observation(seen: RegionObservation) -> list[Any]:
     """Return an observation as a list, without the number of its box, which is not needed."""
     of = seen.candidate
-    said = of.label, of.score, of.kind
-    return [seen.keyframe, seen.p_camera, of.box_px, *said, *of.part.pack()]
+    label_fields = of.label, of.score, of.kind
+    return [seen.keyframe, seen.p_camera, of.box_px, *label_fields, *of.part.pack()]
 
 
-def _unpacked_sighting(
-    keyframe: int, p_camera: np.ndarray, box_px: np.ndarray, *said: Any
+def _unpacked_observation(
+    keyframe: int, p_camera: np.ndarray, box_px: np.ndarray, *label_fields: Any
 ) -> RegionObservation:
-    label, score, kind, *part = said
+    label, score, kind, *part = label_fields
     of = RegionProposal(box_px, Foreground.unpack(*part), label, score, None, kind)
     return RegionObservation(keyframe, of, p_camera)

@@ -13,7 +13,7 @@ from .region import Region, RegionObservation
 
 STRIDE_PX = 4  # Distance of the sampled pixels and side of the square that each represents.
 MARGIN_PX = 24  # Margin around the visible points, which are few and end within their region.
-LEAST = 12  # Minimum sampled pixels of a propagated mask.
+MIN_PIXELS = 12  # Minimum sampled pixels of a propagated mask.
 # Maximum distance to the nearest point as a multiple of the points' spacing; farther is behind.
 SPACING = 1.5
 
@@ -172,7 +172,7 @@ def propagate_mask(
     is_own = is_inside & (p_now[:, 2] > 0) & is_in(seen.candidate.part, there, across)
     near = KDTree(seen.p_camera).query(p_seen[is_own])[0]
     is_own[is_own] = near < max(max_gap_m, SPACING * _spacing_m(seen, camera))
-    if np.count_nonzero(is_own) < LEAST:
+    if np.count_nonzero(is_own) < MIN_PIXELS:
         return None
     return _enlarged(row[is_own], column[is_own], depth_m.shape)
 
@@ -252,17 +252,17 @@ class RegionMatcher:
         self._seen = projected(self._regions, *args)
 
     def same(
-        self, sighting: RegionObservation, overlap: float, taken: Collection[int]
+        self, observation: RegionObservation, overlap: float, taken: Collection[int]
     ) -> int | None:
         """Return the id of the region that matches an observation best; None if none matches.
 
         Args:
-            sighting: The observation.
+            observation: The observation.
             overlap: Minimum fraction of the region's points in the mask of the observation, and of
                 the observation's points in the mask of the region.
             taken: Ids of regions that are matched already.
         """
-        shares = self._seen.shares_in(sighting.candidate.part)
+        shares = self._seen.shares_in(observation.candidate.part)
         shares[self._seen.counts < self._least] = 0
         place = self._depth_m.shape, self._camera, self._T_map_keyframe
         best, most = None, overlap
@@ -270,7 +270,7 @@ class RegionMatcher:
             region = self._regions[int(i)]
             if region.id in taken:
                 continue
-            back = reverse_overlap(sighting, region, *place, self._least)
+            back = reverse_overlap(observation, region, *place, self._least)
             if min(back, shares[i]) >= most:
                 best, most = region.id, min(back, float(shares[i]))
         return best
@@ -301,7 +301,7 @@ class RegionMatcher:
         np.fill_diagonal(iou, 1)
         return iou
 
-    def carried(self, region: int) -> Foreground | None:
+    def propagated(self, region: int) -> Foreground | None:
         """Propagate the mask of a region into the keyframe; see `propagate_mask`."""
         i = next(i for i, one in enumerate(self._regions) if one.id == region)
         shape, is_its = self._regions[i].shape, self._seen.of == i

@@ -35,7 +35,7 @@ class RegionProposalConfig:
     same_iou: float = 0.5
     # Minimum IoU of a box and the box of a region that shows the same object.
     fits_iou: float = 0.6
-    alike_iou: float = 0.7  # Minimum IoU of the boxes of two similar regions; one is enough.
+    similar_iou: float = 0.7  # Minimum IoU of the boxes of two similar regions; one is enough.
     explained: float = 0.5  # Minimum fraction of labelled pixels for a region to be explained.
     min_side_px: int = 24  # Minimum side of a region; smaller ones show a labeller nothing.
     # Maximum size as a fraction of the image; larger ones are rooms, not objects.
@@ -47,7 +47,7 @@ class RegionProposalConfig:
     segments: GeometricSegmentationConfig = field(default_factory=GeometricSegmentationConfig)
 
     def __post_init__(self) -> None:
-        shares = self.sure, self.same_iou, self.fits_iou, self.alike_iou, self.explained
+        shares = self.sure, self.same_iou, self.fits_iou, self.similar_iou, self.explained
         shares = (*shares, self.max_share, self.min_fill)
         if not (min(shares) >= 0 and max(shares) <= 1):
             raise ConfigError(
@@ -56,7 +56,7 @@ class RegionProposalConfig:
                     "sure",
                     "same_iou",
                     "fits_iou",
-                    "alike_iou",
+                    "similar_iou",
                     "explained",
                     "max_share",
                     "min_fill",
@@ -115,19 +115,19 @@ def propose_regions(
         room: Structural planes, see `geometric_segmentation`.
         config: Settings.
     """
-    asked, is_taken = _boxed(boxes_px, labels, scores, depth_m, camera, found, room, config)
+    proposals, is_taken = _boxed(boxes_px, labels, scores, depth_m, camera, found, room, config)
     is_sure = np.asarray(scores) >= config.sure
     explained = is_labelled | _painted(boxes_px[is_sure], depth_m.shape)
-    asked += [
+    proposals += [
         one
-        for one, is_asked in zip(found, is_taken, strict=True)
-        if not is_asked
+        for one, is_selected in zip(found, is_taken, strict=True)
+        if not is_selected
         and (one.kind == "standing" or _share(explained, one.part) < config.explained)
     ]
     worth = [
         one
-        for one in asked
-        if one.score >= config.sure or _is_worth_a_look(one, depth_m.shape, config)
+        for one in proposals
+        if one.score >= config.sure or _is_plausible(one, depth_m.shape, config)
     ]
     size = {id(one): np.count_nonzero(one.part.mask) for one in worth}
     # Boxes with a high score need no label request, and are dropped first.
@@ -150,7 +150,7 @@ def _boxed(
     A box gets the region that fits it best. If none fits, it gets its own foreground. Structural
     planes are removed from the foreground if the remainder is large enough.
     """
-    asked, is_taken, pieces = [], [False] * len(found), None
+    proposals, is_taken, pieces = [], [False] * len(found), None
     regions_px = _boxes(found)
     for i in distinct_boxes(boxes_px, scores, config):
         label, score = labels[i], float(scores[i])
@@ -158,14 +158,14 @@ def _boxed(
         best = int(np.argmax(fits)) if len(fits) else -1
         if best >= 0 and fits[best] >= config.fits_iou:
             is_taken[best] = True
-            asked.append(replace(found[best], label=label, score=score, number=i))
+            proposals.append(replace(found[best], label=label, score=score, number=i))
             continue
         pieces = pieces or surfaces(depth_m, camera, config.foreground)
         part = foreground(boxes_px[i], depth_m, pieces, camera, config.foreground)
         whole = RegionProposal(boxes_px[i], part, label, score, i)
         cut = replace(whole, part=remove_structure(part, room, config.foreground.min_inside))
-        asked.append(cut if _is_worth_a_look(cut, depth_m.shape, config) else whole)
-    return asked, is_taken
+        proposals.append(cut if _is_plausible(cut, depth_m.shape, config) else whole)
+    return proposals, is_taken
 
 
 def remove_structure(part: Foreground, room: Sequence[Foreground], inside: float) -> Foreground:
@@ -231,9 +231,9 @@ def regions_of_image(
     for kind in _ORDER:
         for segment in found:
             one = RegionProposal(segment.part.box_px, segment.part, kind=segment.kind)
-            if segment.kind != kind or not _is_worth_a_look(one, shape, config):
+            if segment.kind != kind or not _is_plausible(one, shape, config):
                 continue
-            if np.all(ious(_boxes(out), one.box_px[None]) < config.alike_iou):
+            if np.all(ious(_boxes(out), one.box_px[None]) < config.similar_iou):
                 out.append(one)
     stands = np.any([one.part.image(shape) for one in out if one.kind == "standing"], axis=0)
     return [_without(one, stands) if one.kind == "apart" and stands.any() else one for one in out]
@@ -261,7 +261,7 @@ def distinct_boxes(
     return non_maximum_suppression(boxes_px, scores, of_any_class, config.same_iou).tolist()
 
 
-def _is_worth_a_look(
+def _is_plausible(
     candidate: RegionProposal, shape: tuple[int, ...], config: RegionProposalConfig
 ) -> bool:
     """Return whether a region is worth a label request, by its size and how it fills its box."""

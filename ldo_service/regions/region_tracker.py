@@ -54,7 +54,7 @@ class RegionTrackerConfig:
     views: int = 5  # Number of best views in a label request.
     views_first: int = 2  # Minimum views before a request; a single one may show a flaw of depth.
     patience: int = 3  # Keyframes without a better view before a request; one may yet come.
-    max_questions: int = 3  # Maximum label requests for a region.
+    max_requests: int = 3  # Maximum label requests for a region.
     # Label requests per keyframe; pending regions with the best views go first. Half of them
     # show no object. The paper requests on 10-25 % of the frames (IV.B.8); the flat, 1.0 per
     # keyframe.
@@ -70,9 +70,10 @@ class RegionTrackerConfig:
     boxes_vote: bool = True
     # Minimum votes for a label: one box with a score of 0.6, or four with 0.3.
     min_votes: float = 0.35
-    min_carried: float = 0.5  # Minimum confidence of a label that is applied by mask propagation.
+    # Minimum confidence of a label that is applied by mask propagation.
+    min_propagation_confidence: float = 0.5
     # Maximum labels of a keyframe by mask propagation: as many as it has proposals.
-    max_carried: int = 32
+    max_propagated: int = 32
     overlap: float = 0.6  # Minimum mutual overlap of two observations of one region.
     # Maximum depth difference between a point and the surface measured there (delta_z, III.A).
     max_gap_m: float = 0.1
@@ -84,16 +85,16 @@ class RegionTrackerConfig:
     view: ViewConfig = field(default_factory=ViewConfig)
 
     def __post_init__(self) -> None:
-        counts = self.views, self.views_first, self.max_questions, self.most, self.at_once
-        if min(*counts, self.max_carried) < 1:
+        counts = self.views, self.views_first, self.max_requests, self.most, self.at_once
+        if min(*counts, self.max_propagated) < 1:
             raise ConfigError(
                 named(
                     self,
                     "views",
                     "views_first",
-                    "max_questions",
+                    "max_requests",
                     "at_once",
-                    "max_carried",
+                    "max_propagated",
                     "most",
                 )
                 + ": each must be at least 1."
@@ -103,9 +104,10 @@ class RegionTrackerConfig:
                 named(self, "patience", "per_keyframe")
                 + ": patience must be at least 0, per_keyframe positive."
             )
-        if not (0 <= self.min_quality <= 1 and 0 <= self.min_carried <= 1):
+        if not (0 <= self.min_quality <= 1 and 0 <= self.min_propagation_confidence <= 1):
             raise ConfigError(
-                named(self, "min_carried", "min_quality") + ": both must be in [0, 1]."
+                named(self, "min_propagation_confidence", "min_quality")
+                + ": both must be in [0, 1]."
             )
         if self.views_first > self.views or not self.gain > 1:
             raise ConfigError(
@@ -175,39 +177,39 @@ class RegionTracker:
                 [4, 4], by id.
             named: Regions that have a reliable label in the map; they get no label request.
         """
-        config, told, taken = self.config, list[tuple[int, RegionProposal]](), set[int]()
+        config, observed, taken = self.config, list[tuple[int, RegionProposal]](), set[int]()
         regions, place = [*self._regions.values()], (keyframe, depth_m, camera, T_map_keyframe)
         known = RegionMatcher(regions, *place, config.max_gap_m, config.min_points)
         for candidate in found:
-            sighting = observe_region(keyframe, candidate, depth_m, camera)
-            if sighting is None:
+            observation = observe_region(keyframe, candidate, depth_m, camera)
+            if observation is None:
                 continue
-            region = self._same(sighting, known, taken) or self._new(sighting)
+            region = self._same(observation, known, taken) or self._new(observation)
             taken.add(region.id)
-            region = merge_observation(region, sighting, config.max_boxes)
+            region = merge_observation(region, observation, config.max_boxes)
             if candidate.score < config.settled:
                 args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
-                region = self._with_view(region, sighting, region_view(*args, config.view))
+                region = self._with_view(region, observation, region_view(*args, config.view))
             self._keep(region)
-            told.append((region.id, candidate))
+            observed.append((region.id, candidate))
         for candidate in named:
-            sighting = observe_region(keyframe, candidate, depth_m, camera)
-            region = sighting and self._same(sighting, known, taken)
-            if sighting and region and self._label_of(region)[0]:
+            observation = observe_region(keyframe, candidate, depth_m, camera)
+            region = observation and self._same(observation, known, taken)
+            if observation and region and self._label_of(region)[0]:
                 taken.add(region.id)
-                self._keep(merge_observation(region, sighting, config.max_boxes))
-                told.append((region.id, candidate))
-        told += self._propagated(known, taken)
-        opinions = self._opinions(told, known)
-        questions = self._questions(keyframe, T_map_keyframe)
+                self._keep(merge_observation(region, observation, config.max_boxes))
+                observed.append((region.id, candidate))
+        observed += self._propagated(known, taken)
+        region_labels = self._region_labels(observed, known)
+        questions = self._label_requests(keyframe, T_map_keyframe)
         self._forget()
-        return RegionUpdate(questions, opinions)
+        return RegionUpdate(questions, region_labels)
 
     def _same(
-        self, sighting: RegionObservation, known: RegionMatcher, taken: Collection[int]
+        self, observation: RegionObservation, known: RegionMatcher, taken: Collection[int]
     ) -> Region | None:
         """Return the known region that matches an observation, or None."""
-        same = known.same(sighting, self.config.overlap, taken)
+        same = known.same(observation, self.config.overlap, taken)
         return None if same is None else self._regions[same]
 
     def _propagated(
@@ -218,17 +220,17 @@ class RegionTracker:
         for number in known.seen():
             region = self._regions[number]
             label, sure = self._label_of(region)
-            if number in taken or not label or sure < self.config.min_carried:
+            if number in taken or not label or sure < self.config.min_propagation_confidence:
                 continue
-            if len(found) == self.config.max_carried:
+            if len(found) == self.config.max_propagated:
                 break
-            part = known.carried(number)
+            part = known.propagated(number)
             if part is not None:
                 self._keep(region)
                 found.append((number, RegionProposal(part.box_px, part)))
         return found
 
-    def _opinions(
+    def _region_labels(
         self, shown: Sequence[tuple[int, RegionProposal]], known: RegionMatcher
     ) -> list[RegionLabel]:
         """Return the labels of the keyframe's regions that have a label result.
@@ -239,22 +241,22 @@ class RegionTracker:
         regions = [(self._regions[number], of) for number, of in shown]
         named = [(region, of) for region, of in regions if self._label_of(region)[0]]
         overlaps = known.overlaps([(region.id, of.part) for region, of in named])
-        opinions = []
+        region_labels = []
         for (region, of), row in zip(named, overlaps, strict=True):
             votes: Votes = ()
             for (other, _), share in zip(named, row.tolist(), strict=True):
                 if share > 0 and other.is_supported == region.is_supported:
                     votes = with_votes_of(votes, other.votes, share)
             label, sure = winning_label(votes, self.config.min_votes)
-            opinions.append(RegionLabel(of, label, sure))
-        return opinions
+            region_labels.append(RegionLabel(of, label, sure))
+        return region_labels
 
     def shown_in(self, region: int) -> tuple[int, ...]:
         """Return the keyframes of the best views of a region, which its label request contains."""
         known = self._regions.get(region)
         return tuple(view.keyframe for view in known.views) if known else ()
 
-    def carried(
+    def propagated(
         self,
         region: int,
         keyframe: int,
@@ -273,10 +275,12 @@ class RegionTracker:
             return None
         place = keyframe, depth_m, camera, T_map_keyframe
         seen = RegionMatcher([known], *place, config.max_gap_m, config.min_points)
-        part = seen.carried(region) if [*seen.seen()] else None
+        part = seen.propagated(region) if [*seen.seen()] else None
         return part and RegionLabel(RegionProposal(part.box_px, part), label, sure)
 
-    def _questions(self, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> list[RegionRequest]:
+    def _label_requests(
+        self, now: int, T_map_keyframe: Mapping[int, np.ndarray]
+    ) -> list[RegionRequest]:
         """Return label requests for the regions that need one now, up to the allowed number.
 
         The regions whose views improved most since their last request come first, weighted by size
@@ -285,12 +289,12 @@ class RegionTracker:
         config = self.config
         self._allowed = min(self._allowed + config.per_keyframe, float(config.at_once))
         due = [r for r in self._regions.values() if self._is_due(r, now, T_map_keyframe)]
-        due.sort(key=lambda region: -region.view_quality_gain() * _worth(region))
-        asked = [self._asked(region) for region in due[: int(self._allowed)]]
-        self._allowed -= len(asked)
-        return asked
+        due.sort(key=lambda region: -region.view_quality_gain() * _priority(region))
+        requests = [self._request(region) for region in due[: int(self._allowed)]]
+        self._allowed -= len(requests)
+        return requests
 
-    def _asked(self, region: Region) -> RegionRequest:
+    def _request(self, region: Region) -> RegionRequest:
         """Create a label request with the best observation of a region, and count the request."""
         quality = sum(view.quality for view in region.views)
         shape = region.best if region.best and region.questions == 0 else region.shape
@@ -337,17 +341,19 @@ class RegionTracker:
         self._next_id += 1
         return Region(self._next_id - 1, seen.keyframe, seen.box_px, seen)
 
-    def _with_view(self, region: Region, sighting: RegionObservation, view: RegionView) -> Region:
+    def _with_view(
+        self, region: Region, observation: RegionObservation, view: RegionView
+    ) -> Region:
         """Return a region with a view added, if the view is good enough."""
         if view.quality < self.config.min_quality:
             return region
         views = sorted((*region.views, view), key=lambda view: -view.quality)
-        best = sighting if views[0] is view else region.best
+        best = observation if views[0] is view else region.best
         return replace(region, best=best, views=tuple(views[: self.config.views]))
 
     def _is_due(self, region: Region, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> bool:
         """Return whether a label request for a region should be made now."""
-        if self._is_settled(region) or region.questions >= self.config.max_questions:
+        if self._is_settled(region) or region.questions >= self.config.max_requests:
             return False
         best = region.best
         if best is None or best.keyframe not in T_map_keyframe:
@@ -384,7 +390,7 @@ class RegionTracker:
         return out
 
 
-def _worth(region: Region) -> float:
+def _priority(region: Region) -> float:
     """Return the weight of a region's label request, by its size and kind.
 
     Large regions have a higher weight, because they are rarely shadows or parts of objects.

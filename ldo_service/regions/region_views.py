@@ -21,7 +21,7 @@ class ViewConfig:
     good_side_px: float = 128.0  # Side of a region that more pixels would not show better.
     # Variance of the Laplacian (gray levels squared) with a sharpness factor of 0.5.
     sharp: float = 100.0
-    least: float = 0.25  # Factor of a view that is cut off or seen edge on.
+    min_factor: float = 0.25  # Factor of a view that is cut off or seen edge on.
 
     def __post_init__(self) -> None:
         if not (self.context >= 0 and min(self.good_side_px, self.sharp) > 0 and self.side_px > 0):
@@ -29,8 +29,8 @@ class ViewConfig:
                 named(self, "context", "side_px", "good_side_px", "sharp")
                 + ": context must be at least 0, and the other settings must be positive."
             )
-        if not 0 <= self.least <= 1:
-            raise ConfigError(named(self, "least") + ": must be in [0, 1].")
+        if not 0 <= self.min_factor <= 1:
+            raise ConfigError(named(self, "min_factor") + ": must be in [0, 1].")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -104,13 +104,14 @@ def size_factor(box_px: np.ndarray, config: ViewConfig) -> float:
 def border_factor(box_px: np.ndarray, shape: tuple[int, ...], config: ViewConfig) -> float:
     """Return a quality factor for the distance of the box from the border of the image.
 
-    It is `least` at the border and 1 if the distance is at least a tenth of the box's longer side.
+    It is `min_factor` at the border and 1 if the distance is at least a tenth of the box's longer
+    side.
     """
     height, width = shape[:2]
     gaps = *(box_px[:2] + 0.5), width - 0.5 - box_px[2], height - 0.5 - box_px[3]
     wanted = 0.1 * float((box_px[2:] - box_px[:2]).max())
     reached = min(1.0, max(0.0, float(min(gaps))) / wanted)
-    return config.least + (1 - config.least) * reached
+    return config.min_factor + (1 - config.min_factor) * reached
 
 
 def sharpness_factor(crop: np.ndarray, config: ViewConfig) -> float:
@@ -128,12 +129,13 @@ def facing_factor(
 ) -> float:
     """Return a quality factor for how directly the camera faces the surface of a region.
 
-    It is `least + (1 - least) c`, with the mean cosine c between normals and viewing rays; `least`
+    It is `min_factor + (1 - min_factor) c`, with the mean cosine c between normals and viewing
+    rays; `min_factor`
     if no normal is known.
     """
     height, width = part.mask.shape
     if min(height, width) < 3 or not part.mask.any():
-        return config.least
+        return config.min_factor
     rows, columns = part.row + np.arange(height), part.column + np.arange(width)
     z = depth_m[rows[:, None], columns].astype(np.float64)
     rays = camera.rays_at(columns, rows[:, None])
@@ -142,6 +144,6 @@ def facing_factor(
     lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(rays, axis=-1)
     usable = part.mask & (z > 0) & (lengths > 0)
     if not usable.any():
-        return config.least
+        return config.min_factor
     cosines = np.abs((normals * rays).sum(-1)[usable]) / lengths[usable]
-    return config.least + (1 - config.least) * float(cosines.mean())
+    return config.min_factor + (1 - config.min_factor) * float(cosines.mean())

@@ -111,35 +111,37 @@ COLUMNS = (
 class DatabaseWriter:
     """Writer of the keyframe database of a run.
 
-    It keeps at most `places.count` keyframe records in memory, 0.13 MB each.
+    It keeps at most `keyframe_database.count` keyframe records in memory, 0.13 MB each.
     """
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config
-        self._places = KeyframeDatabase()
+        self._database = KeyframeDatabase()
 
     def add(self, message: Keyframe) -> None:
         """Add the record of a keyframe."""
         config = self._config
-        place = make_keyframe_record(
-            keyframe_from_message(message, config.pyramid), config.features, config.places
+        record = make_keyframe_record(
+            keyframe_from_message(message, config.pyramid),
+            config.features,
+            config.keyframe_database,
         )
-        self._places = self._places.with_record(place, config.places)
+        self._database = self._database.with_record(record, config.keyframe_database)
 
-    def save(self, path: Path, poses: KeyframePoses, joined: dict[int, int]) -> None:
+    def save(self, path: Path, poses: KeyframePoses, merged: dict[int, int]) -> None:
         """Write the records of all keyframes in the frame of the map.
 
         Args:
             path: File to write.
             poses: Final poses T_map_keyframe, which replace T_odom_keyframe.
-            joined: For each merged submap, the older submap that it was merged with.
+            merged: For each merged submap, the older submap that it was merged with.
         """
-        places = [
-            replace(place, submap=0, T_odom_keyframe=np.array(poses[place.id]))
-            for place in self._places.all
-            if joined.get(place.submap, place.submap) == 0
+        records = [
+            replace(record, submap=0, T_odom_keyframe=np.array(poses[record.id]))
+            for record in self._database.all
+            if merged.get(record.submap, record.submap) == 0
         ]
-        path.write_bytes(encode_state({"places": [place.pack() for place in places]}))
+        path.write_bytes(encode_state({"places": [record.pack() for record in records]}))
 
 
 def prepare(folder: Path, overwrite: bool) -> None:
@@ -181,16 +183,16 @@ class RunWriter:
     def __init__(self, folder: Path, config_text: str, tracker: TrackerConfig) -> None:
         self.folder, self._hold_out = folder, tracker.hold_out
         self._makes_map = not tracker.localize
-        self._places = DatabaseWriter(tracker.odometry)
+        self._database = DatabaseWriter(tracker.odometry)
         (folder / "config.yaml").write_text(config_text)
         self._csv_file = (folder / "frames.csv").open("w", newline="")
         self._csv = csv.writer(self._csv_file)
         self._csv.writerow(COLUMNS)
         self._tracked: list[FramePose] = []
         self._poses, self._final_poses = KeyframePoses(), FinalPoses()
-        self._joined: dict[int, int] = {}  # Older submap of each merged submap.
+        self._merged_submaps: dict[int, int] = {}  # Older submap of each merged submap.
         self._keyframes: dict[int, dict[str, Any]] = {}
-        self.follower = MapReplica()
+        self.replica = MapReplica()
         self._objects: MapObjects | None = None
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.loops = LoopRecord()
@@ -219,7 +221,7 @@ class RunWriter:
             case GraphCorrection():
                 self.loops.observe(message, step_ms)
                 self._poses.correct(message.graph_version, keyframe_poses_from_correction(message))
-                self._joined = dict(message.merged_submaps)
+                self._merged_submaps = dict(message.merged_submaps)
             case DetectionBoxes():
                 self.boxes += len(message.detections)
             case LabelResult():
@@ -229,7 +231,7 @@ class RunWriter:
             case LoopCandidate() | LoopClosure():
                 self.loops.observe(message, step_ms)
             case MapDelta() | MapSnapshot():
-                self.follower.apply(message)
+                self.replica.apply(message)
 
     def _observe_pose(self, pose: TrackedPose, step_ms: float) -> None:
         self.statuses[pose.status] += 1
@@ -267,7 +269,7 @@ class RunWriter:
         T_reference_keyframe = pose_from_message(keyframe.T_reference_keyframe)
         measured = MeasuredKeyframe(keyframe.stamp_ns, keyframe.keyframe, T_reference_keyframe)
         self._final_poses.add(measured, keyframe.reference)
-        self._places.add(keyframe)
+        self._database.add(keyframe)
         self.newest_stamp_ns = keyframe.stamp_ns
         self._keyframes[keyframe.keyframe] = {
             "keyframe": keyframe.keyframe,
@@ -290,7 +292,7 @@ class RunWriter:
     def in_map(self) -> np.ndarray:
         """Return which Gaussians, [N] bool, are anchored to keyframes in the frame of the map."""
         placed = [k for k, facts in self._keyframes.items() if self._root(facts["submap"]) == 0]
-        return np.isin(self.follower.map.anchors, placed)
+        return np.isin(self.replica.map.anchors, placed)
 
     def objects(self) -> tuple[MapObject, ...]:
         """Return the objects in the map; empty if no detector ran."""
@@ -298,7 +300,7 @@ class RunWriter:
 
     def labelled(self) -> int:
         """Return the number of Gaussians in the map whose best label is not background."""
-        return int(np.count_nonzero(top_labels(self.follower.map.labels[self.in_map()])))
+        return int(np.count_nonzero(top_labels(self.replica.map.labels[self.in_map()])))
 
     def write_refined(self, iterations: int) -> None:
         """Write the refined map with its keyframes and trajectory.
@@ -317,14 +319,14 @@ class RunWriter:
         if not self._makes_map:
             return
         write_json(folder / "keyframes.json", self._placed_keyframes())
-        in_map, gaussians = self.in_map(), self.follower.map
+        in_map, gaussians = self.in_map(), self.replica.map
         write_ply(folder / "map.ply", gaussians.rows[in_map])
-        if self.follower.label_names:
-            names = self.follower.label_names
+        if self.replica.label_names:
+            names = self.replica.label_names
             write_semantics(folder / SEMANTICS, gaussians.labels[in_map], names)
         if self._objects is not None:
             write_objects(folder, self._placed_objects(self._objects))
-        self._places.save(self.folder / DATABASE_FILE, self._poses, self._joined)
+        self._database.save(self.folder / DATABASE_FILE, self._poses, self._merged_submaps)
 
     def online(self) -> Trajectory:
         """Return T_map_camera of each frame as it was published."""
@@ -339,7 +341,7 @@ class RunWriter:
 
     def _root(self, submap: int) -> int:
         """Return the oldest submap merged with `submap`, or `submap` itself if there is none."""
-        return self._joined.get(submap, submap)
+        return self._merged_submaps.get(submap, submap)
 
     def _placed_keyframes(self) -> list[dict[str, Any]]:
         return [
@@ -347,7 +349,7 @@ class RunWriter:
                 **facts,
                 "submap": self._root(facts["submap"]),
                 "T_map_camera": self._poses[keyframe].tolist(),
-                "exposure": self.follower.exposure(keyframe).tolist(),
+                "exposure": self.replica.exposure(keyframe).tolist(),
             }
             for keyframe, facts in self._keyframes.items()
         ]

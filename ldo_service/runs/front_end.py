@@ -145,13 +145,13 @@ class FrontEnd:
         about = index.metadata.get(ABOUT, {})
         _require_settings(path, about, config)
         frames = len(selection.indices(sequence))
-        told = (sequence.name, str(selection.stride), str(frames))
+        ours = (sequence.name, str(selection.stride), str(frames))
         kept = tuple(about.get(name, "") for name in ("source", "stride", "frames"))
-        stamps_ns = np.array([p.stamp_ns for p in index.places if p.topic == POSE_TRACKED.name])
-        if told != kept or not np.isin(stamps_ns, sequence.stamps_ns).all():
+        stamps_ns = np.array([p.stamp_ns for p in index.locations if p.topic == POSE_TRACKED.name])
+        if ours != kept or not np.isin(stamps_ns, sequence.stamps_ns).all():
             raise DataError(
                 f"{path} has {kept[2]} frames of {kept[0]} with stride {kept[1]}; this run has "
-                f"{told[2]} of {told[0]} with stride {told[1]}. Source, stamps, --stride and "
+                f"{ours[2]} of {ours[0]} with stride {ours[1]}. Source, stamps, --stride and "
                 "--max-frames must be the same."
             )
         return cls(frames - len(stamps_ns), index)
@@ -159,18 +159,18 @@ class FrontEnd:
     def __iter__(self) -> Iterator[tuple[Message, ...]]:
         """Yield the messages of each tick of the logical clock, up to the last recorded message."""
         tick = 0
-        for number, places in groupby(self._index.places, lambda place: place.number):
+        for number, locations in groupby(self._index.locations, lambda place: place.number):
             while tick < number:
                 yield ()
                 tick += 1
-            yield self._messages(list(places))
+            yield self._messages(list(locations))
             tick += 1
 
-    def _messages(self, places: list[MessageLocation]) -> tuple[Message, ...]:
+    def _messages(self, locations: list[MessageLocation]) -> tuple[Message, ...]:
         try:
-            return tuple(decode(self._index.body(p), MESSAGES[p.topic]) for p in places)
+            return tuple(decode(self._index.body(p), MESSAGES[p.topic]) for p in locations)
         except (msgspec.DecodeError, LookupError, OSError) as error:
-            raise DataError(f"{self._index.path}, frame {places[0].number}: {error}.") from error
+            raise DataError(f"{self._index.path}, frame {locations[0].number}: {error}.") from error
 
 
 def front_end_settings(config: Config) -> dict[str, object]:
@@ -195,14 +195,14 @@ def _require_settings(path: Path, about: Mapping[str, str], config: Config) -> N
         raise DataError(
             f"{path} lacks the settings of the run that recorded it ({error}). Repeat that run."
         ) from error
-    asked = json.loads(json.dumps(front_end_settings(config)))
-    if was.keys() != asked.keys():
+    configured = json.loads(json.dumps(front_end_settings(config)))
+    if was.keys() != configured.keys():
         made_by, ours = about.get("ldo", "an unknown version"), versions()["ldo-slam"]
         raise DataError(
             f"{path} was recorded by LDO-SLAM {made_by}, whose settings differ from those of "
             f"this version, {ours}. Repeat that run."
         )
-    for name, value in asked.items():
+    for name, value in configured.items():
         if was[name] != value:
             raise ConfigError(
                 f"{name}={value} was {was[name]} when {path} was recorded. With "

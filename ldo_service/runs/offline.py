@@ -91,7 +91,7 @@ class OfflineRun:
             if job.keep_front_end:
                 record = FrontEndRecord(job.folder, job.config, job.sequence, job.selection)
                 self._kept = kept.enter_context(record)
-            self._run(self._heard_again(job.front_end) if job.front_end else frames)
+            self._run(self._recorded_messages(job.front_end) if job.front_end else frames)
         self._kept = None
         self._stage_ms = self._step_percentiles()
 
@@ -122,7 +122,7 @@ class OfflineRun:
             self._advance(min(done, self._work), self._work)
         self._clock.finish()
 
-    def _heard_again(self, front_end: FrontEnd) -> Iterator[tuple[Message, ...]]:
+    def _recorded_messages(self, front_end: FrontEnd) -> Iterator[tuple[Message, ...]]:
         for messages in front_end:
             for message in messages:
                 self.record.observe(message, step_ms=0.0)

@@ -46,7 +46,7 @@ class LoopRecord:
         # Each with the milliseconds of its whole step.
         self._candidates: list[tuple[LoopCandidate, float]] = []
         self._closures: list[LoopClosure] = []
-        self._not_believed: set[tuple[int, int]] = set()  # Pairs of reference and keyframe.
+        self._rejected: set[tuple[int, int]] = set()  # Pairs of reference and keyframe.
 
     def observe(
         self, message: LoopCandidate | LoopClosure | GraphCorrection, step_ms: float
@@ -60,8 +60,8 @@ class LoopRecord:
         match message:
             case GraphCorrection():
                 # A correction lists the newest rejected closures, and all accepted ones.
-                self._not_believed |= set(message.rejected_closures)
-                self._not_believed -= set(message.accepted_closures)
+                self._rejected |= set(message.rejected_closures)
+                self._rejected -= set(message.accepted_closures)
             case LoopClosure():
                 self._closures.append(message)
             case LoopCandidate():
@@ -70,7 +70,7 @@ class LoopRecord:
     @property
     def accepted(self) -> int:
         """Number of loop closures that the pose graph accepts."""
-        return sum(map(self._is_believed, self._closures))
+        return sum(map(self._is_accepted, self._closures))
 
     @property
     def rejected(self) -> int:
@@ -78,8 +78,8 @@ class LoopRecord:
         refused = sum(bool(candidate.rejected_reason) for candidate, _ in self._candidates)
         return refused + len(self._closures) - self.accepted
 
-    def _is_believed(self, closure: LoopClosure) -> bool:
-        return (closure.pose.reference, closure.pose.keyframe) not in self._not_believed
+    def _is_accepted(self, closure: LoopClosure) -> bool:
+        return (closure.pose.reference, closure.pose.keyframe) not in self._rejected
 
     def save(self, folder: Path) -> None:
         """Write the record to a folder."""
@@ -90,7 +90,7 @@ class LoopRecord:
                 for candidate, step_ms in self._candidates
             ],
             "closures": [
-                _closure(closure) | {"is_believed": self._is_believed(closure)}
+                _closure(closure) | {"is_believed": self._is_accepted(closure)}
                 for closure in self._closures
             ],
         }

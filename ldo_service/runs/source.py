@@ -107,12 +107,12 @@ def interleave_prior(
         prior: Poses T_odom_base of another odometry, if there is one.
     """
     poses = iter(() if prior is None else map(_prior_message, prior.stamps_s, prior.T_world_camera))
-    told_ns = -1
+    last_ns = -1
     for frame in frames:
         news: list[Message] = []
-        while told_ns < frame.stamp_ns and (pose := next(poses, None)) is not None:
+        while last_ns < frame.stamp_ns and (pose := next(poses, None)) is not None:
             news.append(pose)
-            told_ns = pose.stamp_ns
+            last_ns = pose.stamp_ns
         yield (*news, frame)
 
 

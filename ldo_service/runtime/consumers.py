@@ -61,7 +61,7 @@ class Consumers:
     def __contains__(self, name: str) -> bool:
         return name in self._known
 
-    def room(self, seq: int) -> int:
+    def credits(self, seq: int) -> int:
         """Return the number of messages that may be sent now without waiting for a consumer."""
         awaited = [c for c in self._known.values() if c.is_awaited]
         limits = [c.limit - seq if c.alive else 0 for c in awaited]

@@ -126,10 +126,10 @@ class LosslessInlet(Inlet):
         Returns:
             Number of lost messages. The producer has sent them, and its outbox no longer has them.
         """
-        known, joins = epoch == self.epoch, not self.is_connected
+        known, is_connecting = epoch == self.epoch, not self.is_connected
         self.is_connected = True
         if known and start <= self.arrived:
-            self.gap = self.gap or joins
+            self.gap = self.gap or is_connecting
             return 0
         lost = start - self.arrived if known else 0
         self.numbers.lost += lost

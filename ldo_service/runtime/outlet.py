@@ -102,13 +102,13 @@ class Outlet:
         self._transport = transport
         topic = self.topic.name
         self._publisher = transport.publisher(data_key(topic))
-        self._again = transport.publisher(retransmit_key(topic))
-        self._welcomes = transport.publisher(producer_hello_key(topic))
+        self._retransmissions = transport.publisher(retransmit_key(topic))
+        self._hellos = transport.publisher(producer_hello_key(topic))
         transport.subscribe(credit_key(topic), self._requested)
         transport.watch_liveliness(self._presence)
         if self.topic.is_state:
             transport.serve_queries(data_key(topic), lambda: self._last_value)
-        self._post_welcomes()  # Running consumers connect at once.
+        self._post_hellos()  # Running consumers connect at once.
 
     # --- sending ----------------------------------------------------------------------------
     def credits(self) -> int:
@@ -116,7 +116,7 @@ class Outlet:
 
         It is 0 while staged messages are not sent.
         """
-        return 0 if self._unsent else self._consumers.room(self._seq)
+        return 0 if self._unsent else self._consumers.credits(self._seq)
 
     async def send(self, message: Message, body: bytes) -> None:
         """Stage one message and commit it."""
@@ -138,7 +138,7 @@ class Outlet:
         """Send the staged messages in order, and wait for credit unless the port is nonblocking."""
         while self._unsent:
             if not self.port.is_nonblocking:
-                await self._wait_for_room()
+                await self._wait_for_credit()
             held = self._unsent.popleft()
             self.sent += 1
             self._sent_at_s = self._loop.time()
@@ -164,14 +164,14 @@ class Outlet:
         """Offset of the first message that was not sent."""
         return self._unsent[0].seq if self._unsent else self._seq
 
-    async def _wait_for_room(self) -> None:
-        self.waited += self._consumers.room(self._next) == 0
-        while self._consumers.room(self._next) == 0:
+    async def _wait_for_credit(self) -> None:
+        self.waited += self._consumers.credits(self._next) == 0
+        while self._consumers.credits(self._next) == 0:
             await self._change()
 
     async def flush(self) -> None:
         """Wait until every lossless consumer has received all messages."""
-        self._post_welcomes()  # Each consumer replies with its credit at once.
+        self._post_hellos()  # Each consumer replies with its credit at once.
         while not self._consumers.all_received(self._seq):
             await self._change()
 
@@ -223,7 +223,7 @@ class Outlet:
         has_backlog = isinstance(request, ConsumerHello) and request.has_backlog
         self._consumers.join(name, self._seq, has_backlog=has_backlog)
         self._consumers.skip_to(self._outbox.first(self._seq))
-        self._post_welcomes()
+        self._post_hellos()
 
     def reset(self, epoch: int) -> None:
         """Restart numbering at 0 under a new epoch; all consumers must connect again."""
@@ -236,10 +236,10 @@ class Outlet:
         for forgotten in (self._unsent, self._parts, self._ahead):
             forgotten.clear()
         self._last_value = ()
-        self._post_welcomes()
+        self._post_hellos()
 
-    def _post_welcomes(self) -> None:
-        self._welcomes.post(
+    def _post_hellos(self) -> None:
+        self._hellos.post(
             b"", encode_link(ProducerHello(self._epoch, self._consumers.next_seq_by_consumer()))
         )
 
@@ -275,7 +275,7 @@ class Outlet:
         if name in self._pushing:
             return
         if self._consumers.skip_to(self._outbox.first(self._seq)):
-            self._post_welcomes()  # They say where the backlog begins now.
+            self._post_hellos()  # They say where the backlog begins now.
             return
         messages = self._consumers.next_of_backlog(
             name, self._next, self._loop.time(), self.REPEAT_AFTER_S
@@ -313,14 +313,14 @@ class Outlet:
         consumer.repeated_from, consumer.repeated_at_s = consumer.arrived, now
         lost = range(consumer.arrived, self._next)
         self.repeated += len(lost)
-        self._repeating = self._loop.create_task(self._send_again(lost))
+        self._repeating = self._loop.create_task(self._resend(lost))
 
-    async def _send_again(self, lost: range) -> None:
+    async def _resend(self, lost: range) -> None:
         try:
             for seq in lost:
                 message = self._outbox.read(seq)
                 if message is not None:
-                    await self._again.send(message.header, message.body)
+                    await self._retransmissions.send(message.header, message.body)
         finally:
             self._repeating = None
 
@@ -376,8 +376,8 @@ class Outlet:
         self._cancel_repeating()
         for publisher in (
             self._publisher,
-            self._again,
-            self._welcomes,
+            self._retransmissions,
+            self._hellos,
             *self._backlogs.values(),
         ):
             publisher.close()

@@ -104,7 +104,7 @@ class Outlets:
         """True if a topic has a required consumer, which must not miss a message."""
         return any(outlet.position() for outlet in self._all.values())
 
-    def room(self) -> dict[Topic, int]:
+    def credits(self) -> dict[Topic, int]:
         """Return the credits of the nonblocking ports; their actor checks them before a step."""
         return {
             outlet.topic: outlet.credits()
@@ -116,7 +116,7 @@ class Outlets:
         """Return the position to save for each topic; None without required consumers."""
         return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
 
-    def hold(self, produced: Sequence[Produced]) -> None:
+    def stage_outputs(self, produced: Sequence[Produced]) -> None:
         """Stage the outputs of a step."""
         for out in produced:
             self._all[type(out.message)].stage_message(out.message, out.body)
@@ -139,7 +139,7 @@ class Outlets:
         for outlet in self._all.values():
             outlet.store()
 
-    def take_back(self) -> None:
+    def discard(self) -> None:
         """Discard the staged outputs."""
         for outlet in self._all.values():
             outlet.rollback()
@@ -149,7 +149,7 @@ class Outlets:
         for outlet in self._all.values():
             await outlet.flush()
 
-    def renew(self, epoch: int) -> None:
+    def restart_numbering(self, epoch: int) -> None:
         """Restart numbering of all topics under a new epoch."""
         for outlet in self._all.values():
             outlet.reset(epoch)

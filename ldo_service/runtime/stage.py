@@ -217,7 +217,7 @@ class Stage:
             try:
                 return await asyncio.wait_for(mailbox.take(), SAVE_AGAIN_S)
             except TimeoutError:
-                await self._tell([])
+                await self._save_and_send([])
         return await mailbox.take()
 
     async def _take(self, delivery: Delivery | StageCommand, mailbox: Mailbox) -> None:
@@ -253,7 +253,7 @@ class Stage:
         try:
             with self._metrics.step():
                 produced = await self._worker.run(self._handle, message)
-            self._outlets.hold(produced)
+            self._outlets.stage_outputs(produced)
             is_saved = await self._saver.save(self._actor, delivery, self._taken(delivery))
         except UnsavedStateError:
             raise
@@ -274,28 +274,28 @@ class Stage:
             return None
         return LoggedInput.of(delivery.port.topic.name, delivery.body, self._actor.situation)
 
-    async def _tell(self, produced: list[Produced], *, whole: bool = False) -> None:
-        self._outlets.hold(produced)
+    async def _save_and_send(self, produced: list[Produced], *, whole: bool = False) -> None:
+        self._outlets.stage_outputs(produced)
         is_saved = await self._saver.save(self._actor, whole=whole)
         await self._outlets.release(is_saved=is_saved)
 
     def _update_flow_status(self) -> None:
         self._actor.situation = FlowStatus(
-            credits=self._outlets.room(),
+            credits=self._outlets.credits(),
             backlog=self._mailbox.waiting() if self._mailbox else {},
         )
 
     async def _publish_restored(self) -> None:
         if self._checkpointer.past.of_actor:
-            await self._say("resumed", lambda: self._actor.on_restored())
+            await self._publish("resumed", lambda: self._actor.on_restored())
 
     async def _publish_final(self) -> None:
-        await self._say("finished", lambda: self._actor.on_stop())
+        await self._publish("finished", lambda: self._actor.on_stop())
 
-    async def _say(self, kind: Kind, words: Callable[[], Iterator[Message]]) -> None:
+    async def _publish(self, kind: Kind, messages: Callable[[], Iterator[Message]]) -> None:
         self._update_flow_status()
         try:
-            produced = await self._worker.run(lambda: produce(self._actor, words()))
+            produced = await self._worker.run(lambda: produce(self._actor, messages()))
         except Exception:
             self._metrics.failures += 1
             log.exception(
@@ -306,7 +306,7 @@ class Stage:
             return
         if produced or kind == "finished":
             self._journal.record_step(kind, self._actor.situation, produced)
-        await self._tell(produced, whole=True)
+        await self._save_and_send(produced, whole=True)
 
     # --- commands -------------------------------------------------------------------------------
     async def _execute(self, order: StageCommand, mailbox: Mailbox) -> None:
@@ -317,7 +317,7 @@ class Stage:
                 case "resume":
                     mailbox.resume()
                 case "reset":
-                    await self._renew(mailbox)
+                    await self._reset(mailbox)
                 case "save":
                     await self._saver.save_checkpoint(self._actor)
         except Exception as error:
@@ -329,7 +329,7 @@ class Stage:
         else:
             self._orders.report(order, "")
 
-    async def _renew(self, mailbox: Mailbox) -> None:
+    async def _reset(self, mailbox: Mailbox) -> None:
         """Replace the actor by a new one with an empty state, under a new epoch.
 
         Other actors connect to it again, as after a restart of its process.
@@ -339,7 +339,7 @@ class Stage:
         self._epoch = new_epoch()
         self._metrics.facts = {}
         mailbox.reset()
-        self._outlets.renew(self._epoch)
+        self._outlets.restart_numbering(self._epoch)
         await self._saver.save(self._actor)
 
     # --- in the actor's thread ------------------------------------------------------------------
@@ -369,7 +369,7 @@ class Stage:
                 )
                 continue
             self._metrics.restarts += 1
-            self._outlets.take_back()
+            self._outlets.discard()
             await self._publish_restored()
             return
 

@@ -39,7 +39,7 @@ def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
         RuntimeError: The actor produced more messages than its credit on a nonblocking output.
     """
     topics = {out.topic.message: out.topic for out in actor.outputs}
-    room = dict(actor.situation.credits)
+    credits = dict(actor.situation.credits)
     produced: list[Produced] = []
     for message in messages:
         topic = topics.get(type(message))
@@ -48,9 +48,9 @@ def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
                 f"{actor.name} produced a {type(message).__name__}, which is not in its outputs. "
                 "Yield only messages of the actor's `outputs`."
             )
-        if topic in room:
-            room[topic] -= 1
-            if room[topic] < 0:
+        if topic in credits:
+            credits[topic] -= 1
+            if credits[topic] < 0:
                 raise RuntimeError(
                     f"{actor.name} produced a message of {topic.name} without credit; it must "
                     "check has_credit first."

@@ -43,7 +43,7 @@ class StopRequest:
         (self._hard if self._soft.is_set() else self._soft).set()
 
     @property
-    def is_asked(self) -> bool:
+    def is_requested(self) -> bool:
         """True after the first request."""
         return self._soft.is_set()
 

@@ -363,13 +363,13 @@ class AssociationCosts:
 
 def association_costs(
     distributions: np.ndarray,
-    looks: PredictedBoxes,
+    predicted: PredictedBoxes,
     regions: RegionStatistics,
     config: AssociationConfig,
 ) -> AssociationCosts:
     """Compute the association costs of landmarks with label distributions [K, C]."""
-    iou = ious(looks.boxes, regions.boxes)
-    gap_m = depth_gaps_m(looks.near_m, looks.far_m, regions.near_m, regions.far_m)
+    iou = ious(predicted.boxes, regions.boxes)
+    gap_m = depth_gaps_m(predicted.near_m, predicted.far_m, regions.near_m, regions.far_m)
     allowed = (iou > 0) & (gap_m <= config.max_depth_gap_m)
     k, r = np.nonzero(allowed)
     allowed[k, r] = common_mass(distributions[k], regions.distributions[r]) >= config.min_shared

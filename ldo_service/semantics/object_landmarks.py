@@ -80,7 +80,7 @@ def shuffled(ids: np.ndarray) -> np.ndarray:
     return np.where(ids == NO_MEMBER, np.uint64(2**64 - 1), places)
 
 
-def joined(
+def merged_members(
     members: np.ndarray, votes: np.ndarray, others: np.ndarray, other_votes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the union of two member lists for each of K landmarks: members [K, 256] and votes.

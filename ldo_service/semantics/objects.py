@@ -27,16 +27,16 @@ from .object_landmarks import (
     derive,
     distributions,
     entropies,
-    joined,
     labels_of,
+    merged_members,
     moved,
     new_landmarks,
     within,
 )
 from .objects_config import ObjectsConfig
 from .observations import (
-    ObjectSighting,
     ObjectUpdate,
+    ObservedObject,
     add_views,
     boxes_overlap,
     inside,
@@ -60,7 +60,7 @@ class Objects:
     def __init__(self, config: ObjectsConfig | None = None) -> None:
         self.config = config or ObjectsConfig()
         self._table = np.zeros(0, LANDMARK)
-        self._next_id = self._merged = self._retired = self._refused = 0
+        self._next_id = self._merged = self._removed = self._refused = 0
 
     def __len__(self) -> int:
         return int(np.count_nonzero(self._table["id"] != CANDIDATE))
@@ -71,7 +71,7 @@ class Objects:
         table = self._table[self._table["id"] != CANDIDATE]
         return table[np.argsort(table["id"])]
 
-    def observe(self, view: MapView, spared: np.ndarray | None = None) -> ObjectUpdate:
+    def observe(self, view: MapView, undetectable: np.ndarray | None = None) -> ObjectUpdate:
         """Update the objects from a keyframe.
 
         A region without an associated landmark creates a candidate. A candidate becomes an object
@@ -83,7 +83,8 @@ class Objects:
 
         Args:
             view: The map and the regions of the keyframe.
-            spared: Labels that the detector does not know, [256] bool. An object with such a label
+            undetectable: Labels that the detector does not know, [256] bool. An object with such a
+                label
                 is missed only if the measured depth shows that it is gone.
 
         Returns:
@@ -97,21 +98,23 @@ class Objects:
         # Observed and predicted regions.
         view, regions = _seen(view, T_camera_map, limits)
         near = np.flatnonzero(within(self._table, view.camera, T_camera_map))
-        looks = predict_boxes(self._table[near], view, T_camera_map, limits)
+        predicted = predict_boxes(self._table[near], view, T_camera_map, limits)
         # Data association.
-        pairs = association_costs(distributions(self._table[near]), looks, regions, limits)
+        pairs = association_costs(distributions(self._table[near]), predicted, regions, limits)
         k, r = self._match(near, pairs)
         excused, left = self._pieces(near, k, pairs, regions, r)
         # Observations and misses.
-        observations = self._update(view, near[k], r, looks.rows[k], looks.shown[k], regions)
-        missed = self._missed(near, looks, excused, spared)
-        observations += self._miss(near[missed], looks.boxes[missed])
+        observations = self._update(
+            view, near[k], r, predicted.rows[k], predicted.shown[k], regions
+        )
+        missed = self._missed(near, predicted, excused, undetectable)
+        observations += self._miss(near[missed], predicted.boxes[missed])
         # New, merged and removed objects.
-        born = self._promote(near[k])
+        created = self._promote(near[k])
         merged, gone = self._merge(view, near, near[k])
-        retired = self._retire(gone)
+        removed = self._remove(gone)
         self._begin(view, regions, left)
-        return ObjectUpdate(tuple(observations), born, merged, retired)
+        return ObjectUpdate(tuple(observations), created, merged, removed)
 
     # --- association ------------------------------------------------------------------------------
     def _match(self, near: np.ndarray, pairs: AssociationCosts) -> tuple[np.ndarray, np.ndarray]:
@@ -155,12 +158,12 @@ class Objects:
         rows: np.ndarray,
         shown: np.ndarray,
         regions: RegionStatistics,
-    ) -> list[ObjectSighting]:
+    ) -> list[ObservedObject]:
         seen, p_seen = self._table[which], regions.distributions[r]
         differs = divergence(distributions(seen), p_seen) >= self.config.max_divergence
         begins = differs & (seen["id"] == CANDIDATE)
         seen["votes"] = update_votes(seen["votes"], rows, view, regions.numbers[r])
-        seen["members"], seen["votes"] = joined(
+        seen["members"], seen["votes"] = merged_members(
             seen["members"], seen["votes"], regions.members[r], one_each(regions.members[r])
         )
         seen["seen"] = np.where(begins, 1, seen["seen"] + 1)
@@ -171,7 +174,7 @@ class Objects:
         self._table[which] = seen
         entropies_seen = entropy(p_seen)
         return [
-            ObjectSighting(
+            ObservedObject(
                 int(seen["id"][i]), regions.boxes[r[i]], p_seen[i], entropies_seen[i], False
             )
             for i in np.flatnonzero(seen["id"] != CANDIDATE)
@@ -207,33 +210,35 @@ class Objects:
     def _missed(
         self,
         near: np.ndarray,
-        looks: PredictedBoxes,
+        predicted: PredictedBoxes,
         excused: np.ndarray,
-        spared: np.ndarray | None,
+        undetectable: np.ndarray | None,
     ) -> np.ndarray:
         """Return the numbers of the landmarks in `near` that are missed in the keyframe.
 
         A landmark is missed if it is visible and the detector did not find it. It is also missed if
         the measured depth lies behind it, so that it is gone.
         """
-        sides = np.clip(looks.boxes[:, 2:] - looks.boxes[:, :2], 0, None)
+        sides = np.clip(predicted.boxes[:, 2:] - predicted.boxes[:, :2], 0, None)
         is_large = np.sqrt(np.prod(sides, axis=1)) >= self.config.min_side_px
-        is_visible = (looks.shown >= self.config.min_visible) & is_large
-        if spared is not None:
-            is_visible &= ~spared[labels_of(self._table[near])]
-        return np.flatnonzero((is_visible | (looks.through >= self.config.min_visible)) & ~excused)
+        is_visible = (predicted.shown >= self.config.min_visible) & is_large
+        if undetectable is not None:
+            is_visible &= ~undetectable[labels_of(self._table[near])]
+        return np.flatnonzero(
+            (is_visible | (predicted.through >= self.config.min_visible)) & ~excused
+        )
 
-    def _miss(self, which: np.ndarray, boxes: np.ndarray) -> list[ObjectSighting]:
+    def _miss(self, which: np.ndarray, boxes: np.ndarray) -> list[ObservedObject]:
         for name in ("missed", "misses"):
             self._table[name][which] += 1
         missed = self._table[which]
         p = distributions(missed)
         return [
-            ObjectSighting(int(missed["id"][i]), boxes[i], p[i], float(entropy(p[i])), True)
+            ObservedObject(int(missed["id"][i]), boxes[i], p[i], float(entropy(p[i])), True)
             for i in np.flatnonzero(missed["id"] != CANDIDATE)
         ]
 
-    def _retire(self, gone: np.ndarray) -> tuple[int, ...]:
+    def _remove(self, gone: np.ndarray) -> tuple[int, ...]:
         """Remove landmarks with too many misses and those in `gone` [K] bool.
 
         Returns:
@@ -246,12 +251,12 @@ class Objects:
         is_candidate = table["id"][missed] == CANDIDATE
         limit = np.where(is_candidate, config.candidate_miss_limit, limit)
         over = missed[table["misses"][missed] >= limit]
-        retired = np.sort(table["id"][over][table["id"][over] != CANDIDATE])
-        self._retired += len(retired)
+        removed = np.sort(table["id"][over][table["id"][over] != CANDIDATE])
+        self._removed += len(removed)
         gone[over] = True
         if np.any(gone):
             self._table = table[~gone]
-        return tuple(retired.tolist())
+        return tuple(removed.tolist())
 
     # --- merges -----------------------------------------------------------------------------------
     def _merge(
@@ -269,11 +274,11 @@ class Objects:
             one, other = self._table[[a]], self._table[[b]]
             if gone[a] or gone[b] or not boxes_overlap(one, other, view, self.config.merge_overlap):
                 continue
-            keep, goes = (a, b) if self._age(a) < self._age(b) else (b, a)
-            self._join(keep, goes, view)
-            gone[goes] = True
-            if self._table["id"][goes] != CANDIDATE:
-                merged.append((int(self._table["id"][goes]), int(self._table["id"][keep])))
+            keep, merged_row = (a, b) if self._age(a) < self._age(b) else (b, a)
+            self._merge_pair(keep, merged_row, view)
+            gone[merged_row] = True
+            if self._table["id"][merged_row] != CANDIDATE:
+                merged.append((int(self._table["id"][merged_row]), int(self._table["id"][keep])))
         self._merged += len(merged)
         return tuple(merged), gone
 
@@ -281,9 +286,9 @@ class Objects:
         """Return a sort key for landmark `k`: objects come before candidates, older ones first."""
         return self._table["id"][k] == CANDIDATE, int(self._table["id"][k]), k
 
-    def _join(self, keep: int, goes: int, view: MapView) -> None:
+    def _merge_pair(self, keep: int, merged_row: int, view: MapView) -> None:
         one = self._table[[keep]]
-        merge_into(one, self._table[[goes]])
+        merge_into(one, self._table[[merged_row]])
         self._derive(one, view.rows, view.labels, view.ids, view.anchors)
         self._table[[keep]] = one
 
@@ -355,7 +360,7 @@ class Objects:
     def pack(self) -> dict[str, Any]:
         """Return arrays and plain numbers for a file or a checkpoint."""
         table = self._table.copy().view(np.uint8).reshape(len(self._table), LANDMARK.itemsize)
-        counts = [self._next_id, self._merged, self._retired, self._refused]
+        counts = [self._next_id, self._merged, self._removed, self._refused]
         return {"landmarks": table, "counts": np.array(counts, np.int64)}
 
     @staticmethod
@@ -373,7 +378,7 @@ class Objects:
             )
         out = Objects(config)
         out._table = table.copy().view(LANDMARK)[:, 0]
-        out._next_id, out._merged, out._retired, out._refused = map(int, packed["counts"])
+        out._next_id, out._merged, out._removed, out._refused = map(int, packed["counts"])
         return out
 
     def metrics(self) -> dict[str, float]:
@@ -382,7 +387,7 @@ class Objects:
             "objects": len(self),
             "object_candidates": len(self._table) - len(self),
             "objects_merged": self._merged,
-            "objects_retired": self._retired,
+            "objects_retired": self._removed,
             "objects_rejected": self._refused,  # Candidates that did not fit into max_objects.
         }
 

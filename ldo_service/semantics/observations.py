@@ -10,15 +10,15 @@ from .object_landmarks import (
     MAX_VOTES,
     NO_MEMBER,
     VIEWS,
-    joined,
     labels_of,
+    merged_members,
     reliable_members,
     rows_of,
 )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class ObjectSighting:
+class ObservedObject:
     """Observation of an object in a keyframe, or a miss of an object that should be visible.
 
     Attributes:
@@ -41,11 +41,11 @@ class ObjectSighting:
 class ObjectUpdate:
     """Changes of the objects by a keyframe."""
 
-    observations: tuple[ObjectSighting, ...] = ()  # Observations and misses.
-    born: tuple[int, ...] = ()  # Ids of new objects.
+    observations: tuple[ObservedObject, ...] = ()  # Observations and misses.
+    created: tuple[int, ...] = ()  # Ids of new objects.
     # Pairs of a removed id and the id of the object that it was merged into.
     merged: tuple[tuple[int, int], ...] = ()
-    retired: tuple[int, ...] = ()  # Ids of objects removed after misses.
+    removed: tuple[int, ...] = ()  # Ids of objects removed after misses.
 
 
 def one_each(members: np.ndarray) -> np.ndarray:
@@ -128,7 +128,10 @@ def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: floa
         view: The map with the Gaussians of both.
         least: Minimum fraction of the reliable members.
     """
-    shares = inside(other[0], awake(one, view)), inside(one[0], awake(other, view))
+    shares = (
+        inside(other[0], resident_positions(one, view)),
+        inside(one[0], resident_positions(other, view)),
+    )
     return max(shares) >= least
 
 
@@ -137,7 +140,7 @@ def merge_into(one: np.ndarray, gone: np.ndarray) -> None:
 
     The caller must derive pose, size and label of `one` again.
     """
-    one["members"], one["votes"] = joined(
+    one["members"], one["votes"] = merged_members(
         one["members"], one["votes"], gone["members"], gone["votes"]
     )
     for name in ("seen", "last"):
@@ -158,7 +161,7 @@ def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
     )
 
 
-def awake(landmark: np.ndarray, view: MapView) -> np.ndarray:
+def resident_positions(landmark: np.ndarray, view: MapView) -> np.ndarray:
     """Return the positions [M, 3] of the reliable resident members of a landmark, a table [1]."""
     where = rows_of(landmark["members"][reliable_members(landmark)], view.ids)
     return view.rows[where[where >= 0], :3].astype(float)

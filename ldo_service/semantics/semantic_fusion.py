@@ -170,23 +170,23 @@ def label_image(
     """
     assert shown.contributions is not None
     made_by = shown.contributions.indices
-    visible, said = aligned_rows(len(made_by)), labels[made_by]
+    visible, label_rows = aligned_rows(len(made_by)), labels[made_by]
     visible[:] = rows[made_by]
-    records = fields(said)
+    records = fields(label_rows)
     known = np.unique(records["ids"][records["weights"] > 0]).tolist()
     image = np.zeros((camera.height, camera.width), np.uint8)
-    most = np.zeros(image.shape, np.float32)
+    largest_sum = np.zeros(image.shape, np.float32)
     for three in (known[k : k + 3] for k in range(0, len(known), 3)):
         visible[:, 11:14] = 0
         for column, label in enumerate(three, 11):
             visible[:, column] = np.sum(records["weights"] * (records["ids"] == label), axis=1)
         sums = render(visible, camera, T_camera_map, threads=threads).color
         for channel, label in enumerate(three):
-            image[sums[..., channel] > most] = label
-            most = np.maximum(most, sums[..., channel])
-    visible[:, 11:14] = background(said)[:, None]
+            image[sums[..., channel] > largest_sum] = label
+            largest_sum = np.maximum(largest_sum, sums[..., channel])
+    visible[:, 11:14] = background(label_rows)[:, None]
     nothing = render(visible, camera, T_camera_map, threads=threads).color[..., 0]
-    return np.where(nothing >= most, np.uint8(BACKGROUND), image)
+    return np.where(nothing >= largest_sum, np.uint8(BACKGROUND), image)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,11 +222,11 @@ def fuse_detections(
     camera: Camera,
     T_map_camera: np.ndarray,
     depth_m: np.ndarray,
-    claims: RegionDetections,
+    detections: RegionDetections,
     config: SemanticFusionConfig,
     *,
     is_late: bool = False,
-    spared: np.ndarray | None = None,
+    undetectable: np.ndarray | None = None,
     threads: int = 1,
 ) -> FusionResult:
     """Update the labels [N, 32] of the map with the labels of a keyframe's regions, in place.
@@ -238,12 +238,14 @@ def fuse_detections(
         camera: Intrinsics of the keyframe.
         T_map_camera: Pose of the camera, [4, 4].
         depth_m: Measured depth, [H, W], meters.
-        claims: Labels of the regions by detector and labeller.
+        detections: Labels of the regions by detector and labeller.
         config: Settings of the fusion.
-        is_late: True if the keyframe was fused before, and `claims` has only the regions with late
+        is_late: True if the keyframe was fused before, and `detections` has only the regions with
+            late
             labels. Gaussians outside of these regions then get no miss. Where the detector's label
             wins, it is not counted a second time.
-        spared: Labels that the detector does not know, [256] bool. Gaussians with such a label get
+        undetectable: Labels that the detector does not know, [256] bool. Gaussians with such a
+            label get
             no miss.
         threads: Number of threads.
 
@@ -254,20 +256,20 @@ def fuse_detections(
         ValueError: If the shapes or types of the arrays do not fit.
     """
     # Assignment of Gaussians to regions.
-    regions = regions_of(claims, depth_m, camera, config)
+    regions = regions_of(detections, depth_m, camera, config)
     T_camera_map = se3.inverse(T_map_camera)
     where = assign_gaussians(
         rows, indices, camera, T_camera_map, depth_m, regions, config.assignment, threads=threads
     )
     # Observed labels.
-    seen = observations(where, indices, camera, claims, config, is_late=is_late)
-    if spared is not None:
+    seen = observations(where, indices, camera, detections, config, is_late=is_late)
+    if undetectable is not None:
         # A label that the detector does not know is neither missed now nor was before.
-        is_spared = spared[top_labels(labels[indices])] & (seen.labels == MISS)
-        seen.labels[is_spared] = NOT_SEEN
-        is_named = spared[np.maximum(seen.labels, 0)] & (seen.labels >= 0)
+        is_undetectable = undetectable[top_labels(labels[indices])] & (seen.labels == MISS)
+        seen.labels[is_undetectable] = NOT_SEEN
+        is_named = undetectable[np.maximum(seen.labels, 0)] & (seen.labels >= 0)
         clear_background(labels, indices[is_named])
-    if claims.replaces_labels and config.region == "foreground":
+    if detections.replaces_labels and config.region == "foreground":
         reset_labels(labels, indices[seen.labels >= 0])
     observe(labels, seen, config.labels, threads=threads)
     # Consistency with the neighbors.
@@ -278,31 +280,31 @@ def fuse_detections(
 
 
 def regions_of(
-    claims: RegionDetections, depth_m: np.ndarray, camera: Camera, config: SemanticFusionConfig
+    detections: RegionDetections, depth_m: np.ndarray, camera: Camera, config: SemanticFusionConfig
 ) -> Regions:
     """Return the regions of the boxes, without the pixels of smaller regions that lie in them.
 
     By the setting `region`, a region is the foreground of its box or the whole box.
     """
-    if config.region == "box" or len(claims.boxes) == 0:
-        return Regions.of_boxes(np.reshape(claims.boxes, (-1, 4)), claims.scores())
-    known = claims.parts or (None,) * len(claims.boxes)
+    if config.region == "box" or len(detections.boxes) == 0:
+        return Regions.of_boxes(np.reshape(detections.boxes, (-1, 4)), detections.scores())
+    known = detections.parts or (None,) * len(detections.boxes)
     parts = [part for part in known if part is not None]
     if len(parts) < len(known):
         found = surfaces(depth_m, camera, config.foreground)
         parts = [
             part or foreground(box, depth_m, found, camera, config.foreground)
-            for box, part in zip(claims.boxes, known, strict=True)
+            for box, part in zip(detections.boxes, known, strict=True)
         ]
-    parts = without_nested(parts, claims.scores(), config.nesting)
-    return Regions.of_foregrounds(claims.boxes, claims.scores(), parts)
+    parts = without_nested(parts, detections.scores(), config.nesting)
+    return Regions.of_foregrounds(detections.boxes, detections.scores(), parts)
 
 
 def observations(
     where: Assignment,
     indices: np.ndarray,
     camera: Camera,
-    claims: RegionDetections,
+    detections: RegionDetections,
     config: SemanticFusionConfig,
     *,
     is_late: bool = False,
@@ -315,27 +317,29 @@ def observations(
     # Tables indexed by outcome: hidden, in no region, in region 0, 1, ...
     # intp avoids a conversion in `take`.
     outcome = np.subtract(where.regions, HIDDEN, dtype=np.intp)
-    said = np.where((claims.confidences > 0) & (not is_late), claims.labels, NOT_SEEN)
+    region_labels = np.where(
+        (detections.confidences > 0) & (not is_late), detections.labels, NOT_SEEN
+    )
     miss = NOT_SEEN if is_late else MISS
-    labels = np.array([NOT_SEEN, miss, *said], np.int16).take(outcome)
-    confidences = np.array([0, 0, *claims.confidences], np.float32).take(outcome)
-    corners, min_px = np.reshape(claims.boxes, (-1, 2, 2)), config.labels.min_px
+    labels = np.array([NOT_SEEN, miss, *region_labels], np.int16).take(outcome)
+    confidences = np.array([0, 0, *detections.confidences], np.float32).take(outcome)
+    corners, min_px = np.reshape(detections.boxes, (-1, 2, 2)), config.labels.min_px
     sides_px = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1))
     # Regions that have a label of the labeller too are fused per Gaussian.
-    is_fused = np.array([False, False, *(claims.open_confidences > 0)])
+    is_fused = np.array([False, False, *(detections.open_confidences > 0)])
     if is_fused.any():
         both = np.flatnonzero(is_fused.take(outcome))
         of = where.regions[both]
         one = fuse_confidences(
-            claims.labels.take(of),
-            claims.confidences.take(of),
+            detections.labels.take(of),
+            detections.confidences.take(of),
             where.overlaps[both],
-            claims.open_labels.take(of),
-            claims.open_confidences.take(of),
+            detections.open_labels.take(of),
+            detections.open_confidences.take(of),
             config.fusion,
         )
-        is_told = one.confidences > (2 * one.by_detector if is_late else 0)
-        labels[both] = np.where(is_told, one.labels, NOT_SEEN)
+        is_labelled = one.confidences > (2 * one.by_detector if is_late else 0)
+        labels[both] = np.where(is_labelled, one.labels, NOT_SEEN)
         confidences[both] = one.confidences
     extents_m = np.fmax(where.depths_m, 0)  # NaN: hidden Gaussians have no extent.
     extents_m /= np.float32(np.sqrt(camera.fx * camera.fy))

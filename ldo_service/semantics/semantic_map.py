@@ -47,18 +47,18 @@ class SemanticMapConfig:
     max_waiting: int = 8
     # Newest keyframes with detections that are remembered, to drop repeated messages. After a
     # restart, a window of 8 is sent again.
-    max_said_again: int = 64
+    max_remembered: int = 64
 
     def __post_init__(self) -> None:
-        if self.max_waiting < 0 or self.max_said_again < 1 or self.max_names > MAX_LABELS:
+        if self.max_waiting < 0 or self.max_remembered < 1 or self.max_names > MAX_LABELS:
             raise ConfigError(
-                named(self, "max_names", "max_waiting", "max_said_again")
-                + ": max_waiting must be at least 0, max_said_again at least 1, "
+                named(self, "max_names", "max_waiting", "max_remembered")
+                + ": max_waiting must be at least 0, max_remembered at least 1, "
                 + f"max_names at most {MAX_LABELS}."
             )
 
     @property
-    def hears_labeller(self) -> bool:
+    def uses_labeller(self) -> bool:
         """True if labels of the labeller are fused into the map."""
         return self.labelling.fusion.rule != "detector"
 
@@ -69,7 +69,7 @@ class KeyframeSemantics:
 
     keyframe: int
     observed: ObjectUpdate
-    asked: tuple[Region, ...] = ()
+    requested: tuple[Region, ...] = ()
 
 
 class SemanticMap:
@@ -100,9 +100,9 @@ class SemanticMap:
         self.config = config or SemanticMapConfig()
         self.vocabulary = Vocabulary(self.config.max_names)
         self.objects = Objects(self.config.objects)
-        is_heard = self.config.hears_labeller
+        is_fused = self.config.uses_labeller
         self.naming = (
-            OpenVocabularyLabeling(self.config.naming, is_heard=is_heard) if has_labeller else None
+            OpenVocabularyLabeling(self.config.naming, is_fused=is_fused) if has_labeller else None
         )
         self._map, self._threads = map_, threads
         self._by_detector, self._by_labeller = set[int](), set[int]()  # Labels by source.
@@ -112,7 +112,7 @@ class SemanticMap:
         self._disagreement = Disagreement(0.0, 0.0)
         self._labelled = 0  # Keyframes.
         self._boxes = self._repeated = self._too_early = self._without_images = 0
-        self._answers_without_images = self._movable = 0
+        self._results_without_images = self._movable = 0
 
     @property
     def is_used(self) -> bool:
@@ -126,7 +126,7 @@ class SemanticMap:
 
     # --- keyframes --------------------------------------------------------------------------------
     def add_detections(
-        self, keyframe: int, claims: RegionDetections | None
+        self, keyframe: int, detections: RegionDetections | None
     ) -> KeyframeSemantics | None:
         """Fuse the detections of a keyframe, or store them until the keyframe is mapped.
 
@@ -134,19 +134,19 @@ class SemanticMap:
 
         Args:
             keyframe: Id of the keyframe.
-            claims: Detections; None if no detector ran on the keyframe.
+            detections: Detections; None if no detector ran on the keyframe.
 
         Returns:
             The result of the fusion; None if nothing was fused.
         """
-        if claims is None and self.naming is None:
+        if detections is None and self.naming is None:
             return None
         if keyframe in self._done or keyframe in self._waiting:
             self._repeated += 1
         elif keyframe in self._map.views:
-            return self._fuse_keyframe(keyframe, claims)
+            return self._fuse_keyframe(keyframe, detections)
         else:
-            self._waiting[keyframe] = claims
+            self._waiting[keyframe] = detections
             while len(self._waiting) > self.config.max_waiting:
                 del self._waiting[next(iter(self._waiting))]
                 self._too_early += 1
@@ -168,7 +168,7 @@ class SemanticMap:
         """
         self._done[keyframe] = None
         self._labelled += 1
-        while len(self._done) > self.config.max_said_again:
+        while len(self._done) > self.config.max_remembered:
             del self._done[next(iter(self._done))]
         if not self._map.views.is_readable(keyframe):
             self._without_images += 1
@@ -178,15 +178,17 @@ class SemanticMap:
         # Find the Gaussians that contribute to the image.
         view, made_by = self._seen(keyframe)
         # Add labels of the labeller and choose label requests.
-        claims, asked = self._with_names(view, made_by.top, found or RegionDetections.none())
+        detections, requested = self._with_names(
+            view, made_by.top, found or RegionDetections.none()
+        )
         # Label the Gaussians.
-        labelled = self._label(view, made_by.indices, claims, is_late=found is None)
+        labelled = self._label(view, made_by.indices, detections, is_late=found is None)
         self._boxes += len(found.boxes) if found else 0
         self._disagreement = labelled.disagreement
         # Update the objects.
-        seen = self._map_view(view, made_by.indices, labelled.assigned.regions, claims)
+        seen = self._map_view(view, made_by.indices, labelled.assigned.regions, detections)
         return KeyframeSemantics(
-            keyframe, self.objects.observe(seen, self._undetectable_labels()), asked
+            keyframe, self.objects.observe(seen, self._undetectable_labels()), requested
         )
 
     def _seen(self, keyframe: int) -> tuple[TrainingView, Contributions]:
@@ -205,30 +207,30 @@ class SemanticMap:
     def _remove_dynamic(self, keyframe: int, found: RegionDetections) -> RegionDetections:
         """Remove detections of dynamic classes, and their surface from the map."""
         names, sure = self.config.movable.classes, self.config.movable_confidence
-        said = [self.vocabulary.name(int(label)) for label in found.labels]
-        is_movable = np.isin(said, names) & (found.confidences >= sure)
+        kinds = [self.vocabulary.name(int(label)) for label in found.labels]
+        is_movable = np.isin(kinds, names) & (found.confidences >= sure)
         if is_movable.any():
-            boxes = [Box(said[i], *(found.boxes[i] + 0.5)) for i in np.flatnonzero(is_movable)]
+            boxes = [Box(kinds[i], *(found.boxes[i] + 0.5)) for i in np.flatnonzero(is_movable)]
             depth_m = self._map.views[keyframe].depth_m
             pixels = dynamic_class_mask(boxes, depth_m, self.config.movable)
             self._movable += self._map.remove_masked(keyframe, pixels)
         return found.where(~is_movable)
 
     def _with_names(
-        self, view: TrainingView, top: np.ndarray, claims: RegionDetections
+        self, view: TrainingView, top: np.ndarray, detections: RegionDetections
     ) -> tuple[RegionDetections, tuple[Region, ...]]:
         """Add known labels to the detections of a keyframe, and choose regions to request."""
-        self._by_detector.update(claims.labels.astype(int).tolist())
+        self._by_detector.update(detections.labels.astype(int).tolist())
         if self.naming is None:
-            return claims, ()
+            return detections, ()
         is_labelled = reliable_label_mask(
             self._map.gaussians.labels, top, self.naming.config.reliable
         )
         T_map_keyframe = self._map.views.poses
-        claims, questions = self.naming.observe_keyframe(
-            view, claims, self.vocabulary, is_labelled, T_map_keyframe
+        detections, requests = self.naming.observe_keyframe(
+            view, detections, self.vocabulary, is_labelled, T_map_keyframe
         )
-        return claims, tuple(question.region for question in questions)
+        return detections, tuple(request.region for request in requests)
 
     def _is_labellers(self, label: int) -> bool:
         """Return whether only the labeller ever gave this label, and never the detector."""
@@ -244,13 +246,13 @@ class SemanticMap:
         self,
         view: TrainingView,
         indices: np.ndarray,
-        claims: RegionDetections,
+        detections: RegionDetections,
         *,
         is_late: bool = False,
     ) -> FusionResult:
         """Fuse the labels of regions into the Gaussians, and mark those that changed."""
-        is_told = claims.open_confidences > 0
-        self._by_labeller.update(claims.open_labels[is_told].astype(int).tolist())
+        is_labelled = detections.open_confidences > 0
+        self._by_labeller.update(detections.open_labels[is_labelled].astype(int).tolist())
         gaussians = self._map.gaussians
         before = gaussians.labels[indices]
         labelled = fuse_detections(
@@ -260,10 +262,10 @@ class SemanticMap:
             view.camera,
             view.T_map_camera,
             view.depth_m,
-            claims,
+            detections,
             self.config.labelling,
             is_late=is_late,
-            spared=self._undetectable_labels(),
+            undetectable=self._undetectable_labels(),
             threads=self._threads,
         )
         is_new = np.any(gaussians.labels[indices] != before, axis=1)
@@ -271,12 +273,16 @@ class SemanticMap:
         return labelled
 
     def _map_view(
-        self, view: TrainingView, indices: np.ndarray, regions: np.ndarray, claims: RegionDetections
+        self,
+        view: TrainingView,
+        indices: np.ndarray,
+        regions: np.ndarray,
+        detections: RegionDetections,
     ) -> MapView:
         gaussians = self._map.gaussians
         at = view.keyframe, view.camera, view.T_map_camera
         known = gaussians.rows, gaussians.labels, gaussians.ids, gaussians.anchors
-        seen = indices, regions, claims.boxes, claims.classes(), view.depth_m
+        seen = indices, regions, detections.boxes, detections.classes(), view.depth_m
         return MapView(*at, *known, *seen)
 
     # --- label results ----------------------------------------------------------------------------
@@ -289,22 +295,22 @@ class SemanticMap:
         Returns:
             True if the label was fused.
         """
-        claims = self.naming and self.naming.apply_label_result(
+        detections = self.naming and self.naming.apply_label_result(
             region, keyframe, answer, self.vocabulary
         )
-        if claims is None:
+        if detections is None:
             return False
         if not self._map.views.is_readable(keyframe):
-            self._answers_without_images += 1
+            self._results_without_images += 1
             return False
         view, made_by = self._seen(keyframe)
-        self._label(view, made_by.indices, claims, is_late=True)
+        self._label(view, made_by.indices, detections, is_late=True)
         self.refresh(view)
-        if self._is_labellers(int(claims.open_labels[0])):
-            self._tell_where_shown(region, keyframe)
+        if self._is_labellers(int(detections.open_labels[0])):
+            self._label_other_views(region, keyframe)
         return True
 
-    def _tell_where_shown(self, region: int, told: int) -> None:
+    def _label_other_views(self, region: int, labelled_keyframe: int) -> None:
         """Fuse the label of a region in the other keyframes of its label request.
 
         This is called only for labels that the detector never gives. A label that the detector
@@ -312,12 +318,14 @@ class SemanticMap:
         """
         assert self.naming is not None
         for keyframe in self.naming.shown_in(region):
-            if keyframe == told or not self._map.views.is_readable(keyframe):
+            if keyframe == labelled_keyframe or not self._map.views.is_readable(keyframe):
                 continue
             view, made_by = self._seen(keyframe)
-            claims = self.naming.carried(region, view, self.vocabulary, self._map.views.poses)
-            if claims is not None:
-                self._label(view, made_by.indices, claims, is_late=True)
+            detections = self.naming.propagated(
+                region, view, self.vocabulary, self._map.views.poses
+            )
+            if detections is not None:
+                self._label(view, made_by.indices, detections, is_late=True)
                 self.refresh(view)
 
     def refresh(self, view: TrainingView | None = None) -> None:
@@ -335,7 +343,7 @@ class SemanticMap:
             "objects": self.objects.pack(),
             "done": list(self._done),
             "labelled": self._labelled,
-            "waiting": [(keyframe, _packed(claims)) for keyframe, claims in self._waiting.items()],
+            "waiting": [(k, _packed(found)) for k, found in self._waiting.items()],
             "naming": self.naming and self.naming.pack(),
             "given": [sorted(self._by_detector), sorted(self._by_labeller)],
         }
@@ -351,9 +359,9 @@ class SemanticMap:
         }
         self._by_detector, self._by_labeller = map(set, state["given"])
         if self.naming and state["naming"]:
-            is_heard = self.config.hears_labeller
+            is_fused = self.config.uses_labeller
             self.naming = OpenVocabularyLabeling.unpack(
-                state["naming"], self.config.naming, is_heard=is_heard
+                state["naming"], self.config.naming, is_fused=is_fused
             )
 
     def metrics(self) -> dict[str, float]:
@@ -382,11 +390,11 @@ class SemanticMap:
             **self.objects.metrics(),
             **(self.naming.metrics() if self.naming else {}),
             # Keyframes without stored images.
-            "answers_without_images": self._answers_without_images,
+            "answers_without_images": self._results_without_images,
         }
 
 
-def _packed(claims: RegionDetections | None) -> list[np.ndarray]:
+def _packed(detections: RegionDetections | None) -> list[np.ndarray]:
     """Return the arrays of a keyframe's detections; none if no detector ran."""
     names = [f.name for f in fields(RegionDetections) if f.name not in ("parts", "replaces_labels")]
-    return [getattr(claims, name) for name in names] if claims else []
+    return [getattr(detections, name) for name in names] if detections else []

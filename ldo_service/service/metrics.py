@@ -174,8 +174,8 @@ def _table(
         now: Health of the actors with a recent heartbeat, for gauges.
         items_of: Function from a health message to label values and items.
     """
-    for (family, name, says), value in rows.items():
-        metric = family(f"ldo_{name}", says, labels=labels)
+    for (family, name, help_text), value in rows.items():
+        metric = family(f"ldo_{name}", help_text, labels=labels)
         for health in known if family is CounterMetricFamily else now:
             for of_labels, item in items_of(health):
                 metric.add_metric(of_labels, float(value(item)))
@@ -183,8 +183,8 @@ def _table(
 
 
 def _processes(begun_anew: dict[str, int]) -> Metric:
-    says = "Restarts of the actor's process since this exporter started."
-    metric = CounterMetricFamily("ldo_process_restarts", says, labels=["actor"])
+    help_text = "Restarts of the actor's process since this exporter started."
+    metric = CounterMetricFamily("ldo_process_restarts", help_text, labels=["actor"])
     for actor, count in begun_anew.items():
         metric.add_metric([actor], count)
     return metric
@@ -259,5 +259,5 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
 def _how_it_is(silent: list[str], start_response: Any) -> list[bytes]:
     status = "503 Service Unavailable" if silent else "200 OK"
     start_response(status, [("Content-Type", "text/plain; charset=utf-8")])
-    says = f"no heartbeat: {', '.join(silent)}" if silent else "every actor reports"
-    return [f"{says}\n".encode()]
+    help_text = f"no heartbeat: {', '.join(silent)}" if silent else "every actor reports"
+    return [f"{help_text}\n".encode()]

@@ -6,12 +6,12 @@ values from the paper, for its own method and for others.
 """
 
 from .runner import Outcome, SuiteRunner
-from .suite import FIGURES, Judged, Suite, SuiteRun, known_suites, load_suite
+from .suite import FIGURES, EvaluatedRun, Suite, SuiteRun, known_suites, load_suite
 from .tables import markdown
 
 __all__ = [
     "FIGURES",
-    "Judged",
+    "EvaluatedRun",
     "Outcome",
     "Suite",
     "SuiteRun",

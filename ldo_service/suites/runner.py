@@ -16,12 +16,12 @@ from ldo_service import versions
 from ldo_service.errors import ConfigError
 from ldo_service.runs.front_end import FRONT_END
 
-from .suite import SYNTHETIC, Judged, Suite, SuiteRun
+from .suite import SYNTHETIC, EvaluatedRun, Suite, SuiteRun
 
 log = logging.getLogger(__name__)
 
 LDO = (sys.executable, "-m", "ldo_service")
-TOLD, RESULTS = "entry.json", "eval.json"
+ENTRY, RESULTS = "entry.json", "eval.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +30,12 @@ class Outcome:
 
     Attributes:
         entry: The run.
-        judged: Results of the run; None if there are none.
+        evaluated: Results of the run; None if there are none.
         missing: Reason why there are no results, as printed in the table.
     """
 
     entry: SuiteRun
-    judged: Judged | None
+    evaluated: EvaluatedRun | None
     missing: str = ""
 
 
@@ -83,29 +83,31 @@ class SuiteRunner:
                 )
                 return Outcome(entry, None, "failed")
         try:
-            return Outcome(entry, judged_in(folder))
+            return Outcome(entry, read_evaluated_run(folder))
         except ConfigError as error:
             log.error("suite: %s", error)
             return Outcome(entry, None, "failed")
 
-    def _told(self, entry: SuiteRun) -> str:
+    def _entry_json(self, entry: SuiteRun) -> str:
         """Return everything that the results of a run depend on, as JSON."""
-        told = {
+        values = {
             **asdict(entry),
             "settings": (*self.settings, *entry.settings),
             "options": self.suite.options(),
             "ldo": versions()["ldo-slam"],
         }
         if self.suite.front_end is None:
-            del told["front_end"]
+            del values["front_end"]
         else:
-            told["front_end_settings"] = self.suite.front_end_settings()
-        return json.dumps(told, indent=1)
+            values["front_end_settings"] = self.suite.front_end_settings()
+        return json.dumps(values, indent=1)
 
     def _is_finished(self, entry: SuiteRun, folder: Path) -> bool:
-        told = folder / TOLD
+        entry_path = folder / ENTRY
         is_kept = entry.variant != self.suite.front_end or (folder / FRONT_END).is_file()
-        return is_kept and told.is_file() and told.read_text() == self._told(entry)
+        return (
+            is_kept and entry_path.is_file() and entry_path.read_text() == self._entry_json(entry)
+        )
 
     def _run(self, entry: SuiteRun, folder: Path) -> str:
         """Execute and evaluate a run; return the reason if it fails, else an empty string."""
@@ -117,21 +119,21 @@ class SuiteRunner:
             run += ("--reuse-front-end", str(self.out / entry.front_end_folder))
         elif self.suite.front_end:
             run += ("--keep-front-end",)
-        for name in (TOLD, RESULTS):  # `ldo run` replaces only its own files.
+        for name in (ENTRY, RESULTS):  # `ldo run` replaces only its own files.
             (folder / name).unlink(missing_ok=True)
         done = _ldo(*run, *settings)
         if done.returncode:
             return _reason(done)
-        judged = _ldo("eval", str(folder), entry.source, "--json")
-        if judged.returncode:
-            return _reason(judged)
-        _write(folder / RESULTS, judged.stdout)
+        evaluated = _ldo("eval", str(folder), entry.source, "--json")
+        if evaluated.returncode:
+            return _reason(evaluated)
+        _write(folder / RESULTS, evaluated.stdout)
         # This file marks the run as finished, so it is written last.
-        _write(folder / TOLD, self._told(entry))
+        _write(folder / ENTRY, self._entry_json(entry))
         return ""
 
 
-def judged_in(folder: Path) -> Judged:
+def read_evaluated_run(folder: Path) -> EvaluatedRun:
     """Return the results of a finished run.
 
     Raises:
@@ -139,7 +141,7 @@ def judged_in(folder: Path) -> Judged:
     """
     try:
         texts = [(folder / name).read_text() for name in ("summary.json", RESULTS)]
-        return Judged(*map(json.loads, texts))
+        return EvaluatedRun(*map(json.loads, texts))
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"{folder} has no valid results ({error}). Remove it to run it again."

@@ -22,7 +22,7 @@ NAME = re.compile(r"[\w][\w .+-]{0,60}")  # Valid names of folders.
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class EvaluatedRun:
     """Results of a run.
 
     Attributes:
@@ -73,22 +73,22 @@ class Score:
 
     title: str
     form: str
-    read: Callable[[Judged], float | None]
+    read: Callable[[EvaluatedRun], float | None]
 
-    def of(self, judged: Judged) -> float | None:
+    def of(self, evaluated: EvaluatedRun) -> float | None:
         """Return the value of a run; None if the run has none."""
         try:
-            return self.read(judged)
+            return self.read(evaluated)
         except (KeyError, IndexError, TypeError):
             return None
 
 
-def _depth_l1_cm(run: Judged) -> float | None:
+def _depth_l1_cm(run: EvaluatedRun) -> float | None:
     depth_l1_m = run.rendering(HELD_OUT, "depth_l1_m")
     return None if depth_l1_m is None else 100 * depth_l1_m
 
 
-def _seconds(stage: str) -> Callable[[Judged], float | None]:
+def _seconds(stage: str) -> Callable[[EvaluatedRun], float | None]:
     return lambda run: 1e-3 * run.summary["stage_ms"][stage]["p50"]
 
 

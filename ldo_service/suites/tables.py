@@ -81,5 +81,5 @@ def _average(suite: Suite, figure: Score, outcomes: Sequence[Outcome]) -> str:
 
 
 def _values(figure: Score, outcomes: Sequence[Outcome]) -> list[float]:
-    found = [figure.of(o.judged) for o in outcomes if o.judged is not None]
+    found = [figure.of(o.evaluated) for o in outcomes if o.evaluated is not None]
     return [value for value in found if value is not None]

@@ -61,8 +61,8 @@ class FrameTracker:
 
     @property
     def can_reuse_keyframes(self) -> bool:
-        """True once at least `returning.after` keyframes were made; 0 there disables the reuse."""
-        return 0 < self.config.returning.after <= self.state.next_id
+        """True once `keyframe_reuse.after` keyframes were made; 0 there disables the reuse."""
+        return 0 < self.config.keyframe_reuse.after <= self.state.next_id
 
     def track(self, frame: RgbdFrame, prior: PriorPose | None = None) -> TrackedFrame:
         """Track a frame, and return its pose with the tracking status.
@@ -86,7 +86,7 @@ class FrameTracker:
             status = TrackingStatus.LOST
         # Relocalization.
         if status is TrackingStatus.LOST:
-            found = self._relocalize(view, self._places_when_lost(), is_lost=True)
+            found = self._relocalize(view, self._records_when_lost(), is_lost=True)
             if found is None:
                 return self._lost_result(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, TrackingStatus.OK
@@ -138,7 +138,7 @@ class FrameTracker:
         )
 
     def relocalize_in(
-        self, frame: RgbdFrame, places: KeyframeDatabase
+        self, frame: RgbdFrame, database: KeyframeDatabase
     ) -> tuple[ReferenceKeyframe, Alignment] | None:
         """Relocalize the frame just tracked in a keyframe database.
 
@@ -146,7 +146,7 @@ class FrameTracker:
             The matching keyframe and the alignment of the frame to it; None if no keyframe is
             verified.
         """
-        found = self._relocalize(self.view(frame), places, is_lost=False)
+        found = self._relocalize(self.view(frame), database, is_lost=False)
         return None if found is None else (found[0], found[1].alignment)
 
     def view(self, frame: RgbdFrame) -> Pyramid:
@@ -181,16 +181,18 @@ class FrameTracker:
         """
         motion = self.state.motion
         T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
-        resting = T_keyframe_odom @ motion.T_odom_camera
+        T_keyframe_previous = T_keyframe_odom @ motion.T_odom_camera
         predicted = self._guesses.align_from_guess(
             keyframe, view, T_keyframe_odom @ motion.predicted(stamp_ns)
         )
         is_sure = self._classify(predicted) is TrackingStatus.OK
-        if is_sure and not self._guesses.is_large_step(predicted, resting, view):
+        if is_sure and not self._guesses.is_large_step(predicted, T_keyframe_previous, view):
             return predicted
         T_odom_camera = self._dead_reckoned_pose()
-        carried = None if T_odom_camera is None else T_keyframe_odom @ T_odom_camera
-        return self._guesses.align_from_all_guesses(predicted, keyframe, view, resting, carried)
+        T_keyframe_reckoned = None if T_odom_camera is None else T_keyframe_odom @ T_odom_camera
+        return self._guesses.align_from_all_guesses(
+            predicted, keyframe, view, T_keyframe_previous, T_keyframe_reckoned
+        )
 
     def _dead_reckoned_pose(self) -> np.ndarray | None:
         """Return T_odom_camera [4, 4] of this frame by dead reckoning with the odometry prior.
@@ -210,7 +212,7 @@ class FrameTracker:
         )
 
     # --- relocalization ---------------------------------------------------------------------------
-    def _places_when_lost(self) -> KeyframeDatabase:
+    def _records_when_lost(self) -> KeyframeDatabase:
         """Add the last mapping keyframe to the database, and return the database.
 
         The mapping keyframe is newer than the reference keyframe and thus closer to the last camera
@@ -218,27 +220,29 @@ class FrameTracker:
         """
         before = self.state
         if before.mapping_keyframe is not None:
-            places = before.places.with_record(before.mapping_keyframe, self.config.places)
-            self.state = replace(before, places=places, mapping_keyframe=None)
-        return self.state.places
+            database = before.database.with_record(
+                before.mapping_keyframe, self.config.keyframe_database
+            )
+            self.state = replace(before, database=database, mapping_keyframe=None)
+        return self.state.database
 
     def _relocalize(
-        self, view: Pyramid, places: KeyframeDatabase, *, is_lost: bool
+        self, view: Pyramid, database: KeyframeDatabase, *, is_lost: bool
     ) -> tuple[ReferenceKeyframe, PoseHypothesis] | None:
         if not self._is_usable(view):
             return None
         state = self.state
         self.state = replace(state, relocalization_count=state.relocalization_count + 1)
         return self._relocalizer.find(
-            view, places, state.relocalization_count, state.history, is_lost=is_lost
+            view, database, state.relocalization_count, state.history, is_lost=is_lost
         )
 
-    def _places_of_other_submaps(self, submap: int) -> KeyframeDatabase:
+    def _records_of_other_submaps(self, submap: int) -> KeyframeDatabase:
         """Return the keyframe records of all submaps that are not merged with the given one."""
         state = self.state
         are_merged = state.submaps.are_merged
         return KeyframeDatabase(
-            tuple(p for p in state.places.all if not are_merged(p.submap, submap))
+            tuple(p for p in state.database.all if not are_merged(p.submap, submap))
         )
 
     def _search_other_submaps(
@@ -251,8 +255,8 @@ class FrameTracker:
         before, config = self.state.submaps, self.config.submaps
         if tracked.status is not TrackingStatus.OK or not before.is_search_due(config):
             return tracked
-        places = self._places_of_other_submaps(keyframe.submap)
-        found = self._relocalize(view, places, is_lost=False)
+        database = self._records_of_other_submaps(keyframe.submap)
+        found = self._relocalize(view, database, is_lost=False)
         look = measurement = None
         if found is not None:
             there, alignment = found[0], found[1].alignment
@@ -364,8 +368,8 @@ class FrameTracker:
             self.state, dynamic_mask=seen.dynamic_mask, motion_evidence=seen.suspicion
         )
         if seen.has_large_change(keyframe.moved_mask, config):
-            left_out = grow_mask(seen.moved_mask, keyframe.view, config)
-            renewed = replace(keyframe, moved_mask=seen.moved_mask, ignore_mask=left_out)
+            ignore_mask = grow_mask(seen.moved_mask, keyframe.view, config)
+            renewed = replace(keyframe, moved_mask=seen.moved_mask, ignore_mask=ignore_mask)
             self.state = replace(self.state, keyframe=renewed)
         return grow_mask(seen.dynamic_mask, view, config)
 

@@ -16,7 +16,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from ldo_service.errors import ConfigError, DataError
+from ldo_service.errors import ConfigError, DataError, named
 from ldo_service.geometry import Camera, codecs, se3
 from ldo_service.storage.state_codec import decode_state
 
@@ -57,13 +57,11 @@ class KeyframeDatabaseConfig:
     def __post_init__(self) -> None:
         if self.count < 3 or self.features < 1:
             raise ConfigError(
-                f"places.count={self.count} must be at least 3 and "
-                f"places.features={self.features} at least 1."
+                named(self, "count", "features")
+                + ": count must be at least 3, features at least 1."
             )
         if self.same < 0 or self.recent < 0:
-            raise ConfigError(
-                f"places.same={self.same:g} and places.recent={self.recent} must not be negative."
-            )
+            raise ConfigError(named(self, "same", "recent") + " must not be negative.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,21 +145,21 @@ class KeyframeRecord:
             view, self.T_odom_keyframe, self.id, self.submap, stored_features=self.features
         )
 
-    def without(self, left_out: np.ndarray) -> "KeyframeRecord":
+    def without(self, ignore_mask: np.ndarray) -> "KeyframeRecord":
         """Return a copy of the record without the features, intensity and depth of masked pixels.
 
         Args:
-            left_out: Mask, [H, W] bool, of the size of `camera`.
+            ignore_mask: Mask, [H, W] bool, of the size of `camera`.
         """
-        if not left_out.any():
+        if not ignore_mask.any():
             return self
-        kept = _are_still(self.points_camera.astype(float), self.camera, left_out)
+        kept = _are_still(self.points_camera.astype(float), self.camera, ignore_mask)
         return replace(
             self,
             points_camera=self.points_camera[kept],
             descriptors=self.descriptors[kept],
-            gray=_gray_bytes(self._gray, left_out),
-            depth=_depth_bytes(self.depth_m, left_out),
+            gray=_gray_bytes(self._gray, ignore_mask),
+            depth=_depth_bytes(self.depth_m, ignore_mask),
         )
 
     @property
@@ -192,9 +190,9 @@ def make_keyframe_record(
         history: Noise of the frames tracked before the keyframe. Its medians are stored.
     """
     view, level = keyframe.view, keyframe.view.levels[0]
-    left_out = resized(keyframe.ignore_mask, level.depth_m.shape)
+    ignore_mask = resized(keyframe.ignore_mask, level.depth_m.shape)
     seen = detect(view, replace(features, count=config.features))
-    kept = _are_still(seen.points_camera, level.camera, left_out)
+    kept = _are_still(seen.points_camera, level.camera, ignore_mask)
     return KeyframeRecord(
         id=keyframe.id,
         submap=keyframe.submap,
@@ -206,29 +204,29 @@ def make_keyframe_record(
         points_camera=seen.points_camera[kept].astype(np.float32),
         descriptors=seen.descriptors[kept],
         camera=level.camera,
-        gray=_gray_bytes(np.rint(level.texels[..., 0]), left_out),
-        depth=_depth_bytes(level.depth_m, left_out),
+        gray=_gray_bytes(np.rint(level.texels[..., 0]), ignore_mask),
+        depth=_depth_bytes(level.depth_m, ignore_mask),
     )
 
 
-def _gray_bytes(gray: np.ndarray, left_out: np.ndarray) -> bytes:
-    _, png = cv2.imencode(".png", np.where(left_out, 0, gray).astype(np.uint8))
+def _gray_bytes(gray: np.ndarray, ignore_mask: np.ndarray) -> bytes:
+    _, png = cv2.imencode(".png", np.where(ignore_mask, 0, gray).astype(np.uint8))
     return png.tobytes()
 
 
-def _depth_bytes(depth_m: np.ndarray, left_out: np.ndarray) -> bytes:
+def _depth_bytes(depth_m: np.ndarray, ignore_mask: np.ndarray) -> bytes:
     steps = np.rint(depth_m * DEPTH_STEPS_PER_M)
-    steps[left_out | (steps > np.iinfo(np.uint16).max)] = 0
+    steps[ignore_mask | (steps > np.iinfo(np.uint16).max)] = 0
     return codecs.encode_depth(steps.astype(np.uint16))[1]
 
 
-def _are_still(points: np.ndarray, camera: Camera, left_out: np.ndarray) -> np.ndarray:
-    """Return the mask of the points that have a measured depth and project outside `left_out`.
+def _are_still(points: np.ndarray, camera: Camera, ignore_mask: np.ndarray) -> np.ndarray:
+    """Return the mask of the points that have a measured depth and project outside `ignore_mask`.
 
     Args:
         points: Points in the camera, [N, 3] meters; z = 0 where unmeasured.
         camera: Intrinsics of the mask.
-        left_out: Pixels to exclude, [H, W] bool.
+        ignore_mask: Pixels to exclude, [H, W] bool.
 
     Returns:
         [N] bool.
@@ -236,7 +234,7 @@ def _are_still(points: np.ndarray, camera: Camera, left_out: np.ndarray) -> np.n
     kept = points[:, 2] > 0
     pixels = np.rint(camera.project(points[kept])).astype(int)
     column, row = np.clip(pixels, 0, [camera.width - 1, camera.height - 1]).T
-    kept[kept] = ~left_out[row, column]
+    kept[kept] = ~ignore_mask[row, column]
     return kept
 
 
@@ -258,7 +256,7 @@ class KeyframeDatabase:
         return len(self.all)
 
     def with_record(
-        self, place: KeyframeRecord, config: KeyframeDatabaseConfig
+        self, record: KeyframeRecord, config: KeyframeDatabaseConfig
     ) -> "KeyframeDatabase":
         """Return the database with a new record.
 
@@ -267,38 +265,38 @@ class KeyframeDatabase:
         the one whose previous and next record are closest to each other.
 
         Args:
-            place: The new record.
+            record: The new record.
             config: Settings.
         """
-        kept = (*self._others(place, config), place)
+        kept = (*self._others(record, config), record)
         if len(kept) > config.count:
             spare = int(np.argmin(neighbor_distances(kept))) + 1
             kept = (*kept[:spare], *kept[spare + 1 :])
         return KeyframeDatabase(kept)
 
-    def with_reused(self, place: KeyframeRecord) -> "KeyframeDatabase":
+    def with_reused(self, record: KeyframeRecord) -> "KeyframeDatabase":
         """Return the database with the record of a reused keyframe moved to the end.
 
         The given record replaces the older one with the same id; its pose in odometry is new.
         """
-        return KeyframeDatabase((*(other for other in self.all if other.id != place.id), place))
+        return KeyframeDatabase((*(other for other in self.all if other.id != record.id), record))
 
-    def without(self, left_out: np.ndarray, keyframe: int) -> "KeyframeDatabase":
+    def without(self, ignore_mask: np.ndarray, keyframe: int) -> "KeyframeDatabase":
         """Return the database with pixels of one record masked; see `KeyframeRecord.without`.
 
         Args:
-            left_out: Pixels to exclude, [H, W] bool.
+            ignore_mask: Pixels to exclude, [H, W] bool.
             keyframe: Id of the record.
         """
-        places = (p.without(left_out) if p.id == keyframe else p for p in self.all)
-        return KeyframeDatabase(tuple(places))
+        records = (p.without(ignore_mask) if p.id == keyframe else p for p in self.all)
+        return KeyframeDatabase(tuple(records))
 
     def in_submap(self, submap: int, without: Set[int] = frozenset()) -> tuple[KeyframeRecord, ...]:
         """Return the records of a submap, except for the ids in `without`."""
         return tuple(p for p in self.all if p.submap == submap and p.id not in without)
 
     def _others(
-        self, place: KeyframeRecord, config: KeyframeDatabaseConfig
+        self, record: KeyframeRecord, config: KeyframeDatabaseConfig
     ) -> tuple[KeyframeRecord, ...]:
         """Return all records except the one that a new record replaces.
 
@@ -308,7 +306,7 @@ class KeyframeDatabase:
         older = self.all[: max(0, len(self.all) - config.recent)]
         if not older:
             return self.all
-        apart = _apart(older, place)
+        apart = _apart(older, record)
         nearest = int(np.argmin(apart))
         if apart[nearest] >= config.same:
             return self.all
@@ -322,7 +320,7 @@ class KeyframeDatabase:
     @cached_property
     def _thumbnails(self) -> np.ndarray:
         """Thumbnails [N, 300] as float32. Their values are integers, so correlations are exact."""
-        return np.array([place.thumbnail for place in self.all], np.float32).reshape(
+        return np.array([record.thumbnail for record in self.all], np.float32).reshape(
             -1, THUMBNAIL[0] * THUMBNAIL[1]
         )
 
@@ -334,25 +332,25 @@ def neighbor_distances(path: Sequence[KeyframeRecord]) -> np.ndarray:
         [N-2], rad, as `motion.image_motion_rad` defines it; infinite if the previous and the next
         record are in different submaps.
     """
-    median_depth_m = np.array([place.median_depth_m for place in path[1:-1]])
+    median_depth_m = np.array([record.median_depth_m for record in path[1:-1]])
     apart = image_motions_rad(se3.inverse(_poses(path[:-2])) @ _poses(path[2:]), median_depth_m)
-    submap = np.array([place.submap for place in path])
+    submap = np.array([record.submap for record in path])
     return np.where(submap[:-2] == submap[2:], apart, np.inf)
 
 
-def _apart(places: tuple[KeyframeRecord, ...], other: KeyframeRecord) -> np.ndarray:
+def _apart(records: tuple[KeyframeRecord, ...], other: KeyframeRecord) -> np.ndarray:
     """Return the distance of each record to another one.
 
     Returns:
         [N], rad, as `motion.image_motion_rad` defines it; infinite for records of another submap.
     """
-    moved = se3.inverse(_poses(places)) @ other.T_odom_keyframe
-    submap = np.array([place.submap for place in places])
+    moved = se3.inverse(_poses(records)) @ other.T_odom_keyframe
+    submap = np.array([record.submap for record in records])
     return np.where(submap == other.submap, image_motions_rad(moved, other.median_depth_m), np.inf)
 
 
-def _poses(places: Sequence[KeyframeRecord]) -> np.ndarray:
-    return np.array([place.T_odom_keyframe for place in places]).reshape(-1, 4, 4)
+def _poses(records: Sequence[KeyframeRecord]) -> np.ndarray:
+    return np.array([record.T_odom_keyframe for record in records]).reshape(-1, 4, 4)
 
 
 def load_keyframe_database(folder: Path) -> KeyframeDatabase:
@@ -370,16 +368,18 @@ def load_keyframe_database(folder: Path) -> KeyframeDatabase:
         )
     try:
         kept = decode_state(path.read_bytes())
-        places = KeyframeDatabase(tuple(KeyframeRecord.unpack(place) for place in kept["places"]))
+        database = KeyframeDatabase(
+            tuple(KeyframeRecord.unpack(record) for record in kept["places"])
+        )
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
     except (msgspec.DecodeError, ValueError, KeyError, TypeError) as error:
         raise DataError(
             f"{path} is not a valid keyframe database ({error!r}). Repeat the run (`ldo run`)."
         ) from error
-    if not len(places):
+    if not len(database):
         raise DataError(
             f"{path} contains no keyframe, because the run made none. Check that the recording "
             "has depth images, and repeat the run."
         )
-    return places
+    return database

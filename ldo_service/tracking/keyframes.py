@@ -35,7 +35,7 @@ class KeyframeConfig:
     # max_translation; the reference keyframe stays. The map gains by more views, tracking by fewer
     # references. Kitchen, held-out views at equal iterations: +0.4 dB, the worst +2 dB. Above 1: no
     # mapping keyframes.
-    supporting: float = 0.33
+    mapping_only_ratio: float = 0.33
 
     def __post_init__(self) -> None:
         if not (0 <= self.still_overlap <= 1 and self.still_motion >= 0):
@@ -43,10 +43,11 @@ class KeyframeConfig:
                 f"still_overlap={self.still_overlap:g} must be within 0..1, "
                 f"still_motion={self.still_motion:g} at least 0."
             )
-        if not min(self.max_rotation_rad, self.max_translation, self.supporting) > 0:
+        if not min(self.max_rotation_rad, self.max_translation, self.mapping_only_ratio) > 0:
             raise ConfigError(
                 f"max_rotation_rad={self.max_rotation_rad:g}, max_translation="
-                f"{self.max_translation:g} and supporting={self.supporting:g} must be positive."
+                f"{self.max_translation:g} and "
+                f"mapping_only_ratio={self.mapping_only_ratio:g} must be positive."
             )
         if not 0 <= self.min_overlap <= 1:
             raise ConfigError(f"min_overlap={self.min_overlap:g} must be within 0..1.")
@@ -170,7 +171,7 @@ def needs_mapping_keyframe(
     It should if the camera has moved far enough since the last mapped frame.
     """
     left = float(limit_ratios(T_mapped_camera, median_depth_m, config))
-    return left > config.supporting and config.supporting <= 1
+    return left > config.mapping_only_ratio and config.mapping_only_ratio <= 1
 
 
 def limit_ratios(

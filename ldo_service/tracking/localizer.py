@@ -37,9 +37,10 @@ class MapFix:
     def is_search_due(self, config: SubmapConfig) -> bool:
         """Return whether to search the map with this frame.
 
-        Every frame is searched until the camera is found, then one in `config.look_every`.
+        Every frame is searched until the camera is found, then one in
+        `config.search_interval_frames`.
         """
-        return self.T_map_odom is None or self.frames_since_search >= config.look_every
+        return self.T_map_odom is None or self.frames_since_search >= config.search_interval_frames
 
     def after(self, tracked: TrackedFrame) -> "MapFix":
         """Return the fix after one more frame; a new submap of odometry has an unknown pose."""
@@ -54,7 +55,7 @@ class MapFix:
         )
         T_map_odom = look.T_there_here if is_confirmed else self.T_map_odom
         # Search again soon after a match that is not confirmed.
-        since = 0 if is_confirmed else config.look_every - config.confirm_after
+        since = 0 if is_confirmed else config.search_interval_frames - config.confirm_after
         return replace(self, T_map_odom=T_map_odom, pending_match=look, frames_since_search=since)
 
     def pack(self) -> dict[str, Any]:
@@ -76,19 +77,19 @@ class Localizer(Odometry):
 
     def __init__(
         self,
-        places: KeyframeDatabase,
+        database: KeyframeDatabase,
         config: OdometryConfig | None = None,
         T_base_camera: np.ndarray | None = None,
     ) -> None:
         """Start without a known pose in the map.
 
         Args:
-            places: Keyframe database of the map. Its poses T_odom_keyframe are in the map frame.
+            database: Keyframe database of the map. Its poses T_odom_keyframe are in the map frame.
             config: Settings; see `Odometry`.
             T_base_camera: Pose of the camera on the robot, [4, 4]; see `Odometry`.
         """
         super().__init__(config, T_base_camera)
-        self._places = places
+        self._database = database
         self._fix = MapFix()
 
     def process(
@@ -143,7 +144,7 @@ class Localizer(Odometry):
 
     def _search(self, frame: RgbdFrame, tracked: TrackedFrame) -> None:
         """Relocalize the frame just tracked in the map, and update the fix."""
-        found = self._frames.relocalize_in(frame, self._places)
+        found = self._frames.relocalize_in(frame, self._database)
         if found is None:
             self._fix = replace(self._fix, frames_since_search=0)
             return

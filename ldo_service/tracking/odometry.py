@@ -75,7 +75,7 @@ class Odometry:
             self.config.align,
             self.config.keyframes,
             self.config.tracking_quality,
-            self.config.returning,
+            self.config.keyframe_reuse,
         )
         self._earlier = RecentKeyframeCache(self.config.pyramid)
 
@@ -111,7 +111,7 @@ class Odometry:
         known, reused = self._find_reusable_keyframe(frame, tracked), None
         if known is not None and self._is_connected_to_map:
             tracked = self._switch_to_keyframe(known, tracked)
-            needed, reused, known = None, known.place.id, None
+            needed, reused, known = None, known.record.id, None
         # Make a keyframe with its relative-pose measurements; it may merge two submaps.
         keyframe = None
         if needed is not None and may_map:
@@ -158,7 +158,7 @@ class Odometry:
             self._frames.state = replace(
                 state,
                 keyframe=replace(state.keyframe, dynamic_class_mask=mask),
-                places=state.places.without(mask, keyframe),
+                database=state.database.without(mask, keyframe),
             )
 
     @property
@@ -211,10 +211,10 @@ class Odometry:
             return None
         state = self._frames.state
         known = [
-            place
-            for place in state.places.all
-            if place.id != tracked.reference
-            and state.submaps.are_merged(place.submap, tracked.submap)
+            record
+            for record in state.database.all
+            if record.id != tracked.reference
+            and state.submaps.are_merged(record.submap, tracked.submap)
         ]
         near = find_nearby_keyframes(
             known, self._map.T_map_keyframe, T_map_camera, self.config.keyframes
@@ -232,9 +232,9 @@ class Odometry:
             tracked.T_odom_camera @ se3.inverse(alignment.T_reference_camera)
         )
         here = {"T_odom_keyframe": T_odom_keyframe, "submap": tracked.submap}
-        place, keyframe = replace(known.place, **here), replace(known.keyframe, **here)
+        record, keyframe = replace(known.record, **here), replace(known.keyframe, **here)
         self._frames.state = self._frames.state.with_reused_keyframe(
-            keyframe, place, tracked.T_odom_camera
+            keyframe, record, tracked.T_odom_camera
         )
         switched = TrackedFrame.of(
             alignment,
@@ -272,7 +272,7 @@ class Odometry:
             keyframe = self._add_reference(frame, tracked, is_connected=known is not None)
             window = self._measure_window(tracked)
             if known is not None:
-                others = (measured for measured in window if measured.a != known.place.id)
+                others = (measured for measured in window if measured.a != known.record.id)
                 window = [known.measures(keyframe), *others]
         self._map.add_keyframe(keyframe, tracked, self.reference)
         merge = tracked.submap_measurement
@@ -298,9 +298,9 @@ class Odometry:
             submaps = frames.state.submaps.with_merge(tracked.submap, other)
             frames.state = replace(frames.state, submaps=submaps)
         keyframe = self._keyframe_of(frame, tracked)
-        place = self._place_of(keyframe)
+        record = self._record_of(keyframe)
         frames.state = frames.state.with_new(
-            keyframe, place, self.config.places, is_tied=is_connected
+            keyframe, record, self.config.keyframe_database, is_measured=is_connected
         )
         return keyframe.id
 
@@ -313,7 +313,7 @@ class Odometry:
         keyframe = self._keyframe_of(frame, tracked)
         self._frames.state = replace(
             self._frames.state,
-            mapping_keyframe=self._place_of(keyframe),
+            mapping_keyframe=self._record_of(keyframe),
             next_id=keyframe.id + 1,
             T_odom_last_mapped=tracked.T_odom_camera,
         )
@@ -328,8 +328,8 @@ class Odometry:
         if keyframe is None or tracked.reference is None:
             return []
         without = {keyframe.id, tracked.reference}
-        places = self._frames.state.places.in_submap(keyframe.submap, without)
-        earlier = self._earlier.newest_first(places, self.config.window.reach)
+        records = self._frames.state.database.in_submap(keyframe.submap, without)
+        earlier = self._earlier.newest_first(records, self.config.window.reach)
         usual = BrightnessModel(
             intensity_sigma=tracked.intensity_sigma, depth_noise_scale=tracked.depth_noise_scale
         )
@@ -347,6 +347,8 @@ class Odometry:
             ignore_mask=tracked.dynamic_mask,
         )
 
-    def _place_of(self, keyframe: ReferenceKeyframe) -> KeyframeRecord:
+    def _record_of(self, keyframe: ReferenceKeyframe) -> KeyframeRecord:
         history = self._frames.state.history
-        return make_keyframe_record(keyframe, self.config.features, self.config.places, history)
+        return make_keyframe_record(
+            keyframe, self.config.features, self.config.keyframe_database, history
+        )

@@ -36,10 +36,10 @@ class PriorConfig:
     # A stamp that is this much earlier is not jitter: the source has restarted.
     restart_after_s: float = 1.0
     # Maximum time of dead reckoning since the last OK frame: 2 % drift at 0.5 m/s are 30 cm then.
-    max_carried_s: float = 30.0
+    max_dead_reckoning_s: float = 30.0
 
     def __post_init__(self) -> None:
-        times_s = self.max_gap_s, self.restart_after_s, self.max_carried_s
+        times_s = self.max_gap_s, self.restart_after_s, self.max_dead_reckoning_s
         limits = *times_s, self.max_speed_m_per_s, self.max_turn_rad_per_s
         if not all(limit > 0 for limit in limits):  # NaN fails too.
             raise ConfigError(
@@ -49,7 +49,7 @@ class PriorConfig:
                     "max_speed_m_per_s",
                     "max_turn_rad_per_s",
                     "restart_after_s",
-                    "max_carried_s",
+                    "max_dead_reckoning_s",
                 )
                 + " must be positive."
             )
@@ -102,14 +102,14 @@ class OdometryPriorBuffer:
         pose begins a new session.
         """
         pose = StampedPose(stamp_ns, T_prior_base)
-        verdict = self._judged(pose, config)
-        if verdict in (PriorCheck.LATE, PriorCheck.BROKEN):
-            return self, verdict
-        if verdict is PriorCheck.FOLLOWS:
-            return replace(self, poses=(*self.poses[1 - KEPT :], pose)), verdict
-        return OdometryPriorBuffer((pose,), self.session + 1), verdict
+        check = self._check(pose, config)
+        if check in (PriorCheck.LATE, PriorCheck.BROKEN):
+            return self, check
+        if check is PriorCheck.FOLLOWS:
+            return replace(self, poses=(*self.poses[1 - KEPT :], pose)), check
+        return OdometryPriorBuffer((pose,), self.session + 1), check
 
-    def _judged(self, pose: StampedPose, config: PriorConfig) -> PriorCheck:
+    def _check(self, pose: StampedPose, config: PriorConfig) -> PriorCheck:
         if not np.isfinite(pose.T_prior_base).all():
             return PriorCheck.BROKEN
         if not self.poses:
@@ -211,10 +211,10 @@ class DeadReckoningStart:
         T_odom_now = T_odom_then * inverse(T_prior_then) * T_prior_now
 
         Return None if the prior has begun another session since, or if more than
-        `config.max_carried_s` have passed.
+        `config.max_dead_reckoning_s` have passed.
         """
         then, elapsed_s = self.reading, (now.stamp_ns - self.reading.stamp_ns) * 1e-9
-        if now.session != then.session or not 0 <= elapsed_s <= config.max_carried_s:
+        if now.session != then.session or not 0 <= elapsed_s <= config.max_dead_reckoning_s:
             return None
         moved = se3.inverse(then.T_prior_camera) @ now.T_prior_camera
         return se3.orthonormalize(self.T_odom_camera @ moved)

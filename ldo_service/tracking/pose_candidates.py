@@ -29,13 +29,13 @@ class PoseHypothesisConfig:
     # 3 cm or less.
     agreement_rad: float = 0.06
     # Fraction of the best support; the images refute a hypothesis with less.
-    rival_support: float = 0.5
+    min_support_ratio: float = 0.5
 
     def __post_init__(self) -> None:
-        if not (self.agreement_rad > 0 and 0 < self.rival_support <= 1):
+        if not (self.agreement_rad > 0 and 0 < self.min_support_ratio <= 1):
             raise ConfigError(
                 f"agreement_rad={self.agreement_rad:g} must be positive, "
-                f"rival_support={self.rival_support:g} within 0..1."
+                f"min_support_ratio={self.min_support_ratio:g} within 0..1."
             )
 
 
@@ -133,7 +133,7 @@ def select_hypothesis(
         align_config: Settings of alignment.
     """
     supports = [support(c, candidates, keyframe, view, align_config) for c in candidates]
-    winner, least = int(np.argmax(supports)), config.rival_support * max(supports)
+    winner, least = int(np.argmax(supports)), config.min_support_ratio * max(supports)
     apart = [
         hypothesis_distance_rad(candidates[winner], c.alignment.T_reference_camera)
         for c in candidates
@@ -181,8 +181,8 @@ class InitialGuessAligner:
         predicted: PoseHypothesis,
         keyframe: ReferenceKeyframe,
         view: Pyramid,
-        resting: np.ndarray,
-        carried: np.ndarray | None,
+        T_keyframe_previous: np.ndarray,
+        T_keyframe_reckoned: np.ndarray | None,
     ) -> PoseHypothesis:
         """Align from all initial guesses besides constant velocity; return the best hypothesis.
 
@@ -190,37 +190,43 @@ class InitialGuessAligner:
             predicted: Hypothesis from the constant-velocity guess, which takes part in the choice.
             keyframe: The keyframe.
             view: Pyramid of the frame.
-            resting: Initial guess that the camera has not moved: T_keyframe_camera [4, 4] of the
+            T_keyframe_previous: Initial guess that the camera has not moved: T_keyframe_camera [4,
+                4] of the
                 previous frame.
-            carried: Initial guess T_keyframe_camera [4, 4] by dead reckoning with the odometry
+            T_keyframe_reckoned: Initial guess T_keyframe_camera [4, 4] by dead reckoning with the
+                odometry
                 prior; None if the prior is unknown.
         """
-        candidates = [predicted, self.align_from_guess(keyframe, view, resting)]
-        if carried is not None:
-            candidates.append(self.align_from_guess(keyframe, view, carried, "prior"))
-        second, pose_source = self._independent_estimate(keyframe, view, resting)
+        candidates = [predicted, self.align_from_guess(keyframe, view, T_keyframe_previous)]
+        if T_keyframe_reckoned is not None:
+            candidates.append(self.align_from_guess(keyframe, view, T_keyframe_reckoned, "prior"))
+        second, pose_source = self._independent_estimate(keyframe, view, T_keyframe_previous)
         if second is not None:
             candidates.append(align_hypothesis(keyframe, view, second, pose_source, self.align))
         chosen = select_hypothesis(candidates, second, keyframe, view, self.candidates, self.align)
-        if carried is None:
+        if T_keyframe_reckoned is None:
             return chosen
-        is_expected = hypothesis_distance_rad(chosen, carried) < self.candidates.agreement_rad
+        is_expected = (
+            hypothesis_distance_rad(chosen, T_keyframe_reckoned) < self.candidates.agreement_rad
+        )
         return replace(chosen, agrees_with_prior=is_expected)
 
-    def is_large_step(self, candidate: PoseHypothesis, resting: np.ndarray, view: Pyramid) -> bool:
+    def is_large_step(
+        self, candidate: PoseHypothesis, T_keyframe_previous: np.ndarray, view: Pyramid
+    ) -> bool:
         """Return whether the camera moved so far that alignment may be in a wrong local minimum.
 
         Args:
             candidate: Hypothesis of the frame.
-            resting: T_keyframe_camera [4, 4] of the previous frame.
+            T_keyframe_previous: T_keyframe_camera [4, 4] of the previous frame.
             view: Pyramid of the frame.
         """
-        moved = se3.inverse(resting) @ candidate.alignment.T_reference_camera
+        moved = se3.inverse(T_keyframe_previous) @ candidate.alignment.T_reference_camera
         shift_rad = image_motion_rad(moved, candidate.median_depth_m)
         return shift_rad * view.camera.fx > self.large_motion * view.camera.width
 
     def _independent_estimate(
-        self, keyframe: ReferenceKeyframe, view: Pyramid, resting: np.ndarray
+        self, keyframe: ReferenceKeyframe, view: Pyramid, T_keyframe_previous: np.ndarray
     ) -> tuple[np.ndarray | None, str]:
         """Estimate T_keyframe_camera [4, 4] from ORB features, or by GICP if that fails.
 
@@ -231,4 +237,4 @@ class InitialGuessAligner:
         pose = estimate_pose(known, seen, view.camera, self.features)
         if pose is not None:
             return se3.inverse(pose.T_camera_reference), "features"
-        return register_gicp(keyframe.reference, view, resting, self.shape), "gicp"
+        return register_gicp(keyframe.reference, view, T_keyframe_previous, self.shape), "gicp"

@@ -193,24 +193,24 @@ class ReferencePoints:
     median_depth_m: float  # Scale of the scene; 1 without any measured depth.
 
 
-def build_reference(pyramid: Pyramid, left_out: np.ndarray | None = None) -> ReferencePoints:
+def build_reference(pyramid: Pyramid, ignore_mask: np.ndarray | None = None) -> ReferencePoints:
     """Build reference points from the pixels with depth.
 
     Args:
         pyramid: Pyramid of the keyframe.
-        left_out: Pixels to ignore, [H, W] bool at working resolution.
+        ignore_mask: Pixels to ignore, [H, W] bool at working resolution.
     """
-    levels = (_without(level, left_out) for level in pyramid.levels)
+    levels = (_without(level, ignore_mask) for level in pyramid.levels)
     points = tuple(_level_points(level, i) for i, level in enumerate(levels))
     depth_m = points[0][2]
     return ReferencePoints(points, float(np.median(depth_m)) if depth_m.size else 1.0)
 
 
-def _without(level: Level, left_out: np.ndarray | None) -> Level:
-    if left_out is None or not left_out.any():
+def _without(level: Level, ignore_mask: np.ndarray | None) -> Level:
+    if ignore_mask is None or not ignore_mask.any():
         return level
     size = level.camera.width, level.camera.height
-    share = cv2.resize(left_out.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    share = cv2.resize(ignore_mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     texels = level.texels.copy()
     texels[..., 3][share > 0] = 0
     return Level(texels, level.camera)

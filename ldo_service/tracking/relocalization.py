@@ -54,10 +54,11 @@ from .tracking_quality import (
 )
 
 NEWEST = 2  # Number of newest records that each SIFT search includes: the camera may be near them.
-RANKED = 10  # Multiple of `alike`: number of ranked records to choose distinct candidates from.
+# Multiple of `appearance_candidates`: number of ranked records to choose distinct candidates from.
+RANKED = 10
 
 
-PosedPlace = tuple[KeyframeRecord, FeaturePose]
+PosedRecord = tuple[KeyframeRecord, FeaturePose]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ class RelocalizationConfig:
     """Settings of relocalization."""
 
     # Records per lost frame by similarity of the thumbnail, as in the prototype.
-    alike: int = 5
+    appearance_candidates: int = 5
     in_turn: int = 3  # Further records in rotation: 1000 records take 11 s at 30 Hz.
     # Further records in rotation by SIFT, which matches across scales; 0: none.
     across_scales: int = 8
@@ -77,30 +78,36 @@ class RelocalizationConfig:
     # Similar records within this distance of each other count as one candidate.
     variety_rad: float = 0.25
     # A match is ambiguous if another record far away has more than this fraction of its inliers.
-    rival_inliers: float = 0.3
+    ambiguous_inlier_ratio: float = 0.3
     # Minimum distance of the camera poses by both records: 57 degrees, or one median depth.
-    rival_rad: float = 1.0
+    ambiguous_rad: float = 1.0
     # Minimum correlation with the thumbnail of the last OK frame; a WEAK frame below it shows
     # another place. Kitchen, frame to frame: above 0.93; against another place: 97 % below.
     familiar: float = 0.4
 
     def __post_init__(self) -> None:
-        if self.alike < 0 or self.in_turn < 0 or self.alike + self.in_turn < 1:
+        if (
+            self.appearance_candidates < 0
+            or self.in_turn < 0
+            or self.appearance_candidates + self.in_turn < 1
+        ):
             raise ConfigError(
-                named(self, "alike", "in_turn") + " must not be negative, and not both 0."
+                named(self, "appearance_candidates", "in_turn")
+                + " must not be negative, and not both 0."
             )
         if self.attempts < 1 or self.across_scales < 0:
             raise ConfigError(
                 named(self, "attempts", "across_scales")
                 + ": attempts must be at least 1, across_scales at least 0."
             )
-        if not min(self.agreement_rad, self.variety_rad, self.rival_rad) > 0:
+        if not min(self.agreement_rad, self.variety_rad, self.ambiguous_rad) > 0:
             raise ConfigError(
-                named(self, "agreement_rad", "variety_rad", "rival_rad") + " must be positive."
+                named(self, "agreement_rad", "variety_rad", "ambiguous_rad") + " must be positive."
             )
-        if not (0 <= self.min_geometric_inliers <= 1 and 0 <= self.rival_inliers <= 1):
+        if not (0 <= self.min_geometric_inliers <= 1 and 0 <= self.ambiguous_inlier_ratio <= 1):
             raise ConfigError(
-                named(self, "min_geometric_inliers", "rival_inliers") + " must be within 0..1."
+                named(self, "min_geometric_inliers", "ambiguous_inlier_ratio")
+                + " must be within 0..1."
             )
         if not 0 <= self.familiar <= 1:
             raise ConfigError(f"familiar={self.familiar:g} must be a correlation within 0..1.")
@@ -119,7 +126,7 @@ class Relocalizer:
     def find(
         self,
         view: Pyramid,
-        places: KeyframeDatabase,
+        database: KeyframeDatabase,
         turn: int,
         history: ResidualHistory,
         *,
@@ -129,7 +136,7 @@ class Relocalizer:
 
         Args:
             view: Pyramid of the frame.
-            places: Keyframe database to search.
+            database: Keyframe database to search.
             turn: Number of searches before this one. It selects which further records are tried.
             history: Residual noise of the last frames, for records that store none.
             is_lost: Allow the search by SIFT, which is too slow while tracking works.
@@ -138,15 +145,15 @@ class Relocalizer:
             The keyframe and the alignment of the frame to it. None if no keyframe is verified or
             the match is ambiguous.
         """
-        if not len(places):
+        if not len(database):
             return None
         likely = self._distinct_candidates(
-            places.all[index] for index in places.rank_by_similarity(view)
+            database.all[index] for index in database.rank_by_similarity(view)
         )
-        poses = self._poses(view, _each_once(likely, _due(places, turn, self.config.in_turn)))
+        poses = self._poses(view, _each_once(likely, _due(database, turn, self.config.in_turn)))
         sure = self._first_verified(view, poses, history)
         if sure is None and is_lost and self.config.across_scales:
-            newest, due = places.all[-NEWEST:], _due(places, turn, self.config.across_scales)
+            newest, due = database.all[-NEWEST:], _due(database, turn, self.config.across_scales)
             others = self._poses_across_scales(view, _each_once(newest, due))
             sure, poses = self._first_verified(view, others, history), [*poses, *others]
         if sure is None or self._is_ambiguous(*sure[0], poses):
@@ -160,27 +167,27 @@ class Relocalizer:
         return bool(seen @ trusted >= self.config.familiar * scale > 0)
 
     def _distinct_candidates(self, ranked: Iterable[KeyframeRecord]) -> list[KeyframeRecord]:
-        """Return at most `alike` of the ranked records, which are all apart from each other."""
+        """Return at most `appearance_candidates` of the ranked records, distinct places alone."""
         likely: list[KeyframeRecord] = []
-        for place in islice(ranked, RANKED * self.config.alike):
-            if len(likely) == self.config.alike:
+        for record in islice(ranked, RANKED * self.config.appearance_candidates):
+            if len(likely) == self.config.appearance_candidates:
                 break
-            if all(_is_apart(place, other, self.config.variety_rad) for other in likely):
-                likely.append(place)
+            if all(_is_apart(record, other, self.config.variety_rad) for other in likely):
+                likely.append(record)
         return likely
 
-    def _poses(self, view: Pyramid, places: Iterable[KeyframeRecord]) -> list[PosedPlace]:
+    def _poses(self, view: Pyramid, records: Iterable[KeyframeRecord]) -> list[PosedRecord]:
         """Match a frame with records by ORB features.
 
         Returns:
             The records that yield a pose of the frame, with that pose; most inliers first.
         """
         seen = detect(view, self.features)
-        return self._posed(view, seen, ((place, place.features) for place in places))
+        return self._posed(view, seen, ((record, record.features) for record in records))
 
     def _poses_across_scales(
-        self, view: Pyramid, places: Iterable[KeyframeRecord]
-    ) -> list[PosedPlace]:
+        self, view: Pyramid, records: Iterable[KeyframeRecord]
+    ) -> list[PosedRecord]:
         """Match a frame with records by SIFT features.
 
         SIFT also matches if the camera is at half or twice the distance to the surface.
@@ -191,75 +198,75 @@ class Relocalizer:
         config = self.features
         image = view.gray, view.depth_m, view.camera
         seen = detect_sift(*image, config.count_across_scales, config)
-        known = ((place, place.sift_features(config)) for place in places)
+        known = ((record, record.sift_features(config)) for record in records)
         return self._posed(view, seen, known)
 
     def _posed(
         self, view: Pyramid, seen: Features, known: Iterable[tuple[KeyframeRecord, Features]]
-    ) -> list[PosedPlace]:
+    ) -> list[PosedRecord]:
         poses = [(p, estimate_pose(there, seen, view.camera, self.features)) for p, there in known]
-        found = [(place, pose) for place, pose in poses if pose is not None]
+        found = [(record, pose) for record, pose in poses if pose is not None]
         return sorted(found, key=lambda pp: -pp[1].inliers)
 
     def _first_verified(
-        self, view: Pyramid, poses: Sequence[PosedPlace], history: ResidualHistory
-    ) -> tuple[PosedPlace, tuple[ReferenceKeyframe, PoseHypothesis]] | None:
+        self, view: Pyramid, poses: Sequence[PosedRecord], history: ResidualHistory
+    ) -> tuple[PosedRecord, tuple[ReferenceKeyframe, PoseHypothesis]] | None:
         """Return the first record and feature pose that direct alignment verifies.
 
         The second element is the keyframe of the record with the alignment.
         """
-        for place, pose in poses[: self.config.attempts]:
-            keyframe = place.keyframe(self.pyramid)
+        for record, pose in poses[: self.config.attempts]:
+            keyframe = record.keyframe(self.pyramid)
             guess = se3.inverse(pose.T_camera_reference)
             candidate = align_hypothesis(keyframe, view, guess, "relocalized", self.align)
-            if self._is_sure(candidate, guess, place.history(history)):
-                return (place, pose), (keyframe, replace(candidate, is_confirmed=True))
+            if self._is_sure(candidate, guess, record.history(history)):
+                return (record, pose), (keyframe, replace(candidate, is_confirmed=True))
         return None
 
     def _is_sure(
         self, candidate: PoseHypothesis, guess: np.ndarray, history: ResidualHistory
     ) -> bool:
         agrees = hypothesis_distance_rad(candidate, guess) < self.config.agreement_rad
-        witnessed = replace(candidate, is_confirmed=agrees)
-        verdict = classify_tracking(witnessed, history, TrackingStatus.LOST, self.tracking_quality)
+        confirmed = replace(candidate, is_confirmed=agrees)
+        status = classify_tracking(confirmed, history, TrackingStatus.LOST, self.tracking_quality)
         inliers = candidate.alignment.geometric_inliers
-        return verdict is TrackingStatus.OK and inliers >= self.config.min_geometric_inliers
+        return status is TrackingStatus.OK and inliers >= self.config.min_geometric_inliers
 
     def _is_ambiguous(
-        self, place: KeyframeRecord, pose: FeaturePose, poses: Iterable[PosedPlace]
+        self, record: KeyframeRecord, pose: FeaturePose, poses: Iterable[PosedRecord]
     ) -> bool:
         """Return whether a distant record of the same submap matches the frame almost as well."""
-        T_odom_camera = _seen_from(place, pose)
+        T_odom_camera = _seen_from(record, pose)
         return any(
-            other.submap == place.submap
-            and rival.inliers > self.config.rival_inliers * pose.inliers
+            other.submap == record.submap
+            and other_pose.inliers > self.config.ambiguous_inlier_ratio * pose.inliers
             and image_motion_rad(
-                se3.inverse(T_odom_camera) @ _seen_from(other, rival), place.median_depth_m
+                se3.inverse(T_odom_camera) @ _seen_from(other, other_pose), record.median_depth_m
             )
-            > self.config.rival_rad
-            for other, rival in poses
+            > self.config.ambiguous_rad
+            for other, other_pose in poses
         )
 
 
-def _due(places: KeyframeDatabase, turn: int, count: int) -> list[KeyframeRecord]:
+def _due(database: KeyframeDatabase, turn: int, count: int) -> list[KeyframeRecord]:
     """Return the next `count` records of the database, which turns visit one after the other."""
     numbers = range(turn * count, (turn + 1) * count)
-    return [places.all[number % len(places)] for number in numbers]
+    return [database.all[number % len(database)] for number in numbers]
 
 
 def _each_once(*groups: Iterable[KeyframeRecord]) -> list[KeyframeRecord]:
     return list(dict.fromkeys(chain(*groups)))
 
 
-def _seen_from(place: KeyframeRecord, pose: FeaturePose) -> np.ndarray:
+def _seen_from(record: KeyframeRecord, pose: FeaturePose) -> np.ndarray:
     """Return T_odom_camera [4, 4] of a frame, given its feature pose relative to a record."""
-    return place.T_odom_keyframe @ se3.inverse(pose.T_camera_reference)
+    return record.T_odom_keyframe @ se3.inverse(pose.T_camera_reference)
 
 
-def _is_apart(place: KeyframeRecord, other: KeyframeRecord, limit_rad: float) -> bool:
-    T_other_place = se3.inverse(other.T_odom_keyframe) @ place.T_odom_keyframe
-    is_far = image_motion_rad(T_other_place, other.median_depth_m) > limit_rad
-    return is_far or place.submap != other.submap
+def _is_apart(record: KeyframeRecord, other: KeyframeRecord, limit_rad: float) -> bool:
+    T_other_record = se3.inverse(other.T_odom_keyframe) @ record.T_odom_keyframe
+    is_far = image_motion_rad(T_other_record, other.median_depth_m) > limit_rad
+    return is_far or record.submap != other.submap
 
 
 Nearby = tuple[KeyframeRecord, np.ndarray]  # A record, and T_keyframe_camera [4, 4] by the map.
@@ -295,7 +302,7 @@ class KeyframeReuseConfig:
 class ReusedKeyframe:
     """Known keyframe that can be reused as the reference."""
 
-    place: KeyframeRecord  # Record of the keyframe.
+    record: KeyframeRecord  # Record of the keyframe.
     keyframe: ReferenceKeyframe  # The keyframe, rebuilt from the record.
     candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
@@ -306,7 +313,7 @@ class ReusedKeyframe:
             keyframe: Id of the new keyframe.
         """
         seen = self.candidate.alignment
-        return RelativePose(self.place.id, keyframe, seen.T_reference_camera, seen.information)
+        return RelativePose(self.record.id, keyframe, seen.T_reference_camera, seen.information)
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,28 +339,28 @@ class KeyframeReuse:
         Returns:
             The keyframe, or None if no alignment is verified or all keyframes are too far.
         """
-        for place, T_place_camera in near[: self.config.tries]:
-            keyframe = place.keyframe(self.pyramid)
-            candidate = align_hypothesis(keyframe, view, T_place_camera, "reused", self.align)
-            histories = history, place.history(history)
-            if self._is_sure(candidate, T_place_camera, histories):
-                return ReusedKeyframe(place, keyframe, candidate)
+        for record, T_record_camera in near[: self.config.tries]:
+            keyframe = record.keyframe(self.pyramid)
+            candidate = align_hypothesis(keyframe, view, T_record_camera, "reused", self.align)
+            histories = history, record.history(history)
+            if self._is_sure(candidate, T_record_camera, histories):
+                return ReusedKeyframe(record, keyframe, candidate)
         return None
 
     def _is_sure(
         self,
         candidate: PoseHypothesis,
-        T_place_camera: np.ndarray,
+        T_record_camera: np.ndarray,
         histories: Sequence[ResidualHistory],
     ) -> bool:
         seen, T = candidate.alignment, candidate.alignment.T_reference_camera
-        agrees = hypothesis_distance_rad(candidate, T_place_camera) < self.config.agreement_rad
-        witnessed = replace(candidate, is_confirmed=agrees)
+        agrees = hypothesis_distance_rad(candidate, T_record_camera) < self.config.agreement_rad
+        confirmed = replace(candidate, is_confirmed=agrees)
         return (
             not left_keyframe_view(T, seen.overlap, candidate.median_depth_m, self.keyframes)
             and seen.geometric_inliers >= self.config.min_geometric_inliers
             and all(
-                classify_tracking(witnessed, history, TrackingStatus.OK, self.tracking_quality)
+                classify_tracking(confirmed, history, TrackingStatus.OK, self.tracking_quality)
                 is TrackingStatus.OK
                 for history in histories
             )
@@ -361,7 +368,7 @@ class KeyframeReuse:
 
 
 def find_nearby_keyframes(
-    places: Sequence[KeyframeRecord],
+    records: Sequence[KeyframeRecord],
     T_map_keyframe: Mapping[int, np.ndarray],
     T_map_camera: np.ndarray,
     config: KeyframeConfig,
@@ -371,15 +378,15 @@ def find_nearby_keyframes(
     Near means that a frame with this pose would not need a new keyframe beside that record.
 
     Args:
-        places: Records to choose from; those without a pose in the map are skipped.
+        records: Records to choose from; those without a pose in the map are skipped.
         T_map_keyframe: Poses [4, 4] of the keyframes in the map, by id.
         T_map_camera: Pose of the camera in the map, [4, 4].
         config: Limits of rotation and translation; see `limit_ratios`.
     """
-    known = [place for place in places if place.id in T_map_keyframe]
+    known = [record for record in records if record.id in T_map_keyframe]
     if not known:
         return []
     T_camera = se3.inverse(np.array([T_map_keyframe[p.id] for p in known])) @ T_map_camera
-    left = limit_ratios(T_camera, np.array([place.median_depth_m for place in known]), config)
+    left = limit_ratios(T_camera, np.array([record.median_depth_m for record in known]), config)
     order = np.argsort(left, kind="stable")
     return [(known[k], T_camera[k]) for k in order if left[k] <= 1]

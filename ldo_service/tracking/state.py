@@ -20,7 +20,7 @@ class KeyframeOrigin(StrEnum):
     """Origin of the reference keyframe; keyframe reuse depends on it."""
 
     NEW = "new"
-    TIED = "tied"  # New, and measured from a known keyframe.
+    MEASURED = "tied"  # New, and measured from a known keyframe.
     KNOWN = "known"  # Made long before; its surface is mapped.
 
 
@@ -29,7 +29,7 @@ class OdometryState:
     """Complete state of odometry that the result of the next frame depends on."""
 
     # Keyframe records for relocalization and keyframe reuse.
-    places: KeyframeDatabase = field(default_factory=KeyframeDatabase)
+    database: KeyframeDatabase = field(default_factory=KeyframeDatabase)
     keyframe: ReferenceKeyframe | None = None  # The reference keyframe, usually the newest one.
     # Record of the last mapping keyframe, if it is newer than the reference keyframe.
     mapping_keyframe: KeyframeRecord | None = None
@@ -53,39 +53,39 @@ class OdometryState:
     def with_new(
         self,
         keyframe: ReferenceKeyframe,
-        place: KeyframeRecord,
+        record: KeyframeRecord,
         config: KeyframeDatabaseConfig,
         *,
-        is_tied: bool,
+        is_measured: bool,
     ) -> "OdometryState":
         """Return the state with the frame just tracked as the new reference keyframe.
 
         Args:
             keyframe: The frame as a keyframe.
-            place: The record of the keyframe, which is added to the database.
+            record: The record of the keyframe, which is added to the database.
             config: Settings of the database.
-            is_tied: The pose of the keyframe was measured relative to a known keyframe.
+            is_measured: The pose of the keyframe was measured relative to a known keyframe.
         """
         return replace(
             self._against(keyframe, keyframe.T_odom_keyframe),
-            places=self.places.with_record(place, config),
+            database=self.database.with_record(record, config),
             next_id=keyframe.id + 1,
-            origin=KeyframeOrigin.TIED if is_tied else KeyframeOrigin.NEW,
+            origin=KeyframeOrigin.MEASURED if is_measured else KeyframeOrigin.NEW,
         )
 
     def with_reused_keyframe(
-        self, keyframe: ReferenceKeyframe, place: KeyframeRecord, T_odom_camera: np.ndarray
+        self, keyframe: ReferenceKeyframe, record: KeyframeRecord, T_odom_camera: np.ndarray
     ) -> "OdometryState":
         """Return the state with a known keyframe as the reference.
 
         Args:
             keyframe: The known keyframe.
-            place: The record of the keyframe, which moves to the end of the database.
+            record: The record of the keyframe, which moves to the end of the database.
             T_odom_camera: Pose of the frame just tracked, [4, 4].
         """
         return replace(
             self._against(keyframe, T_odom_camera),
-            places=self.places.with_reused(place),
+            database=self.database.with_reused(record),
             origin=KeyframeOrigin.KNOWN,
             dynamic_mask=None,
         )
@@ -107,7 +107,7 @@ def pack(state: OdometryState) -> dict[str, Any]:
     A keyframe is packed as gray image, depth, pose and masks. `unpack` computes everything else.
     """
     return {
-        "places": [place.pack() for place in state.places.all],
+        "places": [record.pack() for record in state.database.all],
         "keyframe": None if state.keyframe is None else state.keyframe.pack(),
         "supporting": None if state.mapping_keyframe is None else state.mapping_keyframe.pack(),
         "motion": asdict(state.motion),
@@ -129,16 +129,20 @@ def pack(state: OdometryState) -> dict[str, Any]:
 
 def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
     """Return the state from its packed form; `config` must equal that of the packed state."""
-    keyframe, suspicion, dynamic_mask = (
+    keyframe, evidence, dynamic_mask = (
         values["keyframe"],
         values["suspicion"],
         values["dynamic_mask"],
     )
-    supporting, anchor = values["supporting"], values["anchor"]
+    mapping_keyframe, anchor = values["supporting"], values["anchor"]
     return OdometryState(
-        places=KeyframeDatabase(tuple(KeyframeRecord.unpack(place) for place in values["places"])),
+        database=KeyframeDatabase(
+            tuple(KeyframeRecord.unpack(record) for record in values["places"])
+        ),
         keyframe=None if keyframe is None else ReferenceKeyframe.unpack(keyframe, config),
-        mapping_keyframe=None if supporting is None else KeyframeRecord.unpack(supporting),
+        mapping_keyframe=None
+        if mapping_keyframe is None
+        else KeyframeRecord.unpack(mapping_keyframe),
         motion=ConstantVelocity(**values["motion"]),
         history=ResidualHistory(
             **{name: tuple(noise) for name, noise in values["history"].items()}
@@ -153,8 +157,8 @@ def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
         T_odom_last_mapped=values["T_odom_mapped"],
         dynamic_mask=None if dynamic_mask is None else _mask(dynamic_mask),
         motion_evidence=None
-        if suspicion is None
-        else MotionEvidence(_mask(suspicion[0]), suspicion[1]),
+        if evidence is None
+        else MotionEvidence(_mask(evidence[0]), evidence[1]),
         dead_reckoning_start=None if anchor is None else DeadReckoningStart.unpack(anchor),
     )
 

@@ -28,7 +28,7 @@ class SubmapConfig:
     begin_after_s: float = 3.0
     # Frames between searches of the other submaps: twice a second at 30 Hz. A prime number, so that
     # the searches do not coincide with the frames that are held out from mapping.
-    look_every: int = 17
+    search_interval_frames: int = 17
     confirm_after: int = 7  # Frames between searches while a match is pending.
     confirm_rad: float = 0.06  # Maximum rotation plus parallax between two consistent matches.
     # Minimum rotation plus a third of the parallax between the views of two matches: the field of
@@ -37,10 +37,11 @@ class SubmapConfig:
     misses: int = 3  # Maximum searches in a row without a match before a pending match is dropped.
 
     def __post_init__(self) -> None:
-        if not self.begin_after_s >= 0 or min(self.look_every, self.confirm_after) < 1:
+        if not self.begin_after_s >= 0 or min(self.search_interval_frames, self.confirm_after) < 1:
             raise ConfigError(
                 f"begin_after_s={self.begin_after_s:g} must be at least 0, "
-                f"look_every={self.look_every} and confirm_after={self.confirm_after} at least 1."
+                f"search_interval_frames={self.search_interval_frames} and "
+                f"confirm_after={self.confirm_after} at least 1."
             )
         if not (self.confirm_rad > 0 and self.confirm_apart_rad >= 0 and self.misses >= 0):
             raise ConfigError(
@@ -159,7 +160,7 @@ class Submaps:
 
     def is_search_due(self, config: SubmapConfig) -> bool:
         """Return whether unmerged submaps exist and enough frames have passed since the search."""
-        wait = config.look_every if self.pending_match is None else config.confirm_after
+        wait = config.search_interval_frames if self.pending_match is None else config.confirm_after
         return len(set(self.roots)) > 1 and self.frames_since_search >= wait
 
     def are_merged(self, submap: int, other: int) -> bool:

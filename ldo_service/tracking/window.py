@@ -57,21 +57,21 @@ class RecentKeyframeCache:
         self._rebuilt: dict[int, tuple[KeyframeRecord, ReferenceKeyframe]] = {}
 
     def newest_first(
-        self, places: Sequence[KeyframeRecord], reach: int
+        self, records: Sequence[KeyframeRecord], reach: int
     ) -> Iterator[ReferenceKeyframe]:
         """Iterate over the last keyframes, newest first.
 
         Args:
-            places: Keyframe records, oldest first.
+            records: Keyframe records, oldest first.
             reach: Maximum number of keyframes.
         """
-        last = places[-reach:]
-        ids = {place.id for place in last}
+        last = records[-reach:]
+        ids = {record.id for record in last}
         self._rebuilt = {number: k for number, k in self._rebuilt.items() if number in ids}
-        for place in reversed(last):
-            known = self._rebuilt.get(place.id)
-            if known is None or known[0] is not place:
-                known = self._rebuilt[place.id] = place, place.keyframe(self._config)
+        for record in reversed(last):
+            known = self._rebuilt.get(record.id)
+            if known is None or known[0] is not record:
+                known = self._rebuilt[record.id] = record, record.keyframe(self._config)
             yield known[1]
 
 

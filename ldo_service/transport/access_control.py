@@ -110,7 +110,7 @@ class Rule:
     Messages from the client to the router are "ingress", those from the router "egress".
     """
 
-    says: str  # Name of the rule, part of its id.
+    name: str  # Name of the rule, part of its id.
     flows: tuple[str, ...]
     messages: tuple[str, ...]
     keys: tuple[str, ...]
@@ -118,7 +118,7 @@ class Rule:
     def for_robot(self, robot: str, part: str) -> dict[str, Any]:
         """Return the rule in Zenoh's format; `part` is the prefix of its id."""
         return {
-            "id": f"{part}: {self.says}",
+            "id": f"{part}: {self.name}",
             "permission": "allow",
             "flows": list(self.flows),
             "messages": list(self.messages),
@@ -151,6 +151,6 @@ def _rules_of_readers() -> Iterator[Rule]:
     yield Rule("receive messages", ("egress",), ("put",), topics)
     yield Rule("query", ("ingress",), ("query",), states)
     yield Rule("receive query replies", ("egress",), ("reply", "declare_queryable"), states)
-    asks_who = ("liveliness_query", "declare_liveliness_subscriber")
-    yield Rule("query liveliness", ("ingress",), asks_who, tokens)
+    liveliness_messages = ("liveliness_query", "declare_liveliness_subscriber")
+    yield Rule("query liveliness", ("ingress",), liveliness_messages, tokens)
     yield Rule("receive liveliness", ("egress",), ("liveliness_token",), tokens)

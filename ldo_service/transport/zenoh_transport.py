@@ -157,14 +157,14 @@ class ZenohTransport:
             finally:
                 self._query_slots.release()
 
-        def asked(query: zenoh.Query) -> None:
+        def on_query(query: zenoh.Query) -> None:
             if self._query_slots.acquire(blocking=False):
                 self._answering.submit(reply, query)
             else:
                 with query:
                     query.reply_err(b"too many queries: ask again later")
 
-        handler = zenoh.handlers.Callback(asked, indirect=False)
+        handler = zenoh.handlers.Callback(on_query, indirect=False)
         self._declared.append(self._session.declare_queryable(expression, handler))
 
     def respond(self, key: str, respond: Callable[[bytes], Awaitable[bytes]]) -> None:
@@ -191,7 +191,7 @@ class ZenohTransport:
             self._responding.add(task)
             task.add_done_callback(self._responding.discard)
 
-        def asked(query: zenoh.Query) -> None:
+        def on_query(query: zenoh.Query) -> None:
             if self._query_slots.acquire(blocking=False):
                 payload = query.payload
                 request = payload.to_bytes() if payload is not None else b""
@@ -200,7 +200,7 @@ class ZenohTransport:
                 with query:
                     query.reply_err(b"too many queries: ask again later")
 
-        handler = zenoh.handlers.Callback(asked, indirect=False)
+        handler = zenoh.handlers.Callback(on_query, indirect=False)
         self._declared.append(self._session.declare_queryable(expression, handler))
 
     def close(self) -> None:

@@ -44,7 +44,7 @@ from .view_config import ViewerConfig
 MAX_ACTORS = 64
 # Maximum loop closures received, the newest. A correction lists all that the pose graph accepts.
 MAX_LOOPS = 4096
-FACTS_EVERY_S = 1.0  # Interval of texts, so that they can be read.
+TEXT_INTERVAL_S = 1.0  # Interval of texts, so that they can be read.
 
 KEPT: dict[Topic, int] = {  # Maximum messages kept between two updates; the oldest are dropped.
     POSE_TRACKED: 256,  # 8 s at 30 Hz.
@@ -77,7 +77,7 @@ class LiveScene:
         self._config, self._clock = config, clock
         self._heard: dict[str, panel.HeartbeatRecord] = {}
         self._pose_rate, self._poses = panel.Rate(), 0
-        self._told_s = -FACTS_EVERY_S
+        self._text_updated_s = -TEXT_INTERVAL_S
         self.scene = Scene()
         self.reset()
 
@@ -194,9 +194,9 @@ class LiveScene:
             scene.loops = self._agreed_loops()
         if "gaussians" in changed:
             scene.rows = self._gaussians.map.rows
-        if self._clock() - self._told_s >= FACTS_EVERY_S:
-            self._told_s = self._clock()
-            self._pose_rate.add(self._told_s, self._poses)
+        if self._clock() - self._text_updated_s >= TEXT_INTERVAL_S:
+            self._text_updated_s = self._clock()
+            self._pose_rate.add(self._text_updated_s, self._poses)
             scene.facts = self._facts()
             changed.add("facts")
         return changed

@@ -100,10 +100,10 @@ class RunFolder:
             self._problems[name] = str(error)
 
     def _facts(self) -> str:
-        told = panel.of_summary(self._summary) if self._summary else panel.under_way(self._frames)
+        status = panel.of_summary(self._summary) if self._summary else panel.under_way(self._frames)
         shown = panel.share_shown(len(self.scene.rows), self._gaussians)
         return "\n\n".join(
-            filter(None, (told, shown, *map(panel.escaped, self._problems.values())))
+            filter(None, (status, shown, *map(panel.escaped, self._problems.values())))
         )
 
     # --- one for each file ------------------------------------------------------------------------

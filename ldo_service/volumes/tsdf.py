@@ -174,15 +174,16 @@ class Tsdf:
         offsets_camera = BLOCK * voxel_m @ T_camera_map[:3, :3].T
         at = viewpoint.look_up(corners_camera[:, None] + offsets_camera, depth_m)  # [B, 512]
         reach_m = self.config.truncation_m
-        told = (at.seen_m > 0) & (at.seen_m - at.z_m >= -reach_m)  # Voxels far behind are hidden.
-        block, voxel = np.nonzero(told)
-        slot, z_m, seen_m = slots[block], at.z_m[told], at.seen_m[told]
+        # Voxels far behind are hidden.
+        is_observed = (at.seen_m > 0) & (at.seen_m - at.z_m >= -reach_m)
+        block, voxel = np.nonzero(is_observed)
+        slot, z_m, seen_m = slots[block], at.z_m[is_observed], at.seen_m[is_observed]
         weight = (1 / z_m**2).astype(np.float32)
         total = self._weight[slot, voxel] + weight
         share = weight / total
         distance_m = np.minimum(seen_m - z_m, reach_m)
         self._distance_m[slot, voxel] += share * (distance_m - self._distance_m[slot, voxel])
-        seen_color = color[at.row[told], at.column[told]]
+        seen_color = color[at.row[is_observed], at.column[is_observed]]
         self._color[slot, voxel] += share[:, None] * (seen_color - self._color[slot, voxel])
         self._weight[slot, voxel] = total
 

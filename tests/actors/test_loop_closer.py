@@ -213,11 +213,11 @@ def test_place_that_matches_two_old_places_is_closed_with_neither(first_walk, ro
     T_other_room = np.eye(4)
     T_other_room[0, 3] = 3.0
     other_room = keyframes_of(room, FIRST_WALK, len(first_walk), LONG_AFTER, T_other_room)
-    returning = keyframes_of(room, SECOND_WALK[:5], 2 * len(first_walk), 2 * LONG_AFTER, DRIFT)
+    second_walk = keyframes_of(room, SECOND_WALK[:5], 2 * len(first_walk), 2 * LONG_AFTER, DRIFT)
     permissive = ConsistencyCheckConfig(drift_m=100.0, turn_rad=7.0)
     actor = LoopCloser(LoopCloserConfig(loops=LoopsConfig(plausibility=permissive)))
     handle_all(actor, with_empty_detections([*first_walk, *other_room]))
-    found = handle_all(actor, with_empty_detections(returning))
+    found = handle_all(actor, with_empty_detections(second_walk))
     assert closures(found) == []
     assert any("ambiguous" in candidate.rejected_reason for candidate in candidates(found))
 

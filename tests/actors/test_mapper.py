@@ -131,8 +131,8 @@ def test_replica_of_every_delta_equals_the_map(keyframes, correction) -> None:
 
 def test_replica_equals_the_map_while_gaussians_are_offloaded_and_loaded(keyframes) -> None:
     """Gaussians beyond 3 m are offloaded, and loaded when a camera comes near."""
-    offload = OffloadConfig(max_active=500, reach_m=3.0, clump_m=0.5)
-    builder = MapBuilderConfig(sleep=offload, recent_cameras=1)
+    offload = OffloadConfig(max_active=500, reach_m=3.0, chunk_edge_m=0.5)
+    builder = MapBuilderConfig(offload=offload, recent_cameras=1)
     publish = replace(CONFIG.publish, update_interval_keyframes=1)
     config = replace(CONFIG, builder=builder, publish=publish, iterations=1, min_iterations=1)
     mapper, replica = (

@@ -84,11 +84,11 @@ def boxes_of(
 ) -> DetectionBoxes:
     """Return exact boxes of the given objects, the only ones that the detector knows."""
     known = [thing.name for thing in things]
-    claims = shot.detections(SCENE_OBJECTS)
+    true_boxes = shot.detections(SCENE_OBJECTS)
     names = [
         thing.name for k, thing in enumerate(SCENE_OBJECTS, 1) if np.sum(shot.instances == k) >= 40
     ]
-    found = zip(names, claims.boxes.tolist(), strict=True)
+    found = zip(names, true_boxes.boxes.tolist(), strict=True)
     return DetectionBoxes(
         stamp_ns=number * STAMP_NS,
         keyframe=number,

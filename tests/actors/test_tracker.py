@@ -246,7 +246,9 @@ def test_a_correction_before_any_frame_is_harmless() -> None:
 
 # --- submaps -------------------------------------------------------------------------------------
 QUICK_SUBMAPS = OdometryConfig(
-    submaps=SubmapConfig(begin_after_s=0.06, look_every=3, confirm_after=2, confirm_apart_rad=0.05)
+    submaps=SubmapConfig(
+        begin_after_s=0.06, search_interval_frames=3, confirm_after=2, confirm_apart_rad=0.05
+    )
 )
 
 
@@ -299,7 +301,7 @@ def test_submap_is_measured_at_a_shared_view_and_merged_by_the_correction(
     T_true = se3.inverse(T_world[measured.reference]) @ T_world[measured.keyframe]
     np.testing.assert_allclose(pose_from_message(measured.T_reference_keyframe), T_true, atol=5e-3)
     placed = {k: se3.inverse(T_world[0]) @ T for k, T in T_world.items()}
-    handle_all(tracker, [correction_to_message(0, 1, placed, joined={1: 0})])
+    handle_all(tracker, [correction_to_message(0, 1, placed, merged={1: 0})])
     (pose,) = poses_of(handle_all(tracker, frames_away_and_back[-1:]))
     assert pose.submap == 0
     T_map_camera = pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)

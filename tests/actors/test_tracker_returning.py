@@ -19,7 +19,7 @@ from ldo_service.tracking.relocalization import KeyframeReuseConfig
 
 
 def config_with_reuse(after: int) -> TrackerConfig:
-    return TrackerConfig(odometry=OdometryConfig(returning=KeyframeReuseConfig(after=after)))
+    return TrackerConfig(odometry=OdometryConfig(keyframe_reuse=KeyframeReuseConfig(after=after)))
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import pytest
 from ldo_service.actors.vlm_labeller import VlmLabeller, VlmLabellerConfig, require_labeller
 from ldo_service.config import Config
 from ldo_service.config.network_settings import VlmLabellerSettings
-from ldo_service.detection.labellers import Opinion
+from ldo_service.detection.labellers import ScoredLabel
 from ldo_service.detection.labellers.chat_completion import HttpConfig
 from ldo_service.detection.labellers.http_endpoint import HttpClientConfig
 from ldo_service.errors import ConfigError, EndpointError, ModelError, ReplayDiverged
@@ -87,15 +87,15 @@ class FakeLabeller:
 
     identity, names = "scripted 1", ("cup",)
 
-    def __init__(self, opinions: list[Opinion], gate: Event | None = None) -> None:
-        self.opinions, self.gate = opinions, gate
+    def __init__(self, scored_labels: list[ScoredLabel], gate: Event | None = None) -> None:
+        self.scored_labels, self.gate = scored_labels, gate
         self.seen: list[int] = []
 
-    def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
+    def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
         self.seen.append(len(crops))
         if self.gate:
             assert self.gate.wait(60)
-        return self.opinions
+        return self.scored_labels
 
     def add(self, name: str) -> None:
         self.names = (*self.names, name)
@@ -117,8 +117,8 @@ def test_a_region_gets_its_name(pair: Path, names: Path) -> None:
 
 
 def test_result_lists_alternative_labels_up_to_the_maximum() -> None:
-    opinions = [("cup", 0.5), ("vase", 0.3), ("bowl", 0.1)]
-    answer = only_result(VlmLabeller(labeller=FakeLabeller(opinions)).handle(request()))
+    scored_labels = [("cup", 0.5), ("vase", 0.3), ("bowl", 0.1)]
+    answer = only_result(VlmLabeller(labeller=FakeLabeller(scored_labels)).handle(request()))
     assert (answer.label, answer.alternatives) == ("cup", (("vase", 0.3), ("bowl", 0.1)))
     many = [(f"name {k}", 0.01) for k in range(99)]
     assert (
@@ -168,7 +168,7 @@ def test_unusable_labeller_is_logged_once_and_gives_empty_results(
 
 def test_failures_are_counted_and_logged_once_until_recovery(caplog) -> None:
     class Failing(FakeLabeller):
-        def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
+        def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
             if len(self.seen) in (1, 2):
                 self.seen.append(0)
                 raise EndpointError("it is down.") if len(self.seen) == 2 else ModelError("NaN.")

@@ -92,10 +92,10 @@ def row(sequence: Sequence, config: Config, drift: Drift, folder: Path) -> str:
         sequence, held_out, run.maps, lambda _: None, threads=os.cpu_count() or 1
     )
     pauses = [f"{max(watched.pauses_ms):.0f}" for watched in (tracker, *others)]
-    awake = actors["mapper"].metrics()["gaussians"]
+    resident = actors["mapper"].metrics()["gaussians"]
     return (
         f"{' | '.join(f'{cm:.2f}' for cm in ate_cm)} | {record.loops.accepted} | "
-        f"{rendered[0].mean('psnr_db'):.2f} | {' | '.join(pauses)} | {awake:,.0f} |"
+        f"{rendered[0].mean('psnr_db'):.2f} | {' | '.join(pauses)} | {resident:,.0f} |"
     )
 
 

@@ -131,25 +131,25 @@ def _least(image: np.ndarray) -> float:
     return MIN_SHARE * image.size
 
 
-def asked(
-    scene: Scene, claims: list[RegionDetections], reliability: float
+def with_label_results(
+    scene: Scene, region_detections: list[RegionDetections], reliability: float
 ) -> list[RegionDetections]:
     """Return the detections with the oracle's labels where the detector is uncertain."""
     rng, names = np.random.default_rng(0), scene.truth.class_names
     usable = [k for k, name in enumerate(names) if not is_void(name)]
     out = []
-    for k, (said, frame) in enumerate(zip(claims, scene.frames, strict=True)):
+    for k, (detections, frame) in enumerate(zip(region_detections, scene.frames, strict=True)):
         shown = scene.truth.frame(k).class_ids
-        labels, sure = said.labels.copy(), np.zeros(len(said.boxes), np.float32)
+        labels, sure = detections.labels.copy(), np.zeros(len(detections.boxes), np.float32)
         found = surfaces(frame.depth_m, frame.camera, ForegroundConfig())
-        for i in np.flatnonzero(said.confidences < RegionProposalConfig().sure):
-            mask = region(said.boxes[i], frame, found)
+        for i in np.flatnonzero(detections.confidences < RegionProposalConfig().sure):
+            mask = region(detections.boxes[i], frame, found)
             true = np.bincount(shown[mask], minlength=len(names))[usable]
             right, wrong = usable[int(true.argmax())], usable[rng.integers(len(usable))]
             is_right = rng.random() < reliability
             labels[i] = scene.vocabulary.index(names[right if is_right else wrong])
             sure[i] = reliability
-        out.append(replace(said, open_labels=labels, open_confidences=sure))
+        out.append(replace(detections, open_labels=labels, open_confidences=sure))
     return out
 
 
@@ -175,13 +175,22 @@ def variants() -> dict[str, SemanticFusionConfig]:
     return out
 
 
-class Follower:
+class LabelRun:
     """Labels of a map that follow added and removed Gaussians."""
 
     def __init__(
-        self, name: str, what: str, claims: list[RegionDetections], config: SemanticFusionConfig
+        self,
+        name: str,
+        what: str,
+        region_detections: list[RegionDetections],
+        config: SemanticFusionConfig,
     ) -> None:
-        self.name, self.what, self.claims, self.config = name, what, claims, config
+        self.name, self.what, self.region_detections, self.config = (
+            name,
+            what,
+            region_detections,
+            config,
+        )
         self.labels, self._ids = new_labels(0), np.zeros(0, np.int64)
 
     def follow(self, ids: np.ndarray) -> None:
@@ -195,23 +204,26 @@ class Follower:
         return self.what == DEFAULT
 
 
-def followers(
-    scene: Scene, claims: dict[str, list[RegionDetections]], only: str, reliability: float | None
-) -> Iterator[Follower]:
-    for name, said in claims.items():
+def label_runs(
+    scene: Scene,
+    region_detections: dict[str, list[RegionDetections]],
+    only: str,
+    reliability: float | None,
+) -> Iterator[LabelRun]:
+    for name, detections in region_detections.items():
         for what, config in variants().items():
             if only in what and (name != TRUE_BOXES or "coverage corrected" in what):
-                yield Follower(name, what, said, config)
+                yield LabelRun(name, what, detections, config)
         if reliability is not None and name != TRUE_BOXES:
-            answered = asked(scene, said, reliability)
+            answered = with_label_results(scene, detections, reliability)
             calls = np.mean([np.any(c.open_confidences > 0) for c in answered])
             print(f"{name}: the oracle labels regions on {calls:.0%} of the frames")
             for rule in ("fixed", "adaptive"):
                 config = SemanticFusionConfig(fusion=FusionConfig(rule=rule))
-                yield Follower(name, f"{DEFAULT}, {rule} fusion", answered, config)
+                yield LabelRun(name, f"{DEFAULT}, {rule} fusion", answered, config)
 
 
-def grown(scene: Scene, runs: list[Follower], iterations: int) -> MapBuilder:
+def grown(scene: Scene, runs: list[LabelRun], iterations: int) -> MapBuilder:
     builder = MapBuilder()
     for k in range(0, len(scene.frames), 2):
         frame, T = scene.frames[k], scene.T_map_camera[k]
@@ -221,16 +233,18 @@ def grown(scene: Scene, runs: list[Follower], iterations: int) -> MapBuilder:
         indices, gaussians = shown.contributions.indices, builder.gaussians
         for run in runs:
             run.follow(gaussians.ids)
-            view = frame.camera, T, frame.depth_m, run.claims[k]
+            view = frame.camera, T, frame.depth_m, run.region_detections[k]
             fuse_detections(gaussians.rows, run.labels, indices, *view, run.config)
     return builder
 
 
-def painted(claims: RegionDetections, frame: RgbdFrame, area: str) -> np.ndarray:
+def painted(region_detections: RegionDetections, frame: RgbdFrame, area: str) -> np.ndarray:
     """Return the label image of one frame's regions, the most confident on top."""
     image, config = np.zeros(frame.depth_m.shape, np.uint8), ForegroundConfig()
     found = surfaces(frame.depth_m, frame.camera, config) if area == "foreground" else None
-    for box, label in zip(claims.boxes[::-1], claims.labels[::-1], strict=True):
+    for box, label in zip(
+        region_detections.boxes[::-1], region_detections.labels[::-1], strict=True
+    ):
         if found is None:
             image[pixels_of(box, image.shape)] = label
         else:
@@ -262,13 +276,13 @@ class Report:
 
     def _errors(self, image: Callable[[int], np.ndarray]) -> LabelErrors:
         scene, images = self._scene, {}
-        judge = LabelEvaluator(scene.vocabulary.names, scene.truth.class_names)
+        evaluate = LabelEvaluator(scene.vocabulary.names, scene.truth.class_names)
         for k, frame in enumerate(scene.frames):
             images[k] = image(k)
-            judge.see(LabelView(frame, scene.truth.frame(k), images[k]))
+            evaluate.see(LabelView(frame, scene.truth.frame(k), images[k]))
             if (first := k - APART) in images:
-                judge.compare(images.pop(first), images[k], scene.pairs[first])
-        return judge.errors("")
+                evaluate.compare(images.pop(first), images[k], scene.pairs[first])
+        return evaluate.errors("")
 
     def show(self, name: str, image: Callable[[int], np.ndarray]) -> None:
         if self._pictures is None:
@@ -292,7 +306,7 @@ def top_image(labels: np.ndarray, shown: Rendering) -> np.ndarray:
     return np.where(top >= 0, top_labels(labels)[top], BACKGROUND).astype(np.uint8)
 
 
-def judge_all(scene: Scene, runs: list[Follower], builder: MapBuilder, report: Report) -> None:
+def evaluate_all(scene: Scene, runs: list[LabelRun], builder: MapBuilder, report: Report) -> None:
     frames, T = scene.frames, scene.T_map_camera
     shown: list[Rendering] = [
         builder.render_from(frame.camera, T[k], contributions=True)
@@ -303,7 +317,7 @@ def judge_all(scene: Scene, runs: list[Follower], builder: MapBuilder, report: R
         share = f"{100 * np.mean(top_labels(run.labels) > 0):.3f} %"
         report.line(run.name, run.what, lambda k, r=run: top_image(r.labels, shown[k]), share)
 
-        def summed(k: int, run: Follower = run) -> np.ndarray:
+        def summed(k: int, run: LabelRun = run) -> np.ndarray:
             view = frames[k].camera, se3.inverse(T[k])
             return label_image(rows, run.labels, shown[k], *view, threads=2)
 
@@ -331,23 +345,23 @@ def main() -> None:
         name: str(Path(os.environ["LDO_WEIGHTS"]) / file) for name, file in NETWORKS.items()
     }
     scene = Scene.of(arguments.source, arguments.max_frames, arguments.background)
-    claims = {name: detected(scene, model) for name, model in models.items()}
-    claims[TRUE_BOXES] = true_boxes(scene)
+    region_detections = {name: detected(scene, model) for name, model in models.items()}
+    region_detections[TRUE_BOXES] = true_boxes(scene)
     report = Report(scene, arguments.pictures)
-    for name, said in claims.items():
+    for name, detections in region_detections.items():
         for area in ("foreground", "box"):
             report.line(
                 name,
                 f"{area} painted",
-                lambda k, s=said, a=area: painted(s[k], scene.frames[k], a),
+                lambda k, s=detections, a=area: painted(s[k], scene.frames[k], a),
                 "",
             )
     if arguments.painted:
         return
-    runs = list(followers(scene, claims, arguments.only, arguments.fusion))
+    runs = list(label_runs(scene, region_detections, arguments.only, arguments.fusion))
     builder = grown(scene, runs, arguments.iterations)
     print(f"{len(scene.frames)} frames, {len(builder.gaussians)} Gaussians in the map")
-    judge_all(scene, runs, builder, report)
+    evaluate_all(scene, runs, builder, report)
 
 
 if __name__ == "__main__":

@@ -55,10 +55,10 @@ class Mapped:
     lap: int
     cpu_ms: float
     gaussians: int  # Gaussians in memory.
-    asleep: int  # Offloaded to disk.
+    offloaded: int  # Offloaded to disk.
     over_cap: int  # Gaussians in memory beyond the limit, as they may be visible.
     pruned: int  # Total since the start.
-    woken: int  # Loaded from disk since the start.
+    loaded: int  # Loaded from disk since the start.
     images_mb: float  # Keyframe images in memory.
     resident_mb: float
 
@@ -106,10 +106,10 @@ class TimedMapper(Mapper):
                 lap=keyframe.frame // self._frames_per_lap,
                 cpu_ms=cpu_ms,
                 gaussians=int(facts["gaussians"]),
-                asleep=int(facts["gaussians_offloaded"]),
+                offloaded=int(facts["gaussians_offloaded"]),
                 over_cap=int(facts["gaussians_over_limit"]),
                 pruned=int(facts["gaussians_pruned"]),
-                woken=int(facts["gaussians_loaded_total"]),
+                loaded=int(facts["gaussians_loaded_total"]),
                 images_mb=facts["keyframes_cache_mb"],
                 resident_mb=resident_mb(),
             )
@@ -208,11 +208,11 @@ def report(mapped: list[Mapped], lap: int) -> None:
     of_lap = [m for m in mapped if m.lap == lap]
     first, last, count = mapped[mapped.index(of_lap[0]) - 1], of_lap[-1], len(of_lap)
     cpu_ms = float(np.mean([m.cpu_ms for m in of_lap]))
-    made = [m.gaussians + m.asleep + m.pruned for m in (last, first)]
+    made = [m.gaussians + m.offloaded + m.pruned for m in (last, first)]
     inserted = made[0] - (made[1] if lap else 0)
-    pruned, woken = last.pruned - first.pruned * (lap > 0), last.woken - first.woken * (lap > 0)
-    per_keyframe = (f"{n / count:,.0f}" for n in (inserted, pruned, woken))
-    sizes = (f"{n:,}" for n in (last.gaussians, last.asleep, last.over_cap))
+    pruned, loaded = last.pruned - first.pruned * (lap > 0), last.loaded - first.loaded * (lap > 0)
+    per_keyframe = (f"{n / count:,.0f}" for n in (inserted, pruned, loaded))
+    sizes = (f"{n:,}" for n in (last.gaussians, last.offloaded, last.over_cap))
     resident_mb = float(np.mean([m.resident_mb for m in of_lap]))
     memory = (f"{mb:.0f}" for mb in (last.images_mb, resident_mb))
     columns = (str(lap + 1), str(count), f"{cpu_ms:.0f}", *sizes, *per_keyframe, *memory)

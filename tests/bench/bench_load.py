@@ -80,7 +80,7 @@ class Robot:
         self.samples.append((elapsed_s, rss_mb, median_ms, len(latest) / span_s))
         self.latencies_ms.append(latest)
 
-    def told(self) -> int:
+    def published(self) -> int:
         """Return how many poses the tracker has sent by its own count."""
         (poses,) = [o for o in self.health["tracker"].outputs if o.topic == "pose/tracked"]
         return poses.sent
@@ -197,8 +197,8 @@ class Crowd:
 
     def poses(self) -> list[int]:
         """End the quick subscribers and return how many poses each received."""
-        said = [json.loads(process.communicate(timeout=60)[0]) for process in self._quick]
-        return [counts["ldo/*/pose/tracked"] for of_one in said for counts in of_one]
+        replies = [json.loads(process.communicate(timeout=60)[0]) for process in self._quick]
+        return [counts["ldo/*/pose/tracked"] for of_one in replies for counts in of_one]
 
 
 @contextmanager
@@ -235,7 +235,7 @@ def loaded(
         rate_hz = hz or times * _sustained(robots, scene)
         print(f"{count} robots receive {rate_hz:.1f} Hz each", flush=True)
         crowd = Crowd(network.endpoint, subscribers, stack)
-        before = sum(robot.told() for robot in robots)
+        before = sum(robot.published() for robot in robots)
         cameras = [Camera(robot, scene, rate_hz) for robot in robots]
         started_s = last_s = time.monotonic()
         while (now_s := time.monotonic()) < started_s + 60 * minutes:
@@ -251,9 +251,9 @@ def loaded(
             camera.stop()
         _settle(robots)
         heard = crowd.poses()
-        told = sum(robot.told() for robot in robots) - before
+        published = sum(robot.published() for robot in robots) - before
         rates = sorted(camera.rate_hz for camera in cameras)
-        print(f"poses published {told}, received by quick subscribers {sorted(heard)}")
+        print(f"poses published {published}, received by quick subscribers {sorted(heard)}")
         print(f"sent at the end, Hz: {rates[0]:.1f} to {rates[-1]:.1f}")
         return Outcome(robots)
 

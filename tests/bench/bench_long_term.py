@@ -160,8 +160,8 @@ def sample(actors: list[Actor], keyframes: int) -> Sample:
 def allocated() -> tuple[int, int]:
     libc = ctypes.CDLL(None)
     libc.mallinfo2.restype = Mallinfo2
-    told = libc.mallinfo2()
-    return told.in_use + told.mapped, told.free
+    statistics = libc.mallinfo2()
+    return statistics.in_use + statistics.mapped, statistics.free
 
 
 def growth(samples: list[Sample]) -> tuple[str, dict[str, float], dict[str, float], float]:

@@ -115,10 +115,10 @@ def closed(messages: list[Taken], seen: dict[int, SeenKeyframe], stages: Stages)
     candidates, closures = [], []
     for step in (*(partial(actor.handle, message) for message in messages), actor.on_stop):
         start_s = time.process_time()
-        said = list(step())
+        outputs = list(step())
         ms = 1e3 * (time.process_time() - start_s)
-        compared = [one for one in said if not isinstance(one, LoopClosure)]
-        closures += [one for one in said if isinstance(one, LoopClosure)]
+        compared = [one for one in outputs if not isinstance(one, LoopClosure)]
+        closures += [one for one in outputs if isinstance(one, LoopClosure)]
         candidates += [
             ComparedPair(
                 one.keyframes, one.reference_keyframes, not one.rejected_reason, ms / len(compared)

@@ -108,17 +108,17 @@ def main() -> None:
     known = rooms.rows, rooms.labels, view.ids, view.anchors
     print("refresh", milliseconds(lambda _: objects.refresh(*known), given.repeats))
     names = Vocabulary().names
-    told = milliseconds(
+    duration = milliseconds(
         lambda _: encode(ObjectPublisher().message(objects, names, 0, 0, 0)), given.repeats
     )
-    print("publish", told)
+    print("publish", duration)
     teller = ObjectPublisher()
 
-    def observe_and_tell(number: int) -> None:
+    def observe_and_publish(number: int) -> None:
         observe(given.repeats + number)
         encode(teller.message(objects, names, 0, 0, 0))
 
-    print("observe and publish", milliseconds(observe_and_tell, given.repeats))
+    print("observe and publish", milliseconds(observe_and_publish, given.repeats))
     found = ObjectPublisher().message(objects, names, 0, 0, 0).objects
     print("search ", milliseconds(lambda n: search(COCO[n], _named(found)), given.repeats))
 

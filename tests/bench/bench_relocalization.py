@@ -40,12 +40,12 @@ class Mapped:
     """Sequence with its keyframe database; record ids are frame indices."""
 
     sequence: Sequence
-    places: KeyframeDatabase
+    database: KeyframeDatabase
     history: ResidualHistory
 
     def apart_from(self, frame: int) -> KeyframeDatabase:
         return KeyframeDatabase(
-            tuple(p for p in self.places.all if abs(p.id - frame) > APART_FRAMES)
+            tuple(p for p in self.database.all if abs(p.id - frame) > APART_FRAMES)
         )
 
 
@@ -74,8 +74,8 @@ class Tally:
 
 
 def mapped(source: str) -> Mapped:
-    references_only = replace(CONFIG, keyframes=KeyframeConfig(supporting=2.0))
-    sequence, odometry, places = (
+    references_only = replace(CONFIG, keyframes=KeyframeConfig(mapping_only_ratio=2.0))
+    sequence, odometry, database = (
         open_sequence(source),
         Odometry(references_only),
         KeyframeDatabase(),
@@ -85,18 +85,19 @@ def mapped(source: str) -> Mapped:
         if result.keyframe is not None:
             view = pyramid_of(frame, CONFIG.pyramid)
             keyframe = ReferenceKeyframe(view, result.T_odom_camera, frame.index)
-            places = places.with_record(
-                make_keyframe_record(keyframe, CONFIG.features, CONFIG.places), CONFIG.places
+            database = database.with_record(
+                make_keyframe_record(keyframe, CONFIG.features, CONFIG.keyframe_database),
+                CONFIG.keyframe_database,
             )
-    return Mapped(sequence, places, ResidualHistory(**odometry.snapshot()["history"]))
+    return Mapped(sequence, database, ResidualHistory(**odometry.snapshot()["history"]))
 
 
 def search(
-    frame: RgbdFrame, places: KeyframeDatabase, turn: int, history: ResidualHistory, tally: Tally
+    frame: RgbdFrame, database: KeyframeDatabase, turn: int, history: ResidualHistory, tally: Tally
 ):
     """Return the frame index of the found keyframe and T_keyframe_camera, or None."""
     start_s = time.process_time()
-    found = SEARCH.find(pyramid_of(frame, CONFIG.pyramid), places, turn, history)
+    found = SEARCH.find(pyramid_of(frame, CONFIG.pyramid), database, turn, history)
     tally.times_ms.append(1e3 * (time.process_time() - start_s))
     tally.queries += 1
     return None if found is None else (found[0].id, found[1].alignment.T_reference_camera)
@@ -114,8 +115,8 @@ def judged(query: Sequence, model: Mapped, every: int) -> Tally:
     tally, is_own = Tally(), query is model.sequence
     T_world = true_poses(query)
     for turn, index in enumerate(range(0, len(query), every)):
-        places = model.apart_from(index) if is_own else model.places
-        found = search(query[index], places, turn, model.history, tally)
+        database = model.apart_from(index) if is_own else model.database
+        found = search(query[index], database, turn, model.history, tally)
         if found is None:
             continue
         keyframe, T_keyframe_camera = found
@@ -140,7 +141,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     models = [mapped(source) for source in arguments.sources or default_sources()]
     for model in models:
-        sizes = [place.nbytes for place in model.places.all]
+        sizes = [place.nbytes for place in model.database.all]
         name, kilobytes = model.sequence.name, np.mean(sizes) / 1e3
         print(f"{name}: {len(sizes)} keyframe records of {kilobytes:.0f} kB on average")
     print("\n| frames of | in the map of | searched | found | right | false ", end="")

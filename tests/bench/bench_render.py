@@ -169,10 +169,10 @@ def main() -> None:
                 check_agreement(*runs)
             mine, *theirs = medians_ms(runs, arguments.repeats, clock)
             report(n, f"{width}x{height}", mine, theirs[0] if theirs else None)
-    time_the_twin()
+    time_the_reference()
 
 
-def time_the_twin() -> None:
+def time_the_reference() -> None:
     """Print the times of the kernel and of the NumPy reference for a small image."""
     iteration = Iteration(300, bench_camera(48, 36))
     rows, camera = iteration.gaussians.rows, iteration.camera
@@ -180,8 +180,8 @@ def time_the_twin() -> None:
         {"render": lambda: render(rows, camera, np.eye(4))},
         {"render": lambda: render_reference(rows.astype(float), camera, np.eye(4))},
     ]
-    kernel, twin = medians_ms(runs, repeats=3)
-    both = f"kernel {kernel['render']:.2f} ms, NumPy reference {twin['render']:.0f} ms"
+    kernel, numpy_ms = medians_ms(runs, repeats=3)
+    both = f"kernel {kernel['render']:.2f} ms, NumPy reference {numpy_ms['render']:.0f} ms"
     print(f"300 Gaussians, 48x36: {both}")
 
 

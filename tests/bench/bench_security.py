@@ -19,7 +19,7 @@ def row(attempt: Attempt[Where], where: Where) -> bool:
     seen = attempt.try_it(where)
     is_as_expected = seen == attempt.expected
     mark = "" if is_as_expected else " **not as expected**"
-    print(f"| {attempt.says} | {attempt.expected} | {seen}{mark} |", flush=True)
+    print(f"| {attempt.name} | {attempt.expected} | {seen}{mark} |", flush=True)
     return is_as_expected
 
 

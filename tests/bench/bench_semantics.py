@@ -73,13 +73,13 @@ def cpu_ms(work: Callable[[], object], repeats: int) -> float:
 class Step:
     name: str
     ours: Callable[[], object]
-    twin: Callable[[], object] | None = None
+    numpy_step: Callable[[], object] | None = None
     share: float = 1.0  # Fraction of our work that the reference does.
 
-    def told(self, repeats: int) -> float:
+    def median_ms(self, repeats: int) -> float:
         """Print a line of the table and return the time in ms."""
         ms = cpu_ms(self.ours, repeats)
-        ratio = f"{cpu_ms(self.twin, 3) / self.share / ms:.0f}x" if self.twin else ""
+        ratio = f"{cpu_ms(self.numpy_step, 3) / self.share / ms:.0f}x" if self.numpy_step else ""
         print(f"| {self.name} | {ms:.2f} | {ratio} |", flush=True)
         return ms
 
@@ -91,40 +91,40 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)  # This thread then has all CPU time of a reference.
     n, repeats = arguments.gaussians, arguments.repeats
-    rows, depth_m, claims = scene(n)
+    rows, depth_m, detections = scene(n)
     labels, indices, T = new_labels(n), np.arange(n, dtype=np.uint32), np.eye(4)
     image = depth_m, CAMERA, CONFIG.foreground
     pieces = surfaces(*image)
     in_image = depth_m, pieces, CAMERA, CONFIG.foreground
-    parts = [foreground(box, *in_image) for box in claims.boxes]
-    regions = Regions.of_foregrounds(claims.boxes, claims.scores(), parts)
+    parts = [foreground(box, *in_image) for box in detections.boxes]
+    regions = Regions.of_foregrounds(detections.boxes, detections.scores(), parts)
     where = assign_gaussians(rows, indices, CAMERA, T, depth_m, regions, CONFIG.assignment)
-    seen = observations(where, indices, CAMERA, claims, CONFIG)
+    seen = observations(where, indices, CAMERA, detections, CONFIG)
     observe(labels, seen, CONFIG.labels)
     touched = indices[seen.labels != NOT_SEEN]
 
     few, some = indices[: len(indices) // 100], indices[::100].copy()
     masks = [part.image(depth_m.shape) for part in parts]
     where_few = assign_gaussians(rows, few, CAMERA, T, depth_m, regions, CONFIG.assignment)
-    seen_few = observations(where_few, few, CAMERA, claims, CONFIG)
-    view = CAMERA, T, depth_m, claims.boxes, claims.scores(), masks, CONFIG.assignment
+    seen_few = observations(where_few, few, CAMERA, detections, CONFIG)
+    view = CAMERA, T, depth_m, detections.boxes, detections.scores(), masks, CONFIG.assignment
     # The whole has its own labels: repeated calls of `smooth_labels` spread those of the steps.
-    keyframe = rows, new_labels(n), indices, CAMERA, T, depth_m, claims, CONFIG
+    keyframe = rows, new_labels(n), indices, CAMERA, T, depth_m, detections, CONFIG
     steps = [
         Step("surfaces", lambda: surfaces(*image), lambda: surfaces_reference(*image)),
         Step(
-            f"{len(claims.boxes)} foregrounds",
-            lambda: [foreground(box, *in_image) for box in claims.boxes],
-            lambda: [foreground_reference(box, *in_image) for box in claims.boxes],
+            f"{len(detections.boxes)} foregrounds",
+            lambda: [foreground(box, *in_image) for box in detections.boxes],
+            lambda: [foreground_reference(box, *in_image) for box in detections.boxes],
         ),
-        Step("nesting, tables", lambda: tables(claims, parts)),
+        Step("nesting, tables", lambda: tables(detections, parts)),
         Step(
             "assign",
             lambda: assign_gaussians(rows, indices, CAMERA, T, depth_m, regions, CONFIG.assignment),
             lambda: assign_reference(rows[some], *view),
             0.01,
         ),
-        Step("fuse", lambda: observations(where, indices, CAMERA, claims, CONFIG)),
+        Step("fuse", lambda: observations(where, indices, CAMERA, detections, CONFIG)),
         Step(
             "observe",
             lambda: observe(labels, seen, CONFIG.labels),
@@ -140,13 +140,13 @@ def main() -> None:
     ]
     print(f"{n} Gaussians, {len(touched)} observed, {np.mean(seen.labels >= 0):.0%} in regions")
     print("| step | ms | reference, for equal work |\n|---|---|---|")
-    print(f"| sum | {sum(step.told(repeats) for step in steps):.2f} | |")
-    Step("whole", lambda: fuse_detections(*keyframe)).told(repeats)
+    print(f"| sum | {sum(step.median_ms(repeats) for step in steps):.2f} | |")
+    Step("whole", lambda: fuse_detections(*keyframe)).median_ms(repeats)
 
 
-def tables(claims: RegionDetections, parts: Sequence[Foreground]) -> Regions:
-    left = without_nested(parts, claims.scores(), CONFIG.nesting)
-    return Regions.of_foregrounds(claims.boxes, claims.scores(), left)
+def tables(detections: RegionDetections, parts: Sequence[Foreground]) -> Regions:
+    left = without_nested(parts, detections.scores(), CONFIG.nesting)
+    return Regions.of_foregrounds(detections.boxes, detections.scores(), left)
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ def bench_keyframes(source: str, count: int, stride: int, folder: Path) -> None:
     )
 
 
-def bench_sleep(source: str, count: int, stride: int, active: int, folder: Path) -> None:
+def bench_offload(source: str, count: int, stride: int, active: int, folder: Path) -> None:
     """Measure offloading in a map of `active` Gaussians, repeated from the first keyframes."""
     rows, anchors, poses = mapped(source, count, stride)
     times = -(-active // len(rows))
@@ -67,8 +67,8 @@ def bench_sleep(source: str, count: int, stride: int, active: int, folder: Path)
         poses[anchor] = poses[anchor % count]
         gaussians.add(rows[anchors == anchor % count], anchor)
     print(f"{source}: {len(gaussians)} Gaussians on {len(poses)} anchors")
-    sleeping, before = OffloadedGaussians(folder), gaussians.rows.copy()
-    asleep = list(range(0, len(poses), 2))
+    offloaded, before = OffloadedGaussians(folder), gaussians.rows.copy()
+    offloaded_chunks = list(range(0, len(poses), 2))
 
     def spheres() -> BoundingSpheres:
         return BoundingSpheres.around(gaussians.rows, gaussians.anchors)
@@ -76,14 +76,14 @@ def bench_sleep(source: str, count: int, stride: int, active: int, folder: Path)
     report("spheres", [timed_ms(spheres)])
     report(
         "offload half",
-        [timed_ms(lambda: sleeping.offload_from(gaussians, gaussians.anchors, asleep))],
+        [timed_ms(lambda: offloaded.offload_from(gaussians, gaussians.anchors, offloaded_chunks))],
     )
-    chunks, memory_mb = len(sleeping.numbers()), len(sleeping) * 64 / 1e6
+    chunks, memory_mb = len(offloaded.numbers()), len(offloaded) * 64 / 1e6
     disk_mb = sum(file.stat().st_size for file in folder.iterdir()) / 1e6
     camera = PlacedCamera(open_sequence(source).camera, poses[0])
-    sleeping.visible_chunks(camera)
-    report("visibility", [timed_ms(lambda: sleeping.visible_chunks(camera)) for _ in range(9)])
-    report("load half", [timed_ms(lambda: sleeping.load_into(gaussians, sleeping.numbers()))])
+    offloaded.visible_chunks(camera)
+    report("visibility", [timed_ms(lambda: offloaded.visible_chunks(camera)) for _ in range(9)])
+    report("load half", [timed_ms(lambda: offloaded.load_into(gaussians, offloaded.numbers()))])
     if gaussians.rows.tobytes() != before.tobytes():
         sys.exit("the Gaussians differ after loading; offloading is broken.")
     print(
@@ -119,7 +119,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         chosen = arguments.source, arguments.keyframes, arguments.stride
         bench_keyframes(*chosen, Path(folder) / "keyframes")
-        bench_sleep(*chosen, arguments.active, Path(folder) / "sleep")
+        bench_offload(*chosen, arguments.active, Path(folder) / "sleep")
 
 
 if __name__ == "__main__":

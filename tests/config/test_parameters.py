@@ -55,8 +55,8 @@ def test_value_shared_by_several_actors_is_set_once() -> None:
     assert tracker.pyramid.working_width_px == 160
     assert tracker.align == loops.align
     assert tracker.align.residuals.noise.floor_m == 0.01
-    assert tracker.places == loops.places
-    assert tracker.places.count == 77
+    assert tracker.keyframe_database == loops.keyframe_database
+    assert tracker.keyframe_database.count == 77
     assert tracker.features.count == loops.features.count == 500
     assert (tracker.features.min_inliers, loops.features.min_inliers) == (15, 12)
     assert tracker.movable == semantics.movable == parameters.loop_closer.movable

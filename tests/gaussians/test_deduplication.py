@@ -21,7 +21,7 @@ def test_deduplication_shrinks_a_doubled_map_without_loss_of_quality(small_room)
         frame, T_map_camera = posed[i]
         builder.add(frame, T_DRIFT @ T_map_camera, number, 10)
     repeated = range(FIRST_REPEATED, FIRST_REPEATED + len(FRAMES))
-    builder.move({k: se3.inverse(T_DRIFT) for k in repeated})
+    builder.move_keyframes({k: se3.inverse(T_DRIFT) for k in repeated})
 
     def quality() -> float:
         values = []

@@ -127,7 +127,7 @@ def test_correction_moves_gaussians_and_views_together(posed_frames: dict) -> No
     builder = build_map(posed_frames, iterations=2)
     before = mean_psnr(builder, posed_frames, KEYFRAMES[:1])
     T_new_old = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, 0.1, -0.2]))
-    builder.move(dict.fromkeys(range(len(KEYFRAMES)), T_new_old))
+    builder.move_keyframes(dict.fromkeys(range(len(KEYFRAMES)), T_new_old))
     frame, T = posed_frames[KEYFRAMES[0]]
     np.testing.assert_allclose(builder.views.poses[0], T_new_old @ T, atol=1e-12)
     moved = {KEYFRAMES[0]: (frame, T_new_old @ T)}
@@ -155,7 +155,7 @@ def displaced_frames(posed_frames: dict, x_m: float) -> dict:
 
 def map_with_offloaded(posed_frames: dict, **options) -> MapBuilder:
     """Return a map with most Gaussians of its first half offloaded."""
-    config = MapBuilderConfig(sleep=OffloadConfig(max_active=2000, reach_m=20), recent_cameras=2)
+    config = MapBuilderConfig(offload=OffloadConfig(max_active=2000, reach_m=20), recent_cameras=2)
     builder, displaced = MapBuilder(config, **options), displaced_frames(posed_frames, 100.0)
     for keyframe, i in enumerate(KEYFRAMES):
         builder.add(*posed_frames[i], keyframe, 2)
@@ -239,7 +239,7 @@ def test_dynamic_pixels_do_not_affect_the_map(posed_frames: dict) -> None:
 def test_keyframe_without_images_keeps_only_its_pose(posed_frames: dict, tmp_path: Path) -> None:
     """A restored builder continues bitwise equal."""
     config = MapBuilderConfig(
-        store=KeyframeStoreConfig(cache_mb=0.0, most=2, newest_kept=1), prune_keyframes=2
+        store=KeyframeStoreConfig(cache_mb=0.0, max_keyframes=2, newest_kept=1), prune_keyframes=2
     )
     first, second = (MapBuilder(config, folder=tmp_path / name) for name in ("first", "second"))
     for keyframe, i in enumerate(KEYFRAMES[:3]):
@@ -252,7 +252,7 @@ def test_keyframe_without_images_keeps_only_its_pose(posed_frames: dict, tmp_pat
     second.restore(first.snapshot())
     T_new_old = se3.exp(np.full(6, 0.01))
     for builder in (first, second):
-        builder.move(dict.fromkeys(range(3), T_new_old))
+        builder.move_keyframes(dict.fromkeys(range(3), T_new_old))
         builder.add(*posed_frames[KEYFRAMES[3]], 3, 5)
         builder.refine(5)
         assert builder.refined().keys() <= {0, 3}

@@ -99,7 +99,7 @@ def test_gaussians_of_an_unmoved_anchor_are_loaded_bitwise_equal(tmp_path: Path)
     assert number is not None
     assert offloaded.numbers() == [number]
     assert len(offloaded) == 5
-    offloaded.move({1: MOTION, 3: MOTION})
+    offloaded.move_anchors({1: MOTION, 3: MOTION})
     chunk = offloaded.load(number)
     assert (chunk.anchor, chunk.ids.tolist()) == (2, [10, 11, 12, 13, 14])
     assert chunk.rows.tobytes() == rows_before.tobytes()
@@ -115,7 +115,7 @@ def test_offloaded_gaussians_move_like_resident_ones(tmp_path: Path, motions: in
     offload_anchors(gaussians, offloaded, [0])
     for k in range(motions):
         T_new_old = {0: se3.exp(0.1 * (k + 1) * se3.log(MOTION))}
-        offloaded.move(T_new_old)
+        offloaded.move_anchors(T_new_old)
         gaussians.move_anchors(T_new_old)
         reference.move_anchors(T_new_old)
     assert np.abs(reference.rows[:50] - rows_of(50)).max() > 0.01
@@ -213,7 +213,7 @@ def test_any_offload_sequence_equals_a_map_that_was_never_offloaded(
         elif action == "move":
             moving = [k for k in range(anchors) if selection >> k % 6 & 1]
             motions = {k: se3.exp(rng.normal(0, 0.3, 6)) for k in moving}
-            offloaded.move(motions)
+            offloaded.move_anchors(motions)
             for gaussian_map in (gaussians, reference):
                 gaussian_map.move_anchors(motions)
         else:
@@ -240,7 +240,7 @@ def test_visible_chunks_follow_moved_anchors(tmp_path: Path) -> None:
     assert offloaded.visible_chunks(camera) == [numbers[0], numbers[1], numbers[3]]
     assert offloaded.visible_chunks(camera, reach_m=20) == [numbers[0], numbers[1]]
     behind = se3.exp(np.array([0, 0, 0, 0, 0, -50]))
-    offloaded.move({1: behind, 3: behind})
+    offloaded.move_anchors({1: behind, 3: behind})
     assert offloaded.visible_chunks(camera, reach_m=20) == [numbers[0], numbers[3]]
     offloaded.load(numbers[0])
     assert offloaded.visible_chunks(camera, reach_m=20) == [numbers[3]]
@@ -308,10 +308,10 @@ def test_corridor_walk_renders_bitwise_equal_within_the_resident_limit() -> None
             for gaussian_map in (gaussians, reference):
                 gaussian_map.add(wall_at(z_m + 2, anchor), anchor)
         # Offload.
-        chunks = chunk_numbers(gaussians.means, gaussians.anchors, config.clump_m)
+        chunks = chunk_numbers(gaussians.means, gaussians.anchors, config.chunk_edge_m)
         spheres = BoundingSpheres.around(gaussians.rows, gaussians.anchors, chunks)
         choice = plan_offload(spheres, recent, config)
-        offloaded.offload_from(gaussians, chunks, choice.clumps)
+        offloaded.offload_from(gaussians, chunks, choice.chunks)
         assert choice.excess == 0
         assert len(gaussians) + len(offloaded) == len(reference)
         max_resident = max(max_resident, len(gaussians))

@@ -140,7 +140,7 @@ def test_pieces_hang_together_by_sides_alone_however_they_wind() -> None:
 def given_to_foreground(**changes: object) -> tuple:
     """Return valid arguments of `_foreground.foreground`, in order, with some changed."""
     depth_m, labels = np.ones((20, 30), np.float32), np.zeros((20, 30), np.int32)
-    told = {
+    common = {
         "depth_m": depth_m,
         "focal_px": 20.0,
         "labels": labels,
@@ -154,7 +154,7 @@ def given_to_foreground(**changes: object) -> tuple:
         "grow_px": 2,
         "mask": np.ones((10, 10), np.uint8),
     }
-    return tuple((told | changes).values())
+    return tuple((common | changes).values())
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_what_does_not_fit_is_refused(changes: dict, message: str) -> None:
     ],
 )
 def test_what_does_not_fit_a_depth_image_is_refused(changes: dict, message: str) -> None:
-    told = {
+    common = {
         "depth_m": np.ones((20, 30), np.float32),
         **dict.fromkeys(("fx", "fy", "cx", "cy"), 20.0),
         "max_step": 0.05,
@@ -199,13 +199,13 @@ def test_what_does_not_fit_a_depth_image_is_refused(changes: dict, message: str)
         "labels": np.zeros((20, 30), np.int32),
     }
     with pytest.raises(ValueError, match=message):
-        _foreground.surfaces(*(told | changes).values())
+        _foreground.surfaces(*(common | changes).values())
 
 
 def test_a_mask_is_written_whole() -> None:
-    told = given_to_foreground()
-    _foreground.foreground(*told)
-    assert told[-1].all()  # The depth is constant, and all pixels are on edges.
+    common = given_to_foreground()
+    _foreground.foreground(*common)
+    assert common[-1].all()  # The depth is constant, and all pixels are on edges.
     nothing = given_to_foreground(depth_m=np.zeros((20, 30), np.float32))
     _foreground.foreground(*nothing)
     assert not nothing[-1].any()

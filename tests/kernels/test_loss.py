@@ -37,7 +37,7 @@ def scene(height: int, width: int) -> dict[str, np.ndarray]:
     }
 
 
-def twin(planes: np.ndarray, exposure: np.ndarray, given: dict) -> float:
+def reference_loss(planes: np.ndarray, exposure: np.ndarray, given: dict) -> float:
     """Compute the loss by the reference, in a form that `autograd` can differentiate."""
     color, mask = given["color"] / 255, given["mask"].astype(float)
     return loss_reference(planes, exposure, color, given["depth_m"], mask, WEIGHTS, anp)
@@ -51,14 +51,14 @@ def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_kernel_agrees_with_its_plain_twin_and_its_derivative(
+def test_kernel_agrees_with_the_reference_and_its_derivative(
     height: int, width: int, by_kernel: dict
 ) -> None:
     given, name = scene(height, width), f"{height}x{width}"
     planes, exposure = given["planes"].astype(float), given["exposure"].astype(float)
     total = np.dot(WEIGHTS, by_kernel[f"{name}/terms"][:3])
-    np.testing.assert_allclose(total, twin(planes, exposure, given), atol=2e-7)
-    wanted = grad(twin)(planes, exposure, given)
+    np.testing.assert_allclose(total, reference_loss(planes, exposure, given), atol=2e-7)
+    wanted = grad(reference_loss)(planes, exposure, given)
     error = np.linalg.norm(by_kernel[f"{name}/by_planes"].ravel() - wanted.ravel())
     assert error <= 2e-6 * np.linalg.norm(wanted)
 

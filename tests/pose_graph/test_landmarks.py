@@ -90,7 +90,7 @@ def test_landmarks_converge_to_the_object_centers() -> None:
 
 def test_landmarks_reduce_the_error_of_drifting_odometry() -> None:
     """The errors of the observations are independent."""
-    truth, noise = kitchen(120), NoiseConfig(independent_sights=1.0)
+    truth, noise = kitchen(120), NoiseConfig(independent_observations=1.0)
     graph, _ = graph_with_landmarks(truth, ObjectLandmarkConfig(), sigma=8e-3, noise=noise)
     alone = walked(truth[0], odometry(truth, 1, sigma=8e-3))
     assert ate_m(graph, truth) < 0.7 * ate_m(alone, truth)
@@ -134,7 +134,7 @@ def test_poses_and_landmarks_equal_a_batch_solution_of_the_objective() -> None:
         for observation in observed_boxes(truth, k, rng):
             landmarks.observe(observation)
     landmarks.update_graph(graph)
-    observations = [s for k in graph.landmarks() for s in landmarks.known[k].sights]
+    observations = [s for k in graph.landmarks() for s in landmarks.known[k].observations]
     assert len(graph.landmarks()) >= 3
 
     def cost(T: list[np.ndarray], centers: dict[int, np.ndarray]) -> float:
@@ -146,7 +146,7 @@ def test_poses_and_landmarks_equal_a_batch_solution_of_the_objective() -> None:
             p_camera = se3.transform(se3.inverse(T[s.keyframe]), centers[s.landmark])
             error_px = CAMERA.project(p_camera[None])[0] - s.center_px
             rho = k**2 * np.log1p(s.weight * (error_px @ error_px) / (s.sigma_px * k) ** 2)
-            total += noise.independent_sights * rho
+            total += noise.independent_observations * rho
         return total
 
     start = {i: truth[i] for i in range(10)}
@@ -189,7 +189,7 @@ def test_box_at_the_image_border_adds_a_label_but_no_position() -> None:
     landmarks, graph = ObjectLandmarks(ObjectLandmarkConfig(), NoiseConfig()), walked(np.eye(4), [])
     landmarks.observe(observation)
     landmarks.update_graph(graph)
-    assert landmarks.known[5].sights == ()
+    assert landmarks.known[5].observations == ()
     assert landmarks.known[5].distribution.argmax() == 7
 
 
@@ -198,12 +198,12 @@ def test_repeated_observation_counts_once() -> None:
     graph, landmarks = graph_with_landmarks(truth, ObjectLandmarkConfig())
     known = dict(landmarks.known)
     k, landmark = next(item for item in known.items() if graph.has_landmark(item[0]))
-    repeated = observed_boxes(truth, landmark.sights[0].keyframe, np.random.default_rng(8))
+    repeated = observed_boxes(truth, landmark.observations[0].keyframe, np.random.default_rng(8))
     for observation in repeated:
         landmarks.observe(observation)
     landmarks.update_graph(graph)
     assert landmarks.known[k].evidence == known[k].evidence
-    assert landmarks.known[k].sights == known[k].sights
+    assert landmarks.known[k].observations == known[k].observations
 
 
 def test_landmark_is_removed_after_ten_misses_and_a_vague_one_after_five() -> None:
@@ -253,7 +253,7 @@ def test_landmark_that_cannot_be_solved_is_dropped_and_poses_stay(monkeypatch) -
     build, failures = type(graph)._rebuild, []
 
     def fails_with_landmarks(self: PoseGraph) -> None:
-        if self._known.sights:
+        if self._known.observations:
             failures.append(self)
             raise RuntimeError("indeterminate")
         build(self)
@@ -267,7 +267,7 @@ def test_landmark_that_cannot_be_solved_is_dropped_and_poses_stay(monkeypatch) -
 
 def test_number_of_observations_per_landmark_is_bounded() -> None:
     graph, landmarks = graph_with_landmarks(
-        kitchen(120), ObjectLandmarkConfig(max_sights=8, due_weight=1)
+        kitchen(120), ObjectLandmarkConfig(max_observations=8, due_weight=1)
     )
-    assert {len(landmark.sights) for landmark in landmarks.known.values()} == {8}
-    assert len(graph._known.sights) == 8 * len(graph.landmarks())
+    assert {len(landmark.observations) for landmark in landmarks.known.values()} == {8}
+    assert len(graph._known.observations) == 8 * len(graph.landmarks())

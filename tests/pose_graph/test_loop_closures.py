@@ -148,7 +148,7 @@ def test_closure_between_components_merges_them() -> None:
 
 
 def test_full_closure_set_drops_the_older_of_two_redundant_closures() -> None:
-    known = LoopClosureSet(LoopClosureConfig(most=3))
+    known = LoopClosureSet(LoopClosureConfig(max_closures=3))
     for a, b in ((10, 200), (12, 202), (90, 300), (10, 301)):
         known = known.with_decision(RelativePose(a, b, np.eye(4), np.eye(6)), ClosureDecision(True))
     assert list(known.accepted) == [(12, 202), (90, 300), (10, 301)]

@@ -317,12 +317,12 @@ def test_splitting_a_group_keeps_its_pose_and_information() -> None:
     assert 14 not in known.rows
     ends = {k: before[k] for k in (10, 14, 20)}
     for keyframe in (11, 12, 13, 15, 16, 17, 18, 19):
-        condensed = known.followers.only(known.rows[keyframe])
+        condensed = known.interpolated.only(known.rows[keyframe])
         pair = int(condensed.start_variables[0]), int(condensed.end_variables[0])
         assert pair == ((10, 14) if keyframe < 14 else (14, 20))
         placed = condensed.interpolated_poses(*(ends[k][None] for k in pair))[0]
         np.testing.assert_allclose(placed, before[keyframe], atol=1e-9)
-    np.testing.assert_allclose(known.followers.fractions[[known.rows[12], known.rows[17]]], 0.5)
+    np.testing.assert_allclose(known.interpolated.fractions[[known.rows[12], known.rows[17]]], 0.5)
 
 
 def test_at_most_one_keyframe_in_five_becomes_a_variable_for_closures() -> None:
@@ -536,7 +536,7 @@ def test_every_stored_factor_connects_two_variables_and_is_restored(seed: int) -
         if rng.random() < 0.2 and (earlier := connected(b + 1)[:-1]):
             graph.replace([noisy(earlier[-1], b)])
         known = graph._known
-        for kind in ("odometry", "condensed", "joins"):
+        for kind in ("odometry", "condensed", "bridges"):
             for m in getattr(known, kind).values():
                 assert len({end for end, _ in known.ends(m)}) == 2
         for m in graph.closures.accepted.values():

@@ -81,7 +81,7 @@ def test_failure_that_does_not_repeat_is_a_note_not_a_difference(tmp_path: Path)
 
 def test_killed_actor_and_its_restart_replay(tmp_path: Path) -> None:
     first = recorded(tmp_path, [1, 2, 3, 4, 5], is_killed=True)
-    last = McapIndex(first).places[-1]
+    last = McapIndex(first).locations[-1]
     # The last step is cut in half.
     first.write_bytes(first.read_bytes()[: last.start + last.size // 2])
     recorded(tmp_path, [5, 6, 7])

@@ -37,8 +37,10 @@ def normal_equations(
     p, shade, n, u, v = p[shown], shade[shown], n[shown], u[shown], v[shown]
     column, row, depth = column[shown], row[shown], depth[shown]
 
-    told = (shade > 0) & is_unclipped(target, u, v)
-    r, J = photometric(target, p[told], shade[told], u[told], v[told], appearance)
+    is_usable = (shade > 0) & is_unclipped(target, u, v)
+    r, J = photometric(
+        target, p[is_usable], shade[is_usable], u[is_usable], v[is_usable], appearance
+    )
     H_color, g_color, color = _weighted(r, J, np.full(len(r), appearance.intensity_sigma))
 
     q = np.column_stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy])

@@ -6,7 +6,7 @@ import pytest
 from ldo_service.geometry import Camera, se3
 from ldo_service.regions.foreground import Foreground
 from ldo_service.regions.region import observe_region
-from ldo_service.regions.region_matching import LEAST, STRIDE_PX, pixels, propagate_mask
+from ldo_service.regions.region_matching import MIN_PIXELS, STRIDE_PX, pixels, propagate_mask
 from ldo_service.regions.region_proposals import RegionProposal
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
@@ -85,7 +85,7 @@ def test_fewer_than_twelve_samples_give_no_mask() -> None:
         now_m[:, columns:] = WALL_M
         visible = np.count_nonzero(now_m[::STRIDE_PX, ::STRIDE_PX] == np.float32(OBJECT_M))
         counts[visible] = propagated_to(0.0, depth_m=now_m) is not None
-    assert LEAST == 12
+    assert MIN_PIXELS == 12
     assert min(counts) < 12 < max(counts)
     assert all(is_shown == (visible >= 12) for visible, is_shown in counts.items())
 

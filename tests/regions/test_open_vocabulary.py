@@ -74,14 +74,14 @@ def test_without_box_votes_confidence_is_that_of_the_labeller() -> None:
         place = color, depth_m, camera, {3: np.eye(4), 4: np.eye(4)}
         seen = regions.observe_keyframe(keyframe, [confident_box], *place)
         regions.answered(0, RegionLabelResult("tv", 0.4))
-    (region_label,) = seen.opinions
+    (region_label,) = seen.region_labels
     assert (region_label.label, region_label.sure) == ("tv", pytest.approx(0.4))
 
 
 @pytest.mark.parametrize("is_used", [True, False])
 def test_labels_add_detections_only_if_used(is_used: bool) -> None:
     labeling = OpenVocabularyLabeling.unpack(
-        requested(region(kind="standing")).pack(), is_heard=is_used
+        requested(region(kind="standing")).pack(), is_fused=is_used
     )
     labeling.apply_label_result(
         0, 3, RegionLabelResult("cushion", 0.9), vocabulary := Vocabulary(256)

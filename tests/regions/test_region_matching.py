@@ -11,7 +11,7 @@ from ldo_service.regions.region_proposals import RegionProposal
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 WALL_M = np.full((120, 160), 2.0, np.float32)
-LEAST = 12
+MIN_PIXELS = 12
 
 
 def part(left: int, top: int, width: int, height: int) -> Foreground:
@@ -26,7 +26,9 @@ def region(id_: int, mask: Foreground) -> Region:
 
 def matcher_of(*regions: Region, depth_m: np.ndarray = WALL_M) -> RegionMatcher:
     """Return a matcher of the regions for a later keyframe with the same pose."""
-    return RegionMatcher(regions, 1, depth_m, CAMERA, dict.fromkeys((0, 1), np.eye(4)), 0.1, LEAST)
+    return RegionMatcher(
+        regions, 1, depth_m, CAMERA, dict.fromkeys((0, 1), np.eye(4)), 0.1, MIN_PIXELS
+    )
 
 
 def test_overlaps_match_intersection_over_union() -> None:

@@ -26,7 +26,7 @@ from ldo_service.storage.state_codec import decode_state, encode_state
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 SHAPE = 120, 160
 CONFIG = RegionTrackerConfig(
-    views_first=2, views=3, max_questions=2, patience=0, per_keyframe=9, at_once=9
+    views_first=2, views=3, max_requests=2, patience=0, per_keyframe=9, at_once=9
 )
 RNG = np.random.default_rng(3)
 COLOR = RNG.integers(0, 256, (*SHAPE, 3), np.uint8)
@@ -71,7 +71,7 @@ class KeyframeSequence:
         keyframe = len(self.T_map_keyframe)
         self.T_map_keyframe[keyframe] = pose_at()
         at = COLOR, np.full(SHAPE, 2.0, np.float32), CAMERA, self.T_map_keyframe
-        return self.regions.observe_keyframe(keyframe, found, *at).opinions
+        return self.regions.observe_keyframe(keyframe, found, *at).region_labels
 
     def add_label_result(self, label: str, confidence: float, region: int = 0) -> None:
         self.regions.answered(region, RegionLabelResult(label, confidence))
@@ -112,7 +112,7 @@ def test_best_view_is_requested_when_no_better_one_follows() -> None:
 
 
 def test_requests_are_limited_and_sorted_by_size() -> None:
-    sequence = KeyframeSequence(replace(CONFIG, per_keyframe=0.5, at_once=1, max_questions=1))
+    sequence = KeyframeSequence(replace(CONFIG, per_keyframe=0.5, at_once=1, max_requests=1))
     many = [proposal(left=5, side=20), proposal(left=40, side=40), proposal(left=100, side=30)]
     requests = [sequence.observe(*many) for _ in range(8)]
     assert requests == [[], [1], [], [2], [], [0], [], []]
@@ -183,14 +183,16 @@ def test_label_is_applied_when_its_region_is_observed_again() -> None:
     sequence.T_map_keyframe[keyframe] = pose_at()
     at = COLOR, depth_m, CAMERA, sequence.T_map_keyframe
     requested, known, other = proposal(), proposal(left=62), proposal(left=120)
-    (region_label,) = sequence.regions.observe_keyframe(keyframe, [requested], *at).opinions
+    (region_label,) = sequence.regions.observe_keyframe(keyframe, [requested], *at).region_labels
     assert (region_label.of, region_label.label) == (requested, "teapot")
     assert region_label.sure == pytest.approx(0.5 * 0.25 / (0.25 + 0.16))
     observed = sequence.regions.observe_keyframe(keyframe, [], *at, named=[known, other])
-    assert [(one.of, one.label) for one in observed.opinions] == [(known, "teapot")]
+    assert [(one.of, one.label) for one in observed.region_labels] == [(known, "teapot")]
     inside, surrounding = proposal(left=70, top=50, side=10), proposal(left=20, top=5, side=110)
     assert (
-        sequence.regions.observe_keyframe(keyframe, [inside], *at, named=[surrounding]).opinions
+        sequence.regions.observe_keyframe(
+            keyframe, [inside], *at, named=[surrounding]
+        ).region_labels
         == []
     )
 
@@ -205,7 +207,7 @@ def test_confident_label_is_propagated_without_a_proposal_of_its_region() -> Non
     def labels_at(keyframe: int, *found: RegionProposal, depth_m: np.ndarray = depth_m):
         return sequence.regions.observe_keyframe(
             keyframe, found, COLOR, depth_m, CAMERA, T
-        ).opinions
+        ).region_labels
 
     sequence.add_label_result("teapot", 0.49)
     assert labels_at(2) == [], "the confidence is too low"
@@ -233,9 +235,10 @@ def test_small_region_is_not_propagated() -> None:
     sequence.T_map_keyframe[2] = pose_at()
     at = COLOR, np.full(SHAPE, 2.0, np.float32), CAMERA, sequence.T_map_keyframe
     assert [
-        one.label for one in sequence.regions.observe_keyframe(2, [proposal(side=8)], *at).opinions
+        one.label
+        for one in sequence.regions.observe_keyframe(2, [proposal(side=8)], *at).region_labels
     ] == ["cup"]
-    assert sequence.regions.observe_keyframe(2, [], *at).opinions == []
+    assert sequence.regions.observe_keyframe(2, [], *at).region_labels == []
 
 
 def test_confident_detection_is_not_requested() -> None:
@@ -258,7 +261,7 @@ def test_detections_and_label_results_vote_for_the_label() -> None:
     keyframe = len(sequence.T_map_keyframe)
     sequence.T_map_keyframe[keyframe] = pose_at()
     at = COLOR, np.full(SHAPE, 2.0, np.float32), CAMERA, sequence.T_map_keyframe
-    (region_label,) = sequence.regions.observe_keyframe(keyframe, [proposal()], *at).opinions
+    (region_label,) = sequence.regions.observe_keyframe(keyframe, [proposal()], *at).region_labels
     assert (region_label.label, region_label.sure) == (
         "refrigerator",
         pytest.approx(0.4 * 1.6 / 3.04),
@@ -334,7 +337,7 @@ def test_supported_flag_of_a_region_persists() -> None:
 
 
 def test_propagated_labels_per_keyframe_are_limited() -> None:
-    sequence = KeyframeSequence(replace(CONFIG, max_carried=1))
+    sequence = KeyframeSequence(replace(CONFIG, max_propagated=1))
     for _ in range(2):
         sequence.observe(proposal(left=20), proposal(left=90))
     for region in (0, 1):
@@ -371,7 +374,7 @@ def test_proposal_without_depth_is_ignored() -> None:
     regions = RegionTracker(CONFIG)
     nothing = np.zeros(SHAPE, np.float32)
     observed = regions.observe_keyframe(0, [proposal()], COLOR, nothing, CAMERA, {0: pose_at()})
-    assert (observed.questions, observed.opinions) == ([], [])
+    assert (observed.questions, observed.region_labels) == ([], [])
     assert len(regions) == 0
 
 

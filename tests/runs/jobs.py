@@ -42,7 +42,7 @@ HERE, AWAY, BACK = range(12), range(60, 24, -2), range(24, 4, -2)
 @contextmanager
 def quick_submaps() -> Iterator[None]:
     """Let trackers made from a configuration merge submaps after a few frames."""
-    quick = partial(SubmapConfig, look_every=3, confirm_after=2, confirm_apart_rad=0.05)
+    quick = partial(SubmapConfig, search_interval_frames=3, confirm_after=2, confirm_apart_rad=0.05)
     with patch("ldo_service.config.parameters.SubmapConfig", quick):
         yield
 

@@ -175,7 +175,7 @@ def test_run_with_detector_writes_a_label_per_gaussian(
     model = squares_network("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
     settings = (f"detector.model={model}", "detector.min_score=0.02")
     record = run(room, tmp_path / "out", *settings)
-    saved, gaussians = MapFolder(tmp_path / "out").semantics(), record.follower.map
+    saved, gaussians = MapFolder(tmp_path / "out").semantics(), record.replica.map
     assert saved is not None
     assert (tmp_path / "out" / "map.ply").read_bytes() == (finished / "map.ply").read_bytes()
     assert saved.labels.tobytes() == gaussians.labels[record.in_map()].tobytes()

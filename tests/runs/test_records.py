@@ -12,7 +12,7 @@ from ldo_service.actors.topology import GRAPH
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
-from ldo_service.evaluation.results import judge_loops
+from ldo_service.evaluation.results import run_loop_errors
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.records import LoopRecord, read_loops
@@ -87,7 +87,7 @@ def test_loops_of_a_run_are_evaluated_against_ground_truth(
     finished: Path, walk_with_return: Rearranged
 ) -> None:
     truth = walk_with_return.truth()
-    errors = judge_loops(read_run(finished), walk_with_return, truth)
+    errors = run_loop_errors(read_run(finished), walk_with_return, truth)
     assert errors is not None
     assert max(errors.position_errors_m) < 0.01
 

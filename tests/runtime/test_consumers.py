@@ -5,11 +5,11 @@ from ldo_service.transport.flow_control import Credit
 
 def test_credit_is_limited_by_the_slowest_consumer() -> None:
     consumers = Consumers([])
-    assert consumers.room(seq=5) == UNLIMITED
+    assert consumers.credits(seq=5) == UNLIMITED
     for name, limit in (("one", 12), ("other", 9)):
         consumers.join(name, 5)
         consumers.grant(Credit(name, 1, 5, 5, limit))
-    assert [consumers.room(seq) for seq in (5, 8, 9, 10)] == [4, 1, 0, 0]
+    assert [consumers.credits(seq) for seq in (5, 8, 9, 10)] == [4, 1, 0, 0]
 
 
 def test_late_credit_of_previous_process_does_not_hide_missing_messages() -> None:
@@ -41,7 +41,7 @@ def test_evicted_consumer_returns_after_handling_a_message() -> None:
     consumers.join("mapper", 0)
     consumers.grant(Credit("mapper", 1, 2, 4, 6))
     consumers.evict("mapper")
-    assert consumers.room(4) == 0
+    assert consumers.credits(4) == 0
     assert consumers.is_still_stuck(Credit("mapper", 1, 2, 4, 6))
     assert not consumers.is_still_stuck(Credit("mapper", 1, 3, 4, 7))
 

@@ -9,12 +9,12 @@ Where = TypeVar("Where")
 
 @dataclass(frozen=True, slots=True)
 class Attempt(Generic[Where]):
-    says: str
+    name: str
     expected: str
     try_it: Callable[[Where], str]  # Returns the result in the words of `expected`.
 
     def __str__(self) -> str:
-        return self.says
+        return self.name
 
 
 def kept_in(
@@ -22,7 +22,7 @@ def kept_in(
 ) -> Callable[[str, str], Callable[[Callable[[Where], str]], None]]:
     """Return a decorator that adds a function to `attempts`."""
 
-    def attempt(says: str, expected: str) -> Callable[[Callable[[Where], str]], None]:
-        return lambda try_it: attempts.append(Attempt(says, expected, try_it))
+    def attempt(name: str, expected: str) -> Callable[[Callable[[Where], str]], None]:
+        return lambda try_it: attempts.append(Attempt(name, expected, try_it))
 
     return attempt

@@ -14,6 +14,6 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         yield here
 
 
-@pytest.mark.parametrize("attempt", ATTEMPTS, ids=lambda attempt: attempt.says)
+@pytest.mark.parametrize("attempt", ATTEMPTS, ids=lambda attempt: attempt.name)
 def test_attempt_has_the_expected_result(attempt: Attempt, here: Lab) -> None:
     assert attempt.try_it(here) == attempt.expected

@@ -12,7 +12,7 @@ from ldo_service.semantics.object_landmarks import (
     NO_MEMBER,
     boxes,
     derive,
-    joined,
+    merged_members,
     moments,
     moved,
     new_landmarks,
@@ -41,7 +41,7 @@ def test_joined_members_are_first_in_shuffled_order_and_keep_votes(
 ) -> None:
     members, votes = packed(one, 5)
     others, other_votes = packed(other, 1)
-    got, got_votes = joined(members, votes, others, other_votes)
+    got, got_votes = merged_members(members, votes, others, other_votes)
     known = set(members[members >= 0].tolist())
     expected, _ = packed(sorted(known | set(others[others >= 0].tolist())))
     np.testing.assert_array_equal(got, expected)
@@ -52,13 +52,13 @@ def test_joined_members_are_first_in_shuffled_order_and_keep_votes(
 @given(id_lists, id_lists)
 def test_joined_members_do_not_depend_on_order(one: list[int], other: list[int]) -> None:
     a, b = packed(one), packed(other)
-    np.testing.assert_array_equal(joined(*a, *b)[0], joined(*b, *a)[0])
+    np.testing.assert_array_equal(merged_members(*a, *b)[0], merged_members(*b, *a)[0])
 
 
 def test_members_without_votes_are_removed() -> None:
     members, votes = packed([1, 2, 3])
     votes[members == 2] = 0
-    got, _ = joined(members, votes, *packed([4]))
+    got, _ = merged_members(members, votes, *packed([4]))
     assert sorted(got[got >= 0].tolist()) == [1, 3, 4]
 
 

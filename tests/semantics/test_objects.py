@@ -110,7 +110,11 @@ def test_restored_objects_continue_bitwise_equal() -> None:
     for name in ("landmarks", "counts"):
         np.testing.assert_array_equal(reference.objects.pack()[name], restored.objects.pack()[name])
     for one, other in zip(updates, restored_updates, strict=True):
-        assert (one.born, one.merged, one.retired) == (other.born, other.merged, other.retired)
+        assert (one.created, one.merged, one.removed) == (
+            other.created,
+            other.merged,
+            other.removed,
+        )
         for a, b in zip(one.observations, other.observations, strict=True):
             assert (a.object, a.entropy, a.is_miss) == (b.object, b.entropy, b.is_miss)
             np.testing.assert_array_equal(a.box, b.box)
@@ -132,7 +136,7 @@ def observe_from_front(
 def test_object_is_confirmed_at_the_third_keyframe() -> None:
     labelled_map = LabelledMap()
     updates = observe_from_front(labelled_map, (BALL,), 4)
-    assert [update.born for update in updates] == [(), (), (0,), ()]
+    assert [update.created for update in updates] == [(), (), (0,), ()]
     assert [len(update.observations) for update in updates] == [0, 0, 0, 1]
     seen = updates[3].observations[0]
     true = shoot((BALL,), FRONT_POSE).detections((BALL,)).boxes[0]
@@ -146,7 +150,7 @@ def test_region_with_changing_labels_is_never_confirmed() -> None:
     for name in names:
         shot = shoot((BALL,), FRONT_POSE, labelled_map.keyframe)
         detections = shot.detections((replace(BALL, name=name),))
-        assert labelled_map.show(shot, detections)[1].born == ()
+        assert labelled_map.show(shot, detections)[1].created == ()
     assert len(labelled_map.objects) == 0
 
 
@@ -170,7 +174,7 @@ def test_missing_object_is_removed_after_ten_keyframes() -> None:
     observe_from_front(labelled_map, (BALL, VASE), 5)
     kept = {int(k["labels"][0]): int(k["id"]) for k in labelled_map.objects.landmarks}
     updates = observe_from_front(labelled_map, (VASE,), 12)
-    assert [update.retired for update in updates] == [()] * 9 + [(kept[BALL.label],)] + [()] * 2
+    assert [update.removed for update in updates] == [()] * 9 + [(kept[BALL.label],)] + [()] * 2
     assert labelled_map.objects.landmarks["id"].tolist() == [kept[VASE.label]]
     misses = [
         seen.is_miss
@@ -186,7 +190,7 @@ def test_uncertain_object_is_removed_earlier() -> None:
     labelled_map = LabelledMap(Objects(config))
     observe_from_front(labelled_map, (BALL,), 5)
     updates = observe_from_front(labelled_map, (), 6)
-    assert [update.retired for update in updates] == [(), (), (), (), (0,), ()]
+    assert [update.removed for update in updates] == [(), (), (), (), (0,), ()]
 
 
 def test_nine_misses_in_a_row_do_not_remove_an_object() -> None:
@@ -194,7 +198,7 @@ def test_nine_misses_in_a_row_do_not_remove_an_object() -> None:
     observe_from_front(labelled_map, (COUCH,), 4)
     for _ in range(9):
         shot = shoot((COUCH,), FRONT_POSE, labelled_map.keyframe)
-        assert labelled_map.show(shot, NO_DETECTIONS)[1].retired == ()
+        assert labelled_map.show(shot, NO_DETECTIONS)[1].removed == ()
     observe_from_front(labelled_map, (COUCH,), 1)
     (landmark,) = labelled_map.objects.landmarks
     assert (landmark["misses"], landmark["missed"]) == (0, 9)
@@ -294,7 +298,7 @@ def test_objects_move_with_their_gaussians() -> None:
     gaussians, before = labelled_map.builder.gaussians, labelled_map.objects.landmarks
     T = se3.exp(np.array([0.1, -0.2, 0.3, 1.0, 0.5, -0.2]))
     motions = {int(k): T for k in np.unique(gaussians.anchors)}
-    labelled_map.builder.move(motions)
+    labelled_map.builder.move_keyframes(motions)
     labelled_map.objects.move(motions)
     moved = labelled_map.objects.landmarks
     expected = se3.transform(T, before["centroid"])
@@ -324,13 +328,16 @@ def test_refresh_updates_only_objects_within_view() -> None:
 
 
 def test_object_of_unknown_class_is_missed_only_when_its_place_is_empty() -> None:
-    labelled_map, spared = LabelledMap(Objects(ObjectsConfig(min_side_px=10))), np.zeros(256, bool)
+    labelled_map, undetectable = (
+        LabelledMap(Objects(ObjectsConfig(min_side_px=10))),
+        np.zeros(256, bool),
+    )
     observe_from_front(labelled_map, (BALL,), 4)
-    spared[BALL.label] = True
+    undetectable[BALL.label] = True
     for present, missed in (((BALL,), 0), ((), 1)):
         shot = shoot(present, FRONT_POSE, labelled_map.keyframe)
         labelled_map.builder.add(shot.frame, shot.T_map_camera, labelled_map.keyframe, 0)
-        labelled_map.objects.observe(labelled_map.view(shot, NO_DETECTIONS), spared)
+        labelled_map.objects.observe(labelled_map.view(shot, NO_DETECTIONS), undetectable)
         labelled_map.keyframe += 1
         assert labelled_map.objects.landmarks["missed"].tolist() == [missed]
 

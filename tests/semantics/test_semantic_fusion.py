@@ -152,10 +152,10 @@ def test_labels_unknown_to_the_detector_are_not_missed() -> None:
     config = SemanticFusionConfig(labels=LabelConfig(min_px=20))
     rows, labels = labelled(config, late=detections(0, 0.9))
     at = np.arange(len(rows), dtype=np.uint32), CAMERA, np.eye(4), depth_image()
-    lamps, spared = labels.copy(), np.zeros(256, bool)
-    spared[LAMP] = True
+    lamps, undetectable = labels.copy(), np.zeros(256, bool)
+    undetectable[LAMP] = True
     for _ in range(9):
-        fuse_detections(rows, lamps, *at, NO_DETECTIONS, config, spared=spared)
+        fuse_detections(rows, lamps, *at, NO_DETECTIONS, config, undetectable=undetectable)
         fuse_detections(rows, labels, *at, NO_DETECTIONS, config)
     assert np.mean(top_labels(lamps).reshape(64, 96)[object_mask()] == LAMP) > 0.9
     assert not top_labels(labels).any(), "a class that the detector knows can be missed"
@@ -211,11 +211,13 @@ def test_earlier_misses_do_not_delay_a_label_unknown_to_the_detector() -> None:
     config = SemanticFusionConfig(labels=LabelConfig(min_px=1))
     rows, labels = labelled(config, *[NO_DETECTIONS] * 10)
     view = np.arange(len(rows), dtype=np.uint32), CAMERA, np.eye(4), depth_image()
-    spared, known = np.zeros(256, bool), labels.copy()
-    spared[LAMP] = True
-    for spared_classes, fused in ((spared, labels), (None, known)):
+    undetectable, known = np.zeros(256, bool), labels.copy()
+    undetectable[LAMP] = True
+    for undetectable_labels, fused in ((undetectable, labels), (None, known)):
         late = detections(0, 0.9)
-        fuse_detections(rows, fused, *view, late, config, is_late=True, spared=spared_classes)
+        fuse_detections(
+            rows, fused, *view, late, config, is_late=True, undetectable=undetectable_labels
+        )
     assert np.mean(top_labels(labels).reshape(64, 96)[object_mask()] == LAMP) > 0.9
     assert not top_labels(known).any(), "a class that the detector knows was missed"
 

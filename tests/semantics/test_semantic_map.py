@@ -125,7 +125,7 @@ def test_late_detections_label_offloaded_gaussians(posed_frames) -> None:
     frame, T_map_camera = posed_frames[0]
     far_pose = se3.exp(np.array([0, 0, 0, 50.0, 0, 0])) @ T_map_camera
     offload = OffloadConfig(max_active=100, reach_m=8.0)
-    builder = MapBuilder(MapBuilderConfig(sleep=offload, recent_cameras=1))
+    builder = MapBuilder(MapBuilderConfig(offload=offload, recent_cameras=1))
     resident = build_map([(frame, T_map_camera), (frame, far_pose)])
     semantics = SemanticMap(builder, BY_BOX)
     for keyframe, T in enumerate((T_map_camera, far_pose)):

@@ -11,7 +11,7 @@ import pytest
 from ldo_service.config import load_config
 from ldo_service.errors import ConfigError
 from ldo_service.suites import (
-    Judged,
+    EvaluatedRun,
     Outcome,
     Suite,
     SuiteRun,
@@ -39,9 +39,9 @@ def suite_file(folder: Path, text: str) -> str:
     return str(path)
 
 
-def scores(ate_m: float, fps: float = 10.0) -> Judged:
+def scores(ate_m: float, fps: float = 10.0) -> EvaluatedRun:
     trajectory = {"final": {"ate_m": {"rmse": ate_m}}}
-    return Judged({"fps": fps}, {"trajectory": trajectory, "rendering": []})
+    return EvaluatedRun({"fps": fps}, {"trajectory": trajectory, "rendering": []})
 
 
 @pytest.mark.parametrize("name", known_suites())
@@ -78,7 +78,7 @@ def test_first_run_without_its_front_end_is_not_finished(tmp_path: Path) -> None
     first, _, other, _ = runner.entries()[:4]
     for entry in (first, other):
         (tmp_path / entry.folder).mkdir(parents=True)
-        (tmp_path / entry.folder / "entry.json").write_text(runner._told(entry))
+        (tmp_path / entry.folder / "entry.json").write_text(runner._entry_json(entry))
     assert runner._is_finished(other, tmp_path / other.folder)
     assert not runner._is_finished(first, tmp_path / first.folder)
     (tmp_path / first.folder / "front_end.mcap").touch()
@@ -128,7 +128,7 @@ def test_single_sequence_gives_one_table_of_all_scores() -> None:
 
 @pytest.mark.parametrize("name", sorted(FIGURES))
 def test_score_that_was_not_evaluated_is_none(name: str) -> None:
-    assert FIGURES[name].of(Judged({}, {"trajectory": None, "rendering": []})) is None
+    assert FIGURES[name].of(EvaluatedRun({}, {"trajectory": None, "rendering": []})) is None
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 def track(frames: Iterable[RgbdFrame], begin_after_s: float = 0) -> list[TrackingResult]:
     """Track frames; a submap starts after `begin_after_s` seconds of LOST, or never if it is 0."""
     submaps = SubmapConfig(begin_after_s=begin_after_s)
-    config = OdometryConfig(submaps=submaps, keyframes=KeyframeConfig(supporting=2.0))
+    config = OdometryConfig(submaps=submaps, keyframes=KeyframeConfig(mapping_only_ratio=2.0))
     odometry = Odometry(config)
     return [odometry.process(frame) for frame in frames]
 

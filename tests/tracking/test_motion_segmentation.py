@@ -177,7 +177,7 @@ EACH_FRAME = KeyframeConfig(min_frames=1, max_frames=1, still_motion=0.0)  # Nee
 
 
 def track(frames: Iterable[RgbdFrame]) -> list[TrackingResult]:
-    odometry = Odometry(OdometryConfig(keyframes=KeyframeConfig(supporting=2.0)))
+    odometry = Odometry(OdometryConfig(keyframes=KeyframeConfig(mapping_only_ratio=2.0)))
     return [odometry.process(frame) for frame in frames]
 
 

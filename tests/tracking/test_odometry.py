@@ -202,7 +202,7 @@ def test_lost_camera_relocalizes_in_the_last_mapped_frame(large_room) -> None:
     """The view has left the reference keyframe; the restored tracker finds the same pose."""
     rarely = KeyframeConfig(
         min_overlap=0.0, max_frames=1000, max_rotation_rad=np.pi, max_translation=100.0,
-        supporting=0.1,
+        mapping_only_ratio=0.1,
     )  # fmt: skip
     turned = [se3.exp(np.array([0.0, 0.06 * k, 0.0, 0.0, 0.0, 0.0])) for k in range(20)]
     odometry, restored = (Odometry(OdometryConfig(keyframes=rarely)) for _ in range(2))

@@ -119,7 +119,8 @@ def test_inconsistent_pose_is_rejected_or_starts_a_session(stamp_ns, T, check) -
 
 
 @pytest.mark.parametrize(
-    "fields", [{"max_gap_s": 0.0}, {"max_extrapolation_s": -1.0}, {"max_carried_s": float("nan")}]
+    "fields",
+    [{"max_gap_s": 0.0}, {"max_extrapolation_s": -1.0}, {"max_dead_reckoning_s": float("nan")}],
 )
 def test_impossible_settings_are_rejected(fields) -> None:
     with pytest.raises(ConfigError):
@@ -164,7 +165,9 @@ class CoveredWalk:
     def track(
         self, poses: list[np.ndarray] | None, config: OdometryConfig | None = None
     ) -> list[TrackingResult]:
-        config = replace(config or OdometryConfig(), keyframes=KeyframeConfig(supporting=2.0))
+        config = replace(
+            config or OdometryConfig(), keyframes=KeyframeConfig(mapping_only_ratio=2.0)
+        )
         odometry, prior, results = Odometry(config), OdometryPriorBuffer(), []
         for k, frame in enumerate(self.frames):
             if poses is not None:

@@ -67,7 +67,7 @@ def test_every_record_is_tried_in_turn_even_with_another_thumbnail(large_room) -
         )
     )
     frame = large_room.view(T_NEAR)
-    options = {"alike": 0, "in_turn": 2, "across_scales": 0}
+    options = {"appearance_candidates": 0, "in_turn": 2, "across_scales": 0}
     turns = [find_match(crowd, frame, turn, **options) for turn in range(5)]
     assert [match is not None for match in turns] == [False, False, True, False, True]
 
@@ -105,7 +105,7 @@ def test_candidates_are_of_different_neighborhoods(large_room, database) -> None
     crowd = [replace(here, id=k, T_odom_keyframe=se3.exp(np.full(6, 1e-3 * k))) for k in range(6)]
     view = pyramid_of(large_room.view(T_AWAY), PyramidConfig())
     relocalizer, crowded_database = (
-        make_relocalizer(RelocalizationConfig(alike=2)),
+        make_relocalizer(RelocalizationConfig(appearance_candidates=2)),
         KeyframeDatabase((*crowd, database.all[1])),
     )
     candidates = relocalizer._distinct_candidates(
@@ -131,7 +131,7 @@ def test_darker_image_resembles_the_last_trusted_view_and_another_does_not(large
 @pytest.mark.parametrize(
     "fields",
     [
-        {"alike": 0, "in_turn": 0},
+        {"appearance_candidates": 0, "in_turn": 0},
         {"attempts": 0},
         {"min_geometric_inliers": 1.5},
         {"agreement_rad": 0.0},

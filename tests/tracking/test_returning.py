@@ -32,7 +32,7 @@ from ldo_service.tracking.tracking_quality import ResidualHistory, TrackingQuali
 from ldo_service.tracking.tracking_result import KeyframeKind
 from tests.tracking.scenes import record_at
 
-REUSE_EARLY = OdometryConfig(returning=KeyframeReuseConfig(after=1))
+REUSE_EARLY = OdometryConfig(keyframe_reuse=KeyframeReuseConfig(after=1))
 
 
 def moved(x_m: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
@@ -51,7 +51,7 @@ def correction_of(T_map_keyframe: Mapping[int, np.ndarray]) -> MapCorrection:
 def connect(odometry: Odometry) -> None:
     """Mark the reference as measured from a known keyframe, as one more keyframe would."""
     frames = odometry._frames
-    frames.state = replace(frames.state, origin=KeyframeOrigin.TIED)
+    frames.state = replace(frames.state, origin=KeyframeOrigin.MEASURED)
 
 
 def track(
@@ -212,9 +212,9 @@ def test_keyframe_made_after_reuse_is_measured_from_the_reused_ones(room, make_w
     _, T_map = track(odometry, room, outward)
     state = odometry._frames.state
     far = tuple(
-        replace(p, T_odom_keyframe=moved(0.4) @ p.T_odom_keyframe) for p in state.places.all
+        replace(p, T_odom_keyframe=moved(0.4) @ p.T_odom_keyframe) for p in state.database.all
     )
-    odometry._frames.state = replace(state, places=replace(state.places, all=far))
+    odometry._frames.state = replace(state, database=replace(state.database, all=far))
     odometry.correct(correction_of(T_map))
     connect(odometry)
     back = [odometry.process(room.view(T)) for T in reversed(outward[:-1])]
@@ -285,9 +285,9 @@ def test_detected_person_is_removed_from_the_keyframe_record(room) -> None:
     frame = room.view(np.eye(4))
     number = odometry.process(frame).reference
     assert number is not None
-    before = odometry._frames.state.places.all[0]
+    before = odometry._frames.state.database.all[0]
     odometry.mask_dynamic_objects(number, [Box("person", 40.0, 30.0, 90.0, 100.0)])
-    (after,) = odometry._frames.state.places.all
+    (after,) = odometry._frames.state.database.all
     assert np.count_nonzero(before.depth_m[50:80, 50:80]) > 800
     assert np.count_nonzero(after.depth_m[50:80, 50:80]) < 300
 
@@ -305,7 +305,7 @@ def test_relocalized_camera_maps_no_known_view_again(room, make_walk) -> None:
 @pytest.mark.parametrize(("after", "expected"), [(0, False), (3, False), (2, True)])
 def test_keyframes_are_reused_once_there_are_enough(room, after: int, expected: bool) -> None:
     each_frame = KeyframeConfig(min_frames=1, max_frames=1, still_motion=0.0)
-    config = OdometryConfig(returning=KeyframeReuseConfig(after=after), keyframes=each_frame)
+    config = OdometryConfig(keyframe_reuse=KeyframeReuseConfig(after=after), keyframes=each_frame)
     odometry = Odometry(config)
     _, keyframes = track(odometry, room, [moved(0.02 * number) for number in range(2)])
     assert len(keyframes) == 2

@@ -13,7 +13,7 @@ from tests.tracking.scenes import keyframe_at, record_at
 def test_empty_state_survives_packing() -> None:
     restored = unpack(pack(OdometryState()), PyramidConfig())
     assert restored.keyframe is None
-    assert len(restored.places) == 0
+    assert len(restored.database) == 0
 
 
 def test_keyframe_and_records_survive_packing(room) -> None:
@@ -25,7 +25,7 @@ def test_keyframe_and_records_survive_packing(room) -> None:
         frames_since_keyframe=4,
     )
     restored = unpack(pack(state), PyramidConfig())
-    assert [record.id for record in restored.places.all] == [3]
+    assert [record.id for record in restored.database.all] == [3]
     assert restored.keyframe is not None
     assert restored.keyframe.id == 5
     assert restored.mapping_keyframe is not None
@@ -58,7 +58,9 @@ def test_keyframe_of_a_record_keeps_the_features_of_the_record(room) -> None:
 
 def test_unchanged_parts_are_the_same_objects_when_packed_again(room) -> None:
     record = record_at(room, np.eye(4))
-    state = OdometryState(places=KeyframeDatabase((record,)), keyframe=keyframe_at(room, np.eye(4)))
+    state = OdometryState(
+        database=KeyframeDatabase((record,)), keyframe=keyframe_at(room, np.eye(4))
+    )
     before, after = pack(state), pack(state)
     assert before["places"][0] is after["places"][0]
     assert before["keyframe"] is after["keyframe"]

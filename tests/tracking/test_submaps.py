@@ -7,7 +7,7 @@ from ldo_service.tracking.submaps import SubmapConfig, SubmapMatch, Submaps
 from tests.tracking.scenes import yaw
 
 PERIOD_NS = 33_333_333
-CONFIG = SubmapConfig(begin_after_s=0.1, look_every=4, confirm_after=2)
+CONFIG = SubmapConfig(begin_after_s=0.1, search_interval_frames=4, confirm_after=2)
 T_THERE_HERE = se3.exp(np.array([0.0, 0.4, 0.0, 1.0, 0.0, 2.0]))
 
 
@@ -135,7 +135,7 @@ def test_submaps_survive_packing(submaps: Submaps) -> None:
     [
         {"begin_after_s": -1.0},
         {"begin_after_s": float("nan")},
-        {"look_every": 0},
+        {"search_interval_frames": 0},
         {"confirm_after": 0},
         {"confirm_rad": 0.0},
     ],

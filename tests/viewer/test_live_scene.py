@@ -19,7 +19,7 @@ from ldo_service.schemas import (
     ObjectView,
     TrackedPose,
 )
-from ldo_service.viewer.live import FACTS_EVERY_S, MAX_ACTORS, LiveScene
+from ldo_service.viewer.live import MAX_ACTORS, TEXT_INTERVAL_S, LiveScene
 from ldo_service.viewer.view_config import ViewerConfig
 from tests.maps.streams import ChangingMap
 from tests.schemas.examples import EXAMPLES
@@ -270,9 +270,9 @@ def test_facts_show_health_and_rates(live: LiveScene, clock: Clock) -> None:
 
 
 def test_facts_change_at_most_once_per_interval(live: LiveScene, clock: Clock) -> None:
-    clock.now_s += FACTS_EVERY_S
+    clock.now_s += TEXT_INTERVAL_S
     assert changed_by(live) == {"facts"}
-    clock.now_s += FACTS_EVERY_S / 2
+    clock.now_s += TEXT_INTERVAL_S / 2
     assert changed_by(live) == set()
 
 
@@ -281,12 +281,12 @@ def test_number_of_actors_in_the_facts_is_bounded(live: LiveScene, clock: Clock)
     assert isinstance(health, Health)
     for number in range(2 * MAX_ACTORS):
         live.take(msgspec.structs.replace(health, actor=f"a{number}"))
-    clock.now_s += FACTS_EVERY_S
+    clock.now_s += TEXT_INTERVAL_S
     live.update()
     assert live.scene.facts.count("\n| a") == MAX_ACTORS + 1  # The header of the table counts too.
 
 
 def test_facts_report_missing_health_messages(live: LiveScene, clock: Clock) -> None:
-    clock.now_s += FACTS_EVERY_S
+    clock.now_s += TEXT_INTERVAL_S
     live.update()
     assert "No actor reports" in live.scene.facts

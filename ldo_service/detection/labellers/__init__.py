@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-Opinion = tuple[str, float]  # Label as in a vocabulary, and its probability, 0..1.
+ScoredLabel = tuple[str, float]  # Label as in a vocabulary, and its probability, 0..1.
 
 
 class Labeller(Protocol):
@@ -27,7 +27,7 @@ class Labeller(Protocol):
         """Names that it chooses from; empty: any name."""
         ...
 
-    def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
+    def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
         """Return the labels of a region, the most probable first.
 
         Args:
@@ -55,7 +55,7 @@ class Labeller(Protocol):
         ...
 
 
-def fused_over_views(views: Iterable[Iterable[Opinion]]) -> list[Opinion]:
+def fused_over_views(views: Iterable[Iterable[ScoredLabel]]) -> list[ScoredLabel]:
     """Return the mean probability of each label over the views, the most probable first.
 
     A view without a label counts as probability 0. So two views that agree prevail over one with a
@@ -64,9 +64,9 @@ def fused_over_views(views: Iterable[Iterable[Opinion]]) -> list[Opinion]:
     >>> fused_over_views([[("cup", 0.75), ("vase", 0.25)], [("vase", 1.0)]])
     [('vase', 0.625), ('cup', 0.375)]
     """
-    opinions = [tuple(view) for view in views]
+    scored_labels = [tuple(view) for view in views]
     sums: dict[str, float] = defaultdict(float)
-    for name, probability in (opinion for view in opinions for opinion in view):
+    for name, probability in (scored for view in scored_labels for scored in view):
         sums[name] += probability
-    means = [(name, total / len(opinions)) for name, total in sums.items()]
-    return sorted(means, key=lambda opinion: -opinion[1])
+    means = [(name, total / len(scored_labels)) for name, total in sums.items()]
+    return sorted(means, key=lambda scored: -scored[1])

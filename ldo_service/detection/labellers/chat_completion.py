@@ -15,7 +15,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from ldo_service.detection.labellers import Opinion, fused_over_views
+from ldo_service.detection.labellers import ScoredLabel, fused_over_views
 from ldo_service.detection.vocabulary import LONGEST, canonical, is_name
 from ldo_service.errors import ConfigError, EndpointError
 from ldo_service.geometry import codecs
@@ -134,10 +134,10 @@ def _logprobs(raw: msgspec.Raw) -> tuple[float, ...]:
     Empty unless all of them are numbers.
     """
     try:
-        told = msgspec.json.decode(raw, type=_Logprobs | None)
+        response = msgspec.json.decode(raw, type=_Logprobs | None)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
         return ()
-    tokens = (told.content or []) if told else []
+    tokens = (response.content or []) if response else []
     spelling = [t for t in tokens if t.token.strip() and not _MARK.fullmatch(t.token.strip())]
     are_usable = all(isfinite(token.logprob) and token.logprob <= 1e-3 for token in spelling)
     return tuple(token.logprob for token in spelling) if are_usable else ()
@@ -223,21 +223,21 @@ class HttpLabeller:
         if canonical(name) not in self._names:
             self._names.append(canonical(name))
 
-    def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
+    def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
         """Return the labels of a region; see `Labeller`.
 
         A view with a rejected answer has no label. If the server fails after some views, those are
         used. All views together have `patience_s`. A view that would exceed this, by the time of
         those before, is omitted.
         """
-        views: list[list[Opinion]] = []
+        views: list[list[ScoredLabel]] = []
         until_s, slowest_s = self._clock() + self.config.endpoint.patience_s, 0.0
         for crop in crops[: self.config.views]:
             start_s = self._clock()
             if start_s + slowest_s > until_s:
                 break
             try:
-                views.append(self._look(crop, until_s))
+                views.append(self._label_crop(crop, until_s))
             except EndpointError:
                 if not any(views):
                     raise
@@ -260,7 +260,7 @@ class HttpLabeller:
             "answers_without_logprobs": self._untold,
         }
 
-    def _look(self, crop: np.ndarray, until_s: float) -> list[Opinion]:
+    def _label_crop(self, crop: np.ndarray, until_s: float) -> list[ScoredLabel]:
         """Request the label of one view."""
         self._questions += 1
         body = self._endpoint.post("/chat/completions", self._question(crop), until_s)

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ldo_service.detection.labellers import Opinion, fused_over_views
+from ldo_service.detection.labellers import ScoredLabel, fused_over_views
 from ldo_service.detection.onnx_network import Network, sha256
 from ldo_service.detection.vocabulary import COCO, LONGEST, canonical, is_name
 from ldo_service.errors import ConfigError, ModelError
@@ -149,7 +149,7 @@ class DualEncoder:
         """Names as they were given, which is the form that the text encoder gets."""
         return tuple(self._listed.values())
 
-    def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
+    def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
         """Return P(name) = softmax(logit_scale cos(image, name)), averaged over the crops.
 
         With two names, cosines of 0.3 and 0.28 and a scale of 100, it is
@@ -157,11 +157,11 @@ class DualEncoder:
         most probable.
         """
         self._place_listed()
-        rows, told = np.stack([self._rows[name] for name in self._listed]), set(self.names)
+        rows, known_names = np.stack([self._rows[name] for name in self._listed]), set(self.names)
         best = fused_over_views(self._view(crop, rows) for crop in crops)
-        if not best or best[0][0] not in told:
+        if not best or best[0][0] not in known_names:
             return []
-        return [opinion for opinion in best if opinion[0] in told][:MAX_LABELS]
+        return [scored for scored in best if scored[0] in known_names][:MAX_LABELS]
 
     def add(self, name: str) -> None:
         """Add a name to choose from.
@@ -178,7 +178,7 @@ class DualEncoder:
     def metrics(self) -> dict[str, float]:
         return {"names": len(self.names)}
 
-    def _view(self, crop: np.ndarray, rows: np.ndarray) -> list[Opinion]:
+    def _view(self, crop: np.ndarray, rows: np.ndarray) -> list[ScoredLabel]:
         """Return the probability of each name for one crop."""
         probabilities = softmax(self.logit_scale * (rows @ self._image.embed(crop)))
         return list(zip(self._listed, probabilities.tolist(), strict=True))
@@ -204,9 +204,11 @@ class DualEncoder:
 
     def _logit_scale(self) -> float:
         """Return the logit scale of the settings, the embeddings, the image encoder, or CLIP."""
-        carried = self._image.metadata_numbers("logit_scale", 1)
+        stored_scale = self._image.metadata_numbers("logit_scale", 1)
         cached = self.texts.cached.logit_scale if self.texts.cached else None
-        return self.config.logit_scale or cached or (carried[0] if carried else CLIP_SCALE)
+        return (
+            self.config.logit_scale or cached or (stored_scale[0] if stored_scale else CLIP_SCALE)
+        )
 
 
 class ImageEncoder:
@@ -273,8 +275,10 @@ def _square_input(network: Network) -> tuple[str, int]:
     fits = len(shape) == 4 and _allows(shape[0], 1) and _allows(shape[1], 3)
     sides = {side for side in shape[2:] if isinstance(side, int)}
     if kind != "tensor(float)" or not fits or len(sides) > 1:
-        told = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
-        raise ModelError(f"its inputs are {told}. Expected: one image, float32 [N, 3, S, S].")
+        found_inputs = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
+        raise ModelError(
+            f"its inputs are {found_inputs}. Expected: one image, float32 [N, 3, S, S]."
+        )
     return name, next(iter(sides), CLIP_PX)
 
 

@@ -27,13 +27,13 @@ class HttpClientConfig:
     # supervision.step_timeout_s, after which an actor is stopped.
     patience_s: float = 40.0
     per_minute: float = 60.0  # Maximum attempts per minute, evenly spaced.
-    rest_s: float = 10.0  # Pause after a failed request; doubled with each further one.
-    rest_most_s: float = 300.0  # Maximum pause after failed requests.
+    pause_s: float = 10.0  # Pause after a failed request; doubled with each further one.
+    max_pause_s: float = 300.0  # Maximum pause after failed requests.
     key_variable: str = ""  # Environment variable with the API key; empty: none.
 
     def __post_init__(self) -> None:
         times = (self.timeout_s, self.patience_s, self.per_minute)
-        if min(times) <= 0 or min(self.backoff_s, self.rest_s, self.rest_most_s) < 0:
+        if min(times) <= 0 or min(self.backoff_s, self.pause_s, self.max_pause_s) < 0:
             raise ConfigError(
                 named(
                     self,
@@ -41,8 +41,8 @@ class HttpClientConfig:
                     "backoff_s",
                     "patience_s",
                     "per_minute",
-                    "rest_s",
-                    "rest_most_s",
+                    "pause_s",
+                    "max_pause_s",
                 )
                 + ": timeout_s, patience_s and per_minute must be positive, the others not "
                 "negative."
@@ -90,7 +90,7 @@ class HttpClient:
         }
         self._tls = ssl.create_default_context()
         self._clock, self._sleep = clock, sleep
-        self._free_at_s = self._rested_at_s = float("-inf")
+        self._free_at_s = self._paused_until_s = float("-inf")
         self._failures = 0  # Failures in a row.
         self.attempts = 0
 
@@ -108,18 +108,18 @@ class HttpClient:
         Raises:
             EndpointError: If there is no response before the deadline.
         """
-        if self._clock() < self._rested_at_s:
+        if self._clock() < self._paused_until_s:
             raise EndpointError(
                 f"{self.url}: circuit breaker open after a failed request; it closes within "
-                f"{self._config.rest_most_s:g} s."
+                f"{self._config.max_pause_s:g} s."
             )
         try:
             answer = self._post_with_retries(path, body, until_s)
         except DeadlineExceeded:
             raise
         except EndpointError:
-            rest_s = self._config.rest_s * 2 ** min(self._failures, 30)
-            self._rested_at_s = self._clock() + min(rest_s, self._config.rest_most_s)
+            pause_s = self._config.pause_s * 2 ** min(self._failures, 30)
+            self._paused_until_s = self._clock() + min(pause_s, self._config.max_pause_s)
             self._failures += 1
             raise
         self._failures = 0

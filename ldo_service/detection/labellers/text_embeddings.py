@@ -218,8 +218,10 @@ def _text_inputs(network: Network) -> tuple[dict[str, type[np.integer]], int]:
     fits = all(kind in kinds and len(shape) == 2 for _, kind, shape in inputs)
     lengths = {shape[1] for shape in shapes if fits and isinstance(shape[1], int)}
     if not fits or len(tokens) != 1 or len(lengths) > 1 or min(lengths, default=CONTEXT) < 3:
-        told = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
-        raise ModelError(f"its inputs are {told}. Expected: tokens, int64 or int32 [N, length].")
+        found_inputs = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
+        raise ModelError(
+            f"its inputs are {found_inputs}. Expected: tokens, int64 or int32 [N, length]."
+        )
     return {name: kinds[kind] for name, kind, _ in inputs}, int(min(lengths, default=CONTEXT))
 
 

@@ -232,7 +232,7 @@ def test_failed_attempts_leak_no_threads_or_files() -> None:
         return np.array([threading.active_count(), len(os.listdir("/proc/self/fd"))])
 
     with serving(responds(404)) as server:
-        client = labeller(server.url, endpoint={"rest_s": 0, "per_minute": 1e9})
+        client = labeller(server.url, endpoint={"pause_s": 0, "per_minute": 1e9})
         before = open_resources()
         for _ in range(20):
             with pytest.raises(EndpointError):
