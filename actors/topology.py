@@ -40,11 +40,12 @@ class ActorSpec:
     does: str
     inputs: tuple[In, ...]
     outputs: tuple[Out, ...]
+    is_backend: bool  # No other actor waits for its outputs.
     make: Callable[[ActorParameters], Actor]
 
 
 def _box(actor: type[Actor], does: str, make: Callable[[ActorParameters], Actor]) -> ActorSpec:
-    return ActorSpec(actor.name, does, actor.inputs, actor.outputs, make)
+    return ActorSpec(actor.name, does, actor.inputs, actor.outputs, actor.is_backend, make)
 
 
 GRAPH: tuple[ActorSpec, ...] = (

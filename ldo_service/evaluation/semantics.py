@@ -171,7 +171,7 @@ class LabelEvaluator:
         self._pairs += 1
 
     def errors(self, name: str) -> LabelErrors:
-        """Return the errors over all views, for the map with a name."""
+        """Return the errors of the map over all views; the result states the map as `name`."""
         lists = (
             ListErrors(labels, tuple(self._frames), tuple(confusions))
             for labels, confusions in zip(self._lists, self._confusions, strict=True)

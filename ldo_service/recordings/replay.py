@@ -203,7 +203,7 @@ class ReplaySession:
         try:
             return decode(body, kind)
         except msgspec.DecodeError as error:
-            raise self._diverged(step, step.topic, "decoded", f"malformed, {error},") from error
+            raise self._diverged(step, step.topic, "decoded", f"malformed ({error})") from error
 
     def _produce(
         self, step: StepRecord, actor: Actor, messages: Iterable[Message]
@@ -211,7 +211,7 @@ class ReplaySession:
         try:
             return produce(actor, messages)
         except Exception as error:
-            raise self._diverged(step, "the step", "done", f"a failure, {error!r},") from error
+            raise self._diverged(step, "the step", "done", f"a failure ({error!r})") from error
 
     def _fail(self, step: StepRecord, actor: Actor, message: Message) -> None:
         self._actor = None  # The next entry is a start.

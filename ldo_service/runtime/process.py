@@ -7,14 +7,23 @@ import os
 import resource
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
-from ldo_service.transport.interface import Transport
+import msgspec
 
+from ldo_service.schemas import Health, decode, encode
+from ldo_service.schemas.topics import HEALTH
+from ldo_service.transport.flow_control import Header, encode_link
+from ldo_service.transport.interface import Transport, call_soon
+
+from .process_heartbeat import PIPE_VARIABLE, HeartbeatPipe
 from .supervision_policy import RestartBudget
 
 log = logging.getLogger(__name__)
 
+# The parent process repeats the last health message if none arrived for this time: three periods.
+REPEAT_HEALTH_AFTER_S = 1.5
 PARENT_VARIABLE = "LDO_PARENT_PID"  # A child ends when its parent process has ended.
 
 
@@ -71,6 +80,7 @@ class ChildProcess:
         restart_delay_s: float = 0.05,
         silent_after_s: float = 10.0,
         start_within_s: float = 60.0,
+        step_timeout_s: float = 600.0,
     ) -> None:
         """Prepare the process; `run` starts it.
 
@@ -85,6 +95,7 @@ class ChildProcess:
                 window.
             silent_after_s: Maximum time between heartbeats, seconds; then the process is killed.
             start_within_s: Maximum time from the start to the first heartbeat, seconds.
+            step_timeout_s: Maximum duration of a step, and of a suspension of the process, seconds.
         """
         self.name = name
         self._command, self._transport = command, transport
@@ -93,6 +104,10 @@ class ChildProcess:
             name, max_restarts, restart_window_s, restart_delay_s, delay_max_s=5.0
         )
         self._silent_after_s, self._start_within_s = silent_after_s, start_within_s
+        self._step_timeout_s = step_timeout_s
+        self._health: Health | None = None  # Last health message of the process.
+        self._health_at_s = 0.0  # Event-loop time at which it arrived.
+        self._suspended_at_s: float | None = None  # When the process was found suspended.
         self._process: asyncio.subprocess.Process | None = None
         self._draining = False
         self._heard_until_s = float("inf")  # Deadline of the next heartbeat.
@@ -110,7 +125,9 @@ class ChildProcess:
             RestartsExhausted: The restart budget is used up.
         """
         self._loop = asyncio.get_running_loop()
-        self._transport.subscribe(f"health/{self.name}", lambda _header, _body: self._heard())
+        key = f"{HEALTH.name}/{self.name}"
+        self._own_health = self._transport.publisher(key)
+        self._transport.subscribe(key, self._on_health)
         watch = asyncio.create_task(self._kill_when_silent(), name=f"{self.name} watch")
         try:
             while not self._draining:
@@ -122,20 +139,30 @@ class ChildProcess:
             self.kill()
             if self._process:
                 await self._process.wait()
+            self._own_health.close()
 
     async def _run_once(self) -> int:
         """Run one process and return its exit code.
 
         A negative code is the number of the signal that killed the process.
         """
-        self._process = await asyncio.create_subprocess_exec(
-            *self._command, env=self._environment, process_group=0
-        )
-        log.info("%s: started process %d.", self.name, self._process.pid)
-        self._heard_until_s = self._loop.time() + self._start_within_s
-        if self._draining:  # `drain` was called while the process started.
-            self._process.terminate()
-        return await self._process.wait()
+        pipe = HeartbeatPipe(self._on_beat)
+        try:
+            self._process = await asyncio.create_subprocess_exec(
+                *self._command,
+                env={**self._environment, PIPE_VARIABLE: str(pipe.writer)},
+                pass_fds=(pipe.writer,),
+                process_group=0,
+            )
+            pipe.close_writer()
+            log.info("%s: started process %d.", self.name, self._process.pid)
+            self._health, self._suspended_at_s = None, None
+            self._heard_until_s = self._loop.time() + self._start_within_s
+            if self._draining:  # `drain` was called while the process started.
+                self._process.terminate()
+            return await self._process.wait()
+        finally:
+            pipe.close()
 
     def drain(self) -> None:
         """Request a soft stop."""
@@ -148,18 +175,56 @@ class ChildProcess:
         if self._process and self._process.returncode is None:
             self._process.kill()
 
-    def _heard(self) -> None:
-        self._heard_until_s = self._loop.time() + self._silent_after_s
+    # --- heartbeats -------------------------------------------------------------------------
+    def _on_health(self, _header: bytes, body: memoryview) -> None:
+        """Take a health message of the process, on any thread."""
+        with suppress(msgspec.DecodeError):
+            call_soon(self._loop, self._take_health, decode(body, Health))
+
+    def _take_health(self, health: Health) -> None:
+        """Extend the deadline, unless this process sent the message itself."""
+        is_repeated = self._health is not None and health.step_age_s == self._health.step_age_s
+        if health.pid == self.pid and not is_repeated:
+            self._health, self._health_at_s = health, self._loop.time()
+            self._heard_until_s = self._health_at_s + self._silent_after_s
+
+    def _on_beat(self, step_age_s: float) -> None:
+        """Extend the deadline during a step that holds the GIL.
+
+        The stage cannot send its health then, so this process repeats the last one with the age of
+        the step. Between steps the health messages must come from the stage itself.
+        """
+        if not 0.0 < step_age_s <= self._step_timeout_s:
+            return
+        now_s = self._loop.time()
+        self._heard_until_s = max(self._heard_until_s, now_s + self._silent_after_s)
+        if self._health is not None and now_s - self._health_at_s > REPEAT_HEALTH_AFTER_S:
+            health = msgspec.structs.replace(self._health, state="busy", current_step_s=step_age_s)
+            header = Header(self.name, health.epoch, 0, health.stamp_ns)
+            self._own_health.post(encode_link(header), encode(health))
 
     async def _kill_when_silent(self) -> None:
         """Kill the process when its heartbeat timeout expires.
 
-        A suspended process keeps its network connection for seconds, so only the timeout detects it
-        in time.
+        A process that the user suspended (SIGSTOP, a debugger) is not killed before its step
+        timeout has expired too.
         """
         while True:
             await asyncio.sleep(self._silent_after_s / 10)
-            if self._loop.time() > self._heard_until_s:
+            now_s = self._loop.time()
+            if self.pid is not None and _is_suspended(self.pid):
+                if self._suspended_at_s is None:
+                    self._suspended_at_s = now_s
+                    log.warning(
+                        "%s: its process %d is suspended; waiting at most %.0f s "
+                        "(supervision.backend_step_timeout_s). Resume it with `kill -CONT %d`.",
+                        self.name, self.pid, self._step_timeout_s, self.pid,
+                    )  # fmt: skip
+                if now_s - self._suspended_at_s < self._step_timeout_s:
+                    self._heard_until_s = now_s + self._silent_after_s
+            else:
+                self._suspended_at_s = None
+            if now_s > self._heard_until_s:
                 log.error("%s: no heartbeat in time; killing its process %s.", self.name, self.pid)
                 self._heard_until_s = float("inf")
                 self.kill()
@@ -169,6 +234,15 @@ class ChildProcess:
         log.error("%s: its process %s; restarting it within its restart budget.", self.name, how)
         await asyncio.sleep(self._budget.record_failure(self._loop.time()))
         self.restarts += 1
+
+
+def _is_suspended(pid: int) -> bool:
+    """Return whether a process is stopped by a signal or a debugger; False if that is unknown."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (OSError, IndexError):  # Other systems than Linux, or the process has ended.
+        return False
+    return state in "Tt"
 
 
 def python_command(*arguments: str) -> list[str]:

@@ -16,6 +16,7 @@ from ldo_service.transport.flow_control import Header, encode_link, new_epoch
 from ldo_service.transport.interface import Transport
 from ldo_service.transport.worker import Worker
 
+from ._heartbeat import Heartbeat
 from .actor import Actor, FlowStatus
 from .checkpointer import Checkpointer
 from .delivery_state import LoggedInput
@@ -57,6 +58,7 @@ class Stage:
         with_backlog: Mapping[str, frozenset[str]] | None = None,
         on_evicted: Callable[[str], None] = lambda _consumer: None,
         journal: Journal | None = None,
+        heartbeat: Heartbeat | None = None,
     ) -> None:
         """Create the actor and restore its last saved state.
 
@@ -69,6 +71,7 @@ class Stage:
             with_backlog: Those of them for which the stage does not wait, by output topic.
             on_evicted: Called with the name of an evicted consumer.
             journal: Receiver of the journal entries.
+            heartbeat: Heartbeat of this process, if a parent process reads it.
         """
         self._make, self._transport = make, transport
         self._config = config = config or SupervisionConfig()
@@ -80,7 +83,7 @@ class Stage:
         self._actor = self._restored_actor()
         self.name = self._actor.name
         self._epoch = new_epoch()
-        self._metrics = StageMetrics()
+        self._metrics = StageMetrics(heartbeat)
         self._budget = RestartBudget(
             self.name,
             config.max_restarts,

@@ -12,6 +12,7 @@ import numpy as np
 
 from ldo_service.schemas import Health, Message
 
+from ._heartbeat import Heartbeat
 from .process import resident_mb
 
 
@@ -19,6 +20,7 @@ from .process import resident_mb
 class StageMetrics:
     """Counters and step times of a stage; times are of the monotonic clock."""
 
+    heartbeat: Heartbeat | None = None  # Heartbeat of this process, if a parent process reads it.
     state: Literal["starting", "ready", "draining"] = "starting"
     steps: int = 0
     failures: int = 0
@@ -38,11 +40,15 @@ class StageMetrics:
     def step(self) -> Iterator[None]:
         """Measure the duration of a handler; only a step that does not raise is timed."""
         started_s = self.started_at_s = time.monotonic()
+        if self.heartbeat is not None:
+            self.heartbeat.begin()
         try:
             yield
             self.last_step_ms = 1e3 * (time.monotonic() - started_s)
         finally:
             self.started_at_s = None
+            if self.heartbeat is not None:
+                self.heartbeat.end()
 
     def record_step(self, message: Message, is_timed: bool) -> None:
         """Count a finished step.

@@ -36,6 +36,7 @@ from ldo_service.runtime.process import (
     exit_with_parent,
     python_command,
 )
+from ldo_service.runtime.process_heartbeat import start_heartbeat
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.stage_commands import Control
 from ldo_service.runtime.supervision import Runner, StopRequest, Watchdog, supervise
@@ -199,6 +200,7 @@ class Service:
                 },
                 on_evicted=evicted,
                 journal=self._journal(box.name),
+                heartbeat=start_heartbeat() if self.only else None,
             )
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise ConfigError(
@@ -231,6 +233,7 @@ class Service:
             restart_window_s=stage.restart_window_s,
             restart_delay_s=stage.restart_delay_s,
             silent_after_s=self.config.service.heartbeat_timeout_s,
+            step_timeout_s=stage.step_timeout_s(box.is_backend),
         )
 
     async def _stop_with_parent(self, stop: StopRequest) -> None:

@@ -75,7 +75,7 @@ class MemoryStore:
         self._states: dict[str, State] = {}
 
     def backlog_folder(self, actor: str) -> None:  # noqa: ARG002
-        """Return None: messages stay in memory too."""
+        """Return None: unhandled messages are kept in memory, as the states are."""
         return
 
     def save(self, actor: str, state: State) -> None:

@@ -254,7 +254,7 @@ class Odometry:
         kind: KeyframeKind,
         known: ReusedKeyframe | None,
     ) -> NewKeyframe:
-        """Make a keyframe of a frame, measure its relative poses, and add it to the map frame.
+        """Make a keyframe of a frame, measure its relative poses, and add it to the `MapFrame`.
 
         Args:
             frame: The frame just tracked.

@@ -93,7 +93,7 @@ def mask_clipped(gray: np.ndarray) -> np.ndarray:
         gray: Image, [H, W] uint8.
 
     Returns:
-        Gray levels, [H, W] float32; 0 where clipped, black or white.
+        Gray levels, [H, W] float32; 0 where overexposed or already 0 (black).
     """
     return np.where(gray < CLIPPED, gray, 0).astype(np.float32)
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import zenoh
 
@@ -25,8 +26,10 @@ from ldo_service.runtime.process import (
     trim_memory,
 )
 from ldo_service.runtime.supervision import StopRequest, supervise
+from ldo_service.schemas import Health, decode, encode
 from ldo_service.transport.interface import MemoryTransport
 from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport
+from tests.schemas.examples import EXAMPLES
 
 from .fake_actors import NUMBERS, eventually, number, running, send
 
@@ -83,6 +86,7 @@ async def test_killed_and_stopped_processes_are_restarted_without_loss(
         command(network, numbers, 0.01),
         transport,
         silent_after_s=1.0,
+        step_timeout_s=1.0,
         max_restarts=100,
     )
     stop = StopRequest()
@@ -120,6 +124,53 @@ async def test_silent_process_is_restarted() -> None:
     silent = child("import time; time.sleep(1e6)", start_within_s=0.1, silent_after_s=0.1)
     async with running(silent):
         await eventually(lambda: silent.restarts >= 2)
+
+
+# Program that starts its heartbeat and a step, writes a file, and runs C code for a given time.
+STEP = """
+import ctypes, pathlib, sys
+from ldo_service.runtime.process_heartbeat import start_heartbeat
+heartbeat = start_heartbeat()
+heartbeat.begin()
+pathlib.Path({file!r}).touch()
+ctypes.{library}(None).sleep(1000)
+"""
+
+
+def health_of(process: ChildProcess) -> Health:
+    return msgspec.structs.replace(EXAMPLES["health"], actor="child", pid=pid_of(process))
+
+
+async def test_step_that_holds_the_gil_is_not_killed_before_its_timeout(tmp_path: Path) -> None:
+    """The health message of the stage cannot be sent, so the parent process repeats it."""
+    started, transport, healths = tmp_path / "started", MemoryTransport(), []
+    program = [sys.executable, "-c", STEP.format(file=str(started), library="PyDLL")]
+    process = ChildProcess("child", program, transport, silent_after_s=2.0, step_timeout_s=6.0)
+    transport.subscribe("health/child", lambda _, body: healths.append(decode(body, Health)))
+    async with running(process):
+        await eventually(started.exists)
+        transport.publisher("health/child").post(b"", encode(health_of(process)))
+        await eventually(lambda: healths[-1].current_step_s > 4.0)
+        assert process.restarts == 0
+        assert healths[-1].state == "busy"
+        await eventually(lambda: process.restarts == 1)
+
+
+async def test_suspended_process_is_not_killed_before_its_timeout(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    started, transport = tmp_path / "started", MemoryTransport()
+    program = [sys.executable, "-c", STEP.format(file=str(started), library="CDLL")]
+    process = ChildProcess("child", program, transport, silent_after_s=0.5, step_timeout_s=1000)
+    async with running(process):
+        await eventually(started.exists)
+        os.kill(pid_of(process), signal.SIGSTOP)
+        await eventually(lambda: "is suspended" in caplog.text)
+        transport.publisher("health/child").post(b"", encode(health_of(process)))
+        await asyncio.sleep(1.5)  # Three times the heartbeat timeout.
+        assert process.restarts == 0
+        process.kill()
+        await eventually(lambda: process.restarts == 1)
 
 
 async def test_cancelled_child_process_has_ended() -> None:

@@ -23,7 +23,7 @@ Degrader = Callable[[Frames, int], RgbdFrame | None]  # Gives None if no frame a
 BLOCKS = (6, 8)  # Rows and columns of the blocks of depth.
 TRUTH_WITHIN_S = 0.020
 HEADER = """\
-| degradation | OK % | OK % meanwhile | worst cm (frame) | ATE cm | OK again after |
+| degradation | OK % | OK % during | worst cm (frame) | ATE cm | OK again after |
 |---|---|---|---|---|---|"""
 
 
@@ -117,7 +117,7 @@ class Outcome:
     Attributes:
         ok_percent: Fraction of OK frames outside the degradation, percent.
         ok_percent_meanwhile: The same during the degradation; None if no frame arrived.
-        max_m: Largest position error, aligned as without the degradation.
+        max_m: Largest position error, with the alignment fitted without the degradation.
         worst_frame: Time index of the largest error.
         ate_m: RMSE after alignment.
         recovered_after: Frames from the end of the degradation to the first OK frame, if any.
