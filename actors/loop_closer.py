@@ -93,7 +93,7 @@ class LoopCloser(Actor):
         In(DETECTION_BOXES, Backlog(16)),
         In(GRAPH_CORRECTION, Latest(1)),
     )
-    outputs = (Out(LOOP_CLOSURE), Out(LOOP_CANDIDATE))
+    outputs = (Out(LOOP_CLOSURE, is_final=True), Out(LOOP_CANDIDATE, is_final=True))
     is_backend = True
 
     def __init__(self, config: LoopCloserConfig | None = None) -> None:

@@ -118,7 +118,6 @@ class Mapper(Actor):
 
     name = "mapper"
     lags = True  # It writes the whole map only every few keyframes.
-    finishes_last = True  # A loop closure of the last keyframes still corrects the map.
     inputs = (
         In(KEYFRAME_NEW, Lossless(8)),
         In(DETECTION_BOXES, Lossless(8)),
@@ -129,9 +128,9 @@ class Mapper(Actor):
     outputs = (
         Out(MAP_VIEW),
         Out(MAP_DELTA),
-        Out(MAP_SNAPSHOT),
+        Out(MAP_SNAPSHOT, is_final=True),
         Out(LABEL_REQUEST),
-        Out(MAP_OBJECTS),
+        Out(MAP_OBJECTS, is_final=True),
         Out(OBJECT_OBSERVATION),
         Out(KEYFRAME_REFINEMENT),
     )

@@ -229,7 +229,7 @@ class Tracker(Actor):
         return {**self._parts, "prior": self._prior.pack()}
 
     def _tracked_parts(self) -> dict[str, Any]:
-        """Return all parts as of the last frame, correction or detection."""
+        """Return all parts of the tracker's state after the last frame, correction or detection."""
         state = self._odometry.snapshot()
         records = {record["id"]: record for record in state.pop("places")}
         state["order"] = [*records]  # The keyframe used last is the last one.

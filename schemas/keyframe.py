@@ -72,7 +72,8 @@ class Keyframe(Message, frozen=True, kw_only=True):
 class KeyframeMeasurements(Message, frozen=True, kw_only=True):
     """Pose measurements of a keyframe without its images; published on keyframe/measurements.
 
-    The fields are those of `Keyframe`. The optimizer needs no images, so its backlog stays small.
+    Each field means the same as in `Keyframe`. The pose-graph optimizer reads this message instead
+    of `Keyframe`: without images, its backlog stays small.
     """
 
     keyframe: int

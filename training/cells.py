@@ -95,7 +95,12 @@ def make_targets(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
 
 
 def _counts(plane: np.ndarray, kinds: int) -> list[np.ndarray]:
-    """Return the pixels of each object in each cell, one array [cells, kinds] per grid."""
+    """Return how many pixels each object has in each cell, one array [cells, kinds] per grid.
+
+    Args:
+        plane: Object of each pixel, [H, W], 0..kinds-1; the last is the background.
+        kinds: Number of objects, plus one for the background.
+    """
     stride = STRIDES_PX[0]
     rows, columns = (side // stride for side in plane.shape)
     v, u = np.divmod(np.arange(plane.size), plane.shape[1])

@@ -24,7 +24,7 @@ OPSET, IR_VERSION = 17, 8  # Versions that onnxruntime 1.18 supports.
 
 
 class JaxNetwork:
-    """Reader that computes JAX arrays.
+    """Reader that computes JAX arrays; a network calls its methods for each layer.
 
     With a random generator, it initializes weights that are missing.
 

@@ -38,10 +38,10 @@ class New:
 
 @dataclass(frozen=True)
 class AddKeys:
-    """Make keys: a folder to copy to the machine of that name, for --keys.
+    """Make the keys of NAME in the folder DIR/NAME; copy it to that machine, for the option --keys.
 
-    This also updates the access control list in the folder of each service. Copy that file too, and
-    restart the service.
+    This also updates the access control list `access.yaml` in the folder of each service. Copy the
+    new file to each service too, and restart the service.
 
       ldo keys add DIR service mule --robot mule --host mule.local
       ldo keys add DIR camera front --robot mule

@@ -18,7 +18,7 @@ NEWTON_STEPS = 60  # It takes 5 to 15; the iteration is monotone, so it cannot c
 class Evidence:
     """Sums over all observations of a landmark.
 
-    G depends on the observations only through these sums:
+    The cost G(p) of `ldo_service.pose_graph` depends on the observations only through these sums:
 
     sum_k w_k KL(p || q_k) = W sum_c p_c log p_c - sum_c p_c L_c,  W = sum w_k, L = sum w_k log q_k
     """

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from ldo_service.runtime.actor import FlowStatus
 from ldo_service.runtime.inlet import Delivery
 from ldo_service.runtime.journal import (
+    WITHOUT_INPUT,
     Gap,
     Journal,
     Kind,
@@ -106,7 +107,7 @@ class Recorder(Journal):
         error: str = "",
     ) -> None:
         """Record a finished step, unless its input was dropped."""
-        takes_none = kind in ("resumed", "finished")
+        takes_none = kind in WITHOUT_INPUT
         taken = None if takes_none else self._taken
         if taken is None and (not takes_none or self._lost):
             return  # The input was not recorded.

@@ -180,13 +180,19 @@ class ReplaySession:
                 actor.snapshot()  # The stage does so too, and it may change the actor's caches.
                 actor.on_saved()
             case "failed":
-                self._fail(step, actor, self._message(actor, step))
+                self._fail(step, actor.handle(self._message(actor, step)))
             case "dead_lettered":
                 self._replayed.dead_lettered += 1
             case "resumed":
                 self._compare(step, self._produce(step, actor, actor.on_restored()))
                 actor.checkpoint()
                 actor.on_saved()
+            case "idle":
+                self._compare(step, self._produce(step, actor, actor.on_idle()))
+                actor.snapshot()
+                actor.on_saved()
+            case "idle_failed":
+                self._fail(step, actor.on_idle())
             case "finished":
                 self._compare(step, self._produce(step, actor, actor.on_stop()))
 
@@ -213,11 +219,11 @@ class ReplaySession:
         except Exception as error:
             raise self._diverged(step, "the step", "done", f"a failure ({error!r})") from error
 
-    def _fail(self, step: StepRecord, actor: Actor, message: Message) -> None:
+    def _fail(self, step: StepRecord, actor: Actor, messages: Iterable[Message]) -> None:
         self._actor = None  # The next entry is a start.
         self._replayed.failures += 1
         try:
-            produce(actor, actor.handle(message))
+            produce(actor, messages)
         except Exception:
             self._replayed.failures_repeated += 1
         else:

@@ -94,9 +94,9 @@ def reverse_overlap(
 ) -> float:
     """Return the fraction of an observation's points that lie in the mask of a region.
 
-    The points are projected into the keyframe of the region's stored observation, `shape`. Points
+    The points are projected into the keyframe of the stored observation, `region.shape`. Points
     outside its image are not counted. Points that were occluded there count as outside of the mask
-    and lower the fraction. An object that was mostly occluded in `shape` and is fully visible now
+    and lower the fraction. An object that was mostly occluded there and is fully visible now
     therefore becomes a new region.
 
     Args:

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from ldo_service.actors.topology import GRAPH, ActorSpec
 from ldo_service.config import actor_parameters, config_yaml, stage_parameters
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.actor_graph import consumers_with_backlog, lossless_consumers
+from ldo_service.runtime.actor_graph import consumers_with_backlog, finish_order, lossless_consumers
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.schemas import Health, decode, encode
@@ -59,7 +59,7 @@ class _RealTimeRun:
 
     async def go(self) -> RunWriter:
         transport = MemoryTransport()
-        stages = [self._stage(box, transport) for box in GRAPH]
+        stages = [self._stage(box, transport) for box in finish_order(GRAPH)]
         for topic in _made_topics():
             self._observe(topic, transport)
         stop = StopRequest()

@@ -91,6 +91,7 @@ class Out:
     topic: Topic
     # The actor checks its credits before it produces a message; sending never waits.
     is_nonblocking: bool = False
+    is_final: bool = False  # `on_stop` may yield messages of this topic.
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +118,8 @@ class Actor:
     # `snapshot` may return the state of an earlier step. The stage then also saves the inputs that
     # the actor has handled since that step.
     lags = False
-    # Call `on_stop` after that of all other actors, because its messages depend on theirs.
-    finishes_last = False
+    # Time without messages after which the stage calls `on_idle`, seconds.
+    idle_after_s = 0.2
     # The actor queries an external server, whose answers no journal records. A replay skips the
     # actor and feeds its consumers from their own recorded inputs.
     talks_outside = False
@@ -146,11 +147,22 @@ class Actor:
         """
         return iter(())
 
+    def has_idle_work(self) -> bool:
+        """Return whether `on_idle` has work to do; the stage calls it between steps."""
+        return False
+
+    def on_idle(self) -> Iterator[Message]:
+        """Do a part of the work that has to be done while no message arrives.
+
+        New messages wait until it is done, so it must be short.
+        """
+        return iter(())
+
     def on_stop(self) -> Iterator[Message]:
         """Yield the final messages of the actor.
 
-        The stage calls it on a soft stop, after the actor has handled all queued messages. Actors
-        with `finishes_last` come after all other actors.
+        The stage calls it on a soft stop, after the actor has handled all queued messages, in the
+        order of `actor_graph.finish_order`. Only messages of ports with `is_final` are allowed.
         """
         return iter(())
 

@@ -1,7 +1,7 @@
 """Checks of the graph of actors: one producer for each topic, no cycle of lossless inputs."""
 
 from collections.abc import Iterable, Sequence
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from ldo_service.errors import ConfigError, LosslessCycle
 
@@ -19,6 +19,9 @@ class HasPorts(Protocol):
 
     @property
     def outputs(self) -> tuple[Out, ...]: ...
+
+
+T = TypeVar("T", bound=HasPorts)
 
 
 def check_graph(actors: Iterable[HasPorts]) -> None:
@@ -52,6 +55,55 @@ def check_graph(actors: Iterable[HasPorts]) -> None:
 
     for name in waiting:
         visit(name, [])
+
+
+def finish_order(actors: Iterable[T]) -> list[T]:
+    """Return the actors in the order in which they finish, producers first where possible.
+
+    The final messages of an actor may lead to new inputs of others: the last loop closure leads to
+    a correction of the map. An actor with final messages of its own therefore finishes after all
+    actors on the way of such messages to it.
+
+    Args:
+        actors: The actors, producers first.
+    """
+    actors = list(actors)
+    after: dict[str, set[str]] = {actor.name: set() for actor in actors}
+    for last in (actor for actor in actors if _final_topics(actor)):
+        for first in (actor for actor in actors if _final_topics(actor)):
+            way = _reached(_final_topics(first), actors)
+            if last.name in way and first.name not in _reached(_final_topics(last), actors):
+                upstream = {a.name for a in actors if last.name in _reached(_topics(a), actors)}
+                after[last.name] |= ({first.name} | (way & upstream)) - {last.name}
+    order: list[T] = []
+    while actors:
+        finished = {actor.name for actor in order}
+        order.append(next((a for a in actors if after[a.name] <= finished), actors[0]))
+        actors.remove(order[-1])
+    return order
+
+
+def _topics(actor: HasPorts) -> set[str]:
+    return {port.topic.name for port in actor.outputs}
+
+
+def _final_topics(actor: HasPorts) -> set[str]:
+    return {port.topic.name for port in actor.outputs if port.is_final}
+
+
+def _reached(topics: set[str], actors: Sequence[HasPorts]) -> set[str]:
+    """Return the names of the actors that messages of some topics reach, also through others."""
+    reached: set[str] = set()
+    while True:
+        new = {
+            actor.name
+            for actor in actors
+            if actor.name not in reached and topics & {port.topic.name for port in actor.inputs}
+        }
+        if not new:
+            return reached
+        reached |= new
+        topics = topics.union(*(_topics(actor) for actor in actors if actor.name in new))
 
 
 def producers(actors: Iterable[HasPorts]) -> dict[str, str]:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from ldo_service.schemas import decode
+from ldo_service.schemas import Message, decode
 from ldo_service.schemas.topics import Topic
 from ldo_service.storage.state_store import State
 from ldo_service.transport.flow_control import InletPosition, OutletPosition, UnackedMessage
@@ -35,7 +35,7 @@ MAX_WAL_ENTRIES = 64
 class LoggedInput(NamedTuple):
     """Handled message and the flow status of its step, with counts by topic name."""
 
-    topic: str
+    topic: str  # Empty for work while no message arrived.
     body: bytes
     credits: Mapping[str, int]
     backlog: Mapping[str, int]
@@ -178,11 +178,9 @@ def _handled_again(actor: Actor, taken: Iterable[LoggedInput]) -> int | None:
     """Handle logged inputs again; return the index of the first that fails, or None."""
     kinds = {port.topic.name: port.topic.message for port in actor.inputs}
     for number, one in enumerate(taken):
-        kind = kinds[one.topic]
-        assert kind is not None
         actor.situation = one.situation(actor)
         try:
-            produce(actor, actor.handle(decode(one.body, kind)))
+            produce(actor, _messages(actor, one, kinds))
         except Exception:
             log.exception(
                 "%s: replaying a logged input of %s failed; the actor continues without this "
@@ -191,6 +189,16 @@ def _handled_again(actor: Actor, taken: Iterable[LoggedInput]) -> int | None:
             )  # fmt: skip
             return number
     return None
+
+
+def _messages(
+    actor: Actor, one: LoggedInput, kinds: Mapping[str, type[Message] | None]
+) -> Iterable[Message]:
+    if not one.topic:
+        return actor.on_idle()
+    kind = kinds[one.topic]
+    assert kind is not None
+    return actor.handle(decode(one.body, kind))
 
 
 def counts_by_topic(counts: Mapping[str, int], topics: Iterable[Topic]) -> dict[Topic, int]:

@@ -11,7 +11,9 @@ Steps are numbered from 0 in each file. The outputs of an actor depend on nothin
 `ldo_service.recordings.replay` can repeat and verify every step.
 """
 
+import asyncio
 import hashlib
+import logging
 import zlib
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future
@@ -25,13 +27,21 @@ from .actor import FlowStatus
 from .inlet import Delivery
 from .step import Produced
 
+log = logging.getLogger(__name__)
+
+JOURNAL_WITHIN_S = 5.0  # Maximum time to wait at the end for the journal to be written.
+
 Kind: TypeAlias = Literal[
     "done",
     "failed",  # The handler raised: its outputs are dropped and the actor is restored.
     "dead_lettered",  # The message failed twice.
     "resumed",  # Restored messages were published; the step has no input.
+    "idle",  # The actor worked while no message arrived; the step has no input.
+    "idle_failed",  # That work raised: the actor is restored.
     "finished",  # Final messages were published; the step has no input.
 ]
+
+WITHOUT_INPUT: frozenset[Kind] = frozenset(("resumed", "idle", "idle_failed", "finished"))
 
 
 class Output(msgspec.Struct, frozen=True, array_like=True):
@@ -139,3 +149,14 @@ class Journal:
     def metrics(self) -> dict[str, float]:
         """Return the journal's metrics for the health message, by name."""
         return {}
+
+
+async def close_journal(journal: Journal, actor: str) -> None:
+    """Close a journal, and wait for at most `JOURNAL_WITHIN_S` until it is written."""
+    written = asyncio.wrap_future(journal.close())
+    done, _ = await asyncio.wait({written}, timeout=JOURNAL_WITHIN_S)
+    if not done:
+        written.cancel()
+        log.error(
+            "%s: the end of its recording was not written in time; a replay stops earlier.", actor
+        )

@@ -18,7 +18,7 @@ from ldo_service.errors import StageError
 from ldo_service.schemas import Message
 
 from .actor import Actor
-from .actor_graph import check_graph
+from .actor_graph import check_graph, finish_order
 
 Observer = Callable[[str, Message, float], None]  # Actor, output, duration of the step in ms.
 
@@ -143,11 +143,13 @@ class LogicalClock:
         self._settle_all()
 
     def finish(self) -> None:
-        """Deliver the final messages of each actor, producers first.
+        """Deliver the final messages of each actor, in the order of `finish_order`.
 
-        Actors with `finishes_last` come after all other actors. `run` may be called again.
+        `run` may be called again.
         """
-        for thread in sorted(self._threads, key=lambda thread: thread.actor.finishes_last):
+        threads = {thread.actor.name: thread for thread in self._threads}
+        for actor in finish_order(thread.actor for thread in self._threads):
+            thread = threads[actor.name]
             self._expect(thread, self._tick, thread.finish())
             self._settle_all()
 

@@ -25,44 +25,43 @@ class OutletOpener:
         transport: The network.
         config: Limits of supervision.
         store: Storage of the state. A backlog is on disk if the state is.
-        past: Saved position of the previous process, by topic name.
+        expected: Names of the required consumers, by topic name.
+        with_backlog: Names of those for which the stage does not wait, by topic name.
+        on_evicted: Called with the name of an evicted consumer.
     """
 
     transport: Transport
     config: SupervisionConfig
     store: StateStore
-    past: Mapping[str, OutletPosition]
+    expected: Mapping[str, frozenset[str]]
+    with_backlog: Mapping[str, frozenset[str]]
+    on_evicted: Callable[[str], None]
 
     def open(
-        self,
-        port: Out,
-        source: tuple[str, int],
-        expected: frozenset[str],
-        with_backlog: frozenset[str],
-        on_evicted: Callable[[str], None],
+        self, port: Out, source: tuple[str, int], past: Mapping[str, OutletPosition]
     ) -> Outlet:
         """Open the outlet of a port.
 
         Args:
             port: The output of the actor.
             source: Name of the actor, and number of this run of it.
-            expected: Names of the required consumers.
-            with_backlog: Names of those for which the outlet does not wait.
-            on_evicted: Called with the name of an evicted consumer.
+            past: Saved position of the previous process, by topic name.
         """
         name, epoch = source
-        past = self.past.get(port.topic.name, OutletPosition(epoch, 0))
+        topic = port.topic.name
+        position = past.get(topic, OutletPosition(epoch, 0))
+        with_backlog = self.with_backlog.get(topic, frozenset())
         return Outlet(
             port,
             name,
             epoch,
             self.transport,
-            expected,
+            self.expected.get(topic, frozenset()),
             self.config.evict_after_s,
-            on_evicted,
-            past,
+            self.on_evicted,
+            position,
             with_backlog=with_backlog,
-            outbox=self._outbox(name, port.topic, past) if with_backlog else None,
+            outbox=self._outbox(name, port.topic, position) if with_backlog else None,
         )
 
     def _outbox(self, source: str, topic: Topic, past: OutletPosition) -> Outbox:

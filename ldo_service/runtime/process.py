@@ -95,7 +95,8 @@ class ChildProcess:
                 window.
             silent_after_s: Maximum time between heartbeats, seconds; then the process is killed.
             start_within_s: Maximum time from the start to the first heartbeat, seconds.
-            step_timeout_s: Maximum duration of a step, and of a suspension of the process, seconds.
+            step_timeout_s: Maximum duration of a step, seconds. A suspended process (SIGSTOP, a
+                debugger) sends no heartbeats, and is killed only after this time too.
         """
         self.name = name
         self._command, self._transport = command, transport

@@ -21,7 +21,7 @@ from .actor import Actor, FlowStatus
 from .checkpointer import Checkpointer
 from .delivery_state import LoggedInput
 from .inlet import Delivery
-from .journal import Journal, Kind
+from .journal import Journal, Kind, close_journal
 from .mailbox import Mailbox
 from .outlets import OutletOpener, Outlets
 from .stage_commands import CommandReceiver, StageCommand
@@ -44,8 +44,6 @@ class Stage:
     required consumers and acknowledge its input. While the disk is full, most stages take no more
     messages; see `StateSaver`.
     """
-
-    JOURNAL_WITHIN_S = 5.0  # Maximum time to wait at the end for the journal to be written.
 
     def __init__(
         self,
@@ -75,23 +73,19 @@ class Stage:
         """
         self._make, self._transport = make, transport
         self._config = config = config or SupervisionConfig()
-        self._store = store or MemoryStore()
-        self._checkpointer = Checkpointer(self._store)
-        self._expected, self._with_backlog = expected or {}, with_backlog or {}
-        self._on_evicted = on_evicted
+        store = store or MemoryStore()
+        self._checkpointer = Checkpointer(store)
+        self._opener = OutletOpener(
+            transport, config, store, expected or {}, with_backlog or {}, on_evicted
+        )
         self._journal = journal or Journal()
         self._actor = self._restored_actor()
         self.name = self._actor.name
         self._epoch = new_epoch()
         self._metrics = StageMetrics(heartbeat)
-        self._budget = RestartBudget(
-            self.name,
-            config.max_restarts,
-            config.restart_window_s,
-            config.restart_delay_s,
-            config.restart_delay_max_s,
-        )
+        self._budget = RestartBudget.of(self.name, config)
         self._drain_requested = False
+        self._is_idle_failed = False  # The last idle work failed.
         self._mailbox: Mailbox | None = None
         self._reader = MessageDecoder(self.name)
         self._outlets = Outlets()
@@ -126,7 +120,7 @@ class Stage:
             await asyncio.gather(*tasks, return_exceptions=True)
             self._worker.close()
             self._close_ports(self._mailbox)
-            await self._close_journal()
+            await close_journal(self._journal, self.name)
 
     def drain(self) -> None:
         """Request a soft stop: handle queued messages, publish the final messages, end."""
@@ -136,30 +130,13 @@ class Stage:
             self._mailbox.close()
 
     def _open_outlets(self) -> None:
-        opener = OutletOpener(
-            self._transport, self._config, self._store, self._checkpointer.past.outputs
-        )
-        self._outlets = Outlets(
-            opener.open(
-                port,
-                (self.name, self._epoch),
-                self._expected.get(port.topic.name, frozenset()),
-                self._with_backlog.get(port.topic.name, frozenset()),
-                self._on_evicted,
-            )
-            for port in self._actor.outputs
-        )
+        past, source = self._checkpointer.past.outputs, (self.name, self._epoch)
+        self._outlets = Outlets(self._opener.open(o, source, past) for o in self._actor.outputs)
         self._health = self._transport.publisher(f"{HEALTH.name}/{self.name}")
 
     def _open_saver(self) -> StateSaver:
-        return StateSaver(
-            self._checkpointer,
-            self._worker,
-            self._outlets,
-            self._metrics,
-            self._journal,
-            is_draining=lambda: self._drain_requested,
-        )
+        saved = self._checkpointer, self._worker, self._outlets
+        return StateSaver(*saved, self._metrics, self._journal, lambda: self._drain_requested)
 
     def _open_mailbox(self) -> Mailbox:
         mailbox = Mailbox(
@@ -183,17 +160,6 @@ class Stage:
         self._outlets.close()
         self._health.close()
 
-    async def _close_journal(self) -> None:
-        written = asyncio.wrap_future(self._journal.close())
-        done, _ = await asyncio.wait({written}, timeout=self.JOURNAL_WITHIN_S)
-        if not done:
-            written.cancel()
-            log.error(
-                "%s: the end of its recording was not written in time, so a replay stops before "
-                "the last steps. Record to a faster disk.",
-                self.name,
-            )
-
     # --- work -----------------------------------------------------------------------------------
     async def _work(self, mailbox: Mailbox) -> None:
         try:
@@ -215,13 +181,16 @@ class Stage:
             )
 
     async def _next(self, mailbox: Mailbox) -> Delivery | StageCommand | None:
-        """Take the next delivery or command, and retry to save an unsaved state meanwhile."""
-        while self._saver.is_unsaved:
+        """Take the next delivery or command; save an unsaved state and do idle work meanwhile."""
+        while True:
+            is_unsaved = self._saver.is_unsaved
+            if not is_unsaved and not self._has_idle_work(mailbox):
+                return await mailbox.take()
+            timeout_s = SAVE_AGAIN_S if is_unsaved else self._actor.idle_after_s
             try:
-                return await asyncio.wait_for(mailbox.take(), SAVE_AGAIN_S)
+                return await asyncio.wait_for(mailbox.take(), timeout_s)
             except TimeoutError:
-                await self._save_and_send([])
-        return await mailbox.take()
+                await (self._save_and_send([]) if is_unsaved else self._work_idly())
 
     async def _take(self, delivery: Delivery | StageCommand, mailbox: Mailbox) -> None:
         if isinstance(delivery, StageCommand):
@@ -234,6 +203,7 @@ class Stage:
         mailbox.done(delivery, rejected=message is None)
 
     async def _step(self, message: Message, delivery: Delivery) -> None:
+        self._is_idle_failed = False
         for _attempt in range(2):
             if await self._try(message, delivery):
                 return
@@ -247,35 +217,69 @@ class Stage:
         )  # fmt: skip
 
     async def _try(self, message: Message, delivery: Delivery) -> bool:
-        """Handle a message, save the state and send the outputs.
+        """Handle a message; return False if the handler failed."""
+        produced = await self._attempt(
+            lambda: self._actor.handle(message),
+            ("done", "failed"),
+            f"handling {type(message).__name__}",
+            delivery,
+        )
+        if produced is not None:
+            is_timed = bool(produced) or not self._actor.outputs
+            self._metrics.record_step(message, is_timed=is_timed)
+        return produced is not None
+
+    def _has_idle_work(self, mailbox: Mailbox) -> bool:
+        is_stopped = self._is_idle_failed or self._drain_requested or mailbox.is_held
+        return not is_stopped and self._actor.has_idle_work()
+
+    async def _work_idly(self) -> None:
+        """Do a part of the actor's idle work; after a failure, none until the next message."""
+        kinds: tuple[Kind, Kind] = ("idle", "idle_failed")
+        produced = await self._attempt(lambda: self._actor.on_idle(), kinds, "idle work")
+        self._is_idle_failed = produced is None
+
+    async def _attempt(
+        self,
+        work: Callable[[], Iterator[Message]],
+        kinds: tuple[Kind, Kind],
+        what: str,
+        delivery: Delivery | None = None,
+    ) -> list[Produced] | None:
+        """Run a step in the actor's thread, save the state and send the outputs.
+
+        Args:
+            work: Handler that yields the messages of the step.
+            kinds: Kinds of its journal entry after a success and after a failure.
+            what: Description of the step for the log.
+            delivery: Its input.
 
         Returns:
-            False if the handler failed; the actor is then restored.
+            The outputs; None if the step failed. The actor is then restored.
         """
         self._update_flow_status()
         try:
             with self._metrics.step():
-                produced = await self._worker.run(self._handle, message)
+                produced = await self._worker.run(lambda: produce(self._actor, work()))
             self._outlets.stage_outputs(produced)
-            is_saved = await self._saver.save(self._actor, delivery, self._taken(delivery))
+            is_saved = await self._saver.save(self._actor, delivery, self._logged(delivery))
         except UnsavedStateError:
             raise
         except Exception as error:
-            log.exception("%s: handling %s failed; restoring the actor.",
-                          self.name, type(message).__name__)  # fmt: skip
-            self._journal.record_step("failed", self._actor.situation, error=repr(error))
+            log.exception("%s: %s failed; restoring the actor.", self.name, what)
+            self._journal.record_step(kinds[1], self._actor.situation, error=repr(error))
             await self._restart()
-            return False
-        self._journal.record_step("done", self._actor.situation, produced)
+            return None
+        self._journal.record_step(kinds[0], self._actor.situation, produced)
         await self._outlets.release(is_saved=is_saved)
-        self._metrics.record_step(message, is_timed=bool(produced) or not self._actor.outputs)
-        return True
+        return produced
 
-    def _taken(self, delivery: Delivery) -> LoggedInput | None:
-        """Return the log entry of the input for an actor that lags, else None."""
+    def _logged(self, delivery: Delivery | None) -> LoggedInput | None:
+        """Return the write-ahead log entry of a step if the actor lags."""
         if not self._actor.lags:
             return None
-        return LoggedInput.of(delivery.port.topic.name, delivery.body, self._actor.situation)
+        topic, body = (delivery.port.topic.name, delivery.body) if delivery else ("", b"")
+        return LoggedInput.of(topic, body, self._actor.situation)
 
     async def _save_and_send(self, produced: list[Produced], *, whole: bool = False) -> None:
         self._outlets.stage_outputs(produced)
@@ -346,9 +350,6 @@ class Stage:
         await self._saver.save(self._actor)
 
     # --- in the actor's thread ------------------------------------------------------------------
-    def _handle(self, message: Message) -> list[Produced]:
-        return produce(self._actor, self._actor.handle(message))
-
     def _restored_actor(self) -> Actor:
         actor = self._checkpointer.restore_actor(self._make)
         self._journal.record_start(self._checkpointer.past.of_actor or None)

@@ -19,6 +19,17 @@ class RestartBudget:
         self._delay_s, self._delay_max_s = delay_s, delay_max_s
         self._failed_at_s: deque[float] = deque()
 
+    @staticmethod
+    def of(name: str, config: "SupervisionConfig") -> "RestartBudget":
+        """Return the restart budget of an actor by the limits of supervision."""
+        return RestartBudget(
+            name,
+            config.max_restarts,
+            config.restart_window_s,
+            config.restart_delay_s,
+            config.restart_delay_max_s,
+        )
+
     def record_failure(self, now_s: float) -> float:
         """Count a failure and return the delay before the restart, in seconds.
 

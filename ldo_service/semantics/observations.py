@@ -162,6 +162,9 @@ def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
 
 
 def resident_positions(landmark: np.ndarray, view: MapView) -> np.ndarray:
-    """Return the positions [M, 3] of the reliable resident members of a landmark, a table [1]."""
+    """Return the positions [M, 3] of the reliable resident members of a landmark.
+
+    `landmark` is an array with one row of the landmark table.
+    """
     where = rows_of(landmark["members"][reliable_members(landmark)], view.ids)
     return view.rows[where[where >= 0], :3].astype(float)

@@ -219,7 +219,7 @@ class SemanticMap:
     def _with_names(
         self, view: TrainingView, top: np.ndarray, detections: RegionDetections
     ) -> tuple[RegionDetections, tuple[Region, ...]]:
-        """Add known labels to the detections of a keyframe, and choose regions to request."""
+        """Add known labels to the detections of a keyframe, and choose regions to label."""
         self._by_detector.update(detections.labels.astype(int).tolist())
         if self.naming is None:
             return detections, ()

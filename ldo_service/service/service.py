@@ -29,7 +29,7 @@ from ldo_service.errors import ConfigError, StageError
 from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import new_path, prepare_recording
 from ldo_service.runtime import check_graph
-from ldo_service.runtime.actor_graph import consumers_with_backlog, lossless_consumers
+from ldo_service.runtime.actor_graph import consumers_with_backlog, finish_order, lossless_consumers
 from ldo_service.runtime.journal import Journal
 from ldo_service.runtime.process import (
     ChildProcess,
@@ -162,10 +162,10 @@ class Service:
 
     # --- stages and child processes ---------------------------------------------------------------
     def _runners(self, transport: ZenohTransport) -> list[Runner]:
-        """Create the stages and child processes, producers first."""
+        """Create the stages and child processes, in the order in which they finish."""
         children: dict[str, ChildProcess] = {}
         runners: list[Runner] = []
-        for box in GRAPH:
+        for box in finish_order(GRAPH):
             if self.only and box.name not in self.only:
                 continue
             if not self.only and box.name in self.config.service.process_actors:

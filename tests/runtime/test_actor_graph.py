@@ -1,9 +1,10 @@
 import pytest
 
+from ldo_service.actors.topology import GRAPH
 from ldo_service.errors import ConfigError, LosslessCycle
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out, check_graph
 from ldo_service.runtime.actor import Policy
-from ldo_service.runtime.actor_graph import lossless_consumers, producers
+from ldo_service.runtime.actor_graph import finish_order, lossless_consumers, producers
 from ldo_service.schemas.message import Message
 from ldo_service.schemas.topics import Topic
 
@@ -14,6 +15,13 @@ def actor(kind: str, inputs: list[tuple[Topic, Policy]], outputs: list[Topic]) -
     ports = tuple(In(topic, policy) for topic, policy in inputs)
     members = {"name": kind, "inputs": ports, "outputs": tuple(Out(topic) for topic in outputs)}
     return type(kind, (Actor,), members)
+
+
+def final(kind: str, inputs: list[tuple[Topic, Policy]], outputs: list[Topic]) -> type[Actor]:
+    """Return an actor whose outputs are all final."""
+    made = actor(kind, inputs, outputs)
+    made.outputs = tuple(Out(topic, is_final=True) for topic in outputs)
+    return made
 
 
 def test_lossless_cycle_is_rejected_with_its_path() -> None:
@@ -66,3 +74,16 @@ def test_lossless_consumers_and_producers_of_topics_are_listed() -> None:
 def test_invalid_policy_is_rejected(make: object) -> None:
     with pytest.raises(ConfigError):
         make()  # type: ignore[operator]
+
+
+def test_final_messages_reach_other_actors_before_these_finish() -> None:
+    """The last closure leads to a correction, which moves the map before it is published."""
+    names = [actor.name for actor in finish_order(GRAPH)]
+    assert names[-3:] == ["loop_closer", "optimizer", "mapper"]
+    assert sorted(names) == sorted(actor.name for actor in GRAPH)
+
+
+def test_actors_finish_in_a_cycle_of_final_messages_too() -> None:
+    one = final("one", [(B, Latest())], [A])
+    two = final("two", [(A, Lossless())], [B])
+    assert finish_order([one, two]) == [one, two]

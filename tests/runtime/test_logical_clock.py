@@ -106,12 +106,14 @@ def test_latest_inputs_drop_no_messages() -> None:
 
 
 class FinalDoubler(Doubler):
+    outputs = (Out(DOUBLES, is_final=True),)
+
     def on_stop(self) -> Iterator[Message]:
         yield Double(stamp_ns=9, value=-1)
 
 
 class CountPublisher(OrderCollector):
-    outputs = (Out(PIECES),)
+    outputs = (Out(PIECES, is_final=True),)
 
     def on_stop(self) -> Iterator[Message]:
         yield Piece(stamp_ns=0, version=len(self.seen), part=0, parts=1)
@@ -124,12 +126,9 @@ def test_final_messages_come_last_and_producers_first() -> None:
     assert outputs[-1] == ("collector", Piece(stamp_ns=0, version=7, part=0, parts=1))
 
 
-def test_actor_that_finishes_last_publishes_after_all_others() -> None:
-    class LastFinalDoubler(FinalDoubler):
-        finishes_last = True
-
-    outputs = run([LastFinalDoubler(), CountPublisher()], {"doubler": 4}, 3)
-    assert [name for name, _ in outputs[-2:]] == ["collector", "doubler"]
+def test_actor_finishes_after_those_whose_final_messages_reach_it() -> None:
+    outputs = run([CountPublisher(), FinalDoubler()], {"doubler": 4}, 3)
+    assert [name for name, _ in outputs[-2:]] == ["doubler", "collector"]
 
 
 def test_actors_finish_after_an_empty_source() -> None:

@@ -57,7 +57,10 @@ class HttpClientConfig:
 
 
 class DeadlineExceeded(EndpointError):
-    """Deadline that passed without a failure of the server."""
+    """Deadline that passed before the server had its full `timeout_s` to answer.
+
+    It does not count as a failure of the server.
+    """
 
 
 class HttpClient:
