@@ -19,7 +19,8 @@ import msgspec
 import numpy as np
 
 from ldo_service.conversions.frames import camera_from_message
-from ldo_service.conversions.objects import dense_distribution, landmark_to_message
+from ldo_service.conversions.landmarks import landmark_observation_from_message
+from ldo_service.conversions.objects import landmark_to_message
 from ldo_service.conversions.poses import (
     correction_to_message,
     measurements_from_message,
@@ -29,13 +30,9 @@ from ldo_service.conversions.poses import (
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.keyframe_poses import T_map_submap
-from ldo_service.pose_graph.landmarks import (
-    MAX_CLASSES,
-    LandmarkObservation,
-    ObjectLandmarkConfig,
-    ObjectLandmarks,
-)
-from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
+from ldo_service.pose_graph.landmarks import MAX_CLASSES, ObjectLandmarkConfig, ObjectLandmarks
+from ldo_service.pose_graph.pose_graph import PoseGraph
+from ldo_service.pose_graph.pose_graph_config import PoseGraphConfig
 from ldo_service.runtime import Actor, Backlog, In, Out
 from ldo_service.schemas import (
     GraphCorrection,
@@ -193,7 +190,9 @@ class Optimizer(Actor):
         newest = self._newest.get(message.submap)
         known = [m for m in measurements_from_message(message) if m.a in self._graph]
         if newest is None:
-            self._add_first_keyframe(message, T_odom_keyframe)
+            # The pose of a new submap relative to the other submaps is unknown.
+            self._first[message.submap] = message.keyframe
+            self._graph.add_first(message.keyframe, T_map_submap(message.submap) @ T_odom_keyframe)
         elif known:
             self._graph.add(*known)
         else:
@@ -201,14 +200,6 @@ class Optimizer(Actor):
         self._newest[message.submap] = (message.keyframe, T_odom_keyframe)
         for pose in message.submap_measurements:
             self._merge_submap(pose)
-
-    def _add_first_keyframe(
-        self, message: KeyframeMeasurements, T_odom_keyframe: np.ndarray
-    ) -> None:
-        """Add the first keyframe of a submap; its pose relative to other submaps is unknown."""
-        self._first[message.submap] = message.keyframe
-        T_map_keyframe = T_map_submap(message.submap) @ T_odom_keyframe
-        self._graph.add_first(message.keyframe, T_map_keyframe)
 
     def _add_odometry_fallback(
         self, newest: tuple[int, np.ndarray], keyframe: int, T_odom_keyframe: np.ndarray
@@ -298,23 +289,14 @@ class Optimizer(Actor):
         for seen in self._early_observations:
             camera = self._cameras.get(seen.keyframe)
             if camera is not None:
-                self._landmarks.observe(self._observation(seen, camera))
+                self._landmarks.observe(
+                    landmark_observation_from_message(seen, camera, self._class)
+                )
             elif seen.keyframe not in self._graph:
                 later.append(seen)
             else:
                 self._too_late += 1
         self._early_observations = self._keep_newest(later)
-
-    def _observation(self, seen: ObjectObservation, camera: Camera) -> LandmarkObservation:
-        return LandmarkObservation(
-            seen.keyframe,
-            seen.object,
-            np.array(seen.box_px),
-            dense_distribution(seen.distribution, self._class, MAX_CLASSES),
-            seen.entropy,
-            seen.is_miss,
-            np.array(astuple(camera)[:6]),
-        )
 
     def _class(self, name: str) -> int:
         """Return the index of a class; 0 (`other`) beyond the maximum number of classes."""

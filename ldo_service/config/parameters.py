@@ -33,12 +33,12 @@ from ldo_service.maps.publisher import PublishConfig
 from ldo_service.pose_graph.factors import NoiseConfig
 from ldo_service.pose_graph.landmarks import ObjectLandmarkConfig
 from ldo_service.pose_graph.loop_closures import LoopClosureConfig
-from ldo_service.pose_graph.pose_graph import PoseGraphConfig
+from ldo_service.pose_graph.pose_graph_config import PoseGraphConfig
 from ldo_service.recordings.mcap_file import RecordConfig
 from ldo_service.regions.foreground import ForegroundConfig
 from ldo_service.regions.open_vocabulary import OpenVocabularyConfig
 from ldo_service.regions.region_proposals import RegionProposalConfig
-from ldo_service.regions.region_tracker import RegionTrackerConfig
+from ldo_service.regions.region_tracker_config import RegionTrackerConfig
 from ldo_service.runtime.supervision_policy import SupervisionConfig
 from ldo_service.semantics.data_association import AssociationConfig
 from ldo_service.semantics.gaussian_labels import ConsistencyConfig, LabelConfig

@@ -5,17 +5,17 @@ The Gaussians of a chunk have the same anchor keyframe.
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 
 import numpy as np
 
 from ldo_service.errors import DataError
-from ldo_service.geometry import se3
 from ldo_service.storage.checksummed_folder import ChecksummedFolder
 
 from .chunk import Chunk, pack, unpack
+from .chunk_entry import ChunkEntry, LostIdRange
 from .model import GaussianBatch, GaussianMap, new_labels
 from .rows import ROW
 from .visibility import BoundingSpheres, PlacedCamera
@@ -25,38 +25,6 @@ log = logging.getLogger(__name__)
 _DISK_FULL = "Gaussians stay in memory, which may run out: free some disk space."
 MAX_MOTIONS = 32  # Pending motions of a chunk; a chunk with more is rewritten.
 REWRITTEN_PER_CALL = 16  # Chunks rewritten per call of `move_anchors`: 2 ms each.
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Entry:
-    """Table entry of one offloaded chunk, which stays in memory.
-
-    The chunk has `count` Gaussians, whose ids lie between `first_id` and `last_id`.
-    """
-
-    anchor: int
-    first_id: int
-    last_id: int
-    count: int
-    center_map: np.ndarray  # [3], current center of its bounding sphere in the map frame.
-    radius_m: float
-    # Motions T_new_old [4, 4] of the anchor since the file was written.
-    motions: tuple[np.ndarray, ...] = ()
-
-    def moved(self, T_new_old: np.ndarray) -> "_Entry":
-        center = se3.transform(T_new_old, self.center_map)
-        return replace(self, center_map=center, motions=(*self.motions, T_new_old))
-
-
-@dataclass(frozen=True, slots=True)
-class LostIdRange:
-    """Range of ids, both ends included, in which the Gaussians of a damaged chunk lie.
-
-    Ids of this range that are neither in memory nor in another chunk are lost.
-    """
-
-    first_id: int
-    last_id: int
 
 
 class OffloadedGaussians:
@@ -77,7 +45,7 @@ class OffloadedGaussians:
 
     def __init__(self, folder: Path | None) -> None:
         self._files = ChecksummedFolder(folder, "gaussians", _DISK_FULL)
-        self._entries: dict[int, _Entry] = {}  # Key: file number, ascending.
+        self._entries: dict[int, ChunkEntry] = {}  # Key: file number, ascending.
         self._next_number = 0
         self._retired: list[int] = []  # Unused files, since the last snapshot.
         self._retired_before: list[int] = []  # Unused files, before the last snapshot.
@@ -114,7 +82,7 @@ class OffloadedGaussians:
             self._remove_unknown()
         sphere = BoundingSpheres.around(rows, chunk.anchors)
         place = sphere.centers[0], float(sphere.radii_m[0])
-        entry = _Entry(chunk.anchor, int(ids[0]), int(ids[-1]), len(ids), *place)
+        entry = ChunkEntry(chunk.anchor, int(ids[0]), int(ids[-1]), len(ids), *place)
         return self._write(chunk, entry)
 
     def load(self, number: int) -> Chunk:
@@ -290,7 +258,7 @@ class OffloadedGaussians:
         motions = np.split(state["motions"], np.cumsum(state["motion_counts"]))[:-1]
         numbers = state["numbers"].tolist()
         self._entries = {
-            number: _Entry(*fields, motions=tuple(own))
+            number: ChunkEntry(*fields, motions=tuple(own))
             for number, *fields, own in zip(numbers, *columns, motions, strict=True)
         }
         self._next_number, self._spheres = int(state["next_number"]), None
@@ -311,7 +279,7 @@ class OffloadedGaussians:
         }
 
     # --- files ------------------------------------------------------------------------------------
-    def _write(self, chunk: Chunk, entry: _Entry) -> int | None:
+    def _write(self, chunk: Chunk, entry: ChunkEntry) -> int | None:
         number = self._next_number
         if not self._files.write(number, pack(chunk)):
             return None

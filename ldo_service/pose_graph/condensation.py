@@ -4,7 +4,7 @@ After Grisetti, Kuemmerle and Ni, Robust Optimization of Factor Graphs by using 
 Measurements (2012). The poses of condensed keyframes are interpolated between two variables.
 """
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -76,6 +76,35 @@ class CondensedKeyframes:
             T_tails: T_map_tail of each condensed keyframe, [F, 4, 4].
         """
         return interpolate(T_heads @ self.T_head, T_tails @ self.T_tail, self.fractions)
+
+    def pose_at(self, row: int, pose: Callable[[int], np.ndarray]) -> np.ndarray:
+        """Return T_map_keyframe [4, 4] of the condensed keyframe of one row.
+
+        Args:
+            row: Row of the keyframe.
+            pose: Function that returns T_map_keyframe [4, 4] of its head and of its tail.
+        """
+        one = self.only(row)
+        ends = int(one.start_variables[0]), int(one.end_variables[0])
+        T_head, T_tail = (pose(k)[None] for k in ends)
+        return one.interpolated_poses(T_head, T_tail)[0]
+
+    def poses_with_variables(
+        self, variables: np.ndarray, T_map_variable: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ids [K], ascending, and T_map_keyframe [K, 4, 4] of all keyframes.
+
+        Args:
+            variables: Ids of the V keyframes that are variables, [V], ascending.
+            T_map_variable: Their poses in the map, [V, 4, 4].
+        """
+        heads, tails = (
+            np.searchsorted(variables, ids) for ids in (self.start_variables, self.end_variables)
+        )
+        keyframes = np.concatenate([variables, self.keyframes])
+        order = np.argsort(keyframes)
+        T_map = self.interpolated_poses(T_map_variable[heads], T_map_variable[tails])
+        return keyframes[order], np.concatenate([T_map_variable, T_map])[order]
 
     def moved(self, row: int, T_head_keyframe: np.ndarray) -> "CondensedKeyframes":
         """Return the condensed keyframes with a new measured pose [4, 4] in one row."""

@@ -1,12 +1,10 @@
 """Incremental smoothing (iSAM2) of keyframe poses from relative measurements and landmarks."""
 
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError, named
 from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .component_merging import (
@@ -19,43 +17,15 @@ from .condensation import group_to_condense
 from .factor_store import FactorStore
 from .factors import (
     BoxObservation,
-    NoiseConfig,
     information,
     pack_observations,
     pack_relative,
     unpack_observations,
     unpack_relative,
 )
-from .loop_closures import ClosureDecision, LoopClosureConfig, LoopClosureSet, Pair, pair_of
+from .loop_closures import ClosureDecision, LoopClosureSet, Pair, pair_of
+from .pose_graph_config import PoseGraphConfig
 from .solver import Name, Solver, Variables, point_key
-
-
-@dataclass(frozen=True, slots=True)
-class PoseGraphConfig:
-    """Parameters of the pose graph."""
-
-    noise: NoiseConfig = field(default_factory=NoiseConfig)
-    closures: LoopClosureConfig = field(default_factory=LoopClosureConfig)
-    # Keyframes per group; one stays a variable (paper, III.C: every 10).
-    condense_keyframes: int = 10
-    window_keyframes: int = 20  # Newest keyframes, not condensed: their measurements still change.
-    # A condensed keyframe becomes a variable again if a closure changes it by more sigmas than
-    # this. There is at most one group per `keyframes_each` keyframes, to bound the solver's time.
-    max_interpolation_sigmas: float = 0.1
-    keyframes_each: int = 5
-    max_changes: int = 64  # Number between two rebuilds; a restored graph repeats them bit by bit.
-
-    def __post_init__(self) -> None:
-        counts = self.condense_keyframes, self.window_keyframes, self.max_changes
-        if min(*counts, self.keyframes_each) < 1:
-            raise ConfigError(
-                named(
-                    self, "condense_keyframes", "window_keyframes", "keyframes_each", "max_changes"
-                )
-                + " must be at least 1."
-            )
-        if self.max_interpolation_sigmas < 0:
-            raise ConfigError(named(self, "max_interpolation_sigmas") + " must not be negative.")
 
 
 class PoseGraph:
@@ -72,8 +42,8 @@ class PoseGraph:
     of iSAM2 fails. The same calls in the same order give bitwise equal results.
     """
 
-    def __init__(self, config: PoseGraphConfig = PoseGraphConfig()) -> None:
-        self._config = config
+    def __init__(self, config: PoseGraphConfig | None = None) -> None:
+        self._config = config = config or PoseGraphConfig()
         self._known = FactorStore(config.noise, config.closures)
         self._initial: Variables = {}  # The value each variable was inserted with.
         self._solver = Solver()
@@ -211,11 +181,9 @@ class PoseGraph:
             is_room = len(known.condensed) * config.keyframes_each < len(self)
             error_sigmas = known.interpolation_error_sigmas(keyframe, variables)
             if is_room and error_sigmas > config.max_interpolation_sigmas:
-                inner = known.interpolated.only(known.rows[keyframe])
-                ends = int(inner.start_variables[0]), int(inner.end_variables[0])
-                T_head, T_tail = (variables[k][None] for k in ends)
+                T_map = known.interpolated.pose_at(known.rows[keyframe], variables.__getitem__)
                 known.restore_variable(keyframe)
-                variables = {**variables, keyframe: inner.interpolated_poses(T_head, T_tail)[0]}
+                variables = {**variables, keyframe: T_map}
         return variables
 
     def _merge_components(self, measured: RelativePose) -> None:
@@ -306,10 +274,7 @@ class PoseGraph:
         row = self._known.rows.get(keyframe)
         if row is None:
             return self._solver.pose(keyframe)
-        inner = self._known.interpolated.only(row)
-        ends = int(inner.start_variables[0]), int(inner.end_variables[0])
-        T_head, T_tail = (self._solver.pose(k)[None] for k in ends)
-        return inner.interpolated_poses(T_head, T_tail)[0]
+        return self._known.interpolated.pose_at(row, self._solver.pose)
 
     def poses(self) -> dict[int, np.ndarray]:
         """Return T_map_keyframe [4, 4] of every keyframe, by id, ascending."""
@@ -318,17 +283,10 @@ class PoseGraph:
 
     def all_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the ids of all keyframes [K], ascending, and T_map_keyframe [K, 4, 4]."""
-        variables, interpolated = self._solver.variables(), self._known.interpolated
+        variables = self._solver.variables()
         keys = np.array([k for k in variables if k in self], np.int64)
         T_map = np.array([variables[k] for k in keys.tolist()]).reshape(-1, 4, 4)
-        heads, tails = (
-            np.searchsorted(keys, ids)
-            for ids in (interpolated.start_variables, interpolated.end_variables)
-        )
-        keyframes = np.concatenate([keys, interpolated.keyframes])
-        order = np.argsort(keyframes)
-        every = np.concatenate([T_map, interpolated.interpolated_poses(T_map[heads], T_map[tails])])
-        return keyframes[order], every[order]
+        return self._known.interpolated.poses_with_variables(keys, T_map)
 
     # --- iSAM2 ------------------------------------------------------------------------------------
     def _update(
@@ -379,9 +337,8 @@ class PoseGraph:
         if group:
             known.condense(group, {k: self.pose(k) for k in group})
         if group or len(self._changes) > config.max_changes:
-            interpolated = known.rows.keys()
-            variables = self._solver.variables()
-            self._restart_solver({k: v for k, v in variables.items() if k not in interpolated})
+            variables = self._solver.variables().items()
+            self._restart_solver({k: v for k, v in variables if k not in known.rows})
 
     def _restart_solver(self, variables: Variables) -> None:
         """Rebuild the solver from the given values, and start a new list of changes."""

@@ -27,7 +27,8 @@ from .region_proposals import (
     propose_regions,
     regions_of_image,
 )
-from .region_tracker import RegionTracker, RegionTrackerConfig
+from .region_tracker import RegionTracker
+from .region_tracker_config import RegionTrackerConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ VIEWS = 3  # Best views that are stored.
 NO_MEMBER = -1
 MAX_VOTES = 8  # Maximum votes: a member that is wrong is removed after as many keyframes.
 TRIM = 0.02  # Fraction of the members at each end of an axis that counts as outliers of the box.
+_AT_A_TIME = 128  # Landmarks per batch of `derive_in_batches`, to stay in cache.
 
 LANDMARK = np.dtype(
     [
@@ -168,6 +169,18 @@ def derive(
         "anchor": _commonest(anchors[np.maximum(where, 0)], where >= 0),
     }.items():
         table[name][known] = values
+
+
+def derive_in_batches(table: np.ndarray, *gaussians: np.ndarray, least: int) -> None:
+    """Derive landmarks [K] in place, in batches that stay in cache.
+
+    Args:
+        table: Landmarks, [K] records of `LANDMARK`.
+        *gaussians: Rows, labels, ids and anchors of the map, see `derive`.
+        least: Minimum number of members.
+    """
+    for start in range(0, len(table), _AT_A_TIME):
+        derive(table[start : start + _AT_A_TIME], *gaussians, least=least)
 
 
 def _opacities(rows: np.ndarray, where: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from .gaussian_labels import BACKGROUND
 from .object_landmarks import (
     LANDMARK,
     NO_MEMBER,
-    derive,
+    derive_in_batches,
     distributions,
     entropies,
     labels_of,
@@ -47,7 +47,6 @@ from .observations import (
 )
 
 CANDIDATE = -1  # Value in place of an id.
-_AT_A_TIME = 128  # Landmarks per batch of `derive`, to stay in cache.
 
 
 class Objects:
@@ -84,8 +83,7 @@ class Objects:
         Args:
             view: The map and the regions of the keyframe.
             undetectable: Labels that the detector does not know, [256] bool. An object with such a
-                label
-                is missed only if the measured depth shows that it is gone.
+                label is missed only if the measured depth shows that it is gone.
 
         Returns:
             The changes of the objects.
@@ -181,18 +179,8 @@ class Objects:
         ]
 
     def _derive(self, table: np.ndarray, *gaussians: np.ndarray) -> None:
-        """Derive landmarks in batches where enough of their Gaussians are resident.
-
-        Args:
-            table: Landmarks, [K] records of `LANDMARK`, updated in place.
-            *gaussians: Rows, labels, ids and anchors of the map, see `object_landmarks.derive`.
-        """
-        for start in range(0, len(table), _AT_A_TIME):
-            derive(
-                table[start : start + _AT_A_TIME],
-                *gaussians,
-                least=self.config.association.min_gaussians,
-            )
+        """Derive landmarks in place; those with too few resident Gaussians stay unchanged."""
+        derive_in_batches(table, *gaussians, least=self.config.association.min_gaussians)
 
     def _promote(self, which: np.ndarray) -> tuple[int, ...]:
         """Turn candidates with enough observations into objects and return their ids."""

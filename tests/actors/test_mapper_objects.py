@@ -16,7 +16,7 @@ from ldo_service.conversions.poses import correction_to_message, matrix6_to_mess
 from ldo_service.geometry import se3
 from ldo_service.regions.open_vocabulary import OpenVocabularyConfig, OpenVocabularyLabeling
 from ldo_service.regions.region_proposals import RegionProposalConfig
-from ldo_service.regions.region_tracker import RegionTrackerConfig
+from ldo_service.regions.region_tracker_config import RegionTrackerConfig
 from ldo_service.schemas import (
     Array,
     Detection,

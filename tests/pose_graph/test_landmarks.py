@@ -14,7 +14,8 @@ from ldo_service.pose_graph.landmarks import (
     ObjectLandmarks,
     triangulate,
 )
-from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
+from ldo_service.pose_graph.pose_graph import PoseGraph
+from ldo_service.pose_graph.pose_graph_config import PoseGraphConfig
 from ldo_service.pose_graph.solver import point_key, solve_batch
 from ldo_service.storage.state_codec import decode_state, encode_state
 

@@ -9,7 +9,8 @@ from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.pose_graph.condensation import group_to_condense
 from ldo_service.pose_graph.factors import NoiseConfig
-from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
+from ldo_service.pose_graph.pose_graph import PoseGraph
+from ldo_service.pose_graph.pose_graph_config import PoseGraphConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
 
 from .trajectories import REFINED, ate_m, closures, kitchen, odometry, round_trips, walked

@@ -6,7 +6,8 @@ import numpy as np
 
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
-from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
+from ldo_service.pose_graph.pose_graph import PoseGraph
+from ldo_service.pose_graph.pose_graph_config import PoseGraphConfig
 
 ODOMETRY = np.diag([2e3**2] * 3 + [5e2**2] * 3)  # 0.5 mrad and 2 mm, as from alignment.
 REFINED = np.diag([2e2**2] * 3 + [1e2**2] * 3)  # 5 mrad and 1 cm, as of a closure.

@@ -16,7 +16,8 @@ from ldo_service.regions.open_vocabulary import (
 )
 from ldo_service.regions.region import RegionLabel, RegionLabelResult
 from ldo_service.regions.region_proposals import RegionProposal
-from ldo_service.regions.region_tracker import RegionTracker, RegionTrackerConfig
+from ldo_service.regions.region_tracker import RegionTracker
+from ldo_service.regions.region_tracker_config import RegionTrackerConfig
 
 PART = Foreground(10, 20, np.ones((30, 40), bool))
 BOX = np.array([19.5, 9.5, 59.5, 39.5], np.float32)

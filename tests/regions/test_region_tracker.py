@@ -12,7 +12,8 @@ from ldo_service.geometry import Camera, codecs
 from ldo_service.regions.foreground import Foreground
 from ldo_service.regions.region import RegionLabel, RegionLabelResult
 from ldo_service.regions.region_proposals import RegionProposal
-from ldo_service.regions.region_tracker import MAX_VIEWS, RegionTracker, RegionTrackerConfig
+from ldo_service.regions.region_tracker import RegionTracker
+from ldo_service.regions.region_tracker_config import MAX_VIEWS, RegionTrackerConfig
 from ldo_service.regions.region_views import (
     ViewConfig,
     border_factor,

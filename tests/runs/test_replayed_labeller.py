@@ -7,7 +7,7 @@ from unittest.mock import patch
 
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
-from ldo_service.regions.region_tracker import RegionTrackerConfig
+from ldo_service.regions.region_tracker_config import RegionTrackerConfig
 from ldo_service.runs.replayed import open_recording
 from ldo_service.runtime.journal import StepRecord
 from ldo_service.runtime.stage import Stage

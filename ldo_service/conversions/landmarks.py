@@ -1,0 +1,36 @@
+"""Conversion of object observations to observations of landmarks, which need the pose graph.
+
+`objects` does not contain it, because every actor would then import gtsam.
+"""
+
+from collections.abc import Callable
+from dataclasses import astuple
+
+import numpy as np
+
+from ldo_service.geometry import Camera
+from ldo_service.pose_graph.landmarks import MAX_CLASSES, LandmarkObservation
+from ldo_service.schemas import ObjectObservation
+
+from .objects import dense_distribution
+
+
+def landmark_observation_from_message(
+    message: ObjectObservation, camera: Camera, class_index: Callable[[str], int]
+) -> LandmarkObservation:
+    """Return the observation of a landmark of the pose graph.
+
+    Args:
+        message: Observation of the object in a keyframe.
+        camera: Intrinsics of this keyframe.
+        class_index: Function from a label to its class, below `MAX_CLASSES`.
+    """
+    return LandmarkObservation(
+        message.keyframe,
+        message.object,
+        np.array(message.box_px),
+        dense_distribution(message.distribution, class_index, MAX_CLASSES),
+        message.entropy,
+        message.is_miss,
+        np.array(astuple(camera)[:6]),
+    )

@@ -1,0 +1,40 @@
+"""Table entries of offloaded chunks and of lost ones, without their Gaussians."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ldo_service.geometry import se3
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ChunkEntry:
+    """Table entry of one offloaded chunk, which stays in memory.
+
+    The chunk has `count` Gaussians, whose ids lie between `first_id` and `last_id`.
+    """
+
+    anchor: int
+    first_id: int
+    last_id: int
+    count: int
+    center_map: np.ndarray  # [3], current center of its bounding sphere in the map frame.
+    radius_m: float
+    # Motions T_new_old [4, 4] of the anchor since the file was written.
+    motions: tuple[np.ndarray, ...] = ()
+
+    def moved(self, T_new_old: np.ndarray) -> "ChunkEntry":
+        """Return the entry after a motion T_new_old [4, 4] of its anchor keyframe."""
+        center = se3.transform(T_new_old, self.center_map)
+        return replace(self, center_map=center, motions=(*self.motions, T_new_old))
+
+
+@dataclass(frozen=True, slots=True)
+class LostIdRange:
+    """Range of ids, both ends included, in which the Gaussians of a damaged chunk lie.
+
+    Ids of this range that are neither in memory nor in another chunk are lost.
+    """
+
+    first_id: int
+    last_id: int
