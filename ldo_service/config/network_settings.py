@@ -95,7 +95,7 @@ class HttpSettings:
     # Timeout of one attempt of a request to the server, seconds.
     timeout_s: PositiveFloat = 10.0
     # Timeout of the label of one region, with all views, attempts and waits, seconds. Together with
-    # timeout_s it must be below supervision.step_timeout_s and service.control_timeout_s.
+    # timeout_s it must be below service.control_timeout_s and supervision.backend_step_timeout_s.
     deadline_s: PositiveFloat = 40.0
     # Environment variable with the API key. Empty sends no key.
     api_key_variable: str = ""

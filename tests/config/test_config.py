@@ -34,7 +34,7 @@ def test_default_print_has_public_and_changed_settings_only() -> None:
     settings = settings_of(Config())
     lines = explained_yaml(Config()).splitlines()
     printed = [line for line in lines if "  # " in line]
-    assert len(printed) == sum(setting.is_public for setting in settings) == 62
+    assert len(printed) == sum(setting.is_public for setting in settings) == 64
     all_lines = explained_yaml(Config(), with_advanced=True).splitlines()
     assert len([line for line in all_lines if "  # " in line]) == len(settings)
     assert "pyramid_levels" not in explained_yaml(Config())
@@ -145,8 +145,8 @@ def test_invalid_file_is_refused_with_the_reason(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "limit"),
     [
-        (["deadline_s=55"], "supervision.step_timeout_s=60"),
-        (["deadline_s=30", "timeout_s=30"], "supervision.step_timeout_s=60"),
+        (["deadline_s=595"], "supervision.backend_step_timeout_s=600"),
+        (["deadline_s=30", "timeout_s=30"], "service.control_timeout_s=55"),
         (["deadline_s=48"], "service.control_timeout_s=55"),
     ],
 )

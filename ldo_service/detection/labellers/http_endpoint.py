@@ -24,7 +24,7 @@ class HttpClientConfig:
     attempts: int = 3
     backoff_s: float = 0.5  # Pause before the second attempt; doubled before each further one.
     # Maximum time for a region with all its views, attempts and pauses. It must be below
-    # supervision.step_timeout_s, after which an actor is stopped.
+    # supervision.backend_step_timeout_s, after which an actor is stopped.
     patience_s: float = 40.0
     per_minute: float = 60.0  # Maximum attempts per minute, evenly spaced.
     pause_s: float = 10.0  # Pause after a failed request; doubled with each further one.
