@@ -54,7 +54,7 @@ def test_every_message_is_one_paragraph(tmp_path: Path) -> None:
 def test_indices_outside_the_sequence_are_rejected() -> None:
     room = open_sequence("synthetic")
     for index in (-1, len(room)):
-        with pytest.raises(IndexError, match="of 120"):
+        with pytest.raises(IndexError, match="only frames 0 to 119"):
             room[index]
 
 

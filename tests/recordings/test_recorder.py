@@ -143,7 +143,7 @@ def test_recording_is_readable_with_the_mcap_library(tmp_path: Path) -> None:
         reader = make_reader(stream)
         found = list(reader.iter_messages())
         (about,) = reader.iter_metadata()
-    assert about.metadata == {"robot": "test", "version": "2"}
+    assert about.metadata == {"robot": "test", "version": "3"}
     assert {channel.message_encoding for _, channel, _ in found} == {"msgpack"}
     for schema, _, message in found:
         assert schema is not None
