@@ -95,6 +95,8 @@ class LoopCloser(Actor):
     )
     outputs = (Out(LOOP_CLOSURE, is_final=True), Out(LOOP_CANDIDATE, is_final=True))
     is_backend = True
+    # A camera that makes no keyframe for this time stands still.
+    idle_after_s = 5.0
 
     def __init__(self, config: LoopCloserConfig | None = None) -> None:
         super().__init__()
@@ -227,6 +229,14 @@ class LoopCloser(Actor):
                 )
                 yield loop_closure_to_message(result)
             yield loop_candidate_to_message(result)
+
+    def has_idle_work(self) -> bool:
+        return self.config.is_on and not self._waiting and self.recognizer.can_flush
+
+    def on_idle(self) -> Iterator[LoopClosure | LoopCandidate]:
+        """Compare the last keyframes of a camera that stands still."""
+        self._parts = None
+        yield from self._to_messages(self.recognizer.flush(self.poses, self._joined))
 
     def on_stop(self) -> Iterator[LoopClosure | LoopCandidate]:
         """Search loops for the pending keyframes and for the unfinished subgraph."""

@@ -2,7 +2,7 @@
 
 in   keyframe/new          Keyframe             Lossless(8)        a lost keyframe leaves a hole
 in   detection/boxes       DetectionBoxes       Lossless(8)        labels come from detections
-in   label/result          LabelResult          Latest(1 per key)  newest label of each region
+in   label/result          LabelResult          Lossless(8)         newest label of each region
 in   graph/correction      GraphCorrection      Latest(1)          the newest has all poses
 in   map/refine            RefineMap            Latest(1)          only the newest request counts
 out  map/view              MapRendering         the map rendered at the newest keyframe
@@ -39,10 +39,12 @@ from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
+from ldo_service.maps.label_queue import LabelRequestQueue
 from ldo_service.maps.publisher import MapPublisher, MessageContext, ObjectPublisher, PublishConfig
 from ldo_service.maps.relative_measurements import RelativeMeasurements
-from ldo_service.regions.region import RegionLabelResult
+from ldo_service.regions.region import Region, RegionLabelResult
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
+from ldo_service.runtime.actor import UNLIMITED
 from ldo_service.schemas import (
     AnchorMotion,
     DetectionBoxes,
@@ -73,6 +75,9 @@ from ldo_service.schemas.topics import (
     OBJECT_OBSERVATION,
 )
 from ldo_service.semantics.semantic_map import KeyframeSemantics, SemanticMap, SemanticMapConfig
+
+# Idle steps between two messages with changed Gaussians: some seconds of work, up to 4 MB.
+IDLE_STEPS_PER_DELTA = 8
 
 MapOutput = MapRendering | MapDelta | MapSnapshot | MapObjects
 Output = MapOutput | LabelRequest | ObjectObservation | KeyframeRefinement
@@ -121,7 +126,7 @@ class Mapper(Actor):
     inputs = (
         In(KEYFRAME_NEW, Lossless(8)),
         In(DETECTION_BOXES, Lossless(8)),
-        In(LABEL_RESULT, Latest(1, per_key=True)),
+        In(LABEL_RESULT, Lossless(8)),
         In(GRAPH_CORRECTION, Latest(1)),
         In(MAP_REFINE, Latest(1)),
     )
@@ -129,7 +134,7 @@ class Mapper(Actor):
         Out(MAP_VIEW),
         Out(MAP_DELTA),
         Out(MAP_SNAPSHOT, is_final=True),
-        Out(LABEL_REQUEST),
+        Out(LABEL_REQUEST, is_nonblocking=True),
         Out(MAP_OBJECTS, is_final=True),
         Out(OBJECT_OBSERVATION),
         Out(KEYFRAME_REFINEMENT),
@@ -151,6 +156,8 @@ class Mapper(Actor):
         self._publisher = MapPublisher(self._map, self.config.publish)
         self._newest: tuple[int, int] = (0, -1)  # Stamp in ns and id of the newest keyframe.
         self._refit = LoopRefit(self._map, self.config.refit)
+        self._label_queue = LabelRequestQueue()
+        self._idle_steps = 0  # Since the last published changes.
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
 
@@ -239,6 +246,7 @@ class Mapper(Actor):
         answer = RegionLabelResult(message.label, message.confidence, message.alternatives)
         if self._semantics.apply_label(message.region, message.keyframe, answer):
             yield from self._objects()
+        yield from self._label_requests()
 
     def _publish_semantics(
         self, fused: KeyframeSemantics | None, stamp_ns: int
@@ -246,8 +254,21 @@ class Mapper(Actor):
         if fused is not None:
             names = self._semantics.names
             yield from observations_to_messages(fused.observed, names, fused.keyframe, stamp_ns)
-            yield from (label_request_to_message(region, stamp_ns) for region in fused.requested)
+            for region in fused.requested:
+                self._queue_label_request(region, stamp_ns)
+            yield from self._label_requests()
             yield from self._objects()
+
+    def _queue_label_request(self, region: Region, stamp_ns: int) -> None:
+        camera = self._map.views.cameras[region.keyframe]
+        request = label_request_to_message(region, stamp_ns)
+        for one in self._label_queue.add(request, region.best.surface_m2(camera)):
+            assert self._semantics.naming is not None
+            self._semantics.naming.withdraw(one.region, one.keyframe)
+
+    def _label_requests(self) -> Iterator[LabelRequest]:
+        """Yield the label requests for which the labeller has room."""
+        yield from self._label_queue.take(self.situation.credits.get(LABEL_REQUEST, UNLIMITED))
 
     def _objects(self) -> Iterator[MapObjects]:
         """Yield all objects in one message; yield nothing before the first detections."""
@@ -307,6 +328,23 @@ class Mapper(Actor):
             yield from self._publisher.publish_snapshot(self._message_context())
             yield from self._objects()
 
+    def has_idle_work(self) -> bool:
+        return self._refit.has_work()
+
+    def on_idle(self) -> Iterator[Output]:
+        """Refit the map after corrections while no keyframe arrives."""
+        self._refit.while_idle()
+        self._idle_steps += 1
+        is_done = not self._refit.has_work()
+        if is_done:
+            self._semantics.refresh()
+            self._checkpoint = {}  # Saves the work; no keyframe may follow.
+        yield from self._refinement()
+        if is_done or self._idle_steps >= IDLE_STEPS_PER_DELTA:
+            self._idle_steps = 0
+            yield from self._publisher.deltas(self._message_context(), with_changed=True)
+            yield from self._objects()
+
     def on_stop(self) -> Iterator[Output]:
         """Publish the final map after removing duplicate Gaussians of the newest keyframes."""
         if self._map.size():
@@ -344,6 +382,7 @@ class Mapper(Actor):
             "links": self._links.snapshot(),
             "publisher": self._publisher.snapshot(),
             "refit": self._refit.snapshot(),
+            "label_queue": self._label_queue.pack(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
@@ -356,11 +395,14 @@ class Mapper(Actor):
         self._links.restore(saved["links"])
         self._publisher.restore(saved["publisher"])
         self._refit.restore(saved["refit"])
+        self._label_queue = LabelRequestQueue.unpack(saved["label_queue"])
 
     def metrics(self) -> dict[str, float]:
         return {
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
+            # Requests that wait until the labeller has room.
+            "label_requests_waiting": len(self._label_queue),
             **self._refit.metrics(),
             **self._map.metrics(),
             **self._semantics.metrics(),

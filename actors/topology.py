@@ -40,7 +40,7 @@ class ActorSpec:
     does: str
     inputs: tuple[In, ...]
     outputs: tuple[Out, ...]
-    is_backend: bool  # No other actor waits for its outputs.
+    is_backend: bool  # True if no other actor waits for its outputs.
     make: Callable[[ActorParameters], Actor]
 
 

@@ -1,6 +1,6 @@
 """Labelling of regions that the detector does not know.
 
-in   label/request   LabelRequest   Latest(1 per region)   newer crops show more of the region
+in   label/request   LabelRequest   Backlog(2)             one waits while another is labelled
 in   label/add       AddLabel       Latest(32)             has priority, because a user waits
 out  label/result    LabelResult                           one for every request, with delay
 out  label/names     LabelNames                            one for every label/add
@@ -26,7 +26,7 @@ from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
 from ldo_service.detection.model_registry import open_labeller
 from ldo_service.detection.vocabulary import read_names
 from ldo_service.errors import ConfigError, EndpointError, FrameError, ModelError
-from ldo_service.runtime import Actor, In, Latest, Out
+from ldo_service.runtime import Actor, Backlog, In, Latest, Out
 from ldo_service.schemas import AddLabel, LabelNames, LabelRequest, LabelResult
 from ldo_service.schemas.labels import MAX_ALTERNATIVES, MAX_NAMES
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_REQUEST, LABEL_RESULT
@@ -65,7 +65,7 @@ class VlmLabeller(Actor):
 
     name = "vlm_labeller"
     inputs = (
-        In(LABEL_REQUEST, Latest(1, per_key=True, max_keys=32)),
+        In(LABEL_REQUEST, Backlog(2)),
         In(LABEL_ADD, Latest(32), has_priority=True),
     )
     outputs = (Out(LABEL_RESULT), Out(LABEL_NAMES))

@@ -169,6 +169,11 @@ class LoopDetector:
         """True if there is an unfinished subgraph."""
         return bool(self._open)
 
+    @property
+    def can_flush(self) -> bool:
+        """True if the unfinished subgraph is long enough to be compared."""
+        return len(self._open) >= self._config.subgraphs.min_keyframes
+
     def add(
         self,
         place: KeyframeRecord,
@@ -204,7 +209,7 @@ class LoopDetector:
         Loops are likely then. A run often ends where it began, and the newest keyframes are near
         the place where tracking was lost.
         """
-        if len(self._open) < self._config.subgraphs.min_keyframes:
+        if not self.can_flush:
             return []
         return self._completed(poses, merged)
 

@@ -180,7 +180,7 @@ class ReplaySession:
                 actor.snapshot()  # The stage does so too, and it may change the actor's caches.
                 actor.on_saved()
             case "failed":
-                self._fail(step, actor.handle(self._message(actor, step)))
+                self._fail(step, actor, actor.handle(self._message(actor, step)))
             case "dead_lettered":
                 self._replayed.dead_lettered += 1
             case "resumed":
@@ -192,7 +192,7 @@ class ReplaySession:
                 actor.snapshot()
                 actor.on_saved()
             case "idle_failed":
-                self._fail(step, actor.on_idle())
+                self._fail(step, actor, actor.on_idle())
             case "finished":
                 self._compare(step, self._produce(step, actor, actor.on_stop()))
 

@@ -150,6 +150,11 @@ class OpenVocabularyLabeling:
             del self._open[next(iter(self._open))]
             self._overdue += 1
 
+    def withdraw(self, region: int, keyframe: int) -> None:
+        """Drop a label request that was not sent, and count it."""
+        if self._open.pop((region, keyframe), None) is not None:
+            self._overdue += 1
+
     # --- label results ----------------------------------------------------------------------------
     def apply_label_result(
         self, region: int, keyframe: int, answer: RegionLabelResult, vocabulary: Vocabulary

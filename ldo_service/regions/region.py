@@ -120,6 +120,13 @@ class RegionObservation:
         """Number of pixels of the mask."""
         return int(np.count_nonzero(self.candidate.part.mask))
 
+    def surface_m2(self, camera: Camera) -> float:
+        """Return the visible surface of the region, as if it faced the camera, square meters."""
+        if not len(self.p_camera):
+            return 0.0
+        depth_m = float(np.median(self.p_camera[:, 2]))
+        return self.size_px * depth_m**2 / (camera.fx * camera.fy)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Region:

@@ -58,6 +58,11 @@ class Consumers:
     def __len__(self) -> int:
         return len(self._known)
 
+    @property
+    def has_backlogs_only(self) -> bool:
+        """True if there are required consumers, and all of them have a backlog."""
+        return bool(self.expected) and self.expected <= self.with_backlog
+
     def __contains__(self, name: str) -> bool:
         return name in self._known
 
@@ -66,6 +71,11 @@ class Consumers:
         awaited = [c for c in self._known.values() if c.is_awaited]
         limits = [c.limit - seq if c.alive else 0 for c in awaited]
         return max(0, min(limits, default=UNLIMITED))
+
+    def window_room(self, seq: int) -> int:
+        """Return the room in the windows of all consumers, also of those with a backlog."""
+        limits = [c.limit - seq if c.alive else 0 for c in self._known.values()]
+        return max(0, min(limits, default=0))
 
     def handled(self, seq: int) -> int:
         """Return the offset of the first message that some consumer has not handled."""

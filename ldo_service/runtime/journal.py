@@ -37,7 +37,7 @@ Kind: TypeAlias = Literal[
     "dead_lettered",  # The message failed twice.
     "resumed",  # Restored messages were published; the step has no input.
     "idle",  # The actor worked while no message arrived; the step has no input.
-    "idle_failed",  # That work raised: the actor is restored.
+    "idle_failed",  # The idle work raised: the actor is restored.
     "finished",  # Final messages were published; the step has no input.
 ]
 

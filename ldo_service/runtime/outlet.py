@@ -114,9 +114,14 @@ class Outlet:
     def credits(self) -> int:
         """Return how many messages may be sent now without waiting.
 
-        It is 0 while staged messages are not sent.
+        It is 0 while staged messages are not sent. If no consumer is awaited, it is the room in
+        the windows of the consumers, so that the actor need not fill a backlog.
         """
-        return 0 if self._unsent else self._consumers.credits(self._seq)
+        if self._unsent:
+            return 0
+        if self.port.is_nonblocking and self._consumers.has_backlogs_only:
+            return self._consumers.window_room(self._seq)
+        return self._consumers.credits(self._seq)
 
     async def send(self, message: Message, body: bytes) -> None:
         """Stage one message and commit it."""

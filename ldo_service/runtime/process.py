@@ -108,7 +108,7 @@ class ChildProcess:
         self._step_timeout_s = step_timeout_s
         self._health: Health | None = None  # Last health message of the process.
         self._health_at_s = 0.0  # Event-loop time at which it arrived.
-        self._suspended_at_s: float | None = None  # When the process was found suspended.
+        self._suspended_at_s: float | None = None  # Event-loop time of a suspension.
         self._process: asyncio.subprocess.Process | None = None
         self._draining = False
         self._heard_until_s = float("inf")  # Deadline of the next heartbeat.

@@ -28,8 +28,8 @@ class StateSaver:
 
     While the disk is full, the saver retries and the stage takes no messages, with two exceptions:
 
-    - A stage with nonblocking outputs continues. Its credit is 0 until the staged outputs are saved
-      and sent.
+    - A stage with nonblocking outputs and without lossless inputs continues. Its credit is 0 until
+      the staged outputs are saved and sent.
     - A stage without lossless inputs and without required consumers continues too.
 
     A stage that is about to end does not wait for the disk.
@@ -135,7 +135,7 @@ class StateSaver:
 
     def _waits_for_disk(self, actor: Actor) -> bool:
         takes = any(isinstance(port.policy, Lossless) for port in actor.inputs)
-        return not self._outlets.is_nonblocking and (takes or self._outlets.has_required_consumers)
+        return takes or (self._outlets.has_required_consumers and not self._outlets.is_nonblocking)
 
     def _record_failure(self, actor: Actor, error: OSError) -> None:
         self._metrics.failures += self._checkpointer.record_failure(actor.name, error)

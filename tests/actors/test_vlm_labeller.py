@@ -266,26 +266,36 @@ def stage(transport: MemoryTransport, labeller: FakeLabeller, **fields) -> Stage
     return Stage(lambda: VlmLabeller(labeller=labeller), transport, config=QUICK, **fields)
 
 
-async def test_slow_labeller_queues_newest_request_per_region_and_at_most_32() -> None:
+def mapper_outlet(transport: MemoryTransport) -> Outlet:
+    """Return an outlet of label requests as the mapper has it, which never waits."""
+    return Outlet(
+        Out(LABEL_REQUEST, is_nonblocking=True),
+        "mapper",
+        1,
+        transport,
+        ("vlm_labeller",),
+        with_backlog=("vlm_labeller",),
+    )
+
+
+async def test_slow_labeller_has_room_for_two_requests_and_loses_none() -> None:
     transport, gate, results = MemoryTransport(), Event(), []
     transport.subscribe(
         LABEL_RESULT.name, lambda _, body: results.append(decode(body, LabelResult))
     )
     labeller = FakeLabeller([("cup", 0.5)], gate)
-    slow = stage(transport, labeller)
-    mapper = Outlet(Out(LABEL_REQUEST), "mapper", 1, transport)
-    async with running(slow):
-        await send(mapper, request(0))
-        await eventually(lambda: labeller.seen)
-        for region in (1, 1, 1, *range(2, 41)):
-            await send(mapper, request(region, crops=(crop_message(plain_image("red")),) * 2))
-        await eventually(lambda: slow.health().inputs[0].queued == 32)
-        assert len(results) == 0, "sending waits for no result"
+    mapper = mapper_outlet(transport)
+    assert mapper.credits() == 0, "a labeller that is absent has no room"
+    async with running(stage(transport, labeller)):
+        await eventually(lambda: mapper.credits() == 2)
+        for region in range(5):
+            await send(mapper, request(region))
+        assert mapper.credits() == 0
+        assert results == [], "sending waits for no result"
         gate.set()
-        await eventually(lambda: len(results) == 33)
-        dropped = slow.health().inputs[0].dropped
-    assert [answer.region for answer in results] == [0, *range(9, 41)]
-    assert dropped == 2 + 8
+        await eventually(lambda: len(results) == 5)
+        await eventually(lambda: mapper.credits() == 2)
+    assert [answer.region for answer in results] == [0, 1, 2, 3, 4]
 
 
 async def test_added_name_is_handled_before_queued_requests() -> None:
@@ -293,7 +303,7 @@ async def test_added_name_is_handled_before_queued_requests() -> None:
     for topic in (LABEL_RESULT, LABEL_NAMES):
         transport.subscribe(topic.name, lambda *_, name=topic.name: topic_names.append(name))
     labeller = FakeLabeller([("cup", 0.5)], gate)
-    mapper = Outlet(Out(LABEL_REQUEST), "mapper", 1, transport)
+    mapper = mapper_outlet(transport)
     operator = Outlet(Out(LABEL_ADD), "operator", 1, transport)
     async with running(stage(transport, labeller)):
         for region in range(5):
@@ -332,7 +342,7 @@ async def run_recorded(folder: Path, config: VlmLabellerConfig) -> list[LabelRes
     whole = Config(vlm_labeller=settings)
     journal = open_recorder(folder, "vlm_labeller", "robot", whole)
     one = Stage(lambda: VlmLabeller(config), transport, config=QUICK, journal=journal)
-    mapper = Outlet(Out(LABEL_REQUEST), "mapper", 1, transport)
+    mapper = mapper_outlet(transport)
     operator = Outlet(Out(LABEL_ADD), "operator", 1, transport)
     async with running(one) as tasks:
         await send(mapper, request(0, "blue"))

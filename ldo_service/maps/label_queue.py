@@ -1,0 +1,86 @@
+"""Label requests that wait until the labeller has room for them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ldo_service.schemas import LabelRequest, decode, encode
+
+# Maximum waiting requests, some 10 kB each: three for each of 32 regions, as the map has pending.
+MAX_WAITING = 96
+# Regions of which the shown surface is remembered, 16 bytes each.
+MAX_REGIONS = 4096
+
+
+class WaitingRequest(NamedTuple):
+    """Label request and the surface that its view shows, square meters."""
+
+    request: LabelRequest
+    surface_m2: float
+
+
+class LabelRequestQueue:
+    """Queue of label requests, at most one for each region.
+
+    A labeller that is faster than the map gets every request in order. A slower one gets the
+    request whose view shows the most surface of its region that no earlier request showed. The
+    rate of requests therefore follows the speed of the labeller, and large objects get their label
+    first.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[int, WaitingRequest] = {}  # By region, the oldest first.
+        self._shown_m2: dict[int, float] = {}  # Largest surface that a sent request showed.
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def add(self, request: LabelRequest, surface_m2: float) -> list[LabelRequest]:
+        """Add a request, and return the requests that it displaces.
+
+        It replaces an earlier request of the region. If the queue is full, the request with the
+        least new surface is displaced.
+        """
+        replaced = self._waiting.pop(request.region, None)
+        self._waiting[request.region] = WaitingRequest(request, surface_m2)
+        displaced = [replaced.request] if replaced else []
+        while len(self._waiting) > MAX_WAITING:
+            least = min(self._waiting.values(), key=self._new_m2)
+            displaced.append(self._waiting.pop(least.request.region).request)
+        return displaced
+
+    def take(self, room: int) -> list[LabelRequest]:
+        """Remove and return at most `room` requests to send now."""
+        if room >= len(self._waiting):
+            chosen = list(self._waiting.values())
+        else:
+            # The sort is stable: of equal ones, the oldest comes first.
+            best = sorted(self._waiting.values(), key=lambda one: -self._new_m2(one))
+            chosen = best[: max(0, room)]
+        for one in chosen:
+            region = one.request.region
+            del self._waiting[region]
+            shown_m2 = self._shown_m2.pop(region, 0.0)
+            self._shown_m2[region] = max(shown_m2, one.surface_m2)
+        while len(self._shown_m2) > MAX_REGIONS:
+            del self._shown_m2[next(iter(self._shown_m2))]
+        return [one.request for one in chosen]
+
+    def _new_m2(self, one: WaitingRequest) -> float:
+        return max(0.0, one.surface_m2 - self._shown_m2.get(one.request.region, 0.0))
+
+    def pack(self) -> dict[str, Sequence[object]]:
+        """Return plain values for a checkpoint."""
+        return {
+            "waiting": [(encode(one.request), one.surface_m2) for one in self._waiting.values()],
+            "shown": list(self._shown_m2.items()),
+        }
+
+    @staticmethod
+    def unpack(packed: dict[str, Sequence[tuple]]) -> "LabelRequestQueue":
+        """Restore a queue from `pack`."""
+        out = LabelRequestQueue()
+        for body, surface_m2 in packed["waiting"]:
+            request = decode(body, LabelRequest)
+            out._waiting[request.region] = WaitingRequest(request, surface_m2)
+        out._shown_m2 = {int(region): float(shown_m2) for region, shown_m2 in packed["shown"]}
+        return out
