@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from ldo_service.errors import ConfigError
 from ldo_service.recordings import mcap_file
-from ldo_service.recordings.mcap_file import RecordConfig
+from ldo_service.recordings.mcap_file import RECORDING_VERSION, RecordConfig
 from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import (
     JournalFile,
@@ -143,7 +143,7 @@ def test_recording_is_readable_with_the_mcap_library(tmp_path: Path) -> None:
         reader = make_reader(stream)
         found = list(reader.iter_messages())
         (about,) = reader.iter_metadata()
-    assert about.metadata == {"robot": "test", "version": "3"}
+    assert about.metadata == {"robot": "test", "version": str(RECORDING_VERSION)}
     assert {channel.message_encoding for _, channel, _ in found} == {"msgpack"}
     for schema, _, message in found:
         assert schema is not None
