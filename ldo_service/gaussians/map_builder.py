@@ -27,6 +27,8 @@ from .visibility import BoundingSpheres, MaxDepthGrid, PlacedCamera, chunk_numbe
 
 # Iterations per unit of effort: an iteration that reaches almost no Gaussians counts half.
 MAX_ITERATIONS_PER_EFFORT = 2
+# Files in the folder of a map to which its snapshots refer: keyframe images, offloaded Gaussians.
+FILE_PATTERNS = ("images/*.keyframe", "gaussians/*.gaussians")
 
 
 class MapBuilder:

@@ -8,6 +8,7 @@ Format: https://mcap.dev/spec
 """
 
 import logging
+import os
 import shutil
 import struct
 import time
@@ -42,6 +43,7 @@ UNREADABLE = (
     *(MemoryError, OverflowError),  # A damaged length is too large.
 )
 
+FILES_SUFFIX = ".files"  # Suffix of the folder with the files of an actor.
 ABOUT = "ldo/recording"  # Name of the metadata record.
 # Version of the messages, states and journal entries in a recording, a field of its metadata. A
 # change after which an older recording no longer replays increments it. Version 1 had no number.
@@ -187,6 +189,16 @@ class RecordConfig:
             )
 
 
+def recording_bytes(folder: Path) -> int:
+    """Return the size of a recording: its MCAP files and the files of its actors."""
+    total = 0
+    for name in (path for path in folder.iterdir() if path.suffix in (".mcap", FILES_SUFFIX)):
+        for file in os.scandir(name) if name.is_dir() else (name,):
+            with suppress(FileNotFoundError):  # A copy got its final name.
+                total += file.stat().st_size
+    return total
+
+
 class RecordingFile:
     """New MCAP file, written by one thread.
 
@@ -253,7 +265,7 @@ class RecordingFile:
             return False
         self._unchecked = 0
         folder = self.path.parent
-        used = sum(file.stat().st_size for file in folder.glob("*.mcap"))
+        used = recording_bytes(folder)
         free = shutil.disk_usage(folder).free
         return used > self._config.max_gb * 1e9 or free < self._config.min_free_gb * 1e9
 

@@ -28,6 +28,7 @@ from ldo_service.storage.state_codec import encode_state
 from ldo_service.storage.state_store import State
 from ldo_service.transport.worker import Worker
 
+from .actor_files import ActorFiles, FileArchive
 from .mcap_file import RecordConfig, RecordingFile
 
 log = logging.getLogger(__name__)
@@ -51,18 +52,30 @@ class Recorder(Journal):
     steps are not recorded. The gap is recorded and logged once; the actor is not affected.
     """
 
-    def __init__(self, path: Path, about: Mapping[str, str], config: RecordConfig) -> None:
+    def __init__(
+        self,
+        path: Path,
+        about: Mapping[str, str],
+        config: RecordConfig,
+        files: ActorFiles | None = None,
+    ) -> None:
         """Create the file.
 
         Args:
             path: The new file.
             about: Fields of the file's metadata record.
             config: Limits of the recording.
+            files: Files to which the saved state of the actor refers; None if there are none.
 
         Raises:
             OSError: The file exists or cannot be written.
         """
         self._file = RecordingFile(path, about, config)
+        self._archive, self._config = FileArchive(path), config
+        self._files = files
+        # Checksum of each file of the next start by path; None if the actor has no files.
+        self._checksums: dict[str, str] | None = None
+        self._has_all_files = True  # False if a file of the next start is not recorded.
         self._max_waiting = int(config.queue_mb * 1e6)
         self._writer = Worker(f"journal {path.stem}")
         self._lock = Lock()  # Guards `_waiting`.
@@ -74,6 +87,22 @@ class Recorder(Journal):
         self._closed: Future[None] | None = None
 
     # --- called by the stage ----------------------------------------------------------------------
+    def record_files(self) -> None:
+        """Record the files of the actor, which the next start needs if it restores a state."""
+        if self._files is None or not self._file.is_open:
+            return
+        try:
+            self._checksums = self._archive.add(self._files, self._config)
+            self._has_all_files = True
+        except OSError as error:
+            self._has_all_files = False
+            log.error(
+                "%s: the files of the actor in %s cannot be recorded: %s. A replay stops here; the "
+                "robot continues. Record to a disk with more space, or raise recording.max_gb.",
+                *(self._file.path, self._files.folder),
+                ": ".join(str(part) for part in (error.filename, error.strerror) if part),
+            )
+
     def record_start(self, state: State | None) -> None:
         """Record the start of an actor with its state."""
         try:
@@ -83,8 +112,13 @@ class Recorder(Journal):
                       self._file.path, error)  # fmt: skip
             self._submit(0, self._file.add_entry, Gap(step=self._steps, reason="state"))
             return
+        if parts is not None and not self._has_all_files:
+            self._submit(0, self._file.add_entry, Gap(step=self._steps, reason="state"))
+            return
         size = sum(map(len, (parts or {}).values()))
-        self._submit(size, self._file.add_entry, Started(step=self._steps, state=parts))
+        checksums = None if parts is None else self._checksums
+        start = Started(step=self._steps, state=parts, files=checksums)
+        self._submit(size, self._file.add_entry, start)
 
     def record_input(self, delivery: Delivery, stamp_ns: int) -> None:
         """Record the input of the next step, or drop it if the queue is full."""

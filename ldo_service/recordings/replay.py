@@ -8,6 +8,7 @@ that fail again.
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import msgspec
 
@@ -27,6 +28,7 @@ from ldo_service.runtime.step import Produced, produce
 from ldo_service.schemas import Message, decode
 from ldo_service.storage.state_codec import decode_state
 
+from .actor_files import FileArchive
 from .recording import JournalFile
 
 Make = Callable[[Mapping[str, str]], Actor]  # Creates an actor from the metadata of a file.
@@ -70,6 +72,7 @@ def replay(
     files: Iterable[JournalFile],
     make: Make,
     advance: Callable[[], None] = lambda: None,
+    folder: Path | None = None,
 ) -> ReplayReport:
     """Replay all recorded processes of an actor.
 
@@ -78,14 +81,19 @@ def replay(
         files: Recorded files of the actor, in the order of its processes.
         make: Function that creates a new actor.
         advance: Called after each step.
+        folder: Temporary folder with the files of the actor; None if the actor has no files. The
+            files of a recorded start replace its content.
 
     Returns:
         The counters and the first difference, if there is one.
+
+    Raises:
+        DataError: A file of the recording is missing or damaged.
     """
     replayed = ReplayReport(actor)
     try:
         for file in files:
-            for _ in ReplaySession(file, make, replayed).steps():
+            for _ in ReplaySession(file, make, replayed, folder).steps():
                 advance()
     except ReplayDiverged as difference:
         replayed.difference = difference
@@ -95,8 +103,14 @@ def replay(
 class ReplaySession:
     """Replay of one file, step by step."""
 
-    def __init__(self, file: JournalFile, make: Make, replayed: ReplayReport) -> None:
-        self._file, self._make, self._replayed = file, make, replayed
+    def __init__(
+        self,
+        file: JournalFile,
+        make: Make,
+        replayed: ReplayReport,
+        folder: Path | None = None,
+    ) -> None:
+        self._file, self._make, self._replayed, self._folder = file, make, replayed, folder
         self._actor: Actor | None = None  # Steps are skipped while it is None.
         self._last: StepRecord | None = None
 
@@ -137,7 +151,20 @@ class ReplaySession:
             self._actor = self._make(self._file.about)
         else:
             self._replayed.restored += 1
+            self._restore_files(start)
             self._actor = self._restored_actor(start, start.state)
+
+    def _restore_files(self, start: Started) -> None:
+        """Replace the files of the actor by those of a recorded start."""
+        if self._folder is None:
+            return
+        if start.files is not None:
+            FileArchive(self._file.path).restore(start.files, self._folder)
+        elif self._replayed.starts == 1:
+            self._note(
+                "starts from a saved map, but an earlier version recorded it without the keyframe "
+                "images, so the replay may diverge. Make a new recording."
+            )
 
     def _restored_actor(self, start: Started, state: Mapping[str, bytes]) -> Actor:
         try:

@@ -10,6 +10,7 @@ import msgspec
 import yaml
 
 from ldo_service import kernels, versions
+from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.topology import actor_spec
 from ldo_service.config import Config, actor_parameters, config_of
 from ldo_service.errors import ConfigError, DataError
@@ -40,7 +41,10 @@ class RecordedActor:
             DataError: A file cannot be read.
         """
         with TemporaryDirectory(prefix="ldo-replay-") as folder:
-            return replay(self.name, self.files, partial(self._make, Path(folder)), advance)
+            files = Path(folder) / "map"
+            make = partial(self._make, files)
+            has_files = self.name == Mapper.name
+            return replay(self.name, self.files, make, advance, files if has_files else None)
 
     def verify(self) -> ReplayReport:
         """Replay the recording and compare the outputs.

@@ -56,6 +56,9 @@ class Started(msgspec.Struct, frozen=True, kw_only=True):
 
     step: int  # Number of the next step.
     state: dict[str, bytes] | None  # Parts as `state_store` encodes them; None: a new actor.
+    # CRC-32 of each file that the state refers to, by its path in the actor's folder. None if the
+    # actor has no such files.
+    files: dict[str, str] | None = None
 
 
 class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -121,6 +124,9 @@ def digest_of(outputs: Iterable[Output]) -> str:
 
 class Journal:
     """Receiver of journal entries that discards them; `Recorder` writes them to a file."""
+
+    def record_files(self) -> None:
+        """Record the files that a saved state refers to; called before each start of the actor."""
 
     def record_start(self, state: State | None) -> None:
         """Record the start of an actor, with its saved state; None: it has no saved state."""

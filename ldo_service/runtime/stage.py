@@ -351,6 +351,7 @@ class Stage:
 
     # --- in the actor's thread ------------------------------------------------------------------
     def _restored_actor(self) -> Actor:
+        self._journal.record_files()  # The new actor changes them.
         actor = self._checkpointer.restore_actor(self._make)
         self._journal.record_start(self._checkpointer.past.of_actor or None)
         return actor

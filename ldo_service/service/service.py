@@ -17,6 +17,7 @@ from pathlib import Path
 import zenoh
 
 from ldo_service import kernels, versions
+from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.topology import GRAPH, ActorSpec, actor_spec
 from ldo_service.config import (
     Config,
@@ -26,6 +27,8 @@ from ldo_service.config import (
     stage_parameters,
 )
 from ldo_service.errors import ConfigError, StageError
+from ldo_service.gaussians.map_builder import FILE_PATTERNS
+from ldo_service.recordings.actor_files import ActorFiles
 from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import new_path, prepare_recording
 from ldo_service.runtime import check_graph
@@ -53,8 +56,17 @@ log = logging.getLogger(__name__)
 LEAVE_WITHIN_S = 1.0  # Time for a running step after everything else has ended.
 
 
-def open_recorder(folder: Path, actor: str, robot: str, config: Config) -> Recorder:
+def open_recorder(
+    folder: Path, actor: str, robot: str, config: Config, map_folder: Path | None = None
+) -> Recorder:
     """Open a new recording file for an actor in this process.
+
+    Args:
+        folder: Folder of the recording.
+        actor: Name of the actor.
+        robot: Name of the robot.
+        config: Configuration of the service.
+        map_folder: Folder with the mapper's files; None if it is a temporary one.
 
     Raises:
         ConfigError: The folder cannot be written.
@@ -68,7 +80,10 @@ def open_recorder(folder: Path, actor: str, robot: str, config: Config) -> Recor
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        return Recorder(new_path(folder, actor), about, recording_parameters(config))
+        files = None
+        if map_folder is not None and actor == Mapper.name:
+            files = ActorFiles(map_folder, FILE_PATTERNS)
+        return Recorder(new_path(folder, actor), about, recording_parameters(config), files)
     except OSError as error:
         raise ConfigError(
             f"{folder} cannot be recorded to: {error.strerror}. Choose another folder with "
@@ -184,7 +199,8 @@ class Service:
 
         make = box.make
         assert make is not None
-        parameters = actor_parameters(self.config.with_map_folder(self.state / "map"))
+        config = self.config.with_map_folder(self.state / "map")
+        parameters = actor_parameters(config)
         try:
             return Stage(
                 lambda: make(parameters),
@@ -199,7 +215,7 @@ class Service:
                     for out in box.outputs
                 },
                 on_evicted=evicted,
-                journal=self._journal(box.name),
+                journal=self._journal(box.name, Path(config.mapper.image_folder)),
                 heartbeat=start_heartbeat() if self.only else None,
             )
         except (KeyError, ValueError, TypeError, IndexError) as error:
@@ -209,10 +225,10 @@ class Service:
                 "map."
             ) from error
 
-    def _journal(self, actor: str) -> Journal:
+    def _journal(self, actor: str, map_folder: Path) -> Journal:
         if self.recording is None:
             return Journal()
-        return open_recorder(self.recording, actor, self.network.robot, self.config)
+        return open_recorder(self.recording, actor, self.network.robot, self.config, map_folder)
 
     def _child(self, box: ActorSpec, transport: ZenohTransport) -> ChildProcess:
         config = self.state / "config.yaml"

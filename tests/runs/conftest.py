@@ -19,6 +19,7 @@ from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import OdometryPrior
 from ldo_service.schemas.topics import CAMERA_RGBD, ODOMETRY_PRIOR
 from ldo_service.service.service import open_recorder
+from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.interface import MemoryTransport
 from tests.runtime.fake_actors import eventually, running, send
 
@@ -30,9 +31,12 @@ REFINING = tuple(
 CONFIG = load_config(settings=(ROUGH, *REFINING))
 
 
-def stages(folder: Path, transport: MemoryTransport, config: Config) -> list[Stage]:
+def stages(
+    folder: Path, transport: MemoryTransport, config: Config, state: Path | None
+) -> list[Stage]:
     made: list[Stage] = []
-    parameters = actor_parameters(config)
+    map_folder = state and state / "map"
+    parameters = actor_parameters(config.with_map_folder(map_folder) if map_folder else config)
     for box in GRAPH:
         assert box.make is not None
         make, topics = box.make, [out.topic.name for out in box.outputs]
@@ -40,8 +44,9 @@ def stages(folder: Path, transport: MemoryTransport, config: Config) -> list[Sta
             Stage(
                 lambda make=make: make(parameters),
                 transport,
+                store=FolderStore(state / "state") if state else None,
                 expected={name: lossless_consumers(GRAPH, name) for name in topics},
-                journal=open_recorder(folder, box.name, "robot", config),
+                journal=open_recorder(folder, box.name, "robot", config, map_folder),
             )
         )
     return made
@@ -54,6 +59,8 @@ async def record_service(
     count: int = FRAMES,
     prior: Trajectory | None = None,
     until: Callable[[dict[str, Stage]], bool] = lambda _: True,
+    state: Path | None = None,
+    first: int = 0,
 ) -> None:
     """Record the service while it receives a sequence frame by frame, and stop it gracefully.
 
@@ -64,20 +71,22 @@ async def record_service(
         count: Number of frames.
         prior: Prior poses, each sent before the frame of the same index.
         until: Condition on the stages by name that must hold before the stop.
+        state: State folder, from which the service continues; None for states in memory.
+        first: Index of the first frame.
     """
     transport = MemoryTransport()
-    actors = stages(folder, transport, config)
-    camera = Outlet(Out(CAMERA_RGBD), "camera", 1, transport)
+    actors = stages(folder, transport, config, state)
+    camera = Outlet(Out(CAMERA_RGBD), "camera", 1 + first, transport)
     odometry = Outlet(Out(ODOMETRY_PRIOR), "odometry", 1, transport)
     async with running(*actors) as tasks:
         tracker = next(stage for stage in actors if stage.name == "tracker")
-        for index in range(count):
+        for index in range(first, first + count):
             if prior is not None:
                 stamp_ns = round(1e9 * prior.stamps_s[index])
                 pose = pose_to_message(prior.T_world_camera[index])
                 await send(odometry, OdometryPrior(stamp_ns=stamp_ns, T_prior_base=pose))
             await send(camera, raw_frame_to_message(sequence.read(index)))
-            await eventually(lambda frames=index + 1: frames_received(tracker) == frames)
+            await eventually(lambda frames=index + 1 - first: frames_received(tracker) == frames)
         await eventually(lambda: until({stage.name: stage for stage in actors}))
         for stage, task in zip(actors, tasks, strict=True):
             stage.drain()
