@@ -5,7 +5,7 @@ NumPy arrays: a RealSense, a Kinect or a simulator. Depth must be registered to 
 
 Start `ldo serve` in another terminal, then run:
 
-    python examples/1_publish_a_camera.py [FRAMES]
+    .venv/bin/python examples/1_publish_a_camera.py [FRAMES]
 """
 
 import sys

@@ -7,7 +7,7 @@ consistent pose is `T_map_odom @ T_odom_camera`.
 Start `ldo serve` and a camera, such as `ldo publish synthetic:room`, each in its own terminal. Then
 run:
 
-    python examples/2_follow_the_pose.py [POSES]
+    .venv/bin/python examples/2_follow_the_pose.py [POSES]
 """
 
 import sys

@@ -3,10 +3,10 @@
 Any language with Zenoh and MessagePack can read the topics in the same way. `ldo topics
 --json-schema` describes every message.
 
-Install `pip install eclipse-zenoh msgpack`. Start `ldo serve` and a camera, such as `ldo publish
-synthetic:room`, each in its own terminal. Then run:
+Run `.venv/bin/pip install eclipse-zenoh msgpack`. Start `ldo serve` and a camera, such as `ldo
+publish synthetic:room`, each in its own terminal. Then run:
 
-    python examples/3_without_our_package.py [POSES]
+    .venv/bin/python examples/3_without_our_package.py [POSES]
 """
 
 import json

@@ -8,10 +8,10 @@ the service is the pose of the camera on the base.
 A robot publishes the poses of its driver. This example reads them from a file instead and sends
 each at its time. The lines of the file are `stamp tx ty tz qx qy qz qw`, in seconds and meters.
 
-Install `pip install eclipse-zenoh msgpack`. Start `ldo serve`, then this program, then `ldo
+Run `.venv/bin/pip install eclipse-zenoh msgpack`. Start `ldo serve`, then this program, then `ldo
 publish` of the sequence that belongs to the file:
 
-    python examples/4_publish_odometry.py FILE
+    .venv/bin/python examples/4_publish_odometry.py FILE
 """
 
 import json

@@ -4,10 +4,10 @@ The program publishes the transforms `ldo_map` to `ldo_odom` to `ldo_camera` as 
 `tf`. The bridge forwards them to the ROS topic `/tf` while it has subscribers. The axes of
 `ldo_map` and `ldo_odom` are those of the camera's first pose.
 
-Install `pip install 'ldo-slam[ros2]'`. Start `ldo serve`, a camera, such as `ldo publish
+Run `.venv/bin/pip install -e '.[ros2]'`. Start `ldo serve`, a camera, such as `ldo publish
 synthetic:room`, and the bridge: `zenoh-bridge-ros2dds -m client -e tcp/127.0.0.1:7447`. Then run:
 
-    python examples/5_pose_for_ros.py [POSES]
+    .venv/bin/python examples/5_pose_for_ros.py [POSES]
 """
 
 import json

@@ -121,6 +121,11 @@ def named(parameters: object, *fields: str) -> str:
     return ", ".join(f"{owner}.{field}={getattr(parameters, field)!r}" for field in fields)
 
 
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra of the package, as a part of an error text."""
+    return f"`.venv/bin/pip install -e '.[{extra}]'` in the clone of LDO-SLAM"
+
+
 def did_you_mean(name: str, known: Iterable[str], otherwise: str, prefix: str = "") -> str:
     """Return a sentence that suggests the known name most similar to an unknown one.
 

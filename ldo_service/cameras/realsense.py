@@ -1,13 +1,12 @@
 """RealSense camera on USB: depth aligned to color, intrinsics and units from the device."""
 
-import sys
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError, DataError
+from ldo_service.errors import ConfigError, DataError, install_command
 from ldo_service.schemas import CameraModel, CameraRgbd, Image
 
 WAIT_MS = 5000  # Maximum time to wait for a frame; the first one may take two seconds.
@@ -36,7 +35,7 @@ def library() -> Any:
     except ImportError as error:
         raise ConfigError(
             "a RealSense needs the extra `realsense`. Install it by "
-            f"`{sys.executable} -m pip install 'ldo-slam[realsense]'`."
+            f"{install_command('realsense')}."
         ) from error
     return pyrealsense2
 

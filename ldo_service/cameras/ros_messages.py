@@ -4,14 +4,13 @@ Encodings are those of `sensor_msgs/image_encodings`; depth is in millimeters as
 as 32FC1 (REP 118).
 """
 
-import sys
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError, FrameError
+from ldo_service.errors import ConfigError, FrameError, install_command
 from ldo_service.geometry.codecs import read_image_size
 from ldo_service.schemas import CameraModel, CameraRgbd, Image
 from ldo_service.schemas.frames import MAX_PIXELS, ImageEncoding
@@ -180,8 +179,7 @@ def typestore() -> Any:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ConfigError(
-            "reading ROS 2 needs the extra `ros2`. Install it by "
-            f"`{sys.executable} -m pip install 'ldo-slam[ros2]'`."
+            f"reading ROS 2 needs the extra `ros2`. Install it by {install_command('ros2')}."
         ) from error
     return get_typestore(Stores.ROS2_HUMBLE)  # Later versions did not change these messages.
 

@@ -11,12 +11,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 
 from ldo_service import __version__, kernels
 from ldo_service.actors.topology import GRAPH
 from ldo_service.client import connect
 from ldo_service.detection.model_registry import Models
-from ldo_service.errors import ConfigError, LdoError, ModelError
+from ldo_service.errors import ConfigError, LdoError, ModelError, install_command
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH
 from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
@@ -45,6 +46,7 @@ EXTRAS = {
     "realsense": ("pyrealsense2",),
     "ros2": ("rosbags",),
 }
+REINSTALL = "`.venv/bin/pip install -e .` in the clone of LDO-SLAM installs all libraries."
 LISTEN_S = 1.5  # Three heartbeats.
 MARKS = {
     "ok": "[green]ok[/]     ",
@@ -79,7 +81,7 @@ def doctor(
         *networks(),
         *service(robot, endpoint, keys),
     ):
-        console.print(MARKS[finding.mark] + finding.text)
+        console.print(MARKS[finding.mark] + escape(finding.text))
         bad += finding.mark == "bad"
     if bad:
         raise LdoError(
@@ -108,7 +110,7 @@ def libraries() -> Iterator[Finding]:
             importlib.import_module(module)
             yield Finding("ok", f"{package} {version(package)}")
         except (ImportError, PackageNotFoundError) as error:
-            yield Finding("bad", f"{package}: {error}. Get it with `pip install {package}`.")
+            yield Finding("bad", f"{package}: {error}. {REINSTALL}")
 
 
 def extras() -> Iterator[Finding]:
@@ -116,7 +118,7 @@ def extras() -> Iterator[Finding]:
     for extra, packages in EXTRAS.items():
         missing = [p for p in packages if importlib.util.find_spec(p) is None]
         if missing:
-            advice = f"`pip install 'ldo-slam\\[{extra}]'` installs it"  # Escaped for rich.
+            advice = f"{install_command(extra)} installs it"
             yield Finding("absent", f"extra {extra} ({', '.join(missing)}): {advice}")
         else:
             yield Finding("ok", f"extra {extra}")
@@ -205,13 +207,16 @@ def of_actor(actor: ActorStatus) -> Iterator[Finding]:
 
 
 def _in_numbers(health: Health) -> str:
-    dropped = sum(i.dropped for i in health.inputs)
+    dropped = [
+        f"{i.dropped} older {i.topic} replaced by newer ones" for i in health.inputs if i.dropped
+    ]
     lost = sum(i.lost for i in health.inputs)
     rejected = sum(i.rejected for i in health.inputs)
     state = "paused" if health.paused else health.state
     return (
         f"{health.actor} (process {health.pid}): {state}, {health.steps} steps of "
-        f"{health.step_ms_p50:.1f} ms p50, {health.step_ms_p95:.1f} ms p95, {dropped} dropped, "
+        f"{health.step_ms_p50:.1f} ms p50, {health.step_ms_p95:.1f} ms p95, "
+        f"{', '.join(dropped) or '0 dropped'}, "
         f"{lost} lost on the way, {rejected} rejected, {health.restarts} restarts, "
         f"{health.rss_mb:.0f} MB"
     )

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from ldo_service.client import connect
 from ldo_service.config import load_config
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, install_command
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.viewer.live import live
 from ldo_service.viewer.run_folder import RunFolder
@@ -58,9 +58,7 @@ def require_viser() -> None:
         ConfigError: It is not installed.
     """
     if importlib.util.find_spec("viser") is None:
-        raise ConfigError(
-            "the window needs viser: install it with `pip install 'ldo-slam[viewer]'`."
-        )
+        raise ConfigError(f"the window needs viser. Install it by {install_command('viewer')}.")
 
 
 @contextmanager

@@ -104,8 +104,7 @@ def available(names: Sequence[str]) -> list[str]:
         if name not in here:
             log.warning(
                 "execution provider %s is not in this onnxruntime, which has %s; continuing "
-                "without it. `pip install` the onnxruntime package with it, such as "
-                "onnxruntime-gpu.",
+                "without it. Install the onnxruntime package with it, such as onnxruntime-gpu.",
                 name,
                 ", ".join(here),
             )

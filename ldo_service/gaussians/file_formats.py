@@ -24,7 +24,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ldo_service.errors import ConfigError, DataError
+from ldo_service.errors import ConfigError, DataError, install_command
 
 from .rows import aligned_rows
 
@@ -246,7 +246,7 @@ def write_spz(path: Path, rows: np.ndarray) -> None:
         import gsply  # An optional package, whose import takes a third of a second.
     except ImportError as error:
         raise ConfigError(
-            f"writing .spz needs gsply ({error}). Install it: `pip install 'ldo-slam[viewer]'`."
+            f"writing .spz needs gsply ({error}). Install it by {install_command('viewer')}."
         ) from error
     gaussians = gsply.GSData.from_arrays(
         means=rows[:, 0:3] * OPENGL,

@@ -5,7 +5,7 @@ import secrets
 from collections.abc import Sequence
 from datetime import datetime, timedelta
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, install_command
 
 try:
     from cryptography import x509
@@ -14,7 +14,7 @@ try:
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 except ImportError as error:
     raise ConfigError(
-        "creating keys needs the extra `keys`. Install it by `pip install 'ldo-slam[keys]'`."
+        f"creating keys needs the extra `keys`. Install it by {install_command('keys')}."
     ) from error
 
 MAX_DAYS = 36500

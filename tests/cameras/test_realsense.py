@@ -17,7 +17,7 @@ from ldo_service.conversions.frames import camera_from_message
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Camera, camera
 
-rs = pytest.importorskip("pyrealsense2", reason="needs `pip install 'ldo-slam[realsense]'`")
+rs = pytest.importorskip("pyrealsense2", reason="needs `pip install -e '.[realsense]'`")
 
 WIDTH, HEIGHT = 64, 48
 BASELINE_M, DEPTH_M, UNITS_M = 0.05, 1.5, 0.0005

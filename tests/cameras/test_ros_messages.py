@@ -213,5 +213,5 @@ def test_a_stamp_before_the_epoch_is_rejected() -> None:
 
 def test_missing_library_is_an_error_with_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    with pytest.raises(ConfigError, match=r"ldo-slam\[ros2\]"):
+    with pytest.raises(ConfigError, match=r"pip install -e '\.\[ros2\]'"):
         typestore.__wrapped__()

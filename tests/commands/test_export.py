@@ -45,7 +45,7 @@ def test_gaussians_as_splat(run: Path) -> None:
 
 
 def test_gaussians_as_spz(run: Path) -> None:
-    gsply = pytest.importorskip("gsply", reason="pip install 'ldo-slam[viewer]'")
+    gsply = pytest.importorskip("gsply", reason="pip install -e '.[viewer]'")
     export(run, "spz")
     means = gsply.read_spz(run / "gaussians.spz").means
     expected = read_ply(run / "map.ply")[:, 0:3] * [1, -1, -1]

@@ -16,7 +16,7 @@ def test_without_viewer_extra_the_error_names_the_install_command(
     code, _, err = ldo(capsys, "view", run)
     assert code == 2
     assert_one_paragraph(err)
-    assert "pip install 'ldo-slam[viewer]'" in err
+    assert "pip install -e '.[viewer]'" in err
 
 
 @pytest.mark.parametrize("name", ["absent", "."])

@@ -59,7 +59,7 @@ def test_plyfile_reads_the_3dgs_properties(ply: Path, some_rows: np.ndarray) -> 
 
 
 def test_gsply_reads_equal_gaussians(ply: Path, some_rows: np.ndarray) -> None:
-    gsply = pytest.importorskip("gsply", reason="pip install 'ldo-slam[viewer]'")
+    gsply = pytest.importorskip("gsply", reason="pip install -e '.[viewer]'")
     data = gsply.plyread(str(ply))
     np.testing.assert_array_equal(data.means, some_rows[:, 0:3])
     np.testing.assert_array_equal(data.scales, some_rows[:, 3:6])

@@ -55,7 +55,7 @@ def parse(path: Path) -> dict[str, np.ndarray]:
 
 @pytest.fixture
 def spz(tmp_path: Path, some_rows: np.ndarray) -> Path:
-    pytest.importorskip("gsply", reason="pip install 'ldo-slam[viewer]'")
+    pytest.importorskip("gsply", reason="pip install -e '.[viewer]'")
     write_spz(tmp_path / "map.spz", some_rows)
     return tmp_path / "map.spz"
 
@@ -93,5 +93,5 @@ def test_missing_gsply_raises_with_install_command(
     tmp_path: Path, some_rows: np.ndarray, monkeypatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "gsply", None)
-    with pytest.raises(ConfigError, match=r"pip install 'ldo-slam\[viewer\]'"):
+    with pytest.raises(ConfigError, match=r"pip install -e '\.\[viewer\]'"):
         write_spz(tmp_path / "map.spz", some_rows)

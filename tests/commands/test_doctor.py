@@ -1,0 +1,47 @@
+"""Lines of `ldo doctor`; tests/service/test_health.py runs it with a service."""
+
+import importlib.util
+
+import msgspec
+import pytest
+
+from ldo_service.commands import doctor
+from ldo_service.errors import LdoError
+from ldo_service.service.diagnostics import ActorStatus
+from tests.service.test_diagnostics import health, inputs
+
+
+def test_missing_extra_is_named_with_its_install_command(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    for check in ("machine", "libraries", "networks", "service"):
+        monkeypatch.setattr(doctor, check, lambda *_: ())
+    doctor.doctor()
+    out = capsys.readouterr().out
+    for extra in doctor.EXTRAS:
+        assert f".venv/bin/pip install -e '.[{extra}]'" in out
+
+
+def test_missing_library_is_bad(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "LIBRARIES", {"no-such-library": "no_such_library"})
+    (finding,) = doctor.libraries()
+    assert finding.mark == "bad"
+    assert ".venv/bin/pip install -e ." in finding.text
+
+
+def test_bad_line_ends_with_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    for check in ("machine", "libraries", "extras", "networks"):
+        monkeypatch.setattr(doctor, check, lambda: ())
+    monkeypatch.setattr(doctor, "service", lambda *_: [doctor.Finding("bad", "tracker stopped")])
+    with pytest.raises(LdoError, match="problems found: 1"):
+        doctor.doctor()
+
+
+def test_dropped_messages_are_named_by_topic() -> None:
+    corrections, boxes = inputs("graph/correction", dropped=59), inputs("detection/boxes")
+    message = msgspec.structs.replace(health(), inputs=(*corrections, *boxes))
+    (finding,) = doctor.of_actor(ActorStatus("mapper", True, message, 1.5))
+    assert ", 59 older graph/correction replaced by newer ones, 0 lost" in finding.text
+    (finding,) = doctor.of_actor(ActorStatus("mapper", True, health(), 1.5))
+    assert ", 0 dropped, " in finding.text
