@@ -132,6 +132,8 @@ class Service:
                 _leave_if_busy(error.exit_code, str(error))
                 raise
             _leave_if_busy(0, "stopped")
+            if not self.only:
+                log.info("service: stopped; %s", self._state_after_stop())
 
     async def _serve(self, session: zenoh.Session, health: HealthCollector) -> None:
         transport = ZenohTransport(session, self.network)
@@ -146,8 +148,11 @@ class Service:
         pings = asyncio.create_task(watchdog.ping())
         runners = self._runners(transport)
         control = None if self.only else self._open_control(transport)
-        log.info("service: serving %s on %s", ", ".join(r.name for r in runners),
-                 self.network.endpoint)  # fmt: skip
+        names = ", ".join(runner.name for runner in runners)
+        if self.only:  # The main process has printed the line of the service.
+            log.info("%s: ready", names)
+        else:
+            log.info("service: serving %s on %s", names, self.network.endpoint)
         watchdog.notify("READY=1")
         try:
             await supervise(runners, stop, self.config.service.shutdown_timeout_s)
@@ -174,6 +179,11 @@ class Service:
         if self.is_state_kept:
             return str(self.state)
         return f"{self.state}, which is deleted with the service (--state DIR keeps it)"
+
+    def _state_after_stop(self) -> str:
+        if self.is_state_kept:
+            return f"state saved in {self.state}"
+        return "its temporary state is deleted (--state DIR keeps it)"
 
     # --- stages and child processes ---------------------------------------------------------------
     def _runners(self, transport: ZenohTransport) -> list[Runner]:

@@ -78,6 +78,21 @@ def test_interrupted_service_exits_with_0(tmp_path: Path) -> None:
         service.wait_until(lambda: "serving" in service.log)
         assert service.end_with(signal.SIGINT) == 0
         assert "Traceback" not in service.log
+        assert "service: stopped; its temporary state is deleted" in service.log
+
+
+def test_service_prints_one_line_when_it_starts_and_the_state_folder_at_the_end(
+    tmp_path: Path,
+) -> None:
+    state = tmp_path / "state"
+    apart = "--set", "service.process_actors=[optimizer]"
+    at = "--endpoint", free_endpoint(), "--state", state
+    with started(tmp_path / "log", "serve", *at, *apart) as service:
+        service.wait_until(lambda: "optimizer: ready" in service.log)
+        assert service.end_with(signal.SIGINT) == 0
+        assert service.log.count("serving") == 1
+        assert service.log.count("stopped;") == 1
+        assert f"service: stopped; state saved in {state}" in service.log
 
 
 @both_signals
