@@ -325,7 +325,7 @@ class Client:
         try:
             message = AddLabel(stamp_ns=time.time_ns(), name=name)
         except ValueError as error:
-            raise ConfigError(f"{name[:40]!r} cannot be added: {error}.") from error
+            raise ConfigError(f"{name[:40]!r} cannot be added: {error}.") from None
         until_s = time.monotonic() + timeout_s
         with self.poller(LABEL_NAMES.name, LabelNames) as inbox:
             self._send_request(LABEL_ADD, message, min(timeout_s, 3.0))

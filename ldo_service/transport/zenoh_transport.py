@@ -45,15 +45,15 @@ def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
     """
     try:
         config = _session_config(network, router)
-    except zenoh.ZError as error:
+    except zenoh.ZError:
         raise ConfigError(
             f"endpoint {network.endpoint!r} is malformed: write it like {DEFAULT_ENDPOINT}."
-        ) from error
+        ) from None
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
         advice = _why_not_listening(network) if router else _why_not_connected(network)
-        raise ConfigError(f"{advice} ({str(error).split(' at /')[0]})") from error
+        raise ConfigError(f"{advice} ({str(error).split(' at /')[0]})") from None
 
 
 def _session_config(network: Endpoint, router: bool) -> zenoh.Config:

@@ -273,8 +273,9 @@ def test_used_port_and_absent_service_are_reported(network: Endpoint) -> None:
     with pytest.raises(ConfigError, match=r"is another `ldo serve` running there\?"):
         open_session(network, router=True)
     absent = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
-    with pytest.raises(ConfigError, match="no service replies on"):
+    with pytest.raises(ConfigError, match="no service replies on") as failure:
         open_session(absent)
+    assert failure.value.__suppress_context__  # One traceback for the user, not two.
 
 
 @pytest.mark.parametrize("robot", ["", "a/b", "*", "a b", "$x", "a?", "#", "@"])
