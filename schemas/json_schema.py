@@ -1,5 +1,8 @@
 """JSON Schema of every message, for programs in other languages than Python."""
 
+import inspect
+from typing import Any
+
 import msgspec
 
 from ldo_service.schemas.message import Message
@@ -20,6 +23,8 @@ def json_schema() -> dict[str, object]:
     fields as base64 strings. In MessagePack, they have the type `bin`.
     """
     _, definitions = msgspec.json.schema_components(message_types())
+    for definition in definitions.values():
+        _clean_description(definition)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "LDO-SLAM messages",
@@ -31,3 +36,9 @@ def json_schema() -> dict[str, object]:
             if topic.answer is not None
         },
     }
+
+
+def _clean_description(definition: dict[str, Any]) -> None:
+    """Remove the indentation of the source code from a description."""
+    if "description" in definition:
+        definition["description"] = inspect.cleandoc(definition["description"])

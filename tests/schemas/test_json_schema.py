@@ -22,6 +22,14 @@ def test_every_reference_in_the_schema_resolves() -> None:
     assert names <= set(schema["$defs"])  # type: ignore[call-overload]
 
 
+def test_descriptions_have_no_indentation_of_the_source() -> None:
+    definitions = json_schema()["$defs"]
+    assert isinstance(definitions, dict)
+    descriptions = [one["description"] for one in definitions.values() if "description" in one]
+    assert any("\n" in text for text in descriptions)
+    assert not [text for text in descriptions if "\n    " in text]
+
+
 def test_each_message_type_belongs_to_one_topic() -> None:
     types = [topic.message for topic in TOPICS]
     assert len(set(types)) == len(types)
