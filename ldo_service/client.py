@@ -251,7 +251,7 @@ class Client:
                 "detector: `ldo serve --set detector.model=...`; `ldo models` shows how. A service "
                 "that only localizes publishes no objects; the folder of its map has them."
             )
-        raise self._nobody("replies", MAP_OBJECTS)
+        raise self._no_service("replies", MAP_OBJECTS)
 
     def live_actors(self, timeout_s: float = 1.0) -> set[str]:
         """Return the names of the actors with a running process."""
@@ -274,7 +274,7 @@ class Client:
         request = ControlRequest(stamp_ns=time.time_ns(), command=verb)
         answer = self._reader.request(CONTROL, request, ControlAnswer, timeout_s)
         if answer is None:
-            raise self._nobody("replies", CONTROL)
+            raise self._no_service("replies", CONTROL)
         return answer
 
     def refine(
@@ -334,7 +334,7 @@ class Client:
                     if answer.stamp_ns == message.stamp_ns:
                         return _names_or_why(name, answer)
                 time.sleep(0.02)
-        raise self._nobody("replies", LABEL_ADD)
+        raise self._no_service("replies", LABEL_ADD)
 
     def _send_request(self, topic: Topic, message: RefineMap | AddLabel, timeout_s: float) -> None:
         """Publish a request once it has a subscriber.
@@ -343,11 +343,11 @@ class Client:
             ConfigError: No actor subscribes to the request within `timeout_s` seconds.
         """
         if not self._sender.wait_for_subscriber(type(message), timeout_s):
-            raise self._nobody("listens", topic)
+            raise self._no_service("listens", topic)
         self._sender.send(message, "operator", self._sent_requests)
         self._sent_requests += 1
 
-    def _nobody(self, does: str, topic: Topic) -> ConfigError:
+    def _no_service(self, does: str, topic: Topic) -> ConfigError:
         return ConfigError(
             f"no service {does} on {self._network.expression(topic.name)}. Check the name of the "
             "robot and whether its service is running: `ldo doctor`."
