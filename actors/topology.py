@@ -110,17 +110,18 @@ def make_actors(parameters: ActorParameters) -> list[Actor]:
 def producer_of(topic: t.Topic) -> str:
     """Return the name of the actor that publishes a topic.
 
-    The result is `outside` if other programs publish it, and `every stage` if each actor does.
+    The result is `outside` if other programs publish it, `every actor` if each actor does, and
+    `none` if it has no producer.
     """
     for box in GRAPH:
         if any(out.topic is topic for out in box.outputs):
             return box.name
     if topic is t.HEALTH:
-        return "every stage"
+        return "every actor"
     if topic is t.CONTROL:
         return "outside"
     outside = (*t.FROM_OUTSIDE, *t.FROM_ODOMETRY, *t.FROM_OPERATORS)
-    return "outside" if topic in outside else "nobody"
+    return "outside" if topic in outside else "none"
 
 
 def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
@@ -134,7 +135,7 @@ def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
 
 def topics_table() -> str:
     """Return a Markdown table of all topics with their producers, consumers and policies."""
-    lines = ["| topic | says | made by | taken by |", "|---|---|---|---|"]
+    lines = ["| topic | content | producer | consumers |", "|---|---|---|---|"]
     for topic in t.TOPICS:
         name = f"{topic.name}/<actor>" if topic.is_per_actor else topic.name
         state = " *" if topic.is_state else ""

@@ -109,6 +109,28 @@ def messages() -> str:
     return "\n".join(lines[:-1])
 
 
+def types() -> str:
+    """Return Markdown: a table of the type names of fields that are no records."""
+    rows = dict[str, str]()
+    for path in sorted((ROOT / "schemas").glob("*.py")):
+        comments = _comments(path)
+        for node in ast.parse(path.read_text()).body:
+            if not (isinstance(node, ast.Assign) and isinstance(node.value, ast.Subscript)):
+                continue
+            name = ast.unparse(node.targets[0])
+            if re.fullmatch(r"[A-Z]\w*[a-z]\w*", name):
+                meaning = _comment_of(node, comments)
+                rows.setdefault(name, f"| `{name}` | {_values(node.value)} | {meaning} |")
+    head = ["| type | values | meaning |", "|---|---|---|"]
+    return "\n".join([*head, *(rows[name] for name in sorted(rows))])
+
+
+def _values(kind: ast.Subscript) -> str:
+    if ast.unparse(kind.value) == "Literal" and isinstance(kind.slice, ast.Tuple):
+        return ", ".join(f'`"{ast.literal_eval(value)}"`' for value in kind.slice.elts)
+    return f"`{ast.unparse(kind)}`"
+
+
 def _is_struct(node: ast.ClassDef) -> bool:
     return any(ast.unparse(base) in ("msgspec.Struct", "Message") for base in node.bases)
 
@@ -144,7 +166,7 @@ def _comments(path: Path) -> dict[int, tuple[str, bool]]:
         }
 
 
-def _comment_of(field: ast.AnnAssign, comments: dict[int, tuple[str, bool]]) -> str:
+def _comment_of(field: ast.AnnAssign | ast.Assign, comments: dict[int, tuple[str, bool]]) -> str:
     above, line = list[str](), field.lineno - 1
     while line in comments and comments[line][1]:
         above.insert(0, comments[line][0])
@@ -321,6 +343,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
     "public settings": public_settings,
     "number of settings": settings_count,
     "messages": messages,
+    "types": types,
     "commands": commands,
 }
 

@@ -6,6 +6,7 @@ from typing import Literal, cast, get_args
 import msgspec
 import numpy as np
 
+# Type of the numbers of an array: unsigned, signed or float, and bytes per number.
 DType = Literal["u1", "u2", "u4", "i4", "i8", "f4", "f8"]
 DTYPES = get_args(DType)
 MAX_DIMENSIONS = 8

@@ -36,16 +36,10 @@ class CameraModel(msgspec.Struct, frozen=True, kw_only=True):
             )
 
 
-ImageEncoding = Literal[
-    "rgb8",  # Color, 3 bytes per pixel.
-    "bgr8",
-    "jpeg",
-    "png",  # Color of 8 bits, or depth of 16 bits.
-    "z16",  # Depth, little-endian uint16.
-    "z16+zstd",  # The same, compressed.
-    "f32",  # Depth, little-endian float32; NaN and infinity mean "not measured", as in ROS.
-    "f32+zstd",
-]
+# rgb8, bgr8: color, 3 bytes per pixel. jpeg: color. png: color of 8 bits, or depth of 16 bits.
+# z16: depth, little-endian uint16. f32: depth, little-endian float32; NaN and infinity mean "not
+# measured", as in ROS. +zstd: the same, compressed.
+ImageEncoding = Literal["rgb8", "bgr8", "jpeg", "png", "z16", "z16+zstd", "f32", "f32+zstd"]
 BYTES_PER_PIXEL: dict[str, int] = {"rgb8": 3, "bgr8": 3, "z16": 2, "f32": 4}
 
 

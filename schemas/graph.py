@@ -13,7 +13,7 @@ from ldo_service.schemas.objects import (
 )
 from ldo_service.schemas.pose import QUATERNION_TOLERANCE
 
-Pair = tuple[int, int]
+Pair = tuple[int, int]  # Ids of two keyframes.
 
 
 class GraphLandmark(msgspec.Struct, frozen=True, kw_only=True):

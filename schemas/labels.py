@@ -8,7 +8,7 @@ MAX_CROPS = 8
 MAX_ALTERNATIVES = 8  # Maximum labels in addition to the first one.
 MAX_CROP_PX = 1 << 20  # Maximum pixels of a crop; networks use 0.1 megapixels.
 MAX_NAMES = 10_000
-Box = tuple[float, float, float, float]
+Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in pixels; pixel centers at integers.
 
 
 class LabelRequest(Message, frozen=True, kw_only=True):

@@ -5,6 +5,7 @@ from typing import Literal
 from ldo_service.schemas.keyframe import MeasuredPose
 from ldo_service.schemas.message import Message, require_count, require_finite
 
+# Source of the relative pose of two subgraphs; empty: no pose was found.
 Evidence = Literal["", "landmarks", "features", "map"]
 MAX_REASON_LENGTH = 100  # Characters.
 

@@ -13,7 +13,7 @@ MAX_OBJECTS = 10_000
 MAX_CLASSES = 32  # Maximum classes of one distribution.
 ROUNDING = 1e-3  # Tolerance of a sum of probabilities.
 
-Vector3 = tuple[float, float, float]
+Vector3 = tuple[float, float, float]  # x, y, z.
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in pixels; pixel centers at integers.
 # Names and probabilities, the likeliest first. The rest of the sum to 1 belongs to `other`; a
 # class that is not listed may still have a probability.

@@ -28,6 +28,7 @@ class Pose(msgspec.Struct, frozen=True):
 
 IDENTITY = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
+# OK: tracked. WEAK: the pose is uncertain. LOST: the pose of the frame is unknown.
 TrackingStatus = Literal["OK", "WEAK", "LOST"]
 
 Matrix6 = tuple[float, ...]  # 36 numbers, row-major; rotation (rad), then translation (m).

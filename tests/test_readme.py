@@ -20,6 +20,14 @@ def test_generated_files_are_current() -> None:
         assert path.read_text() == text, f"{path.name}: run `python docs/generate.py`"
 
 
+def test_every_type_of_a_field_is_defined_on_the_page_of_topics() -> None:
+    page = (ROOT / "docs/topics.md").read_text()
+    defined = set(re.findall(r"^### (\w+)$|^\| `([A-Z]\w*)` \|", page, re.MULTILINE))
+    names = {name for pair in defined for name in pair if name} | {"Literal", "Array", "None"}
+    for kind in re.findall(r"^\| `[a-z]\w*` \| `([^`]+)` \|", page, re.MULTILINE):
+        assert set(re.findall(r"\b[A-Z]\w*", re.sub(r"'[^']*'", "", kind))) <= names, kind
+
+
 def test_readme_has_at_most_200_lines() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 200
 

@@ -15,7 +15,7 @@ def test_graph_has_no_cycle_of_lossless_inputs() -> None:
 
 def test_every_topic_has_a_producer() -> None:
     for topic in t.TOPICS:
-        assert producer_of(topic) != "nobody", topic.name
+        assert producer_of(topic) != "none", topic.name
 
 
 def test_only_the_mapper_can_hold_back_the_tracker() -> None:
