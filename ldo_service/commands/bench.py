@@ -12,25 +12,21 @@ from ldo_service import kernels
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.iteration import Iteration, bench_camera, iteration_times
 
+from .options import argument
+
 
 def bench(
     what: Annotated[
         Literal["render"],
         tyro.conf.Positional,
-        tyro.conf.arg(
-            help="one iteration of the Gaussian optimizer: rendering, loss, gradients, Adam"
-        ),
+        argument(help="one iteration of the Gaussian optimizer: rendering, loss, gradients, Adam"),
     ],
-    gaussians: Annotated[int, tyro.conf.arg(help="Gaussians in view")] = 100_000,
-    gaussians_out_of_view: Annotated[
-        int, tyro.conf.arg(help="additional Gaussians out of view")
-    ] = 0,
-    size: Annotated[
-        str, tyro.conf.arg(metavar="WxH", help="size of the image, pixels")
-    ] = "640x480",
-    threads: Annotated[int, tyro.conf.arg(help="threads of the kernels")] = 1,
-    repeats: Annotated[int, tyro.conf.arg(help="iterations that each median is taken over")] = 20,
-    json_: Annotated[bool, tyro.conf.arg(name="json", help="print one JSON object")] = False,
+    gaussians: Annotated[int, argument(help="Gaussians in view")] = 100_000,
+    gaussians_out_of_view: Annotated[int, argument(help="additional Gaussians out of view")] = 0,
+    size: Annotated[str, argument(metavar="WxH", help="size of the image, pixels")] = "640x480",
+    threads: Annotated[int, argument(help="threads of the kernels")] = 1,
+    repeats: Annotated[int, argument(help="iterations that each median is taken over")] = 20,
+    json_: Annotated[bool, argument(name="json", help="print one JSON object")] = False,
 ) -> None:
     """Measure how long one iteration of the Gaussian optimizer takes on this machine.
 

@@ -69,10 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not words or words[0] in ("-h", "--help"):
             print(HELP.format(verbs="\n".join(first_lines())))
             sys.exit(0 if words else 2)
-        tyro.extras.subcommand_cli_from_dict(
-            verbs(), prog="ldo", args=words,
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-        )  # fmt: skip
+        _run_verb(words)
     except LdoError as error:
         if debug:
             raise
@@ -84,6 +81,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(130)
     except BrokenPipeError:  # The reader of a pipe closed it, as in `ldo topics | head`.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _run_verb(words: Sequence[str]) -> None:
+    config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+    known = verbs()
+    if words[0] in known:  # An error then points to the help of the verb.
+        tyro.cli(known[words[0]], prog=f"ldo {words[0]}", args=words[1:], config=config)
+    else:
+        tyro.extras.subcommand_cli_from_dict(known, prog="ldo", args=words, config=config)
 
 
 def _handle_interrupts() -> None:

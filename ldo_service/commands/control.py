@@ -9,12 +9,12 @@ from ldo_service.errors import ConfigError, StageError
 from ldo_service.schemas.map import MAX_ITERATIONS
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
-from .options import EndpointAddress, KeysFolder, Robot
+from .options import EndpointAddress, KeysFolder, Robot, argument
 
 Verb = Annotated[
     Literal["pause", "resume", "save", "reset", "refine", "add-label"],
     tyro.conf.Positional,
-    tyro.conf.arg(
+    argument(
         metavar="VERB",
         help="pause: drop all frames; resume: process frames again; save: write every actor's "
         "state now; reset: start again with an empty map; refine: optimize the map further; "
@@ -24,11 +24,11 @@ Verb = Annotated[
 Name = Annotated[
     str,
     tyro.conf.Positional,
-    tyro.conf.arg(metavar="NAME", help="label that add-label adds, such as samovar"),
+    argument(metavar="NAME", help="label that add-label adds, such as samovar"),
 ]
 Iterations = Annotated[
     int,
-    tyro.conf.arg(metavar="N", help=f"iterations of refine, at most {MAX_ITERATIONS} at a time"),
+    argument(metavar="N", help=f"iterations of refine, at most {MAX_ITERATIONS} at a time"),
 ]
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -22,7 +21,7 @@ from ldo_service.schemas import MapObjects
 from ldo_service.synthetic import FlatSequence
 from ldo_service.synthetic.flat.sequence import prerender
 
-from .options import Overwrite, progress
+from .options import Overwrite, argument, progress
 from .run import with_options
 
 FRAMES = 70  # Frames of the synthetic flat that show its first room.
@@ -32,7 +31,7 @@ NETWORKS = "demo"  # Name of the networks that come with the package.
 
 
 def demo(
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR", help="folder for the results")] = Path(
+    out: Annotated[Path, argument(metavar="DIR", help="folder for the results")] = Path(
         "runs/demo"
     ),
     overwrite: Overwrite = False,

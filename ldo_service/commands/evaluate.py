@@ -23,7 +23,7 @@ from ldo_service.evaluation.views import RenderingErrors
 from ldo_service.runs.finished import read_run, require_file
 from ldo_service.runs.source import open_source
 
-from .options import Json, Source, progress
+from .options import Json, Source, argument, progress
 
 FIGURES = {
     "mIoU": "mean_iou",
@@ -87,19 +87,17 @@ def _number(value: float) -> str:
 
 
 def evaluate(
-    folder: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="folder of a run")
-    ],
+    folder: Annotated[Path, tyro.conf.Positional, argument(metavar="DIR", help="folder of a run")],
     source: Source,
     lpips: Annotated[
         Path | None,
-        tyro.conf.arg(
+        argument(
             metavar="FILE.onnx",
             help="network of LPIPS with two inputs, float32 [1, 3, H, W], RGB in -1..1, and one "
             "output with a single number, as torch.onnx.export writes lpips.LPIPS(net='alex')",
         ),
     ] = None,
-    json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
+    json_: Annotated[Json, argument(name="json")] = False,
 ) -> None:
     """Evaluate a run: its trajectory, loop closures, rendered map and labels.
 

@@ -25,7 +25,7 @@ from ldo_service.volumes import (
     write_mesh,
 )
 
-from .options import progress
+from .options import argument, progress
 
 Format = Literal["ply", "splat", "spz", "tum", "csv", "mesh", "occupancy"]
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -45,36 +45,34 @@ class Job:
 
 
 def export(
-    folder: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="folder of a run")
-    ],
+    folder: Annotated[Path, tyro.conf.Positional, argument(metavar="DIR", help="folder of a run")],
     format: Annotated[
         Format,
-        tyro.conf.arg(
+        argument(
             help="Gaussians: ply, splat, spz; trajectory: tum, csv; for planners: mesh, occupancy"
         ),
     ],
     out: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="FILE", help="default: a file in DIR, named after the format"),
+        argument(metavar="FILE", help="default: a file in DIR, named after the format"),
     ] = None,
     online: Annotated[
-        bool, tyro.conf.arg(help="export the map and poses of the run itself, not the refined ones")
+        bool, argument(help="export the map and poses of the run itself, not the refined ones")
     ] = False,
     voxel: Annotated[
         float | None,
-        tyro.conf.arg(metavar="M", help="side of a voxel; default: mesh 0.02, occupancy 0.1"),
+        argument(metavar="M", help="side of a voxel; default: mesh 0.02, occupancy 0.1"),
     ] = None,
     up: Annotated[
-        Up, tyro.conf.arg(help="axis of the map that points up, for the floor plan of occupancy")
+        Up, argument(help="axis of the map that points up, for the floor plan of occupancy")
     ] = "-y",
     heights: Annotated[
         tuple[float, float],
-        tyro.conf.arg(
+        argument(
             metavar="MIN MAX", help="height range of the floor plan, meters above the first camera"
         ),
     ] = (-0.5, 0.5),
-    overwrite: Annotated[bool, tyro.conf.arg(help="replace an earlier FILE")] = False,
+    overwrite: Annotated[bool, argument(help="replace an earlier FILE")] = False,
 ) -> None:
     """Write the map or the trajectory of a run for other programs.
 

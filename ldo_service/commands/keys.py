@@ -14,15 +14,17 @@ from ldo_service.transport.access_control import EVERY_ROBOT, Access, Role, read
 from ldo_service.transport.endpoint import CLOSED, MAX_MESSAGE_MB
 from ldo_service.transport.keys import ACCESS, router_settings
 
+from .options import argument
+
 Folder = Annotated[
     Path,
     tyro.conf.Positional,
-    tyro.conf.arg(metavar="DIR", help="folder of the certificate authority"),
+    argument(metavar="DIR", help="folder of the certificate authority"),
 ]
 Name = Annotated[
-    str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME", help="name of a program or a machine")
+    str, tyro.conf.Positional, argument(metavar="NAME", help="name of a program or a machine")
 ]
-Days = Annotated[int, tyro.conf.arg(metavar="N", help="days that the keys are valid")]
+Days = Annotated[int, argument(metavar="N", help="days that the keys are valid")]
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class AddKeys:
     role: Annotated[
         Role,
         tyro.conf.Positional,
-        tyro.conf.arg(
+        argument(
             metavar="service|camera|odometry|viewer|operator",
             help="role that limits what it may do",
         ),
@@ -59,7 +61,7 @@ class AddKeys:
     name: Name
     robot: Annotated[
         str,
-        tyro.conf.arg(metavar="NAME", help="robot whose topics it may use; default: every robot"),
+        argument(metavar="NAME", help="robot whose topics it may use; default: every robot"),
     ] = EVERY_ROBOT
     host: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -95,11 +97,9 @@ class Router:
 
     folder: Folder
     keys: Annotated[
-        Path, tyro.conf.arg(metavar="DIR", help="folder of keys on the machine of the router")
+        Path, argument(metavar="DIR", help="folder of keys on the machine of the router")
     ] = Path("/etc/ldo/keys")
-    port: Annotated[int, tyro.conf.arg(metavar="PORT", help="port on which the router listens")] = (
-        7447
-    )
+    port: Annotated[int, argument(metavar="PORT", help="port on which the router listens")] = 7447
 
 
 Verb = (

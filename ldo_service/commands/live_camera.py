@@ -7,7 +7,6 @@ from itertools import islice
 from typing import Annotated
 
 import msgspec
-import tyro
 
 from ldo_service.cameras.realsense import RealSenseStream
 from ldo_service.cameras.ros2 import RosCamera, RosTopics
@@ -17,6 +16,8 @@ from ldo_service.runs.source import Selection
 from ldo_service.schemas import CameraRgbd
 from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
+
+from .options import argument
 
 REALSENSE, ROS2 = "realsense", "ros2"
 Notify = Callable[[str], None]
@@ -28,12 +29,10 @@ class RealSenseOptions:
 
     serial: Annotated[
         str,
-        tyro.conf.arg(metavar="NUMBER", help="serial number of the device, if there are several"),
+        argument(metavar="NUMBER", help="serial number of the device, if there are several"),
     ] = ""
-    size: Annotated[str, tyro.conf.arg(metavar="WxH", help="image size of color and depth")] = (
-        "640x480"
-    )
-    fps: Annotated[int, tyro.conf.arg(metavar="HZ", help="frame rate of color and depth")] = 30
+    size: Annotated[str, argument(metavar="WxH", help="image size of color and depth")] = "640x480"
+    fps: Annotated[int, argument(metavar="HZ", help="frame rate of color and depth")] = 30
 
     def stream(self) -> RealSenseStream:
         """Return the stream with these options.
@@ -53,33 +52,31 @@ class RosOptions:
 
     color: Annotated[
         str,
-        tyro.conf.arg(metavar="TOPIC", help="Image, or CompressedImage if it ends in /compressed"),
+        argument(metavar="TOPIC", help="Image, or CompressedImage if it ends in /compressed"),
     ] = ""
     depth: Annotated[
         str,
-        tyro.conf.arg(
-            metavar="TOPIC", help="depth registered to color; may end in /compressedDepth"
-        ),
+        argument(metavar="TOPIC", help="depth registered to color; may end in /compressedDepth"),
     ] = ""
     info: Annotated[
         str,
-        tyro.conf.arg(metavar="TOPIC", help="CameraInfo of color; default: camera_info next to it"),
+        argument(metavar="TOPIC", help="CameraInfo of color; default: camera_info next to it"),
     ] = ""
     bridge: Annotated[
         str,
-        tyro.conf.arg(
+        argument(
             metavar="ADDRESS", help="address of a bridge with its own router; default: --endpoint"
         ),
     ] = ""
     max_skew_s: Annotated[
         float,
-        tyro.conf.arg(metavar="S", help="maximum difference of the stamps of color and depth"),
+        argument(metavar="S", help="maximum difference of the stamps of color and depth"),
     ] = 0.015
     rectified: Annotated[
-        bool, tyro.conf.arg(help="images are rectified: use P of the CameraInfo, not K and D")
+        bool, argument(help="images are rectified: use P of the CameraInfo, not K and D")
     ] = False
     registered: Annotated[
-        bool, tyro.conf.arg(help="depth is registered, although its frame_id is not that of color")
+        bool, argument(help="depth is registered, although its frame_id is not that of color")
     ] = False
 
     def topics(self) -> RosTopics:

@@ -15,10 +15,12 @@ from ldo_service.detection.model_registry import Model, Models
 from ldo_service.detection.vocabulary import read_names
 from ldo_service.errors import ConfigError, LdoError, ModelError
 
+from .options import argument
+
 Name = Annotated[
     str,
     tyro.conf.Positional,
-    tyro.conf.arg(metavar="NAME", help="name for `detector.model` or `vlm_labeller.model`"),
+    argument(metavar="NAME", help="name for `detector.model` or `vlm_labeller.model`"),
 ]
 
 
@@ -35,31 +37,29 @@ class AddModel:
     """
 
     name: Name
-    file: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE", help="network in ONNX")
-    ]
+    file: Annotated[Path, tyro.conf.Positional, argument(metavar="FILE", help="network in ONNX")]
     layout: Annotated[
         Literal["yolov5", "yolox", "yolov8"] | None,
-        tyro.conf.arg(help="layout of its output; default: recognized by its shape"),
+        argument(help="layout of its output; default: recognized by its shape"),
     ] = None
     names: Annotated[
         str,
-        tyro.conf.arg(
+        argument(
             metavar="FILE",
             help="its classes, one per line; default: those in the network, or the 80 of COCO",
         ),
     ] = ""
     license: Annotated[
-        str, tyro.conf.arg(metavar="FILE|TEXT", help="its license, which is stored with it")
+        str, argument(metavar="FILE|TEXT", help="its license, which is stored with it")
     ] = ""
-    text: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help="text encoder in ONNX")] = None
+    text: Annotated[Path | None, argument(metavar="FILE", help="text encoder in ONNX")] = None
     vocabulary: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="FILE", help="byte pairs of the text encoder, as CLIP's .txt.gz"),
+        argument(metavar="FILE", help="byte pairs of the text encoder, as CLIP's .txt.gz"),
     ] = None
     embeddings: Annotated[
         Path | None,
-        tyro.conf.arg(
+        argument(
             metavar="FILE",
             help="names, embeddings and optionally logit_scale, in .npz or .safetensors",
         ),

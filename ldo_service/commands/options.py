@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -16,12 +16,22 @@ from ldo_service.config import Config, actor_parameters
 from ldo_service.runs.job import Advance
 from ldo_service.tracking.keyframe_database import load_keyframe_database
 
+NO_DEFAULTS = ("None", "False", "", "''")  # Defaults that tell a reader nothing.
 LINES = 10  # Lines of progress where the output is no terminal.
+
+
+def argument(**properties: Any) -> Any:
+    """Describe an argument as `tyro.conf.arg` does; the help omits a default that says nothing."""
+    return tyro.conf.arg(help_behavior_hint=_default_hint, **properties)
+
+
+def _default_hint(default: str) -> str:
+    return "" if default in NO_DEFAULTS else f"(default: {default})"
 
 
 ConfigFile = Annotated[
     Path | None,
-    tyro.conf.arg(name="config", metavar="FILE", help="YAML file with the settings to change"),
+    argument(name="config", metavar="FILE", help="YAML file with the settings to change"),
 ]
 Settings = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -34,18 +44,18 @@ Settings = Annotated[
 Source = Annotated[
     str,
     tyro.conf.Positional,
-    tyro.conf.arg(
+    argument(
         metavar="SOURCE",
         help="folder of a data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet export or 7-Scenes, "
         "recognized by its files), a recording, or synthetic:room, :tour or :flat",
     ),
 ]
-MaxFrames = Annotated[int | None, tyro.conf.arg(metavar="N", help="stop after N frames")]
-Stride = Annotated[int, tyro.conf.arg(metavar="N", help="take every N-th frame")]
+MaxFrames = Annotated[int | None, argument(metavar="N", help="stop after N frames")]
+Stride = Annotated[int, argument(metavar="N", help="take every N-th frame")]
 Recording = Annotated[
     Path,
     tyro.conf.Positional,
-    tyro.conf.arg(metavar="DIR", help="folder that `ldo record` wrote"),
+    argument(metavar="DIR", help="folder that `ldo record` wrote"),
 ]
 ActorNames = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -56,7 +66,7 @@ ActorNames = Annotated[
 ]
 StateFolder = Annotated[
     Path | None,
-    tyro.conf.arg(
+    argument(
         name="state",
         aliases=["--resume"],
         metavar="DIR",
@@ -66,30 +76,28 @@ StateFolder = Annotated[
 ]
 Localize = Annotated[
     Path | None,
-    tyro.conf.arg(
+    argument(
         metavar="DIR",
         help="localize in the finished map of this run folder, without changing it",
     ),
 ]
 Robot = Annotated[
     str,
-    tyro.conf.arg(
-        metavar="NAME", help="name of the robot, second part of every topic: ldo/NAME/..."
-    ),
+    argument(metavar="NAME", help="name of the robot, second part of every topic: ldo/NAME/..."),
 ]
 EndpointAddress = Annotated[
-    str, tyro.conf.arg(metavar="ADDRESS", help="address of the service's router")
+    str, argument(metavar="ADDRESS", help="address of the service's router")
 ]
 KeysFolder = Annotated[
     Path | None,
-    tyro.conf.arg(
+    argument(
         name="keys",
         metavar="DIR",
         help="folder with TLS keys, made by `ldo keys add`; ADDRESS is then tls/HOST:PORT",
     ),
 ]
-Overwrite = Annotated[bool, tyro.conf.arg(help="replace an earlier run in the folder")]
-Json = Annotated[bool, tyro.conf.arg(help="print one JSON document and nothing else")]
+Overwrite = Annotated[bool, argument(help="replace an earlier run in the folder")]
+Json = Annotated[bool, argument(help="print one JSON document and nothing else")]
 
 
 def localizing(config: Config, folder: Path | None) -> Config:

@@ -36,6 +36,7 @@ from .options import (
     Robot,
     Settings,
     Stride,
+    argument,
     progress,
 )
 
@@ -47,21 +48,19 @@ def publish(
     source: Annotated[
         str,
         tyro.conf.Positional,
-        tyro.conf.arg(
-            metavar="SOURCE", help="a data set, as for `ldo run`; `realsense`; or `ros2`"
-        ),
+        argument(metavar="SOURCE", help="a data set, as for `ldo run`; `realsense`; or `ros2`"),
     ],
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
     rate: Annotated[
-        float | None, tyro.conf.arg(metavar="HZ", help="frames per second; default: as recorded")
+        float | None, argument(metavar="HZ", help="frames per second; default: as recorded")
     ] = None,
     stride: Stride = 1,
     max_frames: MaxFrames = None,
     restamp: Annotated[
         bool,
-        tyro.conf.arg(help="stamp frames with the time of sending, not of recording"),
+        argument(help="stamp frames with the time of sending, not of recording"),
     ] = False,
     config: ConfigFile = None,
     set: Settings = (),

@@ -26,7 +26,7 @@ from ldo_service.schemas.topics import POSE_TRACKED
 from ldo_service.semantics.text_search import Encode, TextComparisonError
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
-from .options import EndpointAddress, Json, KeysFolder, Robot
+from .options import EndpointAddress, Json, KeysFolder, Robot, argument
 
 LIVE = "live"
 
@@ -35,23 +35,21 @@ def query(
     where: Annotated[
         str,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="DIR|live", help="folder of a finished run, or the running service"),
+        argument(metavar="DIR|live", help="folder of a finished run, or the running service"),
     ],
-    text: Annotated[
-        str, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT", help="name of the object")
-    ],
+    text: Annotated[str, tyro.conf.Positional, argument(metavar="TEXT", help="name of the object")],
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
     model: Annotated[
         str,
-        tyro.conf.arg(
+        argument(
             metavar="NAME",
             help="encoder pair that compares TEXT with the labels if no label has the same "
             "meaning; default for a run: its own labeller",
         ),
     ] = "",
-    json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
+    json_: Annotated[Json, argument(name="json")] = False,
 ) -> None:
     """Find objects by name: print their boxes in the map, best match first.
 

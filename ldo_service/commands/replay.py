@@ -12,12 +12,12 @@ from rich.table import Table
 from ldo_service.recordings.replay import ReplayReport
 from ldo_service.runs.replayed import RecordedActor, open_recording
 
-from .options import Recording, progress
+from .options import Recording, argument, progress
 
 
 def replay(
     recording: Recording,
-    verify: Annotated[bool, tyro.conf.arg(help="exit with code 5 at the first difference")] = False,
+    verify: Annotated[bool, argument(help="exit with code 5 at the first difference")] = False,
     actor: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(metavar="NAME", help="replay only this actor; may be repeated; default: all"),

@@ -6,7 +6,6 @@ from math import gcd
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -29,6 +28,7 @@ from .options import (
     Settings,
     Source,
     Stride,
+    argument,
     localizing,
     progress,
     with_usable_networks,
@@ -37,32 +37,32 @@ from .options import (
 
 def run(
     source: Source,
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR", help="folder for the results")],
+    out: Annotated[Path, argument(metavar="DIR", help="folder for the results")],
     config: ConfigFile = None,
     set: Settings = (),
     max_frames: MaxFrames = None,
     stride: Stride = 1,
     hold_out_every: Annotated[
         int | None,
-        tyro.conf.arg(metavar="N", help="track every N-th frame but never map it; 0: map all"),
+        argument(metavar="N", help="track every N-th frame but never map it; 0: map all"),
     ] = None,
     threads: Annotated[
         int | None,
-        tyro.conf.arg(
+        argument(
             metavar="T",
             help="threads of the renderer; 0: all cores, less one for the tracker with --realtime",
         ),
     ] = None,
     refine_iterations: Annotated[
         int,
-        tyro.conf.arg(
+        argument(
             metavar="N", help="optimize the map for N more iterations at the end, into DIR/refined"
         ),
     ] = 0,
     localize: Localize = None,
     odometry_prior: Annotated[
         Path | None,
-        tyro.conf.arg(
+        argument(
             metavar="FILE",
             help="poses of the robot's base from another odometry, in the TUM format: an initial "
             "guess for the tracker. Set the camera pose on the base by tracker.T_base_camera",
@@ -70,20 +70,20 @@ def run(
     ] = None,
     keep_front_end: Annotated[
         bool,
-        tyro.conf.arg(
+        argument(
             help="record the outputs of tracker and detector, with images, in DIR/front_end.mcap"
         ),
     ] = False,
     reuse_front_end: Annotated[
         Path | None,
-        tyro.conf.arg(
+        argument(
             metavar="RUN",
             help="take the outputs of tracker and detector from this run over the same frames, and "
             "run only the other actors, to compare their settings with equal poses",
         ),
     ] = None,
     realtime: Annotated[
-        bool, tyro.conf.arg(help="pace by stamps and drop late frames, as the service does")
+        bool, argument(help="pace by stamps and drop late frames, as the service does")
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:

@@ -21,18 +21,17 @@ from .options import (
     Robot,
     Settings,
     StateFolder,
+    argument,
     localizing,
 )
 
 Insecure = Annotated[
-    bool, tyro.conf.arg(help="listen on the network without keys: anyone there may do anything")
+    bool, argument(help="listen on the network without keys: anyone there may do anything")
 ]
-Client = Annotated[
-    bool, tyro.conf.arg(help="connect to the router at ADDRESS instead of opening one")
-]
+Client = Annotated[bool, argument(help="connect to the router at ADDRESS instead of opening one")]
 MetricsPort = Annotated[
     int | None,
-    tyro.conf.arg(
+    argument(
         metavar="PORT",
         help="serve Prometheus metrics of every actor on PORT of service.metrics_address",
     ),
@@ -49,7 +48,7 @@ def serve(
     localize: Localize = None,
     record: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="DIR", help="record the inputs of every actor, as `ldo record` does"),
+        argument(metavar="DIR", help="record the inputs of every actor, as `ldo record` does"),
     ] = None,
     keys: KeysFolder = None,
     insecure: Insecure = False,
@@ -88,7 +87,7 @@ def record(
     out: Annotated[
         Path,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="DIR", help="new folder for the recording: an MCAP file per actor"),
+        argument(metavar="DIR", help="new folder for the recording: an MCAP file per actor"),
     ],
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,

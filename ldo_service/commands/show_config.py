@@ -2,18 +2,16 @@
 
 from typing import Annotated
 
-import tyro
-
 from ldo_service.config import explained_yaml, load_config
 
-from .options import ConfigFile, Settings
+from .options import ConfigFile, Settings, argument
 
 
 def show_config(
     config: ConfigFile = None,
     set: Settings = (),
     all_: Annotated[
-        bool, tyro.conf.arg(name="all", help="print advanced settings too; they may change")
+        bool, argument(name="all", help="print advanced settings too; they may change")
     ] = False,
 ) -> None:
     """Print the effective configuration as YAML, with a comment on each setting.

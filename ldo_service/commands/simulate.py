@@ -4,7 +4,6 @@ import json
 from dataclasses import asdict
 from typing import Annotated
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -19,6 +18,7 @@ from .options import (
     Settings,
     Source,
     Stride,
+    argument,
     progress,
     with_usable_networks,
 )
@@ -32,9 +32,9 @@ def simulate(
     max_frames: MaxFrames = None,
     stride: Stride = 1,
     threads: Annotated[
-        int | None, tyro.conf.arg(metavar="T", help="threads of the renderer; 0: all cores but one")
+        int | None, argument(metavar="T", help="threads of the renderer; 0: all cores but one")
     ] = None,
-    json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
+    json_: Annotated[Json, argument(name="json")] = False,
 ) -> None:
     """Run every actor on a logical clock, and print a digest of the outputs of each one.
 

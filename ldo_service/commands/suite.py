@@ -10,7 +10,7 @@ from rich.console import Console
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.suites import SuiteRun, SuiteRunner, load_suite, markdown
 
-from .options import Overwrite, Settings
+from .options import Overwrite, Settings, argument
 
 TABLE = "table.md"
 
@@ -19,11 +19,11 @@ def suite(
     name: Annotated[
         str,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="SUITE", help="YAML file, or the name of a built-in suite"),
+        argument(metavar="SUITE", help="YAML file, or the name of a built-in suite"),
     ],
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR", help="folder for the runs and the table")],
+    out: Annotated[Path, argument(metavar="DIR", help="folder for the runs and the table")],
     data: Annotated[
-        Path, tyro.conf.arg(metavar="DIR", help="folder with the data sets of the suite")
+        Path, argument(metavar="DIR", help="folder with the data sets of the suite")
     ] = Path(),
     set: Settings = (),
     overwrite: Overwrite = False,

@@ -3,7 +3,6 @@
 import json
 from typing import Annotated
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -11,7 +10,7 @@ from ldo_service.actors.topology import consumers_of, mermaid_diagram, producer_
 from ldo_service.schemas.json_schema import json_schema
 from ldo_service.schemas.topics import TOPICS
 
-from .options import Robot
+from .options import Robot, argument
 
 WIDTH = 160  # Columns of a pipe or a file, so that no key is truncated.
 
@@ -20,10 +19,10 @@ def topics(
     robot: Robot = "robot",
     json_schema_: Annotated[
         bool,
-        tyro.conf.arg(name="json-schema", help="print the JSON Schema of every message"),
+        argument(name="json-schema", help="print the JSON Schema of every message"),
     ] = False,
-    markdown: Annotated[bool, tyro.conf.arg(help="print the table of the documentation")] = False,
-    mermaid: Annotated[bool, tyro.conf.arg(help="print the diagram in Mermaid")] = False,
+    markdown: Annotated[bool, argument(help="print the table of the documentation")] = False,
+    mermaid: Annotated[bool, argument(help="print the diagram in Mermaid")] = False,
 ) -> None:
     """List every topic: its key, message, producer, consumers and their policies.
 

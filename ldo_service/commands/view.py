@@ -19,7 +19,7 @@ from ldo_service.viewer.run_folder import RunFolder
 from ldo_service.viewer.scene import Source
 from ldo_service.viewer.view_config import ViewerConfig, viewer_config
 
-from .options import ConfigFile, EndpointAddress, KeysFolder, Robot, Settings
+from .options import ConfigFile, EndpointAddress, KeysFolder, Robot, Settings, argument
 from .query import LIVE
 
 
@@ -27,7 +27,7 @@ def view(
     where: Annotated[
         str,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="DIR|live", help="folder of a run, or the running service"),
+        argument(metavar="DIR|live", help="folder of a run, or the running service"),
     ],
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,

@@ -44,6 +44,23 @@ def test_every_verb_has_a_help_text(capsys, verb: str) -> None:
     assert f"usage: ldo {verb}" in out
 
 
+def test_help_omits_defaults_that_say_nothing(capsys) -> None:
+    for verb in cli.verbs():
+        _, out, _ = ldo(capsys, verb, "--help")
+        assert "default: None" not in out
+        assert "default: False" not in out
+    _, out, _ = ldo(capsys, "run", "--help")
+    assert "(default: 1)" in out
+    assert "(required)" in out
+
+
+def test_unknown_option_points_to_the_help_of_the_verb(capsys) -> None:
+    code, _, err = ldo(capsys, "run", "synthetic:room", "--out", "x", "--foo")
+    assert code == 2
+    assert "--foo" in err
+    assert "ldo run --help" in err
+
+
 def test_a_missing_source_is_bad_data(capsys, tmp_path: Path) -> None:
     code, _, err = ldo(capsys, "run", str(tmp_path / "absent"), "--out", str(tmp_path / "out"))
     assert code == 3
