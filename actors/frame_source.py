@@ -150,7 +150,8 @@ class FrameSource(Actor):
         if message.stamp_ns <= self._last_stamp_ns:
             raise DataError(
                 f"stamp {message.stamp_ns} ns is not after the previous stamp "
-                f"{self._last_stamp_ns} ns. Send frames in the order of their exposure."
+                f"{self._last_stamp_ns} ns. Send frames in the order of their exposure; to send a "
+                "data set again, use `ldo publish SOURCE --restamp`."
             )
 
     def _notice_restart(self, message: Input) -> None:

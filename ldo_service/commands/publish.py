@@ -60,7 +60,10 @@ def publish(
     max_frames: MaxFrames = None,
     restamp: Annotated[
         bool,
-        argument(help="stamp frames with the time of sending, not of recording"),
+        argument(
+            help="stamp frames with the time of sending, not of recording, for example to send a "
+            "data set again"
+        ),
     ] = False,
     config: ConfigFile = None,
     set: Settings = (),
@@ -71,10 +74,13 @@ def publish(
 
     `realsense` is a camera on USB. `ros2` reads topics of ROS 2 that a Zenoh bridge forwards.
 
-    The stamps are those of the source unless --restamp is given. With --restamp the age of a pose
-    is the difference between a subscriber's clock and the stamp of the pose.
+    The stamps are those of the source unless --restamp is given. Stamps must ascend: the service
+    rejects a frame that is not later than the frame before it. To send a data set again, use
+    --restamp. The age of a pose is then the difference between a subscriber's clock and the stamp
+    of the pose.
 
       ldo publish ~/data/rgbd_dataset_freiburg1_desk --rate 15
+      ldo publish ~/data/rgbd_dataset_freiburg1_desk --restamp
       ldo publish realsense --size 848x480
       ldo publish ros2 --color /camera/color/image_raw --depth /camera/aligned_depth/image_raw
     """
@@ -104,7 +110,8 @@ def publish(
             camera.send(index)
             advance(done)
     console.print(
-        f"{camera.sent} frames published, {camera.bad} bad, {camera.unreceived} without subscriber"
+        f"{camera.sent} frames published, {camera.bad} unreadable, "
+        f"{camera.unreceived} without subscriber; `ldo doctor` shows how many the service rejected"
     )
     if camera.bad > MAX_BAD * len(indices):
         raise DataError(f"{camera.bad} of {len(indices)} frames could not be read.")

@@ -169,6 +169,11 @@ def notes(seen: ActorStatus) -> Iterator[str]:
             f"run `ldo control refine --iterations {min(int(due), MAX_ITERATIONS)}` while the "
             "robot stands still"
         )
+    if rejected := health.metrics.get("frames_rejected"):
+        yield (
+            f"rejected {rejected:.0f} camera frames or images: the log of `ldo serve` has the "
+            "reason of the first one"
+        )
     yield from _of_answers(health)
 
 

@@ -49,11 +49,14 @@ def test_nan_depth_means_not_measured(room: Sequence, message: CameraRgbd) -> No
     np.testing.assert_array_equal(frame.depth_m.numpy()[20:], depth[20:])
 
 
-def test_stamps_that_go_back_are_rejected(message: CameraRgbd) -> None:
+def test_stamps_that_go_back_are_rejected(
+    message: CameraRgbd, caplog: pytest.LogCaptureFixture
+) -> None:
     source = FrameSource()
     assert len(list(source.handle(message))) == 1
     assert list(source.handle(message)) == []
     assert source.metrics()["frames_rejected"] == 1
+    assert caplog.records[0].message.endswith("use `ldo publish SOURCE --restamp`.")
 
 
 def test_a_broken_image_is_rejected_and_the_stream_continues(

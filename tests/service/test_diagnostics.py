@@ -111,6 +111,7 @@ def test_each_problem_has_its_own_finding(actor: ActorStatus, text: str) -> None
             "rejected 2 of 9 label results",
         ),
         (health(metrics={"answers_without_logprobs": 4.0}), "default_confidence"),
+        (health(metrics={"frames_rejected": 16.0}), "rejected 16 camera frames"),
         (health(metrics={"names_refused": 1.0}), "rejected 1 added names"),
         (health(metrics={"iterations_pending": 40.0}), "ldo control refine --iterations 40`"),
         (health(metrics={"iterations_pending": 900.0}), "ldo control refine --iterations 500`"),
