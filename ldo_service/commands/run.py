@@ -248,6 +248,7 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
         "tracking": ", ".join(f"{count} {name}" for name, count in status.items()),
         "keyframes": summary["keyframes"],
         "Gaussians": f"{summary['gaussians']:,}",
+        **({"objects": summary["objects"]} if summary["objects"] else {}),
         "speed": f"{summary['fps']:.1f} FPS ({summary['wall_s']:.1f} s, input included)",
         "tracker, mapper": " and ".join(
             f"{summary['stage_ms'][name]['p50']:.1f} ms"
