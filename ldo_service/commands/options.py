@@ -14,6 +14,7 @@ from ldo_service.actors.detector import require_detector
 from ldo_service.actors.vlm_labeller import require_labeller
 from ldo_service.config import Config, actor_parameters
 from ldo_service.runs.job import Advance
+from ldo_service.synthetic import SCENES
 from ldo_service.tracking.keyframe_database import load_keyframe_database
 
 NO_DEFAULTS = ("None", "False", "", "''")  # Defaults that tell a reader nothing.
@@ -46,8 +47,9 @@ Source = Annotated[
     tyro.conf.Positional,
     argument(
         metavar="SOURCE",
-        help="folder of a data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet export or 7-Scenes, "
-        "recognized by its files), a recording, or synthetic:room, :tour or :flat",
+        help="folder of a data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet export, or one seq-XX of "
+        "7-Scenes, recognized by its files), a recording, or a built-in scene synthetic:NAME; "
+        f"NAME is {', '.join(SCENES)}",
     ),
 ]
 MaxFrames = Annotated[int | None, argument(metavar="N", help="stop after N frames")]

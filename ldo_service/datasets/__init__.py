@@ -4,7 +4,7 @@ from pathlib import Path
 
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import Cached, Sequence
-from ldo_service.synthetic import open_synthetic
+from ldo_service.synthetic import SCENES, open_synthetic
 
 from .replica import ReplicaSequence
 from .rig import SequenceOptions
@@ -17,8 +17,8 @@ __all__ = ["Cached", "Sequence", "SequenceOptions", "open_sequence"]
 LAYOUTS = (
     "TUM RGB-D (rgb.txt and depth.txt), Replica as NICE-SLAM lays it out (results/frame*.jpg, "
     "results/depth*.png), ScanNet as SensReader exports it (color/*.jpg, depth/*.png, "
-    "intrinsic/), a seq-XX of 7-Scenes (frame-*.color.png, frame-*.depth.png), or one of the "
-    "built-in synthetic:room, synthetic:tour, synthetic:person and synthetic:flat"
+    "intrinsic/), a seq-XX of 7-Scenes (frame-*.color.png, frame-*.depth.png), or a built-in "
+    f"scene synthetic:NAME, where NAME is {', '.join(SCENES)}"
 )
 
 
@@ -57,6 +57,11 @@ def _open_folder(folder: Path, options: SequenceOptions) -> Sequence:
         return ScanNetSequence(folder, options)
     if any(folder.glob("frame-*.color.*")):
         return SevenScenesSequence(folder, options)
+    if parts := sorted(path.parent.name for path in folder.glob("seq-*/frame-000000.color.*")):
+        raise DataError(
+            f"{folder} contains several sequences of 7-Scenes. Give one of them, such as "
+            f"{folder / parts[0]}."
+        )
     raise DataError(
         f"{folder} has no known layout: it has neither rgb.txt with depth.txt nor a folder "
         "results/, nor the folders color/ and depth/, nor files frame-*.color.*. Known layouts: "

@@ -22,7 +22,16 @@ from ldo_service.synthetic.flat import FlatConfig, FlatSequence
 from . import room_sequence
 from .room_sequence import SyntheticConfig, SyntheticSequence
 
-__all__ = ["FlatConfig", "FlatSequence", "SyntheticConfig", "SyntheticSequence", "open_synthetic"]
+__all__ = [
+    "SCENES",
+    "FlatConfig",
+    "FlatSequence",
+    "SyntheticConfig",
+    "SyntheticSequence",
+    "open_synthetic",
+]
+
+SCENES = (*room_sequence.NAMED, *flat.NAMED)  # Names of all built-in scenes.
 
 
 def open_synthetic(name: str) -> SyntheticSequence | FlatSequence:
@@ -42,5 +51,5 @@ def open_synthetic(name: str) -> SyntheticSequence | FlatSequence:
         return SyntheticSequence.named(plain, **changes)
     if plain in flat.NAMED:
         return FlatSequence.named(plain, **changes)
-    known = ", ".join(f"synthetic:{known}" for known in (*room_sequence.NAMED, *flat.NAMED))
+    known = ", ".join(f"synthetic:{known}" for known in SCENES)
     raise DataError(f"unknown sequence synthetic:{plain}; known are {known}.")

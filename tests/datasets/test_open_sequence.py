@@ -5,6 +5,7 @@ import pytest
 
 from ldo_service.datasets import SequenceOptions, open_sequence
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.synthetic import SCENES
 
 
 def test_synthetic_without_a_name_is_the_room() -> None:
@@ -14,6 +15,23 @@ def test_synthetic_without_a_name_is_the_room() -> None:
 def test_unknown_synthetic_name_lists_the_known_ones() -> None:
     with pytest.raises(DataError, match=r"synthetic:castle.*synthetic:room"):
         open_sequence("synthetic:castle")
+
+
+def test_messages_and_help_list_every_built_in_scene(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs/first-steps.md").read_text()
+    for source in ("synthetic:castle", str(tmp_path)):
+        with pytest.raises(DataError) as caught:
+            open_sequence(source)
+        assert all(name in str(caught.value) for name in SCENES)
+    assert all(f"`synthetic:{name}`" in page for name in SCENES)
+
+
+def test_folder_with_several_sequences_of_7_scenes_names_one_of_them(
+    seven_scenes_folder: Callable[..., Path],
+) -> None:
+    folder = seven_scenes_folder([0, 1])
+    with pytest.raises(DataError, match=f"Give one of them, such as {folder}"):
+        open_sequence(str(folder.parent))
 
 
 def test_seed_after_the_name_is_part_of_the_name() -> None:
@@ -54,7 +72,7 @@ def test_every_message_is_one_paragraph(tmp_path: Path) -> None:
 def test_indices_outside_the_sequence_are_rejected() -> None:
     room = open_sequence("synthetic")
     for index in (-1, len(room)):
-        with pytest.raises(IndexError, match="only frames 0 to 119"):
+        with pytest.raises(IndexError, match="frames 0 to 119"):
             room[index]
 
 
