@@ -5,7 +5,7 @@ publish` sends its frames:
 
     ldo record recordings/desk
 
-Copy this file to a folder of your own and run:
+Run `.venv/bin/pip install pytest`, copy this file to a folder of your own and run:
 
     LDO_RECORDING=recordings/desk pytest replay_test.py
 
