@@ -19,6 +19,7 @@ count = int(sys.argv[1]) if len(sys.argv) > 1 else sys.maxsize
 config = zenoh.Config()
 config.insert_json5("mode", json.dumps("client"))
 config.insert_json5("connect/endpoints", json.dumps(["tcp/127.0.0.1:7447"]))
+config.insert_json5("scouting/multicast/enabled", "false")
 
 with (
     zenoh.open(config) as session,
