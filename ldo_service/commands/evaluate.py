@@ -105,9 +105,10 @@ def evaluate(
     map are compared with its frames, and labels with its labels. Without ground truth only the map
     is evaluated.
 
-    The command prints the protocol above the results, and writes trajectory.png, rendering.png and
-    labels.png into DIR. `ldo run --hold-out-every 5` keeps every fifth frame out of the map, so
-    that the map can be evaluated on these frames.
+    The command prints the protocol above the results, and writes trajectory.png and rendering.png
+    into DIR, and labels.png if the source has ground-truth labels and a detector ran. `ldo run
+    --hold-out-every 5` keeps every fifth frame out of the map, so that the map can be evaluated on
+    these frames.
 
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --hold-out-every 5
       ldo eval runs/desk ~/data/rgbd_dataset_freiburg1_desk
