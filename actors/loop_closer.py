@@ -236,7 +236,7 @@ class LoopCloser(Actor):
     def on_idle(self) -> Iterator[LoopClosure | LoopCandidate]:
         """Compare the last keyframes of a camera that stands still."""
         self._parts = None
-        yield from self._to_messages(self.recognizer.flush(self.poses, self._joined))
+        yield from self._to_messages(self.recognizer.flush(self.poses, self._merged_submaps))
 
     def on_stop(self) -> Iterator[LoopClosure | LoopCandidate]:
         """Search loops for the pending keyframes and for the unfinished subgraph."""

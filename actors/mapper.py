@@ -14,14 +14,13 @@ out  object/observation    ObjectObservation    objects observed or missed in a 
 out  keyframe/refinement   KeyframeRefinement   keyframe poses refined by the renderer
 """
 
-import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ldo_service.actors.mapper_config import MapperConfig
 from ldo_service.conversions.frames import frame_from_message, mask_from_array
 from ldo_service.conversions.objects import (
     detections_from_message,
@@ -33,14 +32,12 @@ from ldo_service.conversions.poses import (
     pose_from_message,
     pose_to_message,
 )
-from ldo_service.errors import ConfigError, named
-from ldo_service.gaussians.loop_refit import LoopRefit, LoopRefitConfig
+from ldo_service.gaussians.loop_refit import LoopRefit
 from ldo_service.gaussians.map_builder import MapBuilder
-from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.maps.label_queue import LabelRequestQueue
-from ldo_service.maps.publisher import MapPublisher, MessageContext, ObjectPublisher, PublishConfig
+from ldo_service.maps.publisher import MapPublisher, MessageContext, ObjectPublisher
 from ldo_service.maps.relative_measurements import RelativeMeasurements
 from ldo_service.regions.region import Region, RegionLabelResult
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
@@ -74,45 +71,13 @@ from ldo_service.schemas.topics import (
     MAP_VIEW,
     OBJECT_OBSERVATION,
 )
-from ldo_service.semantics.semantic_map import KeyframeSemantics, SemanticMap, SemanticMapConfig
+from ldo_service.semantics.semantic_map import KeyframeSemantics, SemanticMap
 
 # Idle steps between two messages with changed Gaussians: some seconds of work, up to 4 MB.
 IDLE_STEPS_PER_DELTA = 8
 
 MapOutput = MapRendering | MapDelta | MapSnapshot | MapObjects
 Output = MapOutput | LabelRequest | ObjectObservation | KeyframeRefinement
-
-
-@dataclass(frozen=True, slots=True)
-class MapperConfig:
-    """Parameters of the mapper."""
-
-    builder: MapBuilderConfig = field(default_factory=MapBuilderConfig)
-    semantics: SemanticMapConfig = field(default_factory=SemanticMapConfig)
-    # Iterations per keyframe, fewer where the map is dense: 12 FPS on two cores at 640x480.
-    iterations: int = 12
-    min_iterations: int = 3  # Minimum, however many keyframes wait: new Gaussians need some.
-    folder: str = ""  # Keyframe images; empty: a temporary folder, or one within the state.
-    threads: int = 0  # Threads of the renderer; 0: all cores but one, which the tracker needs.
-    publish: PublishConfig = field(default_factory=PublishConfig)
-    # Newest keyframes for which every relative measurement is updated when the renderer moves them.
-    # The pose graph has condensed older ones; for those only the one to the reference is updated.
-    measured_keyframes: int = 64
-    checkpoint_keyframes: int = 5  # Keyframes between saved maps; a crash repeats at most so many.
-    motion_min_m: float = 2e-4  # A smaller motion by a correction is not visible: 0.1 px.
-    motion_min_rad: float = 2e-4  # Equal to MapBuilderConfig.refined_rad.
-    refit: LoopRefitConfig = field(default_factory=LoopRefitConfig)
-
-    def __post_init__(self) -> None:
-        amounts = ("iterations", "min_iterations", "threads")
-        if min(getattr(self, name) for name in amounts) < 0:
-            raise ConfigError(named(self, *amounts) + " must not be negative.")
-        counts = ("checkpoint_keyframes", "measured_keyframes")
-        if min(getattr(self, name) for name in counts) < 1:
-            raise ConfigError(named(self, *counts) + " must be at least 1.")
-
-    def thread_count(self) -> int:
-        return self.threads or max(1, (os.cpu_count() or 1) - 1)
 
 
 class Mapper(Actor):
@@ -260,9 +225,9 @@ class Mapper(Actor):
             yield from self._objects()
 
     def _queue_label_request(self, region: Region, stamp_ns: int) -> None:
-        camera = self._map.views.cameras[region.keyframe]
         request = label_request_to_message(region, stamp_ns)
-        for one in self._label_queue.add(request, region.best.surface_m2(camera)):
+        surface_m2 = region.surface_m2(self._map.views.cameras[region.keyframe])
+        for one in self._label_queue.add(request, surface_m2):
             assert self._semantics.naming is not None
             self._semantics.naming.withdraw(one.region, one.keyframe)
 

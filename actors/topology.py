@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from ldo_service.actors.detector import Detector, DetectorConfig
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig
 from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
-from ldo_service.actors.mapper import Mapper, MapperConfig
+from ldo_service.actors.mapper import Mapper
+from ldo_service.actors.mapper_config import MapperConfig
 from ldo_service.actors.optimizer import Optimizer, OptimizerConfig
 from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.actors.vlm_labeller import VlmLabeller, VlmLabellerConfig

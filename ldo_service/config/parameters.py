@@ -7,7 +7,7 @@ the reason.
 
 from ldo_service.actors.frame_source import FrameSourceConfig
 from ldo_service.actors.loop_closer import LoopCloserConfig
-from ldo_service.actors.mapper import MapperConfig
+from ldo_service.actors.mapper_config import MapperConfig
 from ldo_service.actors.optimizer import OptimizerConfig
 from ldo_service.actors.topology import ActorParameters
 from ldo_service.actors.tracker import CameraExtrinsics, TrackerConfig

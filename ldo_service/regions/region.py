@@ -166,6 +166,10 @@ class Region:
     answer: RegionLabelResult | None = None
     is_supported: bool = False
 
+    def surface_m2(self, camera: Camera) -> float:
+        """Return the surface that its best view shows, as if it faced the camera, square meters."""
+        return self.best.surface_m2(camera) if self.best else 0.0
+
     def view_quality_gain(self) -> float:
         """Return the gain in summed view quality since the last label request."""
         return sum(view.quality for view in self.views) - self.quality

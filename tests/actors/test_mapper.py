@@ -7,7 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.actors.mapper import Mapper, MapperConfig
+from ldo_service.actors.mapper import Mapper
+from ldo_service.actors.mapper_config import MapperConfig
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.conversions.frames import (
     frame_from_message,

@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.actors.mapper import Mapper, MapperConfig
+from ldo_service.actors.mapper import Mapper
+from ldo_service.actors.mapper_config import MapperConfig
 from ldo_service.conversions.frames import camera_to_message
 from ldo_service.conversions.poses import correction_to_message, matrix6_to_message, pose_to_message
 from ldo_service.geometry import se3

@@ -18,6 +18,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -31,7 +32,9 @@ from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.conversions.poses import keyframe_poses_from_correction
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.errors import ConfigError
+from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import se3
+from ldo_service.geometry.trajectory import Trajectory
 from ldo_service.schemas import GraphCorrection, Health, MapObjects, TrackedPose, decode
 from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
@@ -69,7 +72,9 @@ class Result:
     closures: list[tuple[int, int]] = field(default_factory=list)
     names: dict[str, int] = field(default_factory=dict)
     labelled: int = 0
-    camera_m: dict[int, list[float]] = field(default_factory=dict)  # Keyframe centers in the map.
+    # Centers of the keyframes in the map, meters, by stamp in ns.
+    camera_m: dict[int, list[float]] = field(default_factory=dict)
+    ate_cm: float = float("nan")
 
 
 class Monitor:
@@ -77,6 +82,7 @@ class Monitor:
 
     def __init__(self, session: zenoh.Session, network: Endpoint) -> None:
         self.poses: list[tuple[float, str]] = []
+        self.stamps_ns: dict[int, int] = {}  # Stamp of each keyframe.
         self.health: dict[str, Health] = {}
         self.pids: dict[str, set[int]] = {}
         self.graph: GraphCorrection | None = None
@@ -87,17 +93,22 @@ class Monitor:
             session.declare_subscriber(
                 network.expression(topic),
                 zenoh.handlers.Callback(
-                    lambda sample, kind=kind: self._take(decode(sample.payload.to_bytes(), kind)),
+                    self._taker(kind),
                     indirect=False,
                 ),
             )
             for topic, kind in kinds.items()
         ]
 
-    def _take(self, message: object) -> None:
+    def _taker(self, kind: type[Any]) -> Callable[[zenoh.Sample], None]:
+        return lambda sample: self._take(decode(sample.payload.to_bytes(), kind))
+
+    def _take(self, message: TrackedPose | GraphCorrection | MapObjects | Health) -> None:
         match message:
             case TrackedPose():
                 self.poses.append((time.monotonic(), message.status))
+                if message.keyframe is not None:
+                    self.stamps_ns[message.keyframe] = message.stamp_ns
             case GraphCorrection():
                 self.graph = message
             case MapObjects():
@@ -172,7 +183,7 @@ def run(slowed: str, sequence: Sequence, seconds: float, hz: float, settings: li
         result.recovery_s = wait_until_settled(monitor)
         result.restarts = {name: len(pids) - 1 for name, pids in monitor.pids.items()}
         result.dropped = sum(o.backlog_dropped for h in monitor.health.values() for o in h.outputs)
-        read_outcome(monitor, result)
+        read_outcome(monitor, result, sequence)
         if process.poll() is not None:
             raise SystemExit((folder / "log").read_text()[-3000:])
     return result
@@ -207,13 +218,21 @@ def wait_until_settled(monitor: Monitor) -> float:
     return time.monotonic() - started_s
 
 
-def read_outcome(monitor: Monitor, result: Result) -> None:
+def read_outcome(monitor: Monitor, result: Result, sequence: Sequence) -> None:
     graph = monitor.graph
     assert graph is not None
     poses = keyframe_poses_from_correction(graph)
     result.keyframes = len(poses)
-    result.camera_m = {k: T[:3, 3].tolist() for k, T in poses.items()}
-    result.closures = sorted(graph.accepted_closures)
+    stamps_ns = monitor.stamps_ns
+    result.camera_m = {stamps_ns[k]: T[:3, 3].tolist() for k, T in poses.items() if k in stamps_ns}
+    result.closures = sorted((stamps_ns[a], stamps_ns[b]) for a, b in graph.accepted_closures)
+    truth = sequence.truth()
+    if truth is not None:
+        placed = sorted(result.camera_m.items())
+        T = np.tile(np.eye(4), (len(placed), 1, 1))
+        T[:, :3, 3] = [center for _, center in placed]
+        estimate = Trajectory(np.array([stamp_ns for stamp_ns, _ in placed]) * 1e-9, T)
+        result.ate_cm = 100 * evaluate_trajectory(estimate, truth).ate_m.rmse
     for one in monitor.objects.objects if monitor.objects else ():
         result.names[one.name] = result.names.get(one.name, 0) + 1
     result.labelled = int(monitor.health["vlm_labeller"].metrics.get("regions_named", 0))
@@ -255,7 +274,7 @@ def main() -> None:
                 f"{result.recovery_s:10.0f}  {len(result.closures):8d} "
                 f"{sum(result.names.values()):8d} {worst_cm(result, reference):6.2f}  "
                 f"restarts {sum(result.restarts.values())} dropped {result.dropped} "
-                f"labelled {result.labelled}",
+                f"labelled {result.labelled} ate {result.ate_cm:.2f} cm",
                 flush=True,
             )
     if options.json:

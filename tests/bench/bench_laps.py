@@ -20,7 +20,8 @@ import cv2
 import msgspec
 import numpy as np
 
-from ldo_service.actors.mapper import Mapper, MapperConfig, Output
+from ldo_service.actors.mapper import Mapper, Output
+from ldo_service.actors.mapper_config import MapperConfig
 from ldo_service.actors.topology import make_actors
 from ldo_service.config import actor_parameters, latency_frames, load_config
 from ldo_service.conversions.frames import raw_frame_to_message

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.actors.mapper import Mapper, MapperConfig
+from ldo_service.actors.mapper import Mapper
+from ldo_service.actors.mapper_config import MapperConfig
 from ldo_service.actors.topology import GRAPH
 from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence

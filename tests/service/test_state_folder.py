@@ -18,7 +18,7 @@ ACTORS = {"tracker": Tracker, "mapper": Mapper, "optimizer": Optimizer}
 def save_states(folder: Path, keyframes_made: int, *actors: str) -> Path:
     """Write the states of actors without input, and of a tracker that made keyframes."""
     for name in actors:
-        out = {"keyframe/new": (1, keyframes_made)} if name == "tracker" else {}
+        out = {"keyframe/new": (1, keyframes_made, None)} if name == "tracker" else {}
         state = {**ACTORS[name]().snapshot(), "stage.offsets": {"in": {}, "out": out}}
         FolderStore(folder / "state").save(name, state)
     return folder

@@ -1,0 +1,42 @@
+"""Parameters of the mapper."""
+
+import os
+from dataclasses import dataclass, field
+
+from ldo_service.errors import ConfigError, named
+from ldo_service.gaussians.loop_refit import LoopRefitConfig
+from ldo_service.gaussians.map_builder_config import MapBuilderConfig
+from ldo_service.maps.publisher import PublishConfig
+from ldo_service.semantics.semantic_map import SemanticMapConfig
+
+
+@dataclass(frozen=True, slots=True)
+class MapperConfig:
+    """Parameters of the mapper."""
+
+    builder: MapBuilderConfig = field(default_factory=MapBuilderConfig)
+    semantics: SemanticMapConfig = field(default_factory=SemanticMapConfig)
+    # Iterations per keyframe, fewer where the map is dense: 12 FPS on two cores at 640x480.
+    iterations: int = 12
+    min_iterations: int = 3  # Minimum, however many keyframes wait: new Gaussians need some.
+    folder: str = ""  # Keyframe images; empty: a temporary folder, or one within the state.
+    threads: int = 0  # Threads of the renderer; 0: all cores but one, which the tracker needs.
+    publish: PublishConfig = field(default_factory=PublishConfig)
+    # Newest keyframes for which every relative measurement is updated when the renderer moves them.
+    # The pose graph has condensed older ones; for those only the one to the reference is updated.
+    measured_keyframes: int = 64
+    checkpoint_keyframes: int = 5  # Keyframes between saved maps; a crash repeats at most so many.
+    motion_min_m: float = 2e-4  # A smaller motion by a correction is not visible: 0.1 px.
+    motion_min_rad: float = 2e-4  # Equal to MapBuilderConfig.refined_rad.
+    refit: LoopRefitConfig = field(default_factory=LoopRefitConfig)
+
+    def __post_init__(self) -> None:
+        amounts = ("iterations", "min_iterations", "threads")
+        if min(getattr(self, name) for name in amounts) < 0:
+            raise ConfigError(named(self, *amounts) + " must not be negative.")
+        counts = ("checkpoint_keyframes", "measured_keyframes")
+        if min(getattr(self, name) for name in counts) < 1:
+            raise ConfigError(named(self, *counts) + " must be at least 1.")
+
+    def thread_count(self) -> int:
+        return self.threads or max(1, (os.cpu_count() or 1) - 1)
