@@ -148,7 +148,7 @@ class LogicalClock:
         `run` may be called again.
         """
         threads = {thread.actor.name: thread for thread in self._threads}
-        for actor in finish_order([thread.actor for thread in self._threads]):
+        for actor in finish_order([type(thread.actor) for thread in self._threads]):
             thread = threads[actor.name]
             self._expect(thread, self._tick, thread.finish())
             self._settle_all()

@@ -318,6 +318,22 @@ def test_missing_detections_do_not_block_loop_closing(
     )
 
 
+def test_last_keyframes_of_a_parked_robot_are_compared(first_walk, second_walk) -> None:
+    actor = LoopCloser()
+    handle_all(actor, with_empty_detections([*first_walk, *second_walk[:3]]))
+    assert actor.has_idle_work()
+    (closure,) = closures(list(actor.on_idle()))
+    assert not actor.has_idle_work()
+    assert closure.pose.keyframe in {k.keyframe for k in second_walk[:3]}
+    assert list(actor.on_stop()) == [], "they are compared once"
+
+
+def test_parked_robot_waits_for_detections(first_walk) -> None:
+    actor = LoopCloser()
+    handle_all(actor, first_walk[:4])
+    assert not actor.has_idle_work()
+
+
 def test_last_keyframes_are_compared_on_stop(first_walk, second_walk) -> None:
     actor = LoopCloser()
     loop_messages = handle_all(actor, with_empty_detections([*first_walk, *second_walk[:3]]))

@@ -377,6 +377,38 @@ def test_pending_iterations_restore_quality_after_loop_closure(
     assert psnr_of(mapper, keyframes[1]) > psnr_of(undisturbed, keyframes[1])
 
 
+def test_pending_work_is_done_while_no_keyframe_arrives(keyframes) -> None:
+    undisturbed = Mapper(CONFIG)
+    handle_all(undisturbed, keyframes[:3])
+    mapper = mapper_after_loop_closure(keyframes, CONFIG)
+    assert not undisturbed.has_idle_work()
+    made = []
+    while mapper.has_idle_work():
+        made += mapper.on_idle()
+    assert mapper.metrics()["iterations_pending"] == 0
+    assert mapper.metrics()["keyframes_to_deduplicate"] == 0
+    assert any(isinstance(message, MapDelta) for message in made)
+    assert psnr_of(mapper, keyframes[1]) > psnr_of(undisturbed, keyframes[1])
+
+
+def test_idle_work_since_the_checkpoint_gives_bitwise_equal_state(keyframes, tmp_path) -> None:
+    config = replace(CONFIG, folder=str(tmp_path / "keyframes"), checkpoint_keyframes=100)
+    first = mapper_after_loop_closure(keyframes, config)
+    state = decode_state(encode_state(first.checkpoint()))
+    shutil.copytree(tmp_path / "keyframes", tmp_path / "copy")
+    steps = 3
+    for _ in range(steps):
+        list(first.on_idle())
+    config = replace(config, folder=str(tmp_path / "copy"))
+    idle = LoggedInput("", b"", {}, {})
+    second = restore_actor(
+        Mapper(config), RestoredState(state, taken=(idle,) * steps), lambda: Mapper(config)
+    )
+    one, other = first.checkpoint()["map"], second.checkpoint()["map"]
+    for part in ("map", "poses", "links", "refit"):
+        assert encode_state(one[part]) == encode_state(other[part]), part
+
+
 def test_repeated_corrections_do_not_add_pending_iterations(keyframes) -> None:
     poses = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes[:4]}
     mapper = Mapper(CONFIG)

@@ -77,10 +77,12 @@ async def run_recorded(
     config: RecordConfig | None = None,
     before_each: Callable[[Recorder, int], None] = lambda _recorder, _value: None,
     is_killed: bool = False,
+    wait_s: float = 0.0,
 ) -> Stage:
     """Run and record an actor that handles the values one by one, and return its stage.
 
-    `before_each` is called before each value. A killed actor publishes no final messages.
+    `before_each` is called before each value. A killed actor publishes no final messages. After
+    each value, the actor has `wait_s` seconds without messages.
     """
     recording = folder / "recording"
     recording.mkdir(exist_ok=True)
@@ -105,6 +107,7 @@ async def run_recorded(
             await eventually(
                 lambda n=done: stage.health().steps + stage.health().dead_lettered == n
             )
+            await asyncio.sleep(wait_s)
         if not is_killed:
             stage.drain()
             await task
