@@ -85,10 +85,10 @@ class RestartsExhausted(StageError):
 class StageStalled(StageError):
     """Step of an actor, the handling of one message, that exceeds its time limit."""
 
-    def __init__(self, actor: str, age_s: float) -> None:
+    def __init__(self, actor: str, age_s: float, setting: str) -> None:
         super().__init__(
             f"{actor} has been busy with one message for {age_s:.0f} s and cannot be interrupted. "
-            "Reduce its work per message, or raise supervision.step_timeout_s."
+            f"Reduce its work per message, or raise {setting}."
         )
         self.actor, self.age_s = actor, age_s
 

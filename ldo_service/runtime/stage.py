@@ -36,9 +36,8 @@ log = logging.getLogger(__name__)
 class Stage:
     """Runtime around one actor; `run` lasts until `drain` or cancellation.
 
-    Failures: The stage restores the actor from its last state and repeats a failed step once. A
-    message that fails twice becomes a dead letter and is counted. The `journal` receives everything
-    that a step depends on.
+    Failures: The stage restores the actor and repeats a failed step once. A message that fails
+    twice becomes a dead letter. The `journal` receives everything that a step depends on.
 
     Saving: A step is complete when it is saved. Only then does the stage send its outputs to
     required consumers and acknowledge its input. While the disk is full, most stages take no more
@@ -385,12 +384,13 @@ class Stage:
             self._outlets.check_windows()
             header = Header(self.name, self._epoch, 0, self._metrics.last_stamp_ns)
             self._health.post(encode_link(header), encode(self.health()))
-            if self._metrics.busy_s > self._config.step_timeout_s(self._actor.is_backend):
-                raise StageStalled(self.name, self._metrics.busy_s)
+            limit_s, setting = self._config.step_limit(self._actor.is_backend)
+            if self._metrics.busy_s > limit_s:
+                raise StageStalled(self.name, self._metrics.busy_s, setting)
             await asyncio.sleep(self._config.heartbeat_s)
 
     def health(self) -> Health:
-        """Return the current health message, as sent with every heartbeat."""
+        """Return the current health message."""
         return self._metrics.health(
             actor=self.name,
             epoch=self._epoch,

@@ -98,6 +98,8 @@ class SupervisionConfig:
         if not 0 <= self.nice <= 19:
             raise ConfigError(f"supervision.background_nice={self.nice} must be within 0..19.")
 
-    def step_timeout_s(self, is_backend: bool) -> float:
-        """Return the maximum duration of a step, seconds."""
-        return self.backend_stall_after_s if is_backend else self.stall_after_s
+    def step_limit(self, is_backend: bool) -> tuple[float, str]:
+        """Return the maximum duration of a step in seconds, and the setting that limits it."""
+        if is_backend:
+            return self.backend_stall_after_s, "supervision.backend_step_timeout_s"
+        return self.stall_after_s, "supervision.step_timeout_s"

@@ -8,9 +8,12 @@ the actor handles messages.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from ldo_service.actors.topology import GRAPH
 from ldo_service.schemas import Health
 from ldo_service.schemas.map import MAX_ITERATIONS
 
+# Messages behind which a slow consumer is mentioned: five seconds of keyframes at 2 Hz.
+BEHIND = 10
 SLOW_STEP_S = 5.0  # 8x the slowest step measured (mapper, 1.5 M Gaussians).
 # Maximum idle time with queued messages or a running camera. An actor takes a queued message after
 # each step, and a camera sends many frames a second.
@@ -63,6 +66,7 @@ def diagnose(seen: ActorStatus, heartbeat_s: float = 0.5) -> Iterator[Problem]:
             )
         yield from _of_steps(seen.health)
         yield from _of_failures(seen.health)
+        yield from _of_backlogs(seen.health)
         yield from _of_disk(seen.health)
         yield from _of_models(seen.health)
 
@@ -80,6 +84,8 @@ def _of_steps(health: Health) -> Iterator[Problem]:
     if health.current_step_s > SLOW_STEP_S:
         if _waits_for_server(health):
             return
+        if _is_backend(health.actor):
+            return  # `notes` mentions it: no other actor waits.
         yield Problem(
             f"has been busy with one message for {health.current_step_s:.0f} s",
             "reduce its work per message; after supervision.step_timeout_s the service stops it",
@@ -110,6 +116,21 @@ def _of_failures(health: Health) -> Iterator[Problem]:
             f"{health.dead_lettered} messages as dead letters",
             "the log of `ldo serve` has the traceback of each failure; report it",
         )
+
+
+def _of_backlogs(health: Health) -> Iterator[Problem]:
+    for output in health.outputs:
+        if output.backlog_dropped:
+            yield Problem(
+                f"dropped {output.backlog_dropped} messages of {output.topic}, because "
+                f"{' and '.join(output.behind)} did not handle them in time",
+                "these actors are too slow or not running: raise supervision.backlog_mb, give them "
+                "more CPU time, or choose a smaller network",
+            )
+
+
+def _is_backend(actor: str) -> bool:
+    return any(box.name == actor and box.is_backend for box in GRAPH)
 
 
 def _of_disk(health: Health) -> Iterator[Problem]:
@@ -168,6 +189,19 @@ def notes(seen: ActorStatus) -> Iterator[str]:
             f"has {due:.0f} refit iterations pending after a loop closure: new keyframes run some; "
             f"run `ldo control refine --iterations {min(int(due), MAX_ITERATIONS)}` while the "
             "robot stands still"
+        )
+    for output in health.outputs:
+        for consumer, behind in output.behind.items():
+            if behind > BEHIND:
+                yield (
+                    f"keeps {behind} messages of {output.topic} for {consumer}, which is slower; "
+                    "poses and the map do not wait for it"
+                )
+    is_slow = health.current_step_s > SLOW_STEP_S and not _waits_for_server(health)
+    if is_slow and _is_backend(health.actor):
+        yield (
+            f"has been busy with one message for {health.current_step_s:.0f} s; no other actor "
+            "waits for it, and after supervision.backend_step_timeout_s the service stops it"
         )
     if rejected := health.metrics.get("frames_rejected"):
         yield (

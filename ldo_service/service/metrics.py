@@ -76,6 +76,19 @@ OF_OUTPUT: dict[Row, Callable[[OutputCount], float]] = {
     (CounterMetricFamily, "output_retransmitted", "Messages retransmitted."): lambda o: (
         o.retransmitted
     ),
+    (
+        GaugeMetricFamily,
+        "output_backlog_messages",
+        "Messages that the slowest consumer with a backlog has not handled.",
+    ): lambda o: max(o.behind.values(), default=0),
+    (GaugeMetricFamily, "output_backlog_mb", "Disk space of the backlog, MB."): lambda o: (
+        o.backlog_mb
+    ),
+    (
+        CounterMetricFamily,
+        "output_backlog_dropped",
+        "Messages dropped at the maximum size of the backlog.",
+    ): lambda o: o.backlog_dropped,
 }
 
 

@@ -259,7 +259,7 @@ class Service:
             restart_window_s=stage.restart_window_s,
             restart_delay_s=stage.restart_delay_s,
             silent_after_s=self.config.service.heartbeat_timeout_s,
-            step_timeout_s=stage.step_timeout_s(box.is_backend),
+            step_timeout_s=stage.step_limit(box.is_backend)[0],
         )
 
     async def _stop_with_parent(self, stop: StopRequest) -> None:

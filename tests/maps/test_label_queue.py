@@ -33,7 +33,7 @@ def test_slow_labeller_gets_the_largest_new_surface_first() -> None:
     queue = queue_of({3: 0.1, 1: 0.9, 2: 0.5})
     assert regions(queue.take(1)) == [1]
     assert regions(queue.take(0)) == []
-    queue.add(request(1, keyframe=5), 1.0)  # Only 0.1 m2 more than its last request showed.
+    queue.add(request(1, keyframe=5), 1.0)  # It shows 0.1 m2 more than its last request.
     assert regions(queue.take(1)) == [2]
     assert len(queue) == 2
 

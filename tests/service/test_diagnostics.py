@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from ldo_service.schemas import Health, InputCount
+from ldo_service.schemas import Health, InputCount, OutputCount
 from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
 
 
@@ -22,6 +22,11 @@ def health(**fields) -> Health:
 
 def inputs(topic: str = "frame/rgbd", **fields) -> tuple[InputCount, ...]:
     return (msgspec.structs.replace(health().inputs[0], topic=topic, **fields),)
+
+
+def outputs(**fields) -> tuple[OutputCount, ...]:
+    count = OutputCount(topic="keyframe/new", sent=9, backpressure_waits=0, evicted_consumers=0)
+    return (msgspec.structs.replace(count, **fields),)
 
 
 def status(
@@ -83,6 +88,10 @@ def test_healthy_actor_has_no_findings(actor: ActorStatus) -> None:
             status(health(metrics={"checkpoint_failing": 1.0, "checkpoints_failed": 3.0})),
             "cannot save its last step",
         ),
+        (
+            status(health(outputs=outputs(behind={"detector": 900}, backlog_dropped=7))),
+            "dropped 7 messages of keyframe/new, because detector did not handle them in time",
+        ),
     ],
 )
 def test_each_problem_has_its_own_finding(actor: ActorStatus, text: str) -> None:
@@ -114,6 +123,14 @@ def test_each_problem_has_its_own_finding(actor: ActorStatus, text: str) -> None
         (health(metrics={"frames_rejected": 16.0}), "rejected 16 camera frames"),
         (health(metrics={"names_refused": 1.0}), "rejected 1 added names"),
         (health(metrics={"iterations_pending": 40.0}), "ldo control refine --iterations 40`"),
+        (
+            health(outputs=outputs(behind={"mapper": 3, "detector": 40})),
+            "keeps 40 messages of keyframe/new for detector",
+        ),
+        (
+            health(actor="optimizer", current_step_s=12.0),
+            "12 s; no other actor waits for it",
+        ),
         (health(metrics={"iterations_pending": 900.0}), "ldo control refine --iterations 500`"),
     ],
 )

@@ -94,6 +94,22 @@ def test_metrics_are_served_on_any_local_address(address: str) -> None:
     assert address == "::1", "only IPv6 may be missing"
 
 
+def test_backlog_of_the_slowest_consumer_is_exported() -> None:
+    collector, port = HealthCollector("mule"), free_port()
+    (view,) = EXAMPLES["health"].outputs
+    view = msgspec.structs.replace(
+        view, behind={"detector": 3, "loop_closer": 12}, backlog_mb=1.5, backlog_dropped=2
+    )
+    health = msgspec.structs.replace(EXAMPLES["health"], outputs=(view,))
+    collector.on_health(b"", memoryview(encode(health)))
+    with serve_metrics(collector, port):
+        values = scraped(port)
+    names = labels(("actor", "mapper"), ("topic", "map/view"))
+    assert values["ldo_output_backlog_messages", names] == 12
+    assert values["ldo_output_backlog_mb", names] == 1.5
+    assert values["ldo_output_backlog_dropped_total", names] == 2
+
+
 def test_every_value_of_a_health_message_is_exported(port: int) -> None:
     values = scraped(port)
     mapper = ("actor", "mapper")
@@ -121,6 +137,9 @@ def test_every_value_of_a_health_message_is_exported(port: int) -> None:
         ("ldo_output_backpressure_waits_total", labels(mapper, view)): 4,
         ("ldo_output_evicted_total", labels(mapper, view)): 1,
         ("ldo_output_retransmitted_total", labels(mapper, view)): 3,
+        ("ldo_output_backlog_messages", labels(mapper, view)): 0,
+        ("ldo_output_backlog_mb", labels(mapper, view)): 0,
+        ("ldo_output_backlog_dropped_total", labels(mapper, view)): 0,
         ("ldo_actor_metric", labels(mapper, ("metric", "gaussians"))): 1000,
     }
     age = values.pop(("ldo_heartbeat_age_seconds", labels(mapper)))
