@@ -1,7 +1,7 @@
 """Settings of frame input, data sets, offline runs, service, recordings and viewer."""
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -95,6 +95,9 @@ class ServiceSettings:
     # Actors that run in processes of their own. The default is the actor that uses gtsam, which
     # holds the GIL during every call.
     process_actors: tuple[str, ...] = ("optimizer",)
+    # Actors that run on another machine, by `ldo serve --client --actor NAME`. This service waits
+    # for none of them.
+    remote_actors: tuple[Literal["detector", "vlm_labeller", "loop_closer", "optimizer"], ...] = ()
     # Maximum time for each actor to handle its queued messages when the service stops, seconds.
     shutdown_timeout_s: PositiveFloat = 10.0
     # Seconds without a heartbeat after which a process is killed and started again.

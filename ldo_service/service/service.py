@@ -121,7 +121,7 @@ class Service:
             prepare_recording(self.recording)
         with ExitStack() as stack:
             if not self.only:
-                claim_state(self.state, stack)
+                claim_state(self.state, stack, self.config.service.remote_actors)
             if self.metrics_port is not None:
                 address = self.config.service.metrics_address
                 stack.enter_context(serve_metrics(health, self.metrics_port, address))
@@ -191,7 +191,8 @@ class Service:
         children: dict[str, ChildProcess] = {}
         runners: list[Runner] = []
         for box in finish_order(GRAPH):
-            if self.only and box.name not in self.only:
+            is_elsewhere = not self.only and box.name in self.config.service.remote_actors
+            if is_elsewhere or (self.only and box.name not in self.only):
                 continue
             if not self.only and box.name in self.config.service.process_actors:
                 children[box.name] = self._child(box, transport)

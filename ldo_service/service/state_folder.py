@@ -3,7 +3,7 @@
 import fcntl
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -53,11 +53,16 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
     return folder
 
 
-def claim_state(folder: Path, stack: ExitStack) -> None:
+def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] = ()) -> None:
     """Lock the folder for this service, and check that the states of all actors match.
 
     The states of tracker, mapper and optimizer refer to the same keyframe ids and graph versions.
     If one state was missing or older, the service would connect keyframes of two different runs.
+
+    Args:
+        folder: The state folder.
+        stack: Closed when the service ends.
+        remote_actors: Actors that another machine runs; their states are not in the folder.
 
     Raises:
         ConfigError: Another service uses the folder, or the states do not match.
@@ -71,7 +76,8 @@ def claim_state(folder: Path, stack: ExitStack) -> None:
             f"another service uses the state folder {folder}. Choose another folder with --state."
         ) from error
     store = FolderStore(folder / "state")
-    pasts = {name: RestoredState.of(store.load(name)) for name in INTERDEPENDENT_ACTORS}
+    local = [name for name in INTERDEPENDENT_ACTORS if name not in remote_actors]
+    pasts = {name: RestoredState.of(store.load(name)) for name in local}
     missing = [name for name, past in pasts.items() if past.is_none]
     if missing and any(past.has_passed for past in pasts.values()):
         raise ConfigError(
