@@ -65,7 +65,7 @@ class _RealTimeRun:
         stop = StopRequest()
         started = Usage.now()
         async with asyncio.TaskGroup() as group:
-            service = supervise(stages, stop, self._config.service.shutdown_timeout_s)
+            service = supervise(stages, stop, self._config.service.shutdown_timeout_s, sources=1)
             running = group.create_task(service)
             feeding = group.create_task(self._feed(transport))
             await asyncio.wait({running, feeding}, return_when=asyncio.FIRST_COMPLETED)

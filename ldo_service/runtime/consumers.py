@@ -81,17 +81,21 @@ class Consumers:
         """Return the offset of the first message that some consumer has not handled."""
         return min((c.handled for c in self._known.values()), default=seq)
 
-    def all_received(self, seq: int) -> bool:
+    def all_received(self, seq: int, *, awaited_only: bool = False) -> bool:
         """Return whether every consumer has received every message before `seq`.
 
         A consumer with a backlog only needs the messages for which its window has room. The backlog
         keeps the other ones.
+
+        Args:
+            seq: Offset of the next message.
+            awaited_only: Ignore the consumers with a backlog.
         """
-        return all(
-            c.arrived >= (seq if c.is_awaited else min(seq, c.limit))
-            for c in self._known.values()
-            if c.is_awaited or c.alive
-        )
+        awaited = [c for c in self._known.values() if c.is_awaited]
+        others = [c for c in self._known.values() if not c.is_awaited and c.alive]
+        has_awaited = all(c.arrived >= seq for c in awaited)
+        has_others = awaited_only or all(c.arrived >= min(seq, c.limit) for c in others)
+        return has_awaited and has_others
 
     def behind(self, seq: int) -> dict[str, int]:
         """Return the number of unhandled messages of each consumer with a backlog, by name."""

@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 
 import msgspec
 
@@ -46,6 +47,8 @@ class Outlet:
 
     # Half a credit period; a shorter time would retransmit messages that are still on their way.
     REPEAT_AFTER_S = 0.25
+    # Maximum time to wait at the end for consumers with a backlog: two credit periods.
+    FLUSH_BACKLOG_S = 1.0
 
     def __init__(
         self,
@@ -175,10 +178,18 @@ class Outlet:
             await self._change()
 
     async def flush(self) -> None:
-        """Wait until every lossless consumer has received all messages."""
+        """Wait until every lossless consumer has received all messages.
+
+        A consumer with a backlog may have stopped already. The outlet waits for it only briefly,
+        because its messages stay in the backlog.
+        """
         self._post_hellos()  # Each consumer replies with its credit at once.
-        while not self._consumers.all_received(self._seq):
+        while not self._consumers.all_received(self._seq, awaited_only=True):
             await self._change()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(self.FLUSH_BACKLOG_S):
+                while not self._consumers.all_received(self._seq):
+                    await self._change()
 
     async def _change(self) -> None:
         self._changed.clear()

@@ -171,6 +171,10 @@ class ChildProcess:
         if self._process and self._process.returncode is None:
             self._process.terminate()
 
+    def health(self) -> Health | None:
+        """Return the last health message of the process; None before the first one."""
+        return self._health
+
     def kill(self) -> None:
         """Kill the process now; `run` restarts it."""
         if self._process and self._process.returncode is None:

@@ -13,7 +13,12 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Protocol
 
+from ldo_service.schemas import Health
+
 log = logging.getLogger(__name__)
+
+# Time without work after which the actors are quiet: two heartbeats of a child process.
+QUIET_S = 1.0
 
 # sd_watchdog_enabled(3) recommends two; one may be late on a busy machine.
 PINGS_PER_PERIOD = 3
@@ -27,6 +32,8 @@ class Runner(Protocol):
     async def run(self) -> None: ...
 
     def drain(self) -> None: ...
+
+    def health(self) -> Health | None: ...
 
 
 class StopRequest:
@@ -56,12 +63,30 @@ class StopRequest:
         await self._hard.wait()
 
 
-async def supervise(runners: Sequence[Runner], stop: StopRequest, drain_s: float = 10.0) -> None:
+async def wait_until_quiet(runners: Sequence[Runner], timeout_s: float) -> None:
+    """Wait until no runner has had a queued message or a step for `QUIET_S`, at most `timeout_s`.
+
+    The messages that the last input leads to have then reached all actors.
+    """
+    loop = asyncio.get_running_loop()
+    until_s, quiet_since_s = loop.time() + timeout_s, loop.time()
+    while (now_s := loop.time()) < until_s and now_s - quiet_since_s < QUIET_S:
+        healths = [runner.health() for runner in runners]
+        if any(h and (h.current_step_s or any(i.queued for i in h.inputs)) for h in healths):
+            quiet_since_s = now_s
+        await asyncio.sleep(QUIET_S / 20)
+
+
+async def supervise(
+    runners: Sequence[Runner], stop: StopRequest, drain_s: float = 10.0, sources: int = 0
+) -> None:
     """Run the stages until a stop request, then end them in the given order.
 
     Args:
         runners: Stages and child processes, producers first.
         stop: The stop request.
+        sources: Number of runners at the start that take inputs from outside. After these have
+            ended, the others have `drain_s` to handle what follows from their last outputs.
         drain_s: Time that each runner has for a soft stop before it is cancelled, seconds.
 
     Raises:
@@ -74,8 +99,12 @@ async def supervise(runners: Sequence[Runner], stop: StopRequest, drain_s: float
             await stop.wait_soft()
             hard = asyncio.create_task(stop.wait_hard())
             try:
-                for runner, task in zip(runners, tasks, strict=True):
+                for number, (runner, task) in enumerate(zip(runners, tasks, strict=True), 1):
                     await _end(runner, task, hard, drain_s)
+                    if number == sources:
+                        quiet = asyncio.create_task(wait_until_quiet(runners[number:], drain_s))
+                        await asyncio.wait({quiet, hard}, return_when=asyncio.FIRST_COMPLETED)
+                        quiet.cancel()
             finally:
                 hard.cancel()
     except BaseExceptionGroup as errors:

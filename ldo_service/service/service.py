@@ -155,7 +155,8 @@ class Service:
             log.info("service: serving %s on %s", names, self.network.endpoint)
         watchdog.notify("READY=1")
         try:
-            await supervise(runners, stop, self.config.service.shutdown_timeout_s)
+            sources = sum(_is_fed_from_outside(actor_spec(runner.name)) for runner in runners)
+            await supervise(runners, stop, self.config.service.shutdown_timeout_s, sources)
         finally:
             watchdog.notify("STOPPING=1")
             pings.cancel()

@@ -13,9 +13,10 @@ from ldo_service.conversions.poses import pose_to_message
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import Trajectory
 from ldo_service.runtime import Out
-from ldo_service.runtime.actor_graph import lossless_consumers
+from ldo_service.runtime.actor_graph import consumers_with_backlog, finish_order, lossless_consumers
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
+from ldo_service.runtime.supervision import wait_until_quiet
 from ldo_service.schemas import OdometryPrior
 from ldo_service.schemas.topics import CAMERA_RGBD, ODOMETRY_PRIOR
 from ldo_service.service.service import open_recorder
@@ -37,7 +38,7 @@ def stages(
     made: list[Stage] = []
     map_folder = state and state / "map"
     parameters = actor_parameters(config.with_map_folder(map_folder) if map_folder else config)
-    for box in GRAPH:
+    for box in finish_order(GRAPH):
         assert box.make is not None
         make, topics = box.make, [out.topic.name for out in box.outputs]
         made.append(
@@ -46,6 +47,7 @@ def stages(
                 transport,
                 store=FolderStore(state / "state") if state else None,
                 expected={name: lossless_consumers(GRAPH, name) for name in topics},
+                with_backlog={name: consumers_with_backlog(GRAPH, name) for name in topics},
                 journal=open_recorder(folder, box.name, "robot", config, map_folder),
             )
         )
@@ -88,6 +90,7 @@ async def record_service(
             await send(camera, raw_frame_to_message(sequence.read(index)))
             await eventually(lambda frames=index + 1 - first: frames_received(tracker) == frames)
         await eventually(lambda: until({stage.name: stage for stage in actors}))
+        await wait_until_quiet(actors, 60)
         for stage, task in zip(actors, tasks, strict=True):
             stage.drain()
             await task
