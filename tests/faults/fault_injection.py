@@ -31,6 +31,7 @@ from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import CameraRgbd, GraphCorrection, Health, encode
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
+    KEYFRAME_MEASUREMENTS,
     KEYFRAME_NEW,
     KEYFRAME_REFINEMENT,
     LABEL_RESULT,
@@ -59,7 +60,7 @@ RATE_HZ = 5.0
 CHANGING = {
     topic.name for topic in (KEYFRAME_NEW, DETECTION_BOXES, KEYFRAME_REFINEMENT, LOOP_CLOSURE)
 }
-CHANGING |= {LABEL_RESULT.name, OBJECT_OBSERVATION.name}
+CHANGING |= {LABEL_RESULT.name, OBJECT_OBSERVATION.name, KEYFRAME_MEASUREMENTS.name}
 IDLE_HEARTBEATS = 6  # Equal heartbeats of an idle actor: 1.5 s, longer than a heartbeat takes.
 SECOND_FAULT_RATIO = 0.3  # Fraction of faults with a second one before all have recovered.
 UNCHECKED_RATIO = 0.3  # Fraction of faults after which the service is neither idle nor saved.

@@ -26,6 +26,8 @@ CONSUMERS = ("detector", "mapper", "loop_closer", "optimizer")  # Consumers of k
 KINDS: dict[str, type[Message]] = {
     "keyframe/new": Keyframe,
     "link/again/keyframe/new": Keyframe,
+    "link/again/keyframe/new/detector": Keyframe,
+    "link/again/keyframe/new/loop_closer": Keyframe,
     "graph/correction": GraphCorrection,
     "map/delta": MapDelta,
     "map/snapshot": MapSnapshot,
@@ -33,6 +35,8 @@ KINDS: dict[str, type[Message]] = {
 }
 BEHIND_S = 5.0  # Time after which a message that is still missing counts as lost.
 CREDITS = "link/grant/keyframe/new"
+# The measurements of a keyframe, which the optimizer takes, have the number of the keyframe.
+ALL_CREDITS = (CREDITS, "link/grant/keyframe/measurements")
 
 
 @dataclass
@@ -64,7 +68,7 @@ class MessageRecorder:
         """Subscribe until the session ends, with empty replicas that may have missed messages."""
         self.replica, self.late_replica = MapReplica(), MapReplica()
         self._subscribers.clear()
-        for topic in (*KINDS, CREDITS, "health/*"):
+        for topic in (*KINDS, *ALL_CREDITS, "health/*"):
             prefix = network.expression("")
 
             def store(sample: zenoh.Sample, prefix: str = prefix) -> None:
@@ -93,7 +97,7 @@ class MessageRecorder:
         """Check the messages received since the last call."""
         while self._received:
             topic, header, body = self._received.popleft()
-            if topic == CREDITS:
+            if topic in ALL_CREDITS:
                 self._add_credit(decode_request(memoryview(body)))
             elif topic.startswith("health/"):
                 health = decode(body, Health)

@@ -45,6 +45,7 @@ LIGHT = (  # Little work per keyframe and short timeouts, because the runtime is
         "mapper.iterations=2",
         "mapper.threads=1",
         "supervision.step_timeout_s=4",
+        "supervision.backend_step_timeout_s=4",
         "supervision.heartbeat_s=0.25",
     ),
     *(

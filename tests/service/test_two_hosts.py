@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 ROBOT, HOST = "ldo-robot", "ldo-host"
 ROBOT_ADDRESS, HOST_ADDRESS = "10.213.7.1", "10.213.7.2"
-DELAY_S, LOSS = 0.025, 0.05  # In each direction: 50 ms for both.
+DELAY_S, LOSS = 0.025, 0.05  # Both are for each direction: 50 ms in all.
 NETEM = ("delay", f"{1000 * DELAY_S:g}ms", "loss", f"{100 * LOSS:g}%")
 RETRANSMISSION_S = 0.2  # Minimum retransmission timeout of TCP on Linux.
 REMOTE = ("optimizer", "detector", "vlm_labeller")
