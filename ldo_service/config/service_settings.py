@@ -142,7 +142,7 @@ class SupervisionSettings:
     step_timeout_s: PositiveFloat = 60.0
     # The same for the actors for which no other waits (optimizer, loop closer, detector and
     # labeller), seconds. One optimization of a large pose graph may take minutes.
-    backend_step_timeout_s: PositiveFloat = 600.0
+    backend_step_timeout_s: PositiveFloat = advanced(600.0)
     # Maximum disk space for the messages of one topic that these actors have not handled yet, MB.
     # The oldest are dropped beyond. The default holds 11 minutes of keyframes of 640x480 at 2 Hz.
     backlog_mb: PositiveFloat = 2000.0

@@ -123,7 +123,7 @@ def other_values(setting: Setting) -> list[Any]:
             rules = ["yolov8", "semantic", "fixed", "iou", "box", "paper"]
             return ["elsewhere", *rules]
         case _:
-            return [["x {}"], [0.5, 0.5, 0.5], [2, 2], [0.6, 0.8, 0, 0], [1.0] * 16]
+            return [["x {}"], ["optimizer"], [0.5, 0.5, 0.5], [2, 2], [0.6, 0.8, 0, 0], [1.0] * 16]
 
 
 @pytest.mark.parametrize("setting", SETTINGS, ids=ids)
