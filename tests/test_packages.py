@@ -51,7 +51,8 @@ def test_wheel_contains_compiled_kernels_and_types_without_sources(packages: Pat
     packed = set(zipfile.ZipFile(wheel).namelist())
     modules = {n for n in tracked() if n.endswith("_module.cpp")}
     for module in modules:
-        stem = module.removesuffix("_module.cpp").replace("kernels/", "kernels/_")
+        folder, _, name = module.removesuffix("_module.cpp").rpartition("/")
+        stem = f"{folder}/_{name}"
         assert any(name.startswith(stem + ".") and name.endswith(".so") for name in packed), module
     assert "ldo_service/py.typed" in packed
     assert not [name for name in packed if name.endswith((".cpp", ".hpp", ".pyc"))]
