@@ -303,10 +303,10 @@ class Mapper(Actor):
         is_done = not self._refit.has_work()
         if is_done:
             self._semantics.refresh()
-            self._checkpoint = {}  # Saves the work; no keyframe may follow.
         yield from self._refinement()
         if is_done or self._idle_steps >= IDLE_STEPS_PER_DELTA:
             self._idle_steps = 0
+            self._checkpoint = {}  # A restart repeats at most so many idle steps.
             yield from self._publisher.deltas(self._message_context(), with_changed=True)
             yield from self._objects()
 

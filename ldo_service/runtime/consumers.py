@@ -143,6 +143,11 @@ class Consumers:
             consumer.pushed, consumer.pushed_at_s = messages.stop, now_s
         return messages
 
+    def skip(self, name: str, first: int) -> None:
+        """Let a consumer skip the messages before `first`, which cannot be read."""
+        if name in self._known:
+            self._known[name].handled = max(self._known[name].handled, first)
+
     def skip_to(self, first: int) -> bool:
         """Skip the messages before `first`, which the backlog no longer has.
 

@@ -180,8 +180,7 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until every lossless consumer has received all messages.
 
-        A consumer with a backlog may have stopped already. The outlet waits for it only briefly,
-        because its messages stay in the backlog.
+        A consumer with a backlog may have stopped already, so the outlet waits only briefly for it.
         """
         self._post_hellos()  # Each consumer replies with its credit at once.
         while not self._consumers.all_received(self._seq, awaited_only=True):
@@ -307,10 +306,14 @@ class Outlet:
                 self._backlogs[name] = self._transport.publisher(key)
             for seq in messages:
                 message = await asyncio.to_thread(self._outbox.read, seq)
-                if message is not None:
-                    await self._backlogs[name].send(message.header, message.body)
+                if message is None:  # Damaged on disk; the consumer counts it as lost.
+                    self._consumers.skip(name, seq + 1)
+                    self._post_hellos()
+                    return
+                await self._backlogs[name].send(message.header, message.body)
         finally:
-            del self._pushing[name]
+            if self._pushing.get(name) is asyncio.current_task():
+                del self._pushing[name]
 
     def _retransmit(self, consumer: Consumer, gap: bool) -> None:
         """Retransmit the messages that a consumer has not received.
@@ -344,6 +347,8 @@ class Outlet:
         for task in (self._repeating, *self._pushing.values()):
             if task is not None:
                 task.cancel()
+        self._repeating = None
+        self._pushing.clear()  # A task that has not started does not do so itself.
 
     def _presence(self, name: str, alive: bool) -> None:
         if not alive and not self._closed and name in self._consumers:
@@ -390,10 +395,6 @@ class Outlet:
         """Cancel retransmission and close the publishers."""
         self._closed = True
         self._cancel_repeating()
-        for publisher in (
-            self._publisher,
-            self._retransmissions,
-            self._hellos,
-            *self._backlogs.values(),
-        ):
+        own = self._publisher, self._retransmissions, self._hellos
+        for publisher in (*own, *self._backlogs.values()):
             publisher.close()

@@ -198,3 +198,19 @@ async def test_backlog_in_memory_is_bounded() -> None:
     async with running(collector(transport, seen, policy=Backlog(4), name="slow")):
         await eventually(lambda: seen and seen[-1] == 99)
     assert seen == list(range(seen[0], 100))
+
+
+async def test_message_damaged_on_disk_is_skipped_and_counted(tmp_path: Path) -> None:
+    transport, seen = MemoryTransport(), []
+    source = logged_outlet(transport, tmp_path)
+    await send_saved(source, range(30))
+    (path,) = tmp_path.iterdir()
+    raw = bytearray(path.read_bytes())
+    raw[raw.index(encode(number(15))) + 2] ^= 1
+    path.write_bytes(raw)
+    slow = collector(transport, seen, policy=Backlog(4), name="slow")
+    async with running(slow):
+        await eventually(lambda: seen and seen[-1] == 29)
+        assert slow.health().inputs[0].lost == 1
+    assert len(seen) == 29
+    assert seen == sorted(set(seen))
