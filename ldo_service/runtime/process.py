@@ -205,7 +205,7 @@ class ChildProcess:
         self._heard_until_s = max(self._heard_until_s, now_s + self._silent_after_s)
         if self._health is not None and now_s - self._health_at_s > REPEAT_HEALTH_AFTER_S:
             health = msgspec.structs.replace(self._health, state="busy", current_step_s=step_age_s)
-            self._health = health  # Not quiet; `step_age_s` still marks it as repeated.
+            self._health = health  # `step_age_s` still marks it as repeated.
             header = Header(self.name, health.epoch, 0, health.stamp_ns)
             self._own_health.post(encode_link(header), encode(health))
 
