@@ -143,18 +143,17 @@ class Consumers:
             consumer.pushed, consumer.pushed_at_s = messages.stop, now_s
         return messages
 
-    def skip(self, name: str, first: int) -> None:
-        """Let a consumer skip the messages before `first`, which cannot be read."""
-        if name in self._known:
-            self._known[name].handled = max(self._known[name].handled, first)
+    def skip(self, first: int, since: int = 0) -> bool:
+        """Skip the messages before `first`, which the producer no longer has.
 
-    def skip_to(self, first: int) -> bool:
-        """Skip the messages before `first`, which the backlog no longer has.
+        Args:
+            first: Offset of the first message that the producer has.
+            since: Only for consumers that have handled every message before this offset.
 
         Returns:
             Whether a consumer has missed some of them.
         """
-        late = [c for c in self._known.values() if not c.is_awaited and c.handled < first]
+        late = [c for c in self._known.values() if since <= c.handled < first]
         for consumer in late:
             consumer.handled = first
         return bool(late)

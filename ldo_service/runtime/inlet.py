@@ -133,7 +133,9 @@ class LosslessInlet(Inlet):
             return 0
         lost = start - self.arrived if known else 0
         self.numbers.lost += lost
-        self.epoch, self.handled, self.arrived = epoch, start, start
+        if not (known and self.waiting):  # `done` follows when the queue is handled.
+            self.handled = start
+        self.epoch, self.arrived = epoch, start
         self.gap = True  # Request the messages that were sent before the hello.
         return lost
 
@@ -169,6 +171,8 @@ class LosslessInlet(Inlet):
         super().done(delivery, rejected)
         if delivery.header.epoch == self.epoch:
             self.handled = max(self.handled, delivery.header.seq + 1)
+            if not self.waiting:
+                self.handled = self.arrived
 
     def resume_from(self, past: InletPosition) -> None:
         """Continue at the saved position of the previous process."""

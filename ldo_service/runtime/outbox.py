@@ -102,6 +102,18 @@ class Outbox:
         found = self._log.read(seq) if self._log else None
         return UnackedMessage(*found) if found else None
 
+    def after(self, seq: int, end: int) -> int:
+        """Return the number of the next message that may be readable after a lost one.
+
+        Args:
+            seq: Number of the lost message.
+            end: Number after the last message.
+        """
+        with self._lock:
+            later = [message.seq for message in self._memory if message.seq > seq]
+        in_memory = min(later, default=end)
+        return min(in_memory, self._log.after(seq, end) if self._log else end)
+
     def forget(self, before: int) -> None:
         """Delete the messages before a number, which all consumers have handled."""
         with self._lock:

@@ -27,6 +27,7 @@ from ldo_service.transport.interface import Publisher, Transport, call_soon
 
 from .actor import Out
 from .consumers import Consumer, Consumers
+from .last_value import LastValue
 from .outbox import Outbox
 
 log = logging.getLogger(__name__)
@@ -96,8 +97,7 @@ class Outlet:
         self._backlogs: dict[str, Publisher] = {}
         self._pushing: dict[str, asyncio.Task[None]] = {}
         self._closed = False
-        self._parts: list[tuple[bytes, bytes]] = []  # Parts of an incomplete state.
-        self._last_value: tuple[tuple[bytes, bytes], ...] = ()
+        self._last_value = LastValue()
         self.sent = self.waited = self.repeated = self.evicted = 0
         self._open(transport)
 
@@ -110,15 +110,14 @@ class Outlet:
         transport.subscribe(credit_key(topic), self._requested)
         transport.watch_liveliness(self._presence)
         if self.topic.is_state:
-            transport.serve_queries(data_key(topic), lambda: self._last_value)
+            transport.serve_queries(data_key(topic), lambda: self._last_value.parts)
         self._post_hellos()  # Running consumers connect at once.
 
     # --- sending ----------------------------------------------------------------------------
     def credits(self) -> int:
-        """Return how many messages may be sent now without waiting.
+        """Return how many messages may be sent now; 0 while staged messages are not sent.
 
-        It is 0 while staged messages are not sent. If no consumer is awaited, it is the room in
-        the windows of the consumers, so that the actor need not fill a backlog.
+        If no consumer is awaited, it is the room in their windows, so that no backlog fills.
         """
         if self._unsent:
             return 0
@@ -139,7 +138,8 @@ class Outlet:
         self._unsent.append(held)
         if self._consumers:
             self._outbox.add(held)
-        self._note_state(message, header, body)
+        if self.topic.is_state:
+            self._last_value.add(message, header, body)
         self._seq += 1
 
     async def commit(self) -> None:
@@ -194,14 +194,6 @@ class Outlet:
         self._changed.clear()
         await self._changed.wait()
 
-    def _note_state(self, message: Message, header: bytes, body: bytes) -> None:
-        if self.topic.is_state:
-            if getattr(message, "part", 0) == 0:
-                self._parts.clear()
-            self._parts.append((header, body))
-            if len(self._parts) == getattr(message, "parts", 1):
-                self._last_value = tuple(self._parts)
-
     def position(self) -> OutletPosition | None:
         """Return the position to save; None if there is no required consumer."""
         if not self._consumers.expected:
@@ -237,7 +229,7 @@ class Outlet:
                 return
         has_backlog = isinstance(request, ConsumerHello) and request.has_backlog
         self._consumers.join(name, self._seq, has_backlog=has_backlog)
-        self._consumers.skip_to(self._outbox.first(self._seq))
+        self._consumers.skip(self._outbox.first(self._seq))
         self._post_hellos()
 
     def reset(self, epoch: int) -> None:
@@ -248,9 +240,8 @@ class Outlet:
             self._consumers.expected, with_backlog=self._consumers.with_backlog
         )
         self._outbox.restart(epoch)
-        for forgotten in (self._unsent, self._parts, self._ahead):
+        for forgotten in (self._unsent, self._ahead, self._last_value):
             forgotten.clear()
-        self._last_value = ()
         self._post_hellos()
 
     def _post_hellos(self) -> None:
@@ -289,7 +280,7 @@ class Outlet:
         """Send a consumer with a backlog the messages for which it has room."""
         if name in self._pushing:
             return
-        if self._consumers.skip_to(self._outbox.first(self._seq)):
+        if self._consumers.skip(self._outbox.first(self._seq)):
             self._post_hellos()  # They say where the backlog begins now.
             return
         messages = self._consumers.next_of_backlog(
@@ -306,9 +297,8 @@ class Outlet:
                 self._backlogs[name] = self._transport.publisher(key)
             for seq in messages:
                 message = await asyncio.to_thread(self._outbox.read, seq)
-                if message is None:  # Damaged on disk; the consumer counts it as lost.
-                    self._consumers.skip(name, seq + 1)
-                    self._post_hellos()
+                if message is None:
+                    self._skip_lost(seq)
                     return
                 await self._backlogs[name].send(message.header, message.body)
         finally:
@@ -318,8 +308,7 @@ class Outlet:
     def _retransmit(self, consumer: Consumer, gap: bool) -> None:
         """Retransmit the messages that a consumer has not received.
 
-        If the consumer reports a gap, this happens at once. Otherwise the newest messages may still
-        be on their way, so the outlet first waits for `REPEAT_AFTER_S`.
+        Without a gap they may be on their way, so the outlet first waits for `REPEAT_AFTER_S`.
         """
         now = self._loop.time()
         recently = now - consumer.repeated_at_s < self.REPEAT_AFTER_S
@@ -330,18 +319,26 @@ class Outlet:
         if is_on_its_way or self._repeating is not None:
             return
         consumer.repeated_from, consumer.repeated_at_s = consumer.arrived, now
-        lost = range(consumer.arrived, self._next)
+        lost = range(consumer.arrived, min(self._next, consumer.limit))
         self.repeated += len(lost)
         self._repeating = self._loop.create_task(self._resend(lost))
 
     async def _resend(self, lost: range) -> None:
         try:
             for seq in lost:
-                message = self._outbox.read(seq)
-                if message is not None:
-                    await self._retransmissions.send(message.header, message.body)
+                message = await asyncio.to_thread(self._outbox.read, seq)
+                if message is None:
+                    self._skip_lost(seq)
+                    return
+                await self._retransmissions.send(message.header, message.body)
         finally:
-            self._repeating = None
+            if self._repeating is asyncio.current_task():
+                self._repeating = None
+
+    def _skip_lost(self, seq: int) -> None:
+        """Let the consumers skip a message that the disk has lost, once they have come to it."""
+        if self._consumers.skip(self._outbox.after(seq, self._seq), since=seq):
+            self._post_hellos()
 
     def _cancel_repeating(self) -> None:
         for task in (self._repeating, *self._pushing.values()):

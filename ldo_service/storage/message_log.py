@@ -50,7 +50,9 @@ class _Segment:
 
 
 class MessageLog:
-    """Log of consecutive messages in a folder; any thread may call its methods.
+    """Log of messages in a folder; any thread may call its methods.
+
+    The numbers ascend. They have a hole only where the disk lost messages, as in a power cut.
 
     The oldest messages are deleted when the log exceeds its maximum size. The numbers of the log
     belong to one epoch of their producer. Files of other epochs are deleted.
@@ -72,6 +74,7 @@ class MessageLog:
         self._folder, self._epoch, self._max_bytes, self._syncs = folder, epoch, max_bytes, syncs
         self._lock = Lock()
         self._segments: list[_Segment] = []
+        self._open: _Segment | None = None  # The segment that is being written.
         self._first = first
         self.dropped = 0  # Messages deleted because of the maximum size.
         self._scan(end)
@@ -100,26 +103,40 @@ class MessageLog:
             return sum(segment.size for segment in self._segments)
 
     def append(self, messages: Iterable[LoggedMessage]) -> None:
-        """Append messages whose numbers follow the last one; earlier numbers are skipped.
+        """Append messages with ascending numbers; numbers before `next` are skipped.
+
+        Only one thread may append at a time. Other threads do not wait for the disk meanwhile.
 
         Raises:
             OSError: The disk is full or cannot be written. The log ends after a whole message.
         """
-        with self._lock:
-            for message in messages:
-                if message.seq >= self._next:
-                    self._append(message)
+        for message in messages:
+            with self._lock:
+                if message.seq < self._next:
+                    continue
+                segment = self._open = self._segment_for(message.seq)
+            try:
+                end = self._write(segment, message)
+                with self._lock:
+                    segment.ends.append(end)
+                    self._drop_oldest()
+            finally:
+                self._open = None
 
-    def _append(self, message: LoggedMessage) -> None:
-        if self._segments and message.seq != self._next:
-            self._clear()  # The messages between were lost with their file.
-        if not self._segments or self._segments[-1].size >= SEGMENT_BYTES:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            if not self._segments:
-                self._first = message.seq
-            self._segments.append(_Segment(self._path(message.seq), message.seq))
-        segment = self._segments[-1]
+    def _segment_for(self, seq: int) -> _Segment:
+        """Return the segment to append a number to: a new one after a hole or a full one."""
+        last = self._segments[-1] if self._segments else None
+        if last is not None and seq == last.next and last.size < SEGMENT_BYTES:
+            return last
+        if last is None:
+            self._first = seq
+        self._segments.append(_Segment(self._path(seq), seq))
+        return self._segments[-1]
+
+    def _write(self, segment: _Segment, message: LoggedMessage) -> int:
+        """Write a message to the end of a segment, and return the position after it."""
         header, body = message.header, message.body
+        self._folder.mkdir(parents=True, exist_ok=True)
         with segment.path.open("r+b" if segment.ends else "wb") as file:
             file.seek(segment.size)
             file.write(_RECORD.pack(message.seq, len(header), len(body), _checksum(header, body)))
@@ -127,8 +144,9 @@ class MessageLog:
             file.write(body)
         if self._syncs:
             sync(segment.path)
-        segment.ends.append(segment.size + _RECORD.size + len(header) + len(body))
-        self._drop_oldest()
+            if not segment.ends:
+                sync(self._folder)
+        return segment.size + _RECORD.size + len(header) + len(body)
 
     def _drop_oldest(self) -> None:
         """Delete the oldest segments beyond the maximum size, but never the last one."""
@@ -149,13 +167,13 @@ class MessageLog:
             number = seq - segment.first
             start = segment.ends[number - 1] if number else 0
             size = segment.ends[number] - start
-            try:
-                with segment.path.open("rb") as file:
-                    file.seek(start)
-                    raw = file.read(size)
-            except OSError as error:
-                log.error("%s cannot be read (%s); message %d is lost.", segment.path, error, seq)
-                return None
+        try:
+            with segment.path.open("rb") as file:
+                file.seek(start)
+                raw = file.read(size)
+        except OSError as error:
+            log.error("%s cannot be read (%s); message %d is lost.", segment.path, error, seq)
+            return None
         if len(raw) < size:
             log.error("%s is truncated; message %d is lost.", segment.path, seq)
             return None
@@ -167,11 +185,28 @@ class MessageLog:
             return None
         return LoggedMessage(seq, header, body)
 
+    def after(self, seq: int, end: int) -> int:
+        """Return the next number that the log may have after one that cannot be read.
+
+        Args:
+            seq: The number that cannot be read.
+            end: Number after the last message; returned if the log has none after `seq`.
+        """
+        with self._lock:
+            if self._segment_of(seq) is not None:
+                return seq + 1
+            later = [segment.first for segment in self._segments if segment.first > seq]
+        return min(later, default=end)
+
     def forget(self, before: int) -> None:
         """Delete the segments that only hold messages before a number."""
         with self._lock:
             self._first = max(self._first, before)
-            while self._segments and self._segments[0].next <= before:
+            while (
+                self._segments
+                and self._segments[0].next <= before
+                and self._segments[0] is not self._open
+            ):
                 _remove(self._segments.pop(0).path)
 
     def truncate(self, end: int) -> None:
@@ -205,11 +240,11 @@ class MessageLog:
         return self._folder / f"{self._epoch}-{first:012d}.log"
 
     def _scan(self, end: int) -> None:
-        """Index the files of this epoch up to the first gap, and delete all other files."""
+        """Index the files of this epoch, and delete those of others."""
         for path in sorted(self._folder.glob("*.log")):
             epoch, _, number = path.stem.partition("-")
             first = int(number) if number.isdecimal() else -1
-            follows = not self._segments or first == self._segments[-1].next
+            follows = not self._segments or first >= self._segments[-1].next
             if epoch != str(self._epoch) or first < 0 or not follows:
                 _remove(path)
                 continue

@@ -8,13 +8,15 @@ from threading import Event
 
 import pytest
 
-from ldo_service.runtime.actor import Backlog, Lossless, Out
+from ldo_service.runtime.actor import Backlog, In, Lossless, Out
+from ldo_service.runtime.inlet import Delivery, LosslessInlet
 from ldo_service.runtime.outbox import Outbox
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.schemas import encode
 from ldo_service.storage import message_log
 from ldo_service.storage.message_log import MessageLog
 from ldo_service.transport.flow_control import (
+    Header,
     OutletPosition,
     credit_key,
     data_key,
@@ -214,3 +216,47 @@ async def test_message_damaged_on_disk_is_skipped_and_counted(tmp_path: Path) ->
         assert slow.health().inputs[0].lost == 1
     assert len(seen) == 29
     assert seen == sorted(set(seen))
+
+
+@pytest.mark.parametrize("name", ["slow", "collector"])
+async def test_end_of_the_log_lost_in_a_power_cut_stalls_no_consumer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr(Outlet, "REPEAT_AFTER_S", 0.01)
+    monkeypatch.setattr(message_log, "SEGMENT_BYTES", 200)
+    transport, seen = MemoryTransport(), []
+    source = logged_outlet(transport, tmp_path, expected=(name,))
+    for value in range(20):
+        source.stage_message(number(value), encode(number(value)))
+    source.store()
+    past = source.position()
+    source.close()
+    *_, newest = sorted(tmp_path.iterdir())
+    newest.unlink()
+    source = logged_outlet(transport, tmp_path, past, expected=(name,))
+    policy = Backlog(4) if name == "slow" else Lossless(4)
+    stage = collector(transport, seen, policy=policy, name=name)
+    async with running(stage):
+        await eventually(lambda: len(seen) >= 10)
+        await send_saved(source, [20])
+        await eventually(lambda: seen[-1] == 20)
+        lost = stage.health().inputs[0].lost
+    assert lost == 21 - len(seen) > 0
+    assert seen == sorted(set(seen))
+
+
+async def test_queued_messages_before_a_hole_are_handled_again_after_a_kill() -> None:
+    inlet = LosslessInlet(In(NUMBERS, Backlog(4)))
+    inlet.welcome(5, 0)
+    deliveries = [
+        Delivery(inlet.port, Header("producer", 5, seq, 0), memoryview(b"")) for seq in (0, 1, 2)
+    ]
+    for delivery in deliveries:
+        assert inlet.accept(delivery.header)
+        inlet.offer(delivery)
+    assert inlet.welcome(5, 200) == 197
+    assert inlet.position(None).handled == 0
+    for delivery in deliveries:
+        inlet.waiting.popleft()
+        inlet.done(delivery, rejected=False)
+    assert inlet.position(None).handled == 200

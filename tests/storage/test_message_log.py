@@ -107,6 +107,39 @@ def test_log_continues_after_messages_that_are_missing_on_disk(tmp_path: Path) -
     assert log.read(9) == message(9)
 
 
+def test_log_keeps_older_messages_when_its_end_is_missing(tmp_path: Path) -> None:
+    """A power cut may lose the newest files although the state refers to them."""
+    open_log(tmp_path, 0, 0).append(message(seq) for seq in range(9))
+    *_, newest = sorted(tmp_path.iterdir())
+    newest.unlink()
+    log = open_log(tmp_path, 0, 9)
+    end = log.next
+    assert 0 < end < 9
+    for _ in range(2):  # The hole stays in the log of the next process.
+        log.append([message(9)])
+        assert [log.read(seq) for seq in range(end)] == [message(seq) for seq in range(end)]
+        assert [log.read(seq) for seq in range(end, 9)] == [None] * (9 - end)
+        assert log.read(9) == message(9)
+        assert log.after(end, 10) == 9
+        assert log.after(9, 10) == 10
+        log = open_log(tmp_path, 0, 10)
+
+
+def test_segment_that_is_being_written_is_not_deleted(tmp_path: Path) -> None:
+    log = open_log(tmp_path, 0, 0)
+    log.append([message(0)])
+
+    class Forgetting(MessageLog):
+        def _write(self, segment, one: LoggedMessage) -> int:
+            self.forget(1)  # A credit arrives while the disk is slow.
+            return super()._write(segment, one)
+
+    log.__class__ = Forgetting
+    log.append([message(1)])
+    assert log.read(1) == message(1)
+    assert open_log(tmp_path, 1, 2).read(1) == message(1)
+
+
 def test_failed_write_leaves_a_log_of_whole_messages(tmp_path: Path) -> None:
     log = open_log(tmp_path, 0, 0)
     log.append([message(0)])
