@@ -294,10 +294,16 @@ class Mapper(Actor):
             yield from self._objects()
 
     def has_idle_work(self) -> bool:
-        return self._refit.has_work()
+        has_room = self.situation.credits.get(LABEL_REQUEST, UNLIMITED) > 0
+        return self._refit.has_work() or (has_room and len(self._label_queue) > 0)
 
     def on_idle(self) -> Iterator[Output]:
-        """Refit the map after corrections while no keyframe arrives."""
+        """Refit the map after corrections, and send waiting label requests."""
+        yield from self._label_requests()
+        if self._refit.has_work():
+            yield from self._refit_idly()
+
+    def _refit_idly(self) -> Iterator[Output]:
         self._refit.while_idle()
         self._idle_steps += 1
         is_done = not self._refit.has_work()

@@ -150,8 +150,9 @@ class Mailbox:
             self._ask_for_grants()
         if lost:
             log.error(
-                "%s: lost %d messages of %s after its eviction as a slow consumer, so the map "
-                "lacks them. Reduce its load, or raise supervision.evict_after_s.",
+                "%s: lost %d messages of %s, which their producer no longer has: this actor was "
+                "evicted as too slow, its backlog was full, or the disk lost them. Reduce its "
+                "load, or raise supervision.evict_after_s or supervision.backlog_mb.",
                 self._consumer, lost, inlet.port.topic.name,
             )  # fmt: skip
 
@@ -162,13 +163,21 @@ class Mailbox:
             call_soon(self._loop, self.send_credits)
 
     # --- taking, on the event loop --------------------------------------------------------------
-    async def take(self) -> Delivery | StageCommand | None:
+    async def take(self, timeout_s: float | None = None) -> Delivery | StageCommand | None:
         """Wait for the next command or delivery and take it.
 
         Returns:
             A command if there is one, else the oldest delivery of an input with priority, else the
             oldest delivery. None if the mailbox is closed and empty.
+
+        Raises:
+            TimeoutError: None came in time.
         """
+        # `asyncio.wait_for` of Python 3.11 may swallow the cancellation of a stage.
+        async with asyncio.timeout(timeout_s):
+            return await self._take()
+
+    async def _take(self) -> Delivery | StageCommand | None:
         while True:
             with self._lock:
                 self._wake_pending = False

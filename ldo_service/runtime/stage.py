@@ -26,11 +26,14 @@ from .mailbox import Mailbox
 from .outlets import OutletOpener, Outlets
 from .stage_commands import CommandReceiver, StageCommand
 from .stage_metrics import StageMetrics
-from .state_saver import SAVE_AGAIN_S, StateSaver, UnsavedStateError
+from .state_saver import StateSaver, UnsavedStateError
 from .step import MessageDecoder, Produced, produce
 from .supervision_policy import RestartBudget, SupervisionConfig
 
 log = logging.getLogger(__name__)
+
+# Time between two checks for idle work, which may wait for credit, or for an unsaved state.
+CHECK_S = 0.5
 
 
 class Stage:
@@ -168,28 +171,28 @@ class Stage:
             await self._publish_restored()
             while delivery := await self._next(mailbox):
                 await self._take(delivery, mailbox)
-            await self._publish_final()
+            await self._publish("finished", lambda: self._actor.on_stop())
             if self._saver.is_unsaved:
                 raise UnsavedStateError
             await self._outlets.flush()
         except UnsavedStateError:
-            log.error(
-                "%s: stopped before its last step was saved. The step is repeated after the "
-                "restart, so nothing is lost. Free some disk space before the restart.",
-                self.name,
-            )
+            log.error("%s: stopped before its last step was saved. The step is repeated after the "
+                      "restart, so nothing is lost. Free some disk space before the restart.",
+                      self.name)  # fmt: skip
 
     async def _next(self, mailbox: Mailbox) -> Delivery | StageCommand | None:
-        """Take the next delivery or command; save an unsaved state and do idle work meanwhile."""
+        """Take the next delivery or command; save an unsaved state or work idly meanwhile."""
         while True:
             is_unsaved = self._saver.is_unsaved
-            if not is_unsaved and not self._has_idle_work(mailbox):
-                return await mailbox.take()
-            timeout_s = SAVE_AGAIN_S if is_unsaved else self._actor.idle_after_s
+            has_work = not is_unsaved and self._has_idle_work(mailbox)
+            wait_s = self._actor.idle_after_s if has_work else CHECK_S
             try:
-                return await asyncio.wait_for(mailbox.take(), timeout_s)
+                return await mailbox.take(wait_s)
             except TimeoutError:
-                await (self._save_and_send([]) if is_unsaved else self._work_idly())
+                if is_unsaved:
+                    await self._save_and_send([])
+                elif has_work:
+                    await self._work_idly()
 
     async def _take(self, delivery: Delivery | StageCommand, mailbox: Mailbox) -> None:
         if isinstance(delivery, StageCommand):
@@ -217,25 +220,25 @@ class Stage:
 
     async def _try(self, message: Message, delivery: Delivery) -> bool:
         """Handle a message; return False if the handler failed."""
+        what = f"handling {type(message).__name__}"
         produced = await self._attempt(
-            lambda: self._actor.handle(message),
-            ("done", "failed"),
-            f"handling {type(message).__name__}",
-            delivery,
+            lambda: self._actor.handle(message), ("done", "failed"), what, delivery
         )
         if produced is not None:
-            is_timed = bool(produced) or not self._actor.outputs
-            self._metrics.record_step(message, is_timed=is_timed)
+            self._metrics.record_step(message, bool(produced) or not self._actor.outputs)
         return produced is not None
 
     def _has_idle_work(self, mailbox: Mailbox) -> bool:
-        is_stopped = self._is_idle_failed or self._drain_requested or mailbox.is_held
-        return not is_stopped and self._actor.has_idle_work()
+        if self._is_idle_failed or self._drain_requested or mailbox.is_held:
+            return False
+        self._update_flow_status()  # Work may wait for credit.
+        return self._actor.has_idle_work()
 
     async def _work_idly(self) -> None:
-        """Do a part of the actor's idle work; after a failure, none until the next message."""
-        kinds: tuple[Kind, Kind] = ("idle", "idle_failed")
-        produced = await self._attempt(lambda: self._actor.on_idle(), kinds, "idle work")
+        """Do idle work of the actor; after a failure, none until the next message."""
+        produced = await self._attempt(
+            lambda: self._actor.on_idle(), ("idle", "idle_failed"), "idle work"
+        )
         self._is_idle_failed = produced is None
 
     async def _attempt(
@@ -250,7 +253,7 @@ class Stage:
         Args:
             work: Handler that yields the messages of the step.
             kinds: Kinds of its journal entry after a success and after a failure.
-            what: Description of the step for the log.
+            what: Description for the log.
             delivery: Its input.
 
         Returns:
@@ -295,20 +298,14 @@ class Stage:
         if self._checkpointer.past.of_actor:
             await self._publish("resumed", lambda: self._actor.on_restored())
 
-    async def _publish_final(self) -> None:
-        await self._publish("finished", lambda: self._actor.on_stop())
-
     async def _publish(self, kind: Kind, messages: Callable[[], Iterator[Message]]) -> None:
         self._update_flow_status()
         try:
             produced = await self._worker.run(lambda: produce(self._actor, messages()))
         except Exception:
             self._metrics.failures += 1
-            log.exception(
-                "%s: producing the messages of step %r failed; subscribers may miss the last "
-                "state.",
-                self.name, kind,
-            )  # fmt: skip
+            log.exception("%s: producing the messages of step %r failed; subscribers may miss the "
+                          "last state.", self.name, kind)  # fmt: skip
             return
         if produced or kind == "finished":
             self._journal.record_step(kind, self._actor.situation, produced)

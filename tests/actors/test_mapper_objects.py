@@ -18,6 +18,7 @@ from ldo_service.geometry import se3
 from ldo_service.regions.open_vocabulary import OpenVocabularyConfig, OpenVocabularyLabeling
 from ldo_service.regions.region_proposals import RegionProposalConfig
 from ldo_service.regions.region_tracker_config import RegionTrackerConfig
+from ldo_service.runtime.actor import FlowStatus
 from ldo_service.schemas import (
     Array,
     Detection,
@@ -33,6 +34,7 @@ from ldo_service.schemas import (
     RefineMap,
     encode,
 )
+from ldo_service.schemas.topics import LABEL_REQUEST
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantic_fusion import FusionConfig, SemanticFusionConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
@@ -196,6 +198,20 @@ def test_final_objects_have_the_version_of_the_final_map() -> None:
     assert isinstance(last, MapObjects)
     assert last.version == replicate(mapper.on_stop()).version
     assert last.objects == refined[-1].objects
+
+
+def test_waiting_label_requests_are_sent_when_the_labeller_has_room() -> None:
+    """The camera may stand still by then, so no other message arrives."""
+    mapper = Mapper(CONFIG, has_labeller=True)
+    mapper.situation = FlowStatus(credits={LABEL_REQUEST: 0})
+    assert of_kind(LabelRequest, walk(mapper, WAY[:5], known=(BALL,))) == []
+    waiting = mapper.metrics()["label_requests_waiting"]
+    assert waiting >= 2
+    assert not mapper.has_idle_work()
+    mapper.situation = FlowStatus(credits={LABEL_REQUEST: 1})
+    assert mapper.has_idle_work()
+    assert len(of_kind(LabelRequest, list(mapper.on_idle()))) == 1
+    assert mapper.metrics()["label_requests_waiting"] == waiting - 1
 
 
 def test_restored_mapper_continues_objects_bitwise_equal(tmp_path: Path) -> None:
