@@ -124,19 +124,12 @@ def keyframe_message(frame: RgbdFrame, result: TrackingResult, keyframe: NewKeyf
 
 
 def keyframe_measurements_message(keyframe: Keyframe) -> KeyframeMeasurements:
-    """Return the message with the measurements of a keyframe, without its images."""
-    return KeyframeMeasurements(
-        stamp_ns=keyframe.stamp_ns,
-        keyframe=keyframe.keyframe,
-        camera=keyframe.camera,
-        reference=keyframe.reference,
-        T_reference_keyframe=keyframe.T_reference_keyframe,
-        information=keyframe.information,
-        T_odom_keyframe=keyframe.T_odom_keyframe,
-        window_measurements=keyframe.window_measurements,
-        submap=keyframe.submap,
-        submap_measurements=keyframe.submap_measurements,
-    )
+    """Return the message with the measurements of a keyframe, without its images.
+
+    Each of its fields is a field of `Keyframe` too.
+    """
+    fields = KeyframeMeasurements.__struct_fields__
+    return KeyframeMeasurements(**{name: getattr(keyframe, name) for name in fields})
 
 
 def keyframe_from_message(message: Keyframe, config: PyramidConfig) -> ReferenceKeyframe:

@@ -223,14 +223,14 @@ class MapPublisher:
             "since_changed": self._since_changed,
             "since_snapshot": self._since_snapshot,
             "in_snapshot": self._in_snapshot,
-            "names_told": self._names_published,
+            "names_published": self._names_published,
         }
 
     def restore(self, state: dict[str, int]) -> None:
         self.version = state["version"] + VERSIONS_IN_A_CHECKPOINT
         self._since_changed = state["since_changed"]
         self._since_snapshot, self._in_snapshot = state["since_snapshot"], state["in_snapshot"]
-        self._names_published = state["names_told"]
+        self._names_published = state["names_published"]
 
 
 class ObjectPublisher:

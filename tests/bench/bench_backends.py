@@ -238,7 +238,7 @@ def read_outcome(monitor: Monitor, result: Result, sequence: Sequence) -> None:
     result.labelled = int(monitor.health["vlm_labeller"].metrics.get("regions_named", 0))
 
 
-def worst_cm(one: Result, other: Result) -> float:
+def rmse_cm(one: Result, other: Result) -> float:
     """Return the RMSE between the keyframe centers of two runs after their alignment, cm."""
     common = sorted(one.camera_m.keys() & other.camera_m.keys())
     a = np.array([one.camera_m[k] for k in common])
@@ -272,7 +272,7 @@ def main() -> None:
                 f"{slowed:13} {result.poses_per_s:7.2f} {result.ok_per_s:5.2f} "
                 f"{result.keyframes_per_s:11.2f} {max(result.max_behind.values(), default=0):7d} "
                 f"{result.recovery_s:10.0f}  {len(result.closures):8d} "
-                f"{sum(result.names.values()):8d} {worst_cm(result, reference):6.2f}  "
+                f"{sum(result.names.values()):8d} {rmse_cm(result, reference):6.2f}  "
                 f"restarts {sum(result.restarts.values())} dropped {result.dropped} "
                 f"labelled {result.labelled} ate {result.ate_cm:.2f} cm",
                 flush=True,
