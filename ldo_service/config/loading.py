@@ -190,6 +190,8 @@ def _choices(path: str) -> tuple[str, ...]:
     schema: Any = Config
     for name in path.split("."):
         schema = typing.get_type_hints(schema)[name]
+    if typing.get_origin(schema) is tuple:  # Choices of the items.
+        schema, *_ = typing.get_args(schema)
     return typing.get_args(schema)
 
 

@@ -169,16 +169,20 @@ class Consumers:
             consumer.limit, consumer.shut_since_s = max(grant.limit, consumer.limit), None
         return consumer
 
-    def leave(self, name: str) -> None:
+    def leave(self, name: str) -> bool:
         """Mark a consumer as disconnected.
 
-        The producer forgets it, unless it is required. A required consumer then blocks the producer
-        until it connects again.
+        The producer forgets it, unless it is required. A required consumer without a backlog then
+        blocks the producer until it connects again.
+
+        Returns:
+            Whether the producer waits for it.
         """
         consumer = self._known[name]
         consumer.alive, consumer.shut_since_s = False, None
         if name not in self.expected:
             del self._known[name]
+        return name in self.expected and consumer.is_awaited
 
     def stalled(self, now_s: float, patience_s: float, seq: int) -> list[str]:
         """Return the connected consumers whose window has been full for over `patience_s`."""

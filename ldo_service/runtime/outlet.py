@@ -349,9 +349,9 @@ class Outlet:
 
     def _presence(self, name: str, alive: bool) -> None:
         if not alive and not self._closed and name in self._consumers:
-            log.warning("%s: consumer %s disconnected; waiting for its restart.",
-                        self.topic.name, name)  # fmt: skip
-            self._consumers.leave(name)
+            if self._consumers.leave(name):
+                log.warning("%s: consumer %s disconnected; waiting for its restart.",
+                            self.topic.name, name)  # fmt: skip
             self._forget_handled()
             self._changed.set()
 

@@ -101,6 +101,10 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("supervision.heartbeat_s=.nan", "supervision.heartbeat_s=nan must be a number"),
         ("service.shutdown_timeout_s=-1", "service.shutdown_timeout_s=-1 must be positive."),
         ("supervision.background_nice=20", "supervision.background_nice=20 must be at most 19."),
+        (
+            "service.remote_actors=[optimizer, tracker]",
+            "must be one of 'detector', 'vlm_labeller', 'loop_closer', 'optimizer' in item 2.",
+        ),
         ("paper.ema_rule=mine", "paper.ema_rule=mine must be one of 'corrected', 'paper'."),
         (
             "tracker.alignment.max_iterations=[8, 0]",
