@@ -63,13 +63,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     if not debug:
         logging.getLogger("httpx2").setLevel(logging.WARNING)  # It logs every request.
-    _handle_interrupts()
+    _end_on_interrupts()
+    known = verbs()
+    _raise_on_interrupts()
     try:
         _refuse_renamed_options(words)
         if not words or words[0] in ("-h", "--help"):
             print(HELP.format(verbs="\n".join(first_lines())))
             sys.exit(0 if words else 2)
-        _run_verb(words)
+        _run_verb(words, known)
     except LdoError as error:
         if debug:
             raise
@@ -83,16 +85,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _run_verb(words: Sequence[str]) -> None:
+def _run_verb(words: Sequence[str], known: dict[str, Callable[..., None]]) -> None:
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
-    known = verbs()
     if words[0] in known:  # An error then points to the help of the verb.
         tyro.cli(known[words[0]], prog=f"ldo {words[0]}", args=words[1:], config=config)
     else:
         tyro.extras.subcommand_cli_from_dict(known, prog="ldo", args=words, config=config)
 
 
-def _handle_interrupts() -> None:
+def _end_on_interrupts() -> None:
+    """Let SIGINT and SIGTERM end the process at once.
+
+    While the modules are imported, nothing needs an orderly end, and an exception that a signal
+    raises in the initialization of an extension becomes an ImportError.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
+
+
+def _raise_on_interrupts() -> None:
     """Make SIGINT and SIGTERM raise KeyboardInterrupt.
 
     A shell without job control starts `ldo view &` with SIGINT ignored. Python keeps that setting,

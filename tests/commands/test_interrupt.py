@@ -2,6 +2,7 @@
 
 import signal
 import subprocess
+import sys
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -117,3 +118,28 @@ def test_interrupted_publisher_exits_with_130(tmp_path: Path) -> None:
             assert publisher.end_with(signal.SIGINT) == 130
             assert "ldo: interrupted." in publisher.log
             assert "Traceback" not in publisher.log
+
+
+# It sends the signal when the import of `gtsam` begins.
+INTERRUPTED_IMPORT = """
+import os, sys
+from ldo_service.commands.cli import main
+
+class Interrupter:
+    def find_spec(name, *_):
+        if name == "gtsam":
+            os.kill(os.getpid(), int(sys.argv[1]))
+
+sys.meta_path.insert(0, Interrupter)
+main(["topics"])
+"""
+
+
+@both_signals
+def test_signal_during_the_imports_ends_the_process_without_traceback(
+    number: signal.Signals,
+) -> None:
+    command = sys.executable, "-c", INTERRUPTED_IMPORT, str(int(number))
+    ended = subprocess.run(command, capture_output=True, text=True)
+    assert ended.returncode == -number
+    assert ended.stderr == ""
