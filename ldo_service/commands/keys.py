@@ -40,10 +40,11 @@ class New:
 
 @dataclass(frozen=True)
 class AddKeys:
-    """Make the keys of NAME in the folder DIR/NAME; copy it to that machine, for the option --keys.
+    """Make the keys of the program NAME, in the folder DIR/NAME.
 
-    This also updates the access control list `access.yaml` in the folder of each service. Copy the
-    new file to each service too, and restart the service.
+    Copy this folder to the machine of the program, which takes it as --keys. The command also
+    updates the access control list `access.yaml` in the folder of each service. Copy the new file
+    to each service, and restart the service.
 
       ldo keys add DIR service mule --robot mule --host mule.local
       ldo keys add DIR camera front --robot mule

@@ -106,8 +106,9 @@ def frames_of_ros(
     """
     if service.keys is not None and not options.bridge:
         raise ConfigError(
-            "the router of the service uses keys and forwards only the service's own topics. Run "
-            "the bridge with its own router, and give that router's address with --bridge."
+            "the router of the service runs with --keys, so it forwards only the service's own "
+            "topics, not those of ROS 2. Run the bridge with its own router, and give that "
+            "router's address with --bridge."
         )
     camera = RosCamera(options.topics(), notify)
     bridge = Endpoint(service.robot, options.bridge or service.endpoint)

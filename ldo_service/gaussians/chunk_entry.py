@@ -9,9 +9,9 @@ from ldo_service.geometry import se3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ChunkEntry:
-    """Table entry of one offloaded chunk, which stays in memory.
+    """Table entry of one offloaded chunk.
 
-    The chunk has `count` Gaussians, whose ids lie between `first_id` and `last_id`.
+    The entry stays in memory while the Gaussians are in a file. The chunk has `count` Gaussians, whose ids lie between `first_id` and `last_id`.
     """
 
     anchor: int

@@ -39,9 +39,9 @@ def surfels(
     """Return one flat Gaussian per cell, with the cell's mean color and depth, [M, 16] float32.
 
     Seen from this camera, each Gaussian looks round. Its standard deviation is `sigma_per_spacing`
-    times the side of its cell. Down the slope of the surface it is longer by 1 / cos of the angle
-    between normal and viewing ray. Along the normal it is `thickness` times as long as across the
-    slope.
+    times the side of its cell. Down the slope of the surface it is longer by the factor 1 / cos of
+    the angle between normal and viewing ray. Along the normal it is `thickness` times as long as
+    across the slope.
 
     Args:
         cells: The cells.

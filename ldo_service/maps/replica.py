@@ -87,7 +87,7 @@ class MapReplica:
         return True
 
     def _change(self, changed: GaussianBatch) -> None:
-        """Overwrite the changed Gaussians; a bounded replica may lack some of them."""
+        """Overwrite the changed Gaussians; skip those that a bounded replica does not hold."""
         if not (len(self.map) and len(changed.ids)):
             return
         where = np.searchsorted(self.map.ids, changed.ids)

@@ -179,10 +179,10 @@ class FactorStore:
         return min(share, 1 - share) * float((off / sigmas).max())
 
     def relative(self, without: Pair | None = None) -> Iterable[RelativePose]:
-        """Yield all measurements between variables, except for loop closures and one bridge edge.
+        """Yield all measurements between variables except loop closures.
 
         Args:
-            without: Keyframes of the bridge edge to omit; None omits none.
+            without: Keyframes of a bridge edge that is omitted too; None omits no bridge edge.
         """
         yield from self.odometry.values()
         yield from self.condensed.values()

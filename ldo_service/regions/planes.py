@@ -153,8 +153,8 @@ def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
 def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -> np.ndarray:
     """Return the number of the structural plane of each pixel, [h, w] int32; 0 without one.
 
-    A pixel belongs to a plane if it is one of the plane's pixels. A pixel next to them also belongs
-    to it if its distance from the plane is within the noise.
+    A plane gets the pixels that `found` gives it, and pixels near them whose distance from the
+    plane is within the depth noise.
     """
     out = np.zeros(found.number.shape, np.int32)
     for number, inverse in enumerate(found.inverses, 1):

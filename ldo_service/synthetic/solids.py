@@ -25,7 +25,7 @@ def vector(components: Iterable[np.ndarray | float]) -> Vector:
 class Solid:
     """Convex solid that stands upright in the world, z up.
 
-    The axes of its local frame are the solid's axes. In this frame, the solid fills the cube -1..1.
+    Its local frame is aligned with it, and scaled so that its bounding box is the cube -1..1.
     """
 
     shape: Shape

@@ -139,7 +139,10 @@ class KeyframeRecord:
         return sum(array.nbytes for array in arrays) + len(self.gray) + len(self.depth)
 
     def keyframe(self, config: PyramidConfig) -> ReferenceKeyframe:
-        """Rebuild the keyframe, so that frames can be aligned to it; calls are bitwise equal."""
+        """Rebuild the keyframe, so that frames can be aligned to it.
+
+        Every call returns bitwise the same result.
+        """
         view = build_pyramid(self._gray, self.depth_m, self.camera, config)
         return ReferenceKeyframe(
             view, self.T_odom_keyframe, self.id, self.submap, stored_features=self.features

@@ -162,5 +162,5 @@ def _read(config: FlatConfig, index: int) -> None:
 
 @lru_cache(maxsize=1)
 def _sequence(config: FlatConfig) -> FlatSequence:
-    """Return the sequence, built once per process because its furniture takes a second."""
+    """Return the sequence, built once per process because its furniture takes a second to build."""
     return FlatSequence(config)
