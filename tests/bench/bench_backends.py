@@ -1,12 +1,13 @@
 """Rates of poses and keyframes of a live service whose back ends are slow, and their recovery.
 
     python -m tests.bench.bench_backends [--source DIR] [--seconds 100] [--hz 2] [--pairs 3]
-                                         [--only nothing optimizer ...] [--json FILE]
+                                         [--only nothing optimizer ...] [--replay] [--json FILE]
 
 Each run starts a service with all actors, sends the frames of a recorded walk at a fixed rate, and
 counts poses, poses with status OK and mapped keyframes in a window after a warm-up. Then the back
 ends become fast, and the run waits until no actor is behind. The output compares the rates, the
 closures, the object names and the keyframe poses with those of the run without a slow back end.
+With --replay each run is recorded, and its replay must give the same messages bit for bit.
 """
 
 import argparse
@@ -75,6 +76,7 @@ class Result:
     # Centers of the keyframes in the map, meters, by stamp in ns.
     camera_m: dict[int, list[float]] = field(default_factory=dict)
     ate_cm: float = float("nan")
+    replayed: bool | None = None  # Whether the replay was equal; None without a replay.
 
 
 class Monitor:
@@ -140,16 +142,31 @@ class Monitor:
         return count.delivered
 
 
-def run(slowed: str, sequence: Sequence, seconds: float, hz: float, settings: list[str]) -> Result:
-    """Run one service and return its measurements."""
-    result = Result(slowed)
+def run(slowed: str, sequence: Sequence, options: argparse.Namespace) -> Result:
+    """Run one service, replay its recording if that was asked for, and return the measurements."""
+    with tempfile.TemporaryDirectory() as folder:
+        result = run_service(slowed, sequence, options, Path(folder))
+        if options.replay:
+            command = ["-m", "ldo_service", "replay", f"{folder}/recording", "--verify"]
+            replay = subprocess.run([sys.executable, *command], capture_output=True, text=True)
+            result.replayed = replay.returncode == 0
+            if not result.replayed:
+                print(replay.stdout + replay.stderr, file=sys.stderr)
+    return result
+
+
+def run_service(
+    slowed: str, sequence: Sequence, options: argparse.Namespace, folder: Path
+) -> Result:
+    result, seconds = Result(slowed), options.seconds
+    words = [word for setting in options.settings for word in ("--set", setting)]
+    if options.replay:
+        words += ["--record", str(folder / "recording")]
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         network = Endpoint("robot", free_endpoint())
-        options = [word for setting in settings for word in ("--set", setting)]
         process = subprocess.Popen(
             [sys.executable, str(PROGRAM), "serve", "--endpoint", network.endpoint,
-             "--state", str(folder / "state"), *options],
+             "--state", str(folder / "state"), *words],
             env={**os.environ, "SLOW": json.dumps(SLOW_BACKENDS[slowed]),
                  "RECOVERED": str(folder / "recovered")},
             stderr=(folder / "log").open("wb"),
@@ -160,7 +177,7 @@ def run(slowed: str, sequence: Sequence, seconds: float, hz: float, settings: li
         monitor = Monitor(session, network)
         assert client.wait_for_subscriber(60)
         stop = threading.Event()
-        camera = threading.Thread(target=stream, args=(client, sequence, hz, stop))
+        camera = threading.Thread(target=stream, args=(client, sequence, options.hz, stop))
         camera.start()
         stack.callback(stop.set)
         time.sleep(WARM_UP_S)
@@ -257,6 +274,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=1)
     parser.add_argument("--only", nargs="+", default=list(SLOW_BACKENDS), choices=SLOW_BACKENDS)
     parser.add_argument("--set", nargs="+", default=[], dest="settings")
+    parser.add_argument("--replay", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     sequence = open_sequence(options.source)
@@ -265,7 +283,7 @@ def main() -> None:
     for _ in range(options.pairs):
         reference: Result | None = None
         for slowed in dict.fromkeys(("nothing", *options.only)):
-            result = run(slowed, sequence, options.seconds, options.hz, options.settings)
+            result = run(slowed, sequence, options)
             results.append(result)
             reference = reference or result
             print(
@@ -274,7 +292,8 @@ def main() -> None:
                 f"{result.recovery_s:10.0f}  {len(result.closures):8d} "
                 f"{sum(result.names.values()):8d} {rmse_cm(result, reference):6.2f}  "
                 f"restarts {sum(result.restarts.values())} dropped {result.dropped} "
-                f"labelled {result.labelled} ate {result.ate_cm:.2f} cm",
+                f"labelled {result.labelled} ate {result.ate_cm:.2f} cm "
+                f"replay {result.replayed}",
                 flush=True,
             )
     if options.json:
