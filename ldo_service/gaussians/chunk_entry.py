@@ -11,7 +11,8 @@ from ldo_service.geometry import se3
 class ChunkEntry:
     """Table entry of one offloaded chunk.
 
-    The entry stays in memory while the Gaussians are in a file. The chunk has `count` Gaussians, whose ids lie between `first_id` and `last_id`.
+    The entry stays in memory while the Gaussians are in a file. The chunk has `count` Gaussians,
+    whose ids lie between `first_id` and `last_id`.
     """
 
     anchor: int

@@ -167,8 +167,8 @@ class DualEncoder:
         """Add a name to choose from.
 
         Raises:
-            ConfigError: The name is invalid, or it has no stored embedding and there is no text encoder
-                to compute one.
+            ConfigError: The name is invalid, or it has no stored embedding and there is no text
+                encoder to compute one.
         """
         if not is_name(name):
             raise ConfigError(f"{name[:40]!r} is not a name: write 1 to {LONGEST} characters.")
