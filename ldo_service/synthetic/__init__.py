@@ -11,6 +11,9 @@ Sequences:
 - `room-noisy`, `tour-noisy`, `person-noisy`: The same, with the depth errors of a Kinect.
 - `flat`: Two rooms and a corridor with ground-truth labels, designed to be hard.
 - `flat-exact`: The same flat without sensor noise.
+- `room-handheld`, `tour-handheld`, `person-handheld`, `flat-handheld`: Faster motion, seen by a
+  simulated camera with all effects of real ones. `:` and names joined by `+` choose some of them:
+  `tour-handheld:rolling-shutter+stereo`.
 
 A number after @ is the seed of textures, hand shake and noise: `room@3`.
 """
@@ -19,22 +22,25 @@ from ldo_service.errors import DataError
 from ldo_service.synthetic import flat
 from ldo_service.synthetic.flat import FlatConfig, FlatSequence
 
-from . import room_sequence
+from . import handheld, room_sequence
+from .handheld import HandheldConfig, HandheldSequence
 from .room_sequence import SyntheticConfig, SyntheticSequence
 
 __all__ = [
     "SCENES",
     "FlatConfig",
     "FlatSequence",
+    "HandheldConfig",
+    "HandheldSequence",
     "SyntheticConfig",
     "SyntheticSequence",
     "open_synthetic",
 ]
 
-SCENES = (*room_sequence.NAMED, *flat.NAMED)  # Names of all built-in scenes.
+SCENES = (*room_sequence.NAMED, *flat.NAMED, *handheld.NAMED)  # Names of all built-in scenes.
 
 
-def open_synthetic(name: str) -> SyntheticSequence | FlatSequence:
+def open_synthetic(name: str) -> SyntheticSequence | FlatSequence | HandheldSequence:
     """Return the sequence `synthetic:name`, or `synthetic:name@seed`.
 
     Raises:
@@ -51,5 +57,7 @@ def open_synthetic(name: str) -> SyntheticSequence | FlatSequence:
         return SyntheticSequence.named(plain, **changes)
     if plain in flat.NAMED:
         return FlatSequence.named(plain, **changes)
+    if handheld.MARK in plain:
+        return HandheldSequence.named(plain, **changes)
     known = ", ".join(f"synthetic:{known}" for known in SCENES)
     raise DataError(f"unknown sequence synthetic:{plain}; known are {known}.")

@@ -115,6 +115,37 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     return T
 
 
+def looking(eyes: np.ndarray, gazes: np.ndarray, rolls: np.ndarray) -> np.ndarray:
+    """Return T_world_camera [N, 4, 4] with z along the gaze, rolled by a small angle.
+
+    Args:
+        eyes: Camera centers [N, 3].
+        gazes: Viewing directions [N, 3], of any length.
+        rolls: Angles [N] about the gaze, radians; valid for small ones.
+    """
+    z = gazes / lengths(gazes)[:, None]
+    level = np.stack([z[:, 1], -z[:, 0], np.zeros(len(z))], axis=1)
+    level = level / lengths(level)[:, None]
+    x = level + rolls[:, None] * _crosses(z, level)
+    x = x / lengths(x)[:, None]
+    T = np.zeros((len(eyes), 4, 4))
+    T[:, 3, 3] = 1.0
+    T[:, :3, 0], T[:, :3, 1], T[:, :3, 2], T[:, :3, 3] = x, _crosses(z, x), z, eyes
+    return T
+
+
+def lengths(v: np.ndarray) -> np.ndarray:
+    """Return the lengths [N] of vectors [N, 3]."""
+    x, y, z = v.T
+    return np.sqrt(x * x + y * y + z * z)
+
+
+def _crosses(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    x, y, z = a.T
+    p, q, r = b.T
+    return np.stack([y * r - z * q, z * p - x * r, x * q - y * p], axis=1)
+
+
 def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 

@@ -7,9 +7,12 @@ import numpy as np
 
 from ldo_service.geometry import Camera
 
+from .optics import max_displacement_px, undistorted
 from .solids import Solid, Vector, interval, vector
 
 NEAR_M = 0.05
+# A solid is projected with this many poses of a frame with a pose for each row.
+ROW_POSES = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +32,7 @@ class Hits:
 
 
 class RayCaster:
-    """Ray caster of one camera pose.
+    """Ray caster of one camera pose, or of one pose for each row (rolling shutter).
 
     Each solid is projected into the image once. A ray is tested against a solid only if its pixel
     lies in the window around that projection.
@@ -42,6 +45,14 @@ class RayCaster:
         camera: Camera,
         T_world_camera: np.ndarray,
     ) -> None:
+        """Project the solids into the image.
+
+        Args:
+            shell: Solid that contains the camera.
+            solids: All other solids.
+            camera: Intrinsics; lens distortion bends the rays.
+            T_world_camera: Camera pose [4, 4], or one pose for each row of the image, [H, 4, 4].
+        """
         self.camera = camera
         self._shell = shell
         self._solids = solids
@@ -55,12 +66,13 @@ class RayCaster:
             u: Columns [P], pixels; fractions are allowed.
             v: Rows [P], pixels, in ascending order.
         """
-        direction = self._directions(u, v)
-        depth_m, surface = self._cast_at_shell(direction)
+        direction, origin = self._directions(u, v), self._origins(v)
+        depth_m, surface = self._cast_at_shell(origin, direction)
         for k, (solid, window) in enumerate(zip(self._solids, self._windows, strict=True)):
             rays = window.covered(u, v)
             d = solid.direction_to_local(vector(component[rays] for component in direction))
-            enter, leave = interval(solid.shape, solid.point_to_local(self._origin()), d)
+            o = solid.point_to_local(vector(c[rays] if c.ndim else c for c in origin))
+            enter, leave = interval(solid.shape, o, d)
             nearer = (enter < leave) & (enter > NEAR_M) & (enter < depth_m[rays])
             depth_m[rays[nearer]] = enter[nearer]
             surface[rays[nearer]] = 6 + k
@@ -68,11 +80,11 @@ class RayCaster:
 
     def points(self, u: np.ndarray, v: np.ndarray, depth_m: np.ndarray) -> Vector:
         """Return the world points of pixels at a depth."""
-        d, o = self._directions(u, v), self._origin()
+        d, o = self._directions(u, v), self._origins(v)
         return o[0] + d[0] * depth_m, o[1] + d[1] * depth_m, o[2] + d[2] * depth_m
 
-    def _cast_at_shell(self, direction: Vector) -> tuple[np.ndarray, np.ndarray]:
-        o = self._shell.point_to_local(self._origin())
+    def _cast_at_shell(self, origin: Vector, direction: Vector) -> tuple[np.ndarray, np.ndarray]:
+        o = self._shell.point_to_local(origin)
         d = self._shell.direction_to_local(direction)
         with np.errstate(divide="ignore"):
             leaves = np.stack([(np.where(d[i] > 0, 1.0, -1.0) - o[i]) / d[i] for i in range(3)])
@@ -81,20 +93,28 @@ class RayCaster:
         rays = np.arange(len(axis))
         return leaves[axis, rays], 2 * axis + (np.stack(d)[axis, rays] > 0)
 
-    def _origin(self) -> Vector:
-        return vector(self._T[:3, 3])
+    def _origins(self, v: np.ndarray) -> Vector:
+        """Return the camera center of each ray: one for all rays, or one for each of the rows v."""
+        T = self._poses(v)
+        return T[..., 0, 3], T[..., 1, 3], T[..., 2, 3]
+
+    def _poses(self, v: np.ndarray) -> np.ndarray:
+        """Return the pose [4, 4] of all rays, or the pose [P, 4, 4] of each of the rows v."""
+        if self._T.ndim == 2:
+            return self._T
+        return self._T[np.clip(np.floor(v + 0.5).astype(np.int64), 0, len(self._T) - 1)]
 
     def _directions(self, u: np.ndarray, v: np.ndarray) -> Vector:
         """Return the world directions d of the rays, scaled to z = 1 in the camera.
 
         With this scale, the parameter t of a point o + t d is its depth.
         """
-        x, y, _ = np.moveaxis(self.camera.rays_at(u, v), -1, 0)
-        R = self._T
+        x, y = undistorted(self.camera, u, v)
+        R = self._poses(v)
         return (
-            R[0, 0] * x + R[0, 1] * y + R[0, 2],
-            R[1, 0] * x + R[1, 1] * y + R[1, 2],
-            R[2, 0] * x + R[2, 1] * y + R[2, 2],
+            R[..., 0, 0] * x + R[..., 0, 1] * y + R[..., 0, 2],
+            R[..., 1, 0] * x + R[..., 1, 1] * y + R[..., 1, 2],
+            R[..., 2, 0] * x + R[..., 2, 1] * y + R[..., 2, 2],
         )
 
 
@@ -115,7 +135,32 @@ class _Window:
         return first + np.flatnonzero((u >= self.left) & (u <= self.right))
 
 
+EMPTY = _Window(1, 0, 1, 0)
+
+
 def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
+    """Return the window of a solid at one pose [4, 4], or at the poses of all rows [H, 4, 4].
+
+    The window of several poses contains those of a few of them, with the motion between two of
+    these as a margin. Lens distortion adds its largest displacement.
+    """
+    if T.ndim == 2 and not any(camera.distortion):
+        return _window_at(solid, camera, T)
+    pinhole = camera.rectified()
+    rows = np.linspace(0, len(T) - 1, ROW_POSES).astype(np.int64)
+    poses = T[None] if T.ndim == 2 else T[rows]
+    # A wider image, because distortion moves surfaces from beyond its border into it.
+    margin = max_displacement_px(camera)
+    windows = [_window_at(solid, pinhole, pose, margin) for pose in poses]
+    seen = np.array([(w.left, w.right, w.top, w.bottom) for w in windows if w != EMPTY])
+    if not len(seen):
+        return EMPTY
+    margins = margin + (np.abs(np.diff(seen, axis=0)).max(axis=0) if len(seen) > 1 else 0.0)
+    low, high = (seen - margins).min(axis=0), (seen + margins).max(axis=0)
+    return _Window(low[0], high[1], low[2], high[3])
+
+
+def _window_at(solid: Solid, camera: Camera, T: np.ndarray, margin_px: float = 0.0) -> _Window:
     """Return the window of a solid: the bounds of its projected corners.
 
     The window is empty if the solid is outside the field of view. It is the whole image if the
@@ -125,11 +170,13 @@ def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
     x, y, z = (
         offset[:, 0] * T[0, i] + offset[:, 1] * T[1, i] + offset[:, 2] * T[2, i] for i in range(3)
     )
-    right, bottom = (camera.width - camera.cx) / camera.fx, (camera.height - camera.cy) / camera.fy
-    left, top = (-1 - camera.cx) / camera.fx, (-1 - camera.cy) / camera.fy
+    far_u, far_v = camera.width + margin_px, camera.height + margin_px
+    right, bottom = (far_u - camera.cx) / camera.fx, (far_v - camera.cy) / camera.fy
+    near_px = -1 - margin_px
+    left, top = (near_px - camera.cx) / camera.fx, (near_px - camera.cy) / camera.fy
     beside = (x > right * z).all() or (x < left * z).all()
     if z.max() < NEAR_M or beside or (y > bottom * z).all() or (y < top * z).all():
-        return _Window(1, 0, 1, 0)
+        return EMPTY
     if z.min() < NEAR_M:
         return _Window(-1, camera.width, -1, camera.height)
     u, v = x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy

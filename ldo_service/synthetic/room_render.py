@@ -20,9 +20,14 @@ QUARTERS_PX = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 class RoomRendering:
     """One rendered frame of the room."""
 
-    color: np.ndarray  # Color [H, W, 3] uint8.
+    light: np.ndarray  # Light [H, W, 3] float64 in 0..1.
     depth_m: np.ndarray  # Depth z [H, W] float64, exact at pixel centers.
     is_visitor: np.ndarray  # Mask [H, W] of the pixels that show a visitor.
+
+    @property
+    def color(self) -> np.ndarray:
+        """Color [H, W, 3] uint8 of a perfect camera."""
+        return np.floor(self.light * 255 + 0.5).astype(np.uint8)
 
 
 class Renderer:
@@ -35,27 +40,26 @@ class Renderer:
     def render(
         self, camera: Camera, T_world_camera: np.ndarray, visitors: tuple[Solid, ...] = ()
     ) -> RoomRendering:
-        """Render the room from one camera pose.
+        """Render the room from one camera pose, or from one pose for each row.
 
         The color of a pixel on an outline is the mean of four rays; depth never mixes surfaces.
 
         Args:
             camera: Intrinsics.
-            T_world_camera: Camera pose [4, 4].
+            T_world_camera: Camera pose [4, 4], or one for each row, [H, 4, 4].
             visitors: Solids in addition to the furniture; they cast no shadow.
         """
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
         solids = (*self._room.furniture, *visitors)
         view = RayCaster(self._room.shell, solids, camera, T_world_camera)
         hits = view.cast(u, v)
-        color = self._color(view, solids, u, v, hits)
+        light = self._color(view, solids, u, v, hits)
         edge = outline(hits.surface.reshape(camera.height, camera.width)).ravel()
-        color[edge] = self._antialiased(view, solids, u[edge], v[edge])
-        image = np.floor(color * 255 + 0.5).astype(np.uint8)
+        light[edge] = self._antialiased(view, solids, u[edge], v[edge])
         size = (camera.height, camera.width)
         is_visitor = hits.surface >= SHELL_FACES + len(self._room.furniture)
         return RoomRendering(
-            image.reshape(*size, 3), hits.depth_m.reshape(size), is_visitor.reshape(size)
+            light.reshape(*size, 3), hits.depth_m.reshape(size), is_visitor.reshape(size)
         )
 
     def _antialiased(

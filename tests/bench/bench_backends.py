@@ -76,7 +76,7 @@ class Result:
     # Centers of the keyframes in the map, meters, by stamp in ns.
     camera_m: dict[int, list[float]] = field(default_factory=dict)
     ate_cm: float = float("nan")
-    replayed: bool | None = None  # Whether the replay was equal; None without a replay.
+    replayed: bool | None = None  # The replay was bitwise equal; None without a replay.
 
 
 class Monitor:

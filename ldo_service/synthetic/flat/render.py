@@ -109,7 +109,7 @@ class FlatRenderer:
         ]
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> FlatRendering:
-        """Render the flat from one camera pose.
+        """Render the flat from one camera pose [4, 4], or from one for each row, [H, 4, 4].
 
         The light of a pixel on an outline is the mean of four rays. Depth and labels never mix
         surfaces.

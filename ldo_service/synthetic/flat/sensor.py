@@ -44,7 +44,7 @@ class Sensor:
 
     def depth_m(self, rendering: FlatRendering, rng: np.random.Generator) -> np.ndarray:
         """Return the measured depth [H, W], meters; 0 where unknown."""
-        return measured_depth_m(rendering, self.camera.fx, rng)
+        return measured_depth_m(rendering.depth_m, rendering.light, self.camera.fx, rng)
 
     def motion_px(self, frame: int, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the image motion in u and v, each [H, W], while the shutter is open."""
@@ -65,7 +65,7 @@ class Sensor:
 
 
 def measured_depth_m(
-    rendering: FlatRendering, focal_px: float, rng: np.random.Generator
+    exact_m: np.ndarray, light: np.ndarray, focal_px: float, rng: np.random.Generator
 ) -> np.ndarray:
     """Return depth with the errors of a Kinect-like camera.
 
@@ -74,20 +74,20 @@ def measured_depth_m(
     on dark patches and outside 0.4-5 m.
 
     Args:
-        rendering: The exact frame.
+        exact_m: Exact depth [H, W], meters.
+        light: Light [H, W, 3] in 0..1.
         focal_px: Focal length.
         rng: Source of the noise.
 
     Returns:
         Depth [H, W], meters; 0 where unknown.
     """
-    exact = rendering.depth_m
-    disparity = 1 / (_ragged(exact, rng) * DISPARITY_STEP_PER_M)
-    disparity = disparity + DISPARITY_SIGMA_STEPS * _matching_noise(rng, exact.shape)
+    disparity = 1 / (_ragged(exact_m, rng) * DISPARITY_STEP_PER_M)
+    disparity = disparity + DISPARITY_SIGMA_STEPS * matching_noise(rng, exact_m.shape)
     measured = 1 / (np.maximum(np.floor(disparity + 0.5), 1.0) * DISPARITY_STEP_PER_M)
     seen = (measured >= NEAREST_M) & (measured <= FARTHEST_M)
-    seen &= ~is_shadowed(exact, BASELINE_PX_M * focal_px)
-    return np.where(seen & ~_is_too_dark(rendering.light, rng), measured, 0.0)
+    seen &= ~is_shadowed(exact_m, BASELINE_PX_M * focal_px)
+    return np.where(seen & ~is_too_dark(light, rng), measured, 0.0)
 
 
 def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
@@ -144,14 +144,14 @@ def _ragged(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.take_along_axis(depth_m, column, axis=1)
 
 
-def _is_too_dark(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def is_too_dark(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return a mask [H, W] of pixels without measurement, more of them on darker surfaces."""
     brightness = (light[..., 0] + light[..., 1] + light[..., 2]) / 3
     patches = _enlarged(rng.random(_coarse(brightness.shape, PATCH_PX)), PATCH_PX, brightness.shape)
     return brightness < DARK * patches * (0.5 + rng.random(brightness.shape))
 
 
-def _matching_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+def matching_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     """Return noise [H, W] of unit variance, most of it shared within a window."""
     shared = _enlarged(normal(rng, _coarse(shape, WINDOW_PX)), WINDOW_PX, shape)
     # Interpolation keeps 2/3 of the variance along each axis, hence the factor 1.5.

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ldo_service.synthetic.path import closed_spline
+from ldo_service.synthetic.path import closed_spline, lengths, looking
 
 RATE_HZ = 15
 FRAMES = 640
@@ -75,7 +75,7 @@ class CameraPath:
         state = np.append(_at(KNOTS, place), 0.0)
         for knots in self.shakes:
             state = state + _at(knots, turn * len(knots))
-        return _looking(state[:3], state[3:6], state[6])
+        return looking(state[None, :3], state[None, 3:6], state[None, 6])[0]
 
 
 def hand_held(seed: int) -> CameraPath:
@@ -83,7 +83,7 @@ def hand_held(seed: int) -> CameraPath:
     rng = np.random.default_rng([seed, 2])
     sway = _shake(rng, SWAY_S, SWAY_EYE_M, SWAY_GAZE)
     tremor = _shake(rng, TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE)
-    return CameraPath(_timed(), (sway, tremor))
+    return CameraPath(timed_positions(), (sway, tremor))
 
 
 def _shake(rng: np.random.Generator, period_s: float, eye_m: float, gaze: float) -> np.ndarray:
@@ -91,7 +91,7 @@ def _shake(rng: np.random.Generator, period_s: float, eye_m: float, gaze: float)
     return (rng.random((count, 7)) * 2 - 1) * ([eye_m] * 3 + [gaze] * 4)
 
 
-def _timed() -> np.ndarray:
+def timed_positions() -> np.ndarray:
     """Return positions on the knots at equal time steps.
 
     Neither the walking speed nor the turn rate is exceeded for long.
@@ -99,9 +99,9 @@ def _timed() -> np.ndarray:
     place = np.arange(len(KNOTS) * STEPS_PER_KNOT + 1) / STEPS_PER_KNOT
     state = closed_spline(KNOTS, place[:-1])
     state = np.concatenate([state, state[:1]])
-    walked = _length(np.diff(state[:, :3], axis=0)) / WALK_M_S
-    gaze = state[:, 3:] / _length(state[:, 3:])[:, None]
-    turned = _length(np.diff(gaze, axis=0)) / TURN_RAD_S
+    walked = lengths(np.diff(state[:, :3], axis=0)) / WALK_M_S
+    gaze = state[:, 3:] / lengths(state[:, 3:])[:, None]
+    turned = lengths(np.diff(gaze, axis=0)) / TURN_RAD_S
     time = np.concatenate([[0.0], np.cumsum(np.sqrt(walked * walked + turned * turned))])
     wanted = np.arange(len(time)) * (time[-1] / (len(time) - 1))
     cell = np.clip(np.searchsorted(time, wanted, side="right") - 1, 0, len(time) - 2)
@@ -109,29 +109,5 @@ def _timed() -> np.ndarray:
     return place[cell] + share * (place[cell + 1] - place[cell])
 
 
-def _length(v: np.ndarray) -> np.ndarray:
-    x, y, z = v.T
-    return np.sqrt(x * x + y * y + z * z)
-
-
 def _at(knots: np.ndarray, place: float) -> np.ndarray:
     return closed_spline(knots, np.array([place % len(knots)]))[0]
-
-
-def _looking(eye: np.ndarray, gaze: np.ndarray, roll: float) -> np.ndarray:
-    """Return T_world_camera [4, 4] with z along the gaze, rolled by a small angle."""
-    z = gaze / _length(gaze[None])[0]
-    level = np.array([z[1], -z[0], 0.0])
-    level = level / _length(level[None])[0]
-    down = _cross(z, level)
-    x = level + roll * down
-    x = x / _length(x[None])[0]
-    T = np.eye(4)
-    T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = x, _cross(z, x), z, eye
-    return T
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.array(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )

@@ -1,0 +1,12 @@
+"""Simulator of a hand-held RGB-D camera: motion and effects of real cameras, with exact truth.
+
+synthetic:tour-handheld              all effects, with a Kinect's depth
+synthetic:tour-handheld:blur         motion blur alone, with exact depth
+synthetic:tour-handheld:all+tof@3    all effects with a time-of-flight camera, and seed 3
+synthetic:tour-handheld:none         the same motion without any effect
+"""
+
+from .effects import ALL, Effects
+from .sequence import MARK, NAMED, HandheldConfig, HandheldSequence
+
+__all__ = ["ALL", "MARK", "NAMED", "Effects", "HandheldConfig", "HandheldSequence"]

@@ -1,0 +1,64 @@
+"""Motion of a hand-held camera as a function of time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.synthetic.flat.walk import KNOTS, timed_positions
+from ldo_service.synthetic.path import Path, closed_spline, lengths, looking
+
+# Period of the hand's slow drift and of its quick tremor, seconds, and their amplitudes: of the
+# camera center in meters, and of gaze and roll in radians.
+SWAY_S, SWAY_EYE_M, SWAY_RAD = 0.6, 0.02, 0.06
+TREMOR_S, TREMOR_EYE_M, TREMOR_RAD = 0.2, 0.002, 0.008
+
+
+@dataclass(frozen=True, slots=True)
+class HandMotion:
+    """Motion along a closed curve, once in `duration_s`."""
+
+    knots: np.ndarray  # Camera center and gaze, [M, 6].
+    along: np.ndarray  # Positions [K + 1] on the knots at equal time steps.
+    duration_s: float
+    shakes: tuple[np.ndarray, ...]  # Knots [K, 7] of closed splines added to eye, gaze and roll.
+
+    def poses(self, times_s: np.ndarray) -> np.ndarray:
+        """Return T_world_camera [N, 4, 4] at times [N]."""
+        turn = times_s / self.duration_s
+        turn = turn - np.floor(turn)
+        x = turn * (len(self.along) - 1)
+        cell = np.minimum(x.astype(np.int64), len(self.along) - 2)
+        before, after = self.along[cell], self.along[cell + 1]
+        place = before + (x - cell) * (after - before)
+        state = np.zeros((len(times_s), 7))
+        state[:, :6] = closed_spline(self.knots, _wrapped(place, len(self.knots)))
+        state[:, 3:6] /= lengths(state[:, 3:6])[:, None]
+        for knots in self.shakes:
+            state += closed_spline(knots, _wrapped(turn * len(knots), len(knots)))
+        return looking(state[:, :3], state[:, 3:6], state[:, 6])
+
+
+def room_motion(path: Path, duration_s: float, seed: int) -> HandMotion:
+    """Return the motion along a path through the room, with the shake of a hand."""
+    knots = np.concatenate([path.eyes_m, path.targets_m - path.eyes_m], axis=1)
+    knots[:, 3:] /= lengths(knots[:, 3:])[:, None]
+    along = np.arange(len(knots) + 1.0)
+    return HandMotion(knots, along, duration_s, _shakes(duration_s, seed))
+
+
+def flat_motion(duration_s: float, seed: int) -> HandMotion:
+    """Return the walk through the flat, with the shake of a hand."""
+    return HandMotion(KNOTS, timed_positions(), duration_s, _shakes(duration_s, seed))
+
+
+def _shakes(duration_s: float, seed: int) -> tuple[np.ndarray, ...]:
+    rng = np.random.default_rng([seed, 7])
+    periods = ((SWAY_S, SWAY_EYE_M, SWAY_RAD), (TREMOR_S, TREMOR_EYE_M, TREMOR_RAD))
+    return tuple(
+        (rng.random((int(duration_s / period_s), 7)) * 2 - 1) * ([eye_m] * 3 + [angle_rad] * 4)
+        for period_s, eye_m, angle_rad in periods
+    )
+
+
+def _wrapped(place: np.ndarray, count: int) -> np.ndarray:
+    return place - np.floor(place / count) * count
