@@ -15,45 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 from ldo_service.geometry.boxes import areas, intersections, ious
 
 from .distributions import common_mass, mean_distributions
 from .object_landmarks import MEMBERS, NO_MEMBER, reliable_members, rows_of, shuffled, trimmed
+from .objects_config import AssociationConfig
 
 PROBES = 128  # Members that are projected. The first in shuffled order are a uniform subsample.
-
-
-@dataclass(frozen=True, slots=True)
-class AssociationConfig:
-    """Settings of the data association."""
-
-    min_iou: float = 0.4  # Minimum IoU of the boxes (III.C).
-    # Minimum `common_mass`: a cup lies in the box of its table, but is no table.
-    min_shared: float = 0.3
-    # Maximum gap between depth ranges; tolerance of the occlusion test (delta_z, III.A).
-    max_depth_gap_m: float = 0.1
-    min_gaussians: int = 8  # Minimum Gaussians of a region; with fewer, its position is unknown.
-    # Maximum regions per keyframe, those with the most Gaussians; COCO images have 7.
-    max_regions: int = 64
-    # Detectors draw separate boxes around a plant, its crown and its pot. A box is a part of a
-    # larger one of its class and depth if this fraction of it lies inside; above 1, none is.
-    part_inside: float = 0.9
-
-    def __post_init__(self) -> None:
-        if not (0 < self.min_iou <= 1 and 0 <= self.min_shared <= 1):
-            raise ConfigError(
-                named(self, "min_iou", "min_shared")
-                + ": min_iou must be in (0, 1], min_shared in [0, 1]."
-            )
-        if self.max_depth_gap_m <= 0 or min(self.min_gaussians, self.max_regions) < 1:
-            raise ConfigError(
-                named(self, "max_depth_gap_m", "min_gaussians", "max_regions")
-                + ": max_depth_gap_m must be positive, the counts at least 1."
-            )
-        if self.part_inside <= 0:
-            raise ConfigError(f"part_inside={self.part_inside:g} must be positive.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -178,6 +147,17 @@ def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationCon
     is_hit = view.regions >= 0
     numbers = np.where(is_hit, whole[view.regions * is_hit], view.regions)
     return replace(view, regions=numbers.astype(np.int32))
+
+
+def whole_regions(
+    view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
+) -> tuple[MapView, RegionStatistics]:
+    """Merge regions that show parts of one object, and return the regions with their statistics."""
+    regions = compute_region_statistics(view, T_camera_map, config)
+    whole = merge_parts(view, regions, config)
+    return whole, regions if whole is view else compute_region_statistics(
+        whole, T_camera_map, config
+    )
 
 
 def find_containing_regions(

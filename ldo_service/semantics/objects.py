@@ -8,16 +8,14 @@ import numpy as np
 from ldo_service.geometry import Camera, se3
 
 from .data_association import (
-    AssociationConfig,
     AssociationCosts,
     MapView,
     PredictedBoxes,
     RegionStatistics,
     associate,
     association_costs,
-    compute_region_statistics,
-    merge_parts,
     predict_boxes,
+    whole_regions,
 )
 from .distributions import divergence, entropy
 from .gaussian_labels import BACKGROUND
@@ -70,7 +68,9 @@ class Objects:
         table = self._table[self._table["id"] != CANDIDATE]
         return table[np.argsort(table["id"])]
 
-    def observe(self, view: MapView, undetectable: np.ndarray | None = None) -> ObjectUpdate:
+    def observe(
+        self, view: MapView, undetectable: np.ndarray | None = None, *, is_late: bool = False
+    ) -> ObjectUpdate:
         """Update the objects from a keyframe.
 
         A region without an associated landmark creates a candidate. A candidate becomes an object
@@ -84,6 +84,9 @@ class Objects:
             view: The map and the regions of the keyframe.
             undetectable: Labels that the detector does not know, [256] bool. An object with such a
                 label is missed only if the measured depth shows that it is gone.
+            is_late: The keyframe was observed before, and the view has only regions with late
+                labels. It then counts for candidates that it has not been counted for, objects do
+                not change, and nothing is missed.
 
         Returns:
             The changes of the objects.
@@ -94,13 +97,16 @@ class Objects:
         T_camera_map = se3.inverse(view.T_map_camera)
         limits = self.config.association
         # Observed and predicted regions.
-        view, regions = _seen(view, T_camera_map, limits)
+        view, regions = whole_regions(view, T_camera_map, limits)
         near = np.flatnonzero(within(self._table, view.camera, T_camera_map))
         predicted = predict_boxes(self._table[near], view, T_camera_map, limits)
         # Data association.
         pairs = association_costs(distributions(self._table[near]), predicted, regions, limits)
         k, r = self._match(near, pairs)
         excused, left = self._pieces(near, k, pairs, regions, r)
+        if is_late:
+            is_new = self._lacks(near[k], view.keyframe)
+            k, r, excused[:] = k[is_new], r[is_new], True
         # Observations and misses.
         observations = self._update(
             view, near[k], r, predicted.rows[k], predicted.shown[k], regions
@@ -165,8 +171,9 @@ class Objects:
             seen["members"], seen["votes"], regions.members[r], one_each(regions.members[r])
         )
         seen["seen"] = np.where(begins, 1, seen["seen"] + 1)
-        seen["first"] = np.where(begins, view.keyframe, seen["first"])
-        seen["misses"], seen["last"] = 0, view.keyframe
+        first = np.minimum(seen["first"], view.keyframe)
+        seen["first"] = np.where(begins, view.keyframe, first)
+        seen["misses"], seen["last"] = 0, np.maximum(seen["last"], view.keyframe)
         add_views(seen, view.keyframe, shown, regions.boxes[r])
         self._derive(seen, view.rows, view.labels, view.ids, view.anchors)
         self._table[which] = seen
@@ -177,6 +184,12 @@ class Objects:
             )
             for i in np.flatnonzero(seen["id"] != CANDIDATE)
         ]
+
+    def _lacks(self, which: np.ndarray, keyframe: int) -> np.ndarray:
+        """Return which landmarks [K] are candidates whose observations do not reach a keyframe."""
+        table = self._table[which]
+        is_within = (table["first"] <= keyframe) & (keyframe <= table["last"])
+        return (table["id"] == CANDIDATE) & ~is_within
 
     def _derive(self, table: np.ndarray, *gaussians: np.ndarray) -> None:
         """Derive landmarks in place; those with too few resident Gaussians stay unchanged."""
@@ -378,14 +391,3 @@ class Objects:
             "objects_retired": self._removed,
             "objects_rejected": self._refused,  # Candidates that did not fit into max_objects.
         }
-
-
-def _seen(
-    view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
-) -> tuple[MapView, RegionStatistics]:
-    """Merge regions that show parts of one object, and compute the statistics of the regions."""
-    regions = compute_region_statistics(view, T_camera_map, config)
-    whole = merge_parts(view, regions, config)
-    return whole, regions if whole is view else compute_region_statistics(
-        whole, T_camera_map, config
-    )

@@ -1,10 +1,39 @@
-"""Settings of the objects: when they appear, merge and are removed (paper, III.C)."""
+"""Settings of the objects: association, and when they appear, merge and are removed (III.C)."""
 
 from dataclasses import dataclass, field
 
 from ldo_service.errors import ConfigError, named
 
-from .data_association import AssociationConfig
+
+@dataclass(frozen=True, slots=True)
+class AssociationConfig:
+    """Settings of the data association."""
+
+    min_iou: float = 0.4  # Minimum IoU of the boxes (III.C).
+    # Minimum `common_mass`: a cup lies in the box of its table, but is no table.
+    min_shared: float = 0.3
+    # Maximum gap between depth ranges; tolerance of the occlusion test (delta_z, III.A).
+    max_depth_gap_m: float = 0.1
+    min_gaussians: int = 8  # Minimum Gaussians of a region; with fewer, its position is unknown.
+    # Maximum regions per keyframe, those with the most Gaussians; COCO images have 7.
+    max_regions: int = 64
+    # Detectors draw separate boxes around a plant, its crown and its pot. A box is a part of a
+    # larger one of its class and depth if this fraction of it lies inside; above 1, none is.
+    part_inside: float = 0.9
+
+    def __post_init__(self) -> None:
+        if not (0 < self.min_iou <= 1 and 0 <= self.min_shared <= 1):
+            raise ConfigError(
+                named(self, "min_iou", "min_shared")
+                + ": min_iou must be in (0, 1], min_shared in [0, 1]."
+            )
+        if self.max_depth_gap_m <= 0 or min(self.min_gaussians, self.max_regions) < 1:
+            raise ConfigError(
+                named(self, "max_depth_gap_m", "min_gaussians", "max_regions")
+                + ": max_depth_gap_m must be positive, the counts at least 1."
+            )
+        if self.part_inside <= 0:
+            raise ConfigError(f"part_inside={self.part_inside:g} must be positive.")
 
 
 @dataclass(frozen=True, slots=True)

@@ -256,11 +256,8 @@ def fuse_detections(
         ValueError: If the shapes or types of the arrays do not fit.
     """
     # Assignment of Gaussians to regions.
-    regions = regions_of(detections, depth_m, camera, config)
-    T_camera_map = se3.inverse(T_map_camera)
-    where = assign_gaussians(
-        rows, indices, camera, T_camera_map, depth_m, regions, config.assignment, threads=threads
-    )
+    at = camera, T_map_camera, depth_m, detections, config
+    where = assign_detections(rows, indices, *at, threads=threads)
     # Observed labels.
     seen = observations(where, indices, camera, detections, config, is_late=is_late)
     if undetectable is not None:
@@ -276,6 +273,25 @@ def fuse_detections(
     touched = indices[seen.labels != NOT_SEEN]
     return FusionResult(
         where, seen, smooth_labels(rows, labels, touched, config.consistency, threads=threads)
+    )
+
+
+def assign_detections(
+    rows: np.ndarray,
+    indices: np.ndarray,
+    camera: Camera,
+    T_map_camera: np.ndarray,
+    depth_m: np.ndarray,
+    detections: RegionDetections,
+    config: SemanticFusionConfig,
+    *,
+    threads: int = 1,
+) -> Assignment:
+    """Assign the Gaussians that contribute to a keyframe to its regions; see `fuse_detections`."""
+    regions = regions_of(detections, depth_m, camera, config)
+    T_camera_map = se3.inverse(T_map_camera)
+    return assign_gaussians(
+        rows, indices, camera, T_camera_map, depth_m, regions, config.assignment, threads=threads
     )
 
 

@@ -1,66 +1,31 @@
 """Labels of the Gaussians of a map, and its objects."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-from ldo_service.detection.dynamic_classes import Box, DynamicClassConfig, dynamic_class_mask
+from ldo_service.detection.dynamic_classes import Box, dynamic_class_mask
 from ldo_service.detection.vocabulary import Vocabulary
-from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.renderer import Contributions
 from ldo_service.gaussians.training_views import TrainingView
 from ldo_service.regions.foreground import RegionDetections
-from ldo_service.regions.open_vocabulary import OpenVocabularyConfig, OpenVocabularyLabeling
+from ldo_service.regions.open_vocabulary import OpenVocabularyLabeling
 from ldo_service.regions.region import Region, RegionLabelResult
 
 from .data_association import MapView
 from .gaussian_labels import BACKGROUND, MAX_LABELS, Disagreement, top_labels
 from .objects import Objects
-from .objects_config import ObjectsConfig
 from .observations import ObjectUpdate
 from .semantic_fusion import (
     FusionResult,
-    SemanticFusionConfig,
+    assign_detections,
     fuse_detections,
     reliable_label_mask,
 )
-
-
-@dataclass(frozen=True, slots=True)
-class SemanticMapConfig:
-    """Settings of the labels and objects of a map."""
-
-    labelling: SemanticFusionConfig = field(default_factory=SemanticFusionConfig)
-    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
-    naming: OpenVocabularyConfig = field(default_factory=OpenVocabularyConfig)
-    movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
-    # Minimum score of a detection that removes dynamic surface. Scores below are not relied on
-    # elsewhere either, and a hole where a picture passed for a person would be worse than the
-    # person.
-    movable_confidence: float = 0.6
-    max_names: int = MAX_LABELS  # Maximum names in the vocabulary; a later name is `other`.
-    # Maximum keyframes with detections that are not mapped yet: as many as may be on their way to
-    # the mapper.
-    max_waiting: int = 8
-    # Newest keyframes with detections that are remembered, to drop repeated messages. After a
-    # restart, a window of 8 is sent again.
-    max_remembered: int = 64
-
-    def __post_init__(self) -> None:
-        if self.max_waiting < 0 or self.max_remembered < 1 or self.max_names > MAX_LABELS:
-            raise ConfigError(
-                named(self, "max_names", "max_waiting", "max_remembered")
-                + ": max_waiting must be at least 0, max_remembered at least 1, "
-                + f"max_names at most {MAX_LABELS}."
-            )
-
-    @property
-    def uses_labeller(self) -> bool:
-        """True if labels of the labeller are fused into the map."""
-        return self.labelling.fusion.rule != "detector"
+from .semantic_map_config import SemanticMapConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,29 +269,52 @@ class SemanticMap:
             self._results_without_images += 1
             return False
         view, made_by = self._seen(keyframe)
-        self._label(view, made_by.indices, detections, is_late=True)
+        labelled = self._label(view, made_by.indices, detections, is_late=True)
         self.refresh(view)
-        if self._is_labellers(int(detections.open_labels[0])):
-            self._label_other_views(region, keyframe)
+        at = self._map_view(view, made_by.indices, labelled.assigned.regions, detections)
+        is_undetectable = self._is_labellers(int(detections.open_labels[0]))
+        # A region that the detector found is observed with the detections of each keyframe.
+        if is_undetectable or detections.confidences[0] == 0:
+            views = [at, *self._other_views(region, keyframe, is_labelled=is_undetectable)]
+            for seen in sorted(views, key=lambda seen: seen.keyframe):
+                self.objects.observe(seen, is_late=True)
         return True
 
-    def _label_other_views(self, region: int, labelled_keyframe: int) -> None:
-        """Fuse the label of a region in the other keyframes of its label request.
+    def _other_views(
+        self, region: int, labelled_keyframe: int, *, is_labelled: bool
+    ) -> list[MapView]:
+        """Return the region in the other keyframes of its label request.
 
-        This is called only for labels that the detector never gives. A label that the detector
-        gives was fused with the detections of those keyframes already.
+        Args:
+            region: Id of the region, which has a label.
+            labelled_keyframe: Keyframe in which the label was fused already.
+            is_labelled: Fuse the label in the keyframes too. This is meant for labels that the
+                detector never gives; others were fused with the detections of those keyframes.
         """
         assert self.naming is not None
+        views = []
         for keyframe in self.naming.shown_in(region):
             if keyframe == labelled_keyframe or not self._map.views.is_readable(keyframe):
                 continue
             view, made_by = self._seen(keyframe)
-            detections = self.naming.propagated(
-                region, view, self.vocabulary, self._map.views.poses
-            )
-            if detections is not None:
-                self._label(view, made_by.indices, detections, is_late=True)
+            found = self.naming.propagated(region, view, self.vocabulary, self._map.views.poses)
+            if found is None:
+                continue
+            if is_labelled:
+                regions = self._label(view, made_by.indices, found, is_late=True).assigned.regions
                 self.refresh(view)
+            else:
+                regions = self._assign(view, made_by.indices, found)
+            views.append(self._map_view(view, made_by.indices, regions, found))
+        return views
+
+    def _assign(
+        self, view: TrainingView, indices: np.ndarray, detections: RegionDetections
+    ) -> np.ndarray:
+        """Return the region of each Gaussian, without a change of its label."""
+        at = view.camera, view.T_map_camera, view.depth_m, detections, self.config.labelling
+        rows = self._map.gaussians.rows
+        return assign_detections(rows, indices, *at, threads=self._threads).regions
 
     def refresh(self, view: TrainingView | None = None) -> None:
         """Derive the objects from their Gaussians again: all, or those in view of a keyframe."""

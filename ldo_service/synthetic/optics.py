@@ -6,7 +6,7 @@ import numpy as np
 
 from ldo_service.geometry import Camera
 
-ITERATIONS = 20  # Of a fixed point; the error shrinks by a factor of 3 or more in each.
+ITERATIONS = 20  # The error of the fixed point shrinks by a factor of 3 or more in each.
 
 
 def undistorted(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

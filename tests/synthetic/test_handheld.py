@@ -87,7 +87,7 @@ def test_late_depth_is_exact_at_its_own_time() -> None:
 def test_blur_length_is_the_rotation_during_the_exposure() -> None:
     seq = sequence("tour-handheld:blur")
     rows = seq.exposure_rows(FRAME)
-    far_m = np.full((480, 640), 1e6)  # Only rotation moves what is far away.
+    far_m = np.full((480, 640), 1e6)  # Far surfaces are moved by rotation alone.
     du, dv = exposure_motion_px(far_m, seq.raw_camera, rows)
     turned_rad = se3.rotation_angle(se3.inverse(rows.opened[0]) @ rows.closed[0])
     assert np.hypot(du, dv)[240, 320] == pytest.approx(turned_rad * FOCAL_PX, rel=0.05)

@@ -35,8 +35,8 @@ VERSION = 1  # Increase it with every change that alters a byte of any frame.
 MARK = "-handheld"
 WIDTH_PX, HEIGHT_PX = 640, 480
 FOCAL_PX = 520.0  # Horizontal field of view of 63 degrees, as a Kinect's color camera.
-DISTORTION = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)  # Of the Kinect of TUM's freiburg1.
-READOUT_S = 0.025  # From the first row to the last one.
+DISTORTION = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)  # The Kinect of TUM's freiburg1.
+READOUT_S = 0.025  # Time between the first row and the last one.
 EXPOSURE_S = 0.02
 # Delay of depth after color, drawn by the seed.
 MIN_DELAY_S, MAX_DELAY_S = 0.010, 0.020
@@ -45,7 +45,7 @@ METERING_STEP = 16  # Automatic exposure measures every 16th pixel.
 
 @dataclass(frozen=True, slots=True)
 class ExactImages:
-    """What a perfect camera would record."""
+    """Images that a perfect camera would record."""
 
     light: np.ndarray  # [H, W, 3] float64 in 0..1.
     depth_m: np.ndarray  # [H, W] float64.

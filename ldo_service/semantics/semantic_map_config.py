@@ -1,0 +1,45 @@
+"""Settings of the labels and objects of a map."""
+
+from dataclasses import dataclass, field
+
+from ldo_service.detection.dynamic_classes import DynamicClassConfig
+from ldo_service.errors import ConfigError, named
+from ldo_service.regions.open_vocabulary import OpenVocabularyConfig
+
+from .gaussian_labels import MAX_LABELS
+from .objects_config import ObjectsConfig
+from .semantic_fusion import SemanticFusionConfig
+
+
+@dataclass(frozen=True, slots=True)
+class SemanticMapConfig:
+    """Settings of the labels and objects of a map."""
+
+    labelling: SemanticFusionConfig = field(default_factory=SemanticFusionConfig)
+    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
+    naming: OpenVocabularyConfig = field(default_factory=OpenVocabularyConfig)
+    movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
+    # Minimum score of a detection that removes dynamic surface. Scores below are not relied on
+    # elsewhere either, and a hole where a picture passed for a person would be worse than the
+    # person.
+    movable_confidence: float = 0.6
+    max_names: int = MAX_LABELS  # Maximum names in the vocabulary; a later name is `other`.
+    # Maximum keyframes with detections that are not mapped yet: as many as may be on their way to
+    # the mapper.
+    max_waiting: int = 8
+    # Newest keyframes with detections that are remembered, to drop repeated messages. After a
+    # restart, a window of 8 is sent again.
+    max_remembered: int = 64
+
+    def __post_init__(self) -> None:
+        if self.max_waiting < 0 or self.max_remembered < 1 or self.max_names > MAX_LABELS:
+            raise ConfigError(
+                named(self, "max_names", "max_waiting", "max_remembered")
+                + ": max_waiting must be at least 0, max_remembered at least 1, "
+                + f"max_names at most {MAX_LABELS}."
+            )
+
+    @property
+    def uses_labeller(self) -> bool:
+        """True if labels of the labeller are fused into the map."""
+        return self.labelling.fusion.rule != "detector"
