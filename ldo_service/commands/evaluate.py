@@ -148,6 +148,7 @@ def print_results(results: Results, lpips: Path | None, config: Config) -> None:
         config: Configuration of the run.
     """
     console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
+    console.print(str(results.counts))
     if results.trajectories is None:
         console.print(NO_TRUTH)
     else:

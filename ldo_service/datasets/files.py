@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import re
 from dataclasses import dataclass
 from math import isfinite
@@ -16,6 +17,11 @@ from ldo_service.geometry import Camera, Trajectory, se3
 log = logging.getLogger(__name__)
 
 FRAME_RATE_HZ = 30  # Assumed rate of data sets without stamps: frame k is at k / 30 s.
+
+
+def name_of(folder: Path) -> str:
+    """Return the name of a folder as the user gave it; a link is not followed."""
+    return Path(os.path.abspath(folder)).name
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,16 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import RawFrame, Trajectory, se3
 from ldo_service.geometry.sequence import FrameLabels, Sequence, TrueLabels
 
-from .files import Calibration, is_rigid, number, numbered, pair_by_number, pinhole, read_json
+from .files import (
+    Calibration,
+    is_rigid,
+    name_of,
+    number,
+    numbered,
+    pair_by_number,
+    pinhole,
+    read_json,
+)
 from .images import read_color, read_depth, read_labels
 
 MAX_CLASSES = 256  # Limit of 8-bit images.
@@ -98,7 +107,7 @@ class ReplicaSequence(Sequence):
         self._files = pair_by_number(color, depth, folder / "results")
         calibration = _calibration(folder)
         self.depth_scale = calibration.depth_scale
-        super().__init__(folder.resolve().name, calibration.camera, self._files.stamps_ns)
+        super().__init__(name_of(folder), calibration.camera, self._files.stamps_ns)
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""

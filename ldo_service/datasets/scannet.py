@@ -23,7 +23,14 @@ from ldo_service.geometry import RawFrame, Trajectory, se3
 from ldo_service.geometry.registration import resample_color
 from ldo_service.geometry.sequence import Sequence
 
-from .files import numbered, pair_by_number, read_intrinsics, read_trajectory, read_transform
+from .files import (
+    name_of,
+    numbered,
+    pair_by_number,
+    read_intrinsics,
+    read_trajectory,
+    read_transform,
+)
 from .images import first_size, read_color, read_depth
 from .rig import Rig, SequenceOptions
 
@@ -45,7 +52,7 @@ class ScanNetSequence(Sequence):
         self._rig = options.over(_rig(folder / "intrinsic", *sizes))
         self._is_registering = options.register_depth or not self._rig.is_one_view
         camera = self._rig.color_camera if self._is_registering else self._rig.depth_camera
-        super().__init__(folder.resolve().name, camera, self._files.stamps_ns)
+        super().__init__(name_of(folder), camera, self._files.stamps_ns)
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""

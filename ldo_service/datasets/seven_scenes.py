@@ -21,7 +21,7 @@ import numpy as np
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.sequence import Sequence
 
-from .files import numbered, pair_by_number, read_intrinsics, read_trajectory
+from .files import name_of, numbered, pair_by_number, read_intrinsics, read_trajectory
 from .images import first_size, read_color, read_depth
 from .rig import Rig, SequenceOptions
 
@@ -54,7 +54,7 @@ class SevenScenesSequence(Sequence):
         self._rig = options.over(_rig(folder, self._files.depth))
         self._is_registering = options.register_depth
         camera = self._rig.color_camera if options.register_depth else self._rig.depth_camera
-        super().__init__(folder.resolve().name, camera, self._files.stamps_ns)
+        super().__init__(name_of(folder), camera, self._files.stamps_ns)
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""

@@ -17,7 +17,7 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, RawFrame, Trajectory, associate
 from ldo_service.geometry.sequence import Sequence
 
-from .files import Calibration, number, pinhole, read_json
+from .files import Calibration, name_of, number, pinhole, read_json
 from .images import read_color, read_depth
 
 log = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ class TumSequence(Sequence):
         self._files = [(color.files[i], depth.files[j]) for i, j in pairs]
         calibration = _calibration(folder)
         self.depth_scale = calibration.depth_scale
-        super().__init__(folder.resolve().name, calibration.camera, color.stamps_ns[pairs[:, 0]])
+        super().__init__(name_of(folder), calibration.camera, color.stamps_ns[pairs[:, 0]])
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""
@@ -136,7 +136,8 @@ def _calibration(folder: Path) -> Calibration:
         fields = read_json(path)
         scale = number(fields, "depth_scale", path) if "depth_scale" in fields else DEPTH_SCALE
         return Calibration(pinhole(fields, "width", "height", path), scale)
-    recording = re.search(r"freiburg[123]", folder.resolve().name)
+    names = f"{name_of(folder)} {folder.resolve().name}"
+    recording = re.search(r"freiburg[123]", names)
     if recording is None:
         raise DataError(
             f"{folder} has no camera.json, and its name does not contain freiburg1, 2 or 3, for "

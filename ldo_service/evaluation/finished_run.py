@@ -33,6 +33,24 @@ class RunFrame:
         return self.status == "LOST"
 
 
+@dataclass(frozen=True, slots=True)
+class FrameCounts:
+    """Numbers of the tracked frames of a run by their pose and tracking status."""
+
+    frames: int
+    with_pose: int  # Frames with a pose in the map; frames of unmerged submaps have none.
+    ok: int  # Frames with a pose in the map and the status OK.
+
+    def __str__(self) -> str:
+        if self.frames == 0:
+            return "No frame was tracked."
+        return (
+            f"{self.with_pose} of {self.frames} frames have a pose "
+            f"({self.with_pose / self.frames:.1%}), {self.ok} of them with status OK "
+            f"({self.ok / self.frames:.1%})."
+        )
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Exposures:
     """Exposures of the keyframes.
@@ -116,6 +134,12 @@ class FinishedRun:
     def frame(self, index: int) -> RunFrame:
         """Return the frame with an index in the sequence."""
         return next(frame for frame in self.frames if frame.index == index)
+
+    def counts(self) -> FrameCounts:
+        """Return how many frames have a pose in the map, and how many of these are OK."""
+        final = self.estimates["final"]
+        ok = at_stamps(final, self.stamps_s("OK"))
+        return FrameCounts(len(self.frames), len(final.stamps_s), len(ok.stamps_s))
 
     def stamps_s(self, status: str) -> np.ndarray:
         """Return the stamps of the frames with a tracking status, [M], ascending."""

@@ -12,7 +12,7 @@ from ldo_service.geometry import Trajectory
 from ldo_service.geometry.sequence import Sequence
 
 from . import loops, semantics, trajectory, views
-from .finished_run import FinishedRun, at_stamps
+from .finished_run import FinishedRun, FrameCounts, at_stamps
 from .label_results import finite, plain_labels, sheet_of_labels
 from .loops import LoopErrors, evaluate_loops, seen_keyframes
 from .pictures import save_picture, trajectory_picture
@@ -34,6 +34,7 @@ class Results:
     renderings: list[RenderingErrors]
     labels: list[LabelErrors]  # Errors of maps with labels, if the source has true labels.
     unlabelled: str  # Reason why labels are not evaluated, or empty.
+    counts: FrameCounts  # Frames with a pose.
     vlm_calls_per_frame: float | None  # Missing if the run did not record them.
     pictures: list[Path]
     loops: LoopErrors | None = None  # Missing without ground truth or loop closing.
@@ -84,7 +85,10 @@ def evaluate_run(
     drawn, calls = draw(run.folder, pictures), calls_per_frame(run)
     missing = missing_labels(run, sequence)
     loop_errors = None if truth is None else run_loop_errors(run, sequence, truth)
-    return Results(trajectories, evaluated, renderings, labels, missing, calls, drawn, loop_errors)
+    return Results(
+        *(trajectories, evaluated, renderings, labels, missing, run.counts(), calls, drawn),
+        loops=loop_errors,
+    )
 
 
 def work(run: FinishedRun, sequence: Sequence) -> int:
@@ -174,6 +178,7 @@ def to_json(results: Results) -> dict[str, Any]:
             "labels": semantics.PROTOCOL,
             "frames": results.evaluated.counts(),
         },
+        "frames": asdict(results.counts),
         "trajectory": trajectories and {k: _plain_errors(v) for k, v in trajectories.items()},
         "rendering": [_plain_rendering(row) for row in results.renderings],
         "labels": [plain_labels(row) for row in results.labels],

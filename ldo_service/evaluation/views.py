@@ -9,7 +9,7 @@ import numpy as np
 
 from ldo_service.gaussians.exposure import Exposure, fit_exposure
 from ldo_service.gaussians.renderer import Rendering, render
-from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.geometry import RgbdFrame, se3, valid_pixels
 from ldo_service.geometry.sequence import Sequence
 
 from .finished_run import PosedMap, RunFrame
@@ -29,10 +29,10 @@ Depth L1: mean depth of the rendering, over pixels with measured depth and rende
 0.5; "of measured" is their fraction of the measured pixels. Cells: mean / median of frames.
 online: the map at the end of the stream, refitted after loop closures; refined: after the further
 iterations of --refine-iterations.
-A: held-out frames, tracked and never mapped; every pixel. The map has one brightness, that of the
-camera changes: its gain and bias per channel are interpolated between the keyframes before and
-after. Exposure fitted: to each evaluated frame itself, by least squares. No exposure: the map
-unchanged.
+A: held-out frames, tracked and never mapped; every pixel but the rim that rectification leaves
+black, which B leaves out too. The map has one brightness, that of the camera changes: its gain and
+bias per channel are interpolated between the keyframes before and after. Exposure fitted: to each
+evaluated frame itself, by least squares. No exposure: the map unchanged.
 B: the literature's: every 5th training frame, pixels without depth black in both images.
 LOST frames have no pose and are only counted, WEAK frames are evaluated."""
 
@@ -70,7 +70,7 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     return float("inf") if mse == 0 else float(10 * np.log10(peak**2 / mse))
 
 
-def ssim(a: np.ndarray, b: np.ndarray) -> float:
+def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the mean structural similarity of images [H, W, 3], floating in 0..1.
 
         (2 m_a m_b + c1) (2 s_ab + c2) / ((m_a^2 + m_b^2 + c1) (s_a^2 + s_b^2 + c2))
@@ -78,6 +78,11 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     It is computed per channel under an 11x11 Gaussian window of sigma 1.5 px. The mean is over the
     pixels whose window lies in the image. Only one scale is used. Some papers call the multi-scale
     MS-SSIM by the same name; its values are often higher. Wang et al., TIP 2004.
+
+    Args:
+        a: [H, W, 3].
+        b: [H, W, 3].
+        mask: Pixels that may be in a window, [H, W] bool; None for all.
 
     Raises:
         ValueError: The images differ in shape, or a side is below 11 pixels.
@@ -91,7 +96,12 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     variances = _windowed(a * a) - mean_a**2 + _windowed(b * b) - mean_b**2
     covariance = _windowed(a * b) - mean_a * mean_b
     luminance = (2 * mean_a * mean_b + C1) / (mean_a**2 + mean_b**2 + C1)
-    return float(np.mean(luminance * (2 * covariance + C2) / (variances + C2)))
+    values = luminance * (2 * covariance + C2) / (variances + C2)
+    if mask is not None:
+        margin = WINDOW_PX // 2
+        whole = cv2.erode(mask.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8))
+        values = values[whole[margin:-margin, margin:-margin] > 0]
+    return float(np.mean(values)) if values.size else float("nan")
 
 
 def depth_error(rendered_m: np.ndarray, opacity: np.ndarray, measured_m: np.ndarray) -> DepthError:
@@ -129,6 +139,7 @@ class RenderedView:
     rendering: Rendering
     # Interpolated between keyframes, not fitted to the frame.
     exposure: Exposure = field(default_factory=Exposure)
+    valid: np.ndarray | None = None  # Pixels of the camera image, [H, W] bool; None for all.
 
     @property
     def seen(self) -> np.ndarray:
@@ -147,8 +158,8 @@ class RenderedView:
 
     @property
     def psnr_db(self) -> float:
-        """PSNR over every pixel."""
-        return psnr(*every_pixel(self))
+        """PSNR over every valid pixel."""
+        return psnr(*every_pixel(self), self.valid)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,8 +209,9 @@ def every_pixel(view: RenderedView) -> Images:
 
 def exposure_fitted(view: RenderedView) -> Images:
     """Return camera image and rendering, with the exposure fitted to the camera image."""
-    shown = view.rendering.color
-    return view.seen, fit_exposure(shown, view.seen).applied(shown)
+    shown, seen = view.rendering.color, view.seen
+    fitted = fit_exposure(shown, seen, view.valid)
+    return seen, fitted.applied(shown)
 
 
 def map_as_it_is(view: RenderedView) -> Images:
@@ -255,7 +267,13 @@ class EvaluatedFrames:
 
 
 # --- evaluation -----------------------------------------------------------------------------------
-def view_of(image: RgbdFrame, posed: PosedMap, frame: RunFrame, threads: int = 1) -> RenderedView:
+def view_of(
+    image: RgbdFrame,
+    posed: PosedMap,
+    frame: RunFrame,
+    threads: int = 1,
+    valid: np.ndarray | None = None,
+) -> RenderedView:
     """Render the map at the pose of a frame.
 
     Args:
@@ -263,13 +281,14 @@ def view_of(image: RgbdFrame, posed: PosedMap, frame: RunFrame, threads: int = 1
         posed: The map.
         frame: The frame of the run.
         threads: Threads of the renderer.
+        valid: Pixels of the camera image, [H, W] bool; None for all.
 
     Raises:
         DataError: The frame has no pose.
     """
     T_camera_map = se3.inverse(posed.T_map_camera(frame))
     rendering = render(posed.rows, image.camera, T_camera_map, threads=threads)
-    return RenderedView(image, rendering, posed.exposures.at(frame.stamp_ns))
+    return RenderedView(image, rendering, posed.exposures.at(frame.stamp_ns), valid)
 
 
 def evaluate_rendering(
@@ -295,10 +314,11 @@ def evaluate_rendering(
         DataError: A frame cannot be read or has no pose.
     """
     views: dict[tuple[str, str], list[ViewErrors]] = defaultdict(list)
+    valid = valid_pixels(sequence.raw_camera)
     for done, frame in enumerate(judged.posed, 1):
         image = sequence[frame.index]
         for posed in maps:
-            view = view_of(image, posed, frame, threads)
+            view = view_of(image, posed, frame, threads, valid)
             for protocol, errors in evaluate_view(view, frame.is_held_out, distance):
                 views[posed.name, protocol].append(errors)
         advance(done)
@@ -314,12 +334,14 @@ def evaluate_view(
     depth = depth_error(rendering.depth_m, rendering.opacity, view.frame.depth_m)
     for protocol, images in (HELD_OUT if is_held_out else TRAINING).items():
         seen, shown = images(view)
+        if view.valid is not None:  # The rim is black in both images.
+            shown = shown * view.valid[..., None]
         yield (
             protocol,
             ViewErrors(
                 view.frame.index,
-                psnr(seen, shown),
-                ssim(seen, shown),
+                psnr(seen, shown, view.valid),
+                ssim(seen, shown, view.valid),
                 distance(seen, shown) if distance else None,
                 depth.l1_m,
                 depth.share,

@@ -58,7 +58,9 @@ class Exposure:
         return ((color - self.bias) / np.maximum(self.gain, MIN_GAIN)).clip(0, 1)
 
 
-def fit_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
+def fit_exposure(
+    rendered: np.ndarray, seen: np.ndarray, mask: np.ndarray | None = None
+) -> Exposure:
     """Fit gain and bias by least squares, such that `seen` = gain * `rendered` + bias.
 
     Use it for evaluation only: the fit uses the same image that is compared with the rendering. A
@@ -67,8 +69,10 @@ def fit_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
     Args:
         rendered: [H, W, 3], 0..1.
         seen: [H, W, 3], 0..1.
+        mask: Pixels to use, [H, W] bool; None for all.
     """
-    x, y = rendered.reshape(-1, 3).astype(float), seen.reshape(-1, 3).astype(float)
+    used = np.ones(rendered.shape[:2], bool) if mask is None else mask
+    x, y = rendered[used].astype(float), seen[used].astype(float)
     variance = x.var(axis=0)
     covariance = ((x - x.mean(axis=0)) * (y - y.mean(axis=0))).mean(axis=0)
     gain = np.where(variance > 1e-6, covariance / np.maximum(variance, 1e-6), 1.0)

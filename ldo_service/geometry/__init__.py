@@ -19,7 +19,7 @@ Shapes      Batch dimensions come first. N: Gaussians or points, K: keyframes, H
 """
 
 from .camera import Camera
-from .frames import RawFrame, Rectifier, RgbdFrame, rectify, undistortion_maps
+from .frames import RawFrame, Rectifier, RgbdFrame, rectify, undistortion_maps, valid_pixels
 from .stamps import associate
 from .trajectory import Trajectory
 
@@ -32,4 +32,5 @@ __all__ = [
     "associate",
     "rectify",
     "undistortion_maps",
+    "valid_pixels",
 ]

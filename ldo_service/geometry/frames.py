@@ -135,6 +135,18 @@ def undistortion_maps(camera: Camera) -> Maps | None:
     return u, v
 
 
+def valid_pixels(camera: Camera) -> np.ndarray | None:
+    """Return which pixels of a rectified image show the distorted one, [H, W] bool.
+
+    The others form a black rim. Return None if the camera has no distortion: all pixels are valid.
+    """
+    maps = undistortion_maps(camera)
+    if maps is None:
+        return None
+    u, v = maps
+    return (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
+
+
 def rectify(raw: RawFrame, maps: Maps | None) -> RgbdFrame:
     """Remove the lens distortion of a frame and convert its depth to meters.
 

@@ -18,6 +18,7 @@ from ldo_service.conversions.frames import (
 )
 from ldo_service.conversions.poses import pose_to_message
 from ldo_service.datasets import SequenceOptions, open_sequence
+from ldo_service.datasets.files import name_of
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.sequence import Sequence
@@ -209,7 +210,7 @@ class RecordingSequence(Sequence):
                 f"{CAMERA_DEPTH.name}. Check that frame_source was recorded."
             )
         stamps_ns = np.array([frame.color.stamp_ns for frame in self._frames], np.int64)
-        super().__init__(folder.resolve().name, self._camera(folder), stamps_ns)
+        super().__init__(name_of(folder), self._camera(folder), stamps_ns)
 
     def _camera(self, folder: Path) -> Camera:
         """Return the camera of the first frame that can be read."""

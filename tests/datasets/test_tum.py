@@ -191,3 +191,13 @@ def test_real_kitchen_reads(data: Path) -> None:
     truth = sequence.truth()
     assert truth is not None
     assert len(truth) == len(sequence) == 600
+
+
+def test_sequence_behind_a_link_has_the_name_of_the_link(
+    tum_folder: Writer, tmp_path: Path
+) -> None:
+    link = tmp_path / "rgbd_dataset_freiburg1_linked"
+    folder = tum_folder(["1"], ["1"])
+    (folder / "camera.json").unlink()  # The published intrinsics are chosen by name.
+    link.symlink_to(folder)
+    assert open_sequence(str(link)).name == link.name

@@ -38,6 +38,7 @@ def test_names_are_normalized(name: str) -> None:
     ("name", "expected"),
     [
         ("sofa", "couch"),
+        ("bed sheet", "bed"),
         ("computer-keyboard", "keyboard"),
         ("indoor-plant", "potted plant"),
         ("remote-control", "remote"),

@@ -6,7 +6,7 @@ import pytest
 
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.errors import DataError
-from ldo_service.evaluation.finished_run import at_stamps
+from ldo_service.evaluation.finished_run import FinishedRun, FrameCounts, RunFrame, at_stamps
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import read_run
 
@@ -38,3 +38,15 @@ def test_poses_are_chosen_by_stamp() -> None:
     assert at_stamps(poses, np.array([1e9 + 0.0333333335])).stamps_s.tolist() == [poses.stamps_s[1]]
     assert len(at_stamps(poses, np.array([1e9 + 0.04]))) == 0
     assert len(at_stamps(poses, np.zeros(0))) == 0
+
+
+def test_counts_leave_out_frames_without_a_pose_in_the_map() -> None:
+    """Frame 2 is LOST, and frame 3 is in a submap that was never merged."""
+    frames = tuple(
+        RunFrame(i, i * 10**8, status, False)
+        for i, status in enumerate(["OK", "WEAK", "LOST", "OK", "OK"])
+    )
+    posed = Trajectory(np.array([0.0, 0.1, 0.4]), np.tile(np.eye(4), (3, 1, 1)))
+    run = FinishedRun(Path("run"), frames, {"final": posed}, ())
+    assert run.counts() == FrameCounts(frames=5, with_pose=3, ok=2)
+    assert str(run.counts()).startswith("3 of 5 frames have a pose (60.0%), 2 of them")

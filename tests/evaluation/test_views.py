@@ -165,3 +165,21 @@ def test_frames_without_a_measure_are_excluded_from_its_mean() -> None:
     assert row.median("psnr_db") == 30
     assert row.mean("depth_l1_m") == pytest.approx(0.03)
     assert row.median("lpips") is None
+
+
+def test_black_rim_of_rectification_changes_no_score(sequence: Sequence, run: FinishedRun) -> None:
+    """The frame has a rim that no map renders, as one that rectification leaves black."""
+    frame = run.frame(4)
+    image, valid = sequence[4], np.zeros(sequence[4].depth_m.shape, bool)
+    valid[12:-12, 12:-12] = True
+    rimmed = replace(image, color=image.color * valid[..., None])
+    plain = view_of(image, run.maps[0], frame, valid=valid)
+    view = view_of(rimmed, run.maps[0], frame, valid=valid)
+    assert view.psnr_db == plain.psnr_db
+    without_mask = view_of(rimmed, run.maps[0], frame)
+    assert without_mask.psnr_db < view.psnr_db - 5
+    for (protocol, errors), (_, expected) in zip(
+        evaluate_view(view, True), evaluate_view(plain, True), strict=True
+    ):
+        assert errors.psnr_db == pytest.approx(expected.psnr_db), protocol
+        assert errors.ssim == pytest.approx(expected.ssim), protocol

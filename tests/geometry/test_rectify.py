@@ -3,7 +3,14 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import FrameError
-from ldo_service.geometry import Camera, RawFrame, Rectifier, rectify, undistortion_maps
+from ldo_service.geometry import (
+    Camera,
+    RawFrame,
+    Rectifier,
+    rectify,
+    undistortion_maps,
+    valid_pixels,
+)
 from tests.geometry.cameras import FREIBURG1
 
 CAMERA = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, FREIBURG1)
@@ -121,3 +128,16 @@ def test_parts_that_do_not_match_are_named(changes: dict, word: str) -> None:
     }
     with pytest.raises(FrameError, match=word):
         RawFrame(**(parts | changes))
+
+
+def test_valid_pixels_are_those_that_show_the_white_of_a_white_image() -> None:
+    camera = Camera(64, 48, 60, 60, 31.5, 23.5, (0.3, -0.1, 0.0, 0.0, 0.0))
+    white = np.full((48, 64, 3), 255, np.uint8)
+    raw = RawFrame(0, 0, white, np.ones((48, 64), np.float32), 1.0, camera)
+    shown = rectify(raw, undistortion_maps(camera)).color.min(axis=2)
+    valid = valid_pixels(camera)
+    assert valid is not None
+    assert (shown[valid] == 255).all()
+    assert (shown[~valid] < 255).all()
+    assert 0.5 < valid.mean() < 1.0
+    assert valid_pixels(camera.rectified()) is None
