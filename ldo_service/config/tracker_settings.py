@@ -102,7 +102,7 @@ class KeyframeSettings:
     # keyframe is made.
     max_translation_ratio: PositiveFloat = 0.08
     # Minimum number of frames between keyframes, which limits the load of the mapper.
-    min_interval_frames: PositiveInt = advanced(2)
+    min_interval_frames: PositiveInt = advanced(1)
     # Maximum number of frames between keyframes, if the camera moved at all.
     max_interval_frames: PositiveInt = advanced(30)
     # Fraction of the rotation and translation limits after which a mapping keyframe is made. With a

@@ -24,7 +24,9 @@ class KeyframeConfig:
     min_overlap: float = 0.85
     max_rotation_rad: float = radians(15.0)
     max_translation: float = 0.08  # Fraction of the median depth.
-    min_frames: int = 2  # Frames per keyframe at least: at most every 2nd frame becomes one.
+    # Frames per keyframe at least. A camera that turns by 10 degrees per frame needs a new one at
+    # every frame.
+    min_frames: int = 1
     # Frames per keyframe at most: at least every 30th frame becomes one while the camera moves.
     max_frames: int = 30
     # The camera stands still if the overlap is above still_overlap, and rotation (rad) and

@@ -5,6 +5,7 @@ Conventions: `ldo_service.geometry`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 
@@ -54,6 +55,8 @@ class PoseHypothesis:
     # Distance to the farthest other hypothesis that the images support.
     hypothesis_spread_rad: float = 0.0
     agrees_with_prior: bool = False  # The odometry prior predicts this pose.
+    # Distance to the pose by features alone; infinite without one.
+    feature_distance_rad: float = inf
 
 
 def align_hypothesis(
@@ -190,12 +193,10 @@ class InitialGuessAligner:
             predicted: Hypothesis from the constant-velocity guess, which takes part in the choice.
             keyframe: The keyframe.
             view: Pyramid of the frame.
-            T_keyframe_previous: Initial guess that the camera has not moved: T_keyframe_camera [4,
-                4] of the
-                previous frame.
+            T_keyframe_previous: Initial guess that the camera has not moved: T_keyframe_camera
+                [4, 4] of the previous frame.
             T_keyframe_reckoned: Initial guess T_keyframe_camera [4, 4] by dead reckoning with the
-                odometry
-                prior; None if the prior is unknown.
+                odometry prior; None if the prior is unknown.
         """
         candidates = [predicted, self.align_from_guess(keyframe, view, T_keyframe_previous)]
         if T_keyframe_reckoned is not None:
@@ -204,6 +205,9 @@ class InitialGuessAligner:
         if second is not None:
             candidates.append(align_hypothesis(keyframe, view, second, pose_source, self.align))
         chosen = select_hypothesis(candidates, second, keyframe, view, self.candidates, self.align)
+        if second is not None and pose_source == "features":
+            distance_rad = hypothesis_distance_rad(chosen, second)
+            chosen = replace(chosen, feature_distance_rad=distance_rad)
         if T_keyframe_reckoned is None:
             return chosen
         is_expected = (

@@ -7,7 +7,7 @@ from ldo_service.tracking import PyramidConfig, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.keyframes import KeyframeConfig, ReferenceKeyframe, needs_keyframe
 
-CONFIG = KeyframeConfig()
+CONFIG = KeyframeConfig(min_frames=2)
 TURNED = se3.exp(np.array([0, np.radians(16), 0, 0, 0, 0]))
 MOVED = se3.exp(np.array([0, 0, 0, 0.2, 0, 0]))
 SLIGHTLY_MOVED = se3.exp(np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))

@@ -101,6 +101,20 @@ def test_confirmation_by_features_recovers_weak_but_not_lost_frames() -> None:
     )
 
 
+def test_noisy_pose_is_ok_only_if_that_by_features_is_close() -> None:
+    noisy = hypothesis(intensity_sigma=18.0)
+    close = replace(noisy, feature_distance_rad=0.02)
+    loose = replace(noisy, feature_distance_rad=0.05, is_confirmed=True)
+    statuses = [
+        [classify_tracking(one, HISTORY, previous, CONFIG) for one in (noisy, loose, close)]
+        for previous in (TrackingStatus.OK, TrackingStatus.WEAK, TrackingStatus.LOST)
+    ]
+    ok, weak, lost = TrackingStatus.OK, TrackingStatus.WEAK, TrackingStatus.LOST
+    assert statuses == [[weak, weak, ok], [weak, weak, ok], [lost, lost, lost]]
+    wrong = replace(close, alignment=replace(SOUND, intensity_sigma=70.0))
+    assert classify_tracking(wrong, HISTORY, ok, CONFIG) is lost
+
+
 def test_lost_camera_recovers_only_to_ok() -> None:
     assert status_of(TrackingStatus.LOST, overlap=0.3) is TrackingStatus.LOST
     assert status_of(TrackingStatus.LOST, overlap=0.4) is TrackingStatus.OK
