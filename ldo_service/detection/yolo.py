@@ -127,14 +127,14 @@ class Head:
         low, high = float(scores.min()), float(scores.max())
         if low < -SCORE_TOLERANCE or high > 1 + SCORE_TOLERANCE:
             raise ModelError(
-                f"read as {self.layout.name}, scores of {low:.3g} to {high:.3g} are no "
+                f"with the layout {self.layout.name}, scores of {low:.3g} to {high:.3g} are no "
                 "probabilities: export the network with its last sigmoid."
             )
         if self.cells_apart(output) > CELLS_APART:
             raise ModelError(
-                f"read as {self.layout.name}, boxes lie {self.cells_apart(output):.0f} cells from "
-                f"their own grid cells, expected at most {CELLS_APART:g}: export the network with "
-                "boxes in pixels."
+                f"with the layout {self.layout.name}, boxes lie {self.cells_apart(output):.0f} "
+                f"grid cells from the cells that predict them, expected at most {CELLS_APART:g}: "
+                "export the network with boxes in pixels."
             )
 
     def cells_apart(self, output: np.ndarray) -> float:

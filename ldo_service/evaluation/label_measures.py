@@ -219,8 +219,8 @@ def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
 
     for each class, with `true` pixels of the class, `shown` pixels labelled with it, and `right`
     pixels in both. The means are over the classes that have more than the fraction `gate` of the
-    pixels. Pixels shown with an unknown name are wrong. Long et al., CVPR 2015, section 5, define
-    the same four means.
+    pixels. Pixels shown with an unknown name are wrong. Pixel accuracy, mean accuracy, mean IoU and
+    frequency-weighted IoU are those of Long et al., CVPR 2015, section 5.
 
     Example: a cup has two pixels, of which one is found, and one pixel of the wall is labelled cup.
 

@@ -50,7 +50,7 @@ def label_sheet(
 ) -> np.ndarray:
     """Draw a row [camera, truth, map, error] per picture, and a legend of the names that occur.
 
-    Names are those of the full list (`label_lists.full_list`). Pixels of background show the camera
+    The legend has the names of `label_lists.full_list`. Pixels of background show the camera
     image in gray. The result is uint8 RGB.
 
     Raises:

@@ -38,7 +38,10 @@ def rendering_sheet(
 
 
 def some_of(views: tuple[ViewErrors, ...], count: int = VIEWS) -> list[ViewErrors]:
-    """Choose the best and the worst view by PSNR and others evenly spread, in order of frames."""
+    """Choose the views with the best and the worst PSNR, and others at even intervals.
+
+    The result is sorted by frame.
+    """
     special = {_worst(views), _best(views)} if views else set()
     others = [view for view in views if view not in special]
     places = np.linspace(0, len(others), max(0, count - len(special)), endpoint=False)

@@ -227,8 +227,8 @@ class HttpLabeller:
         """Return the labels of a region; see `Labeller`.
 
         A view with a rejected answer has no label. If the server fails after some views, those are
-        used. All views together have `patience_s`. A view that would exceed this, by the time of
-        those before, is omitted.
+        used. All views together may take `patience_s`. A view that would exceed this limit, if it
+        took as long as the slowest one before, is omitted.
         """
         views: list[list[ScoredLabel]] = []
         until_s, slowest_s = self._clock() + self.config.endpoint.patience_s, 0.0

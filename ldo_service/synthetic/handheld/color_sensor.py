@@ -51,11 +51,11 @@ def automatic_gains(means: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class RowPoses:
-    """Poses T_world_camera [H, 4, 4] of the rows: when exposed, and half an exposure around it."""
+    """Camera poses T_world_camera [H, 4, 4] of the image rows at three times of their exposure."""
 
-    opened: np.ndarray
+    opened: np.ndarray  # The shutter opens.
     middle: np.ndarray
-    closed: np.ndarray
+    closed: np.ndarray  # The shutter closes.
 
 
 def blurred(light: np.ndarray, depth_m: np.ndarray, camera: Camera, rows: RowPoses) -> np.ndarray:
