@@ -122,7 +122,7 @@ class CameraColor(Message, frozen=True, kw_only=True):
 class CameraDepth(Message, frozen=True, kw_only=True):
     """Raw depth image of a camera program, published on camera/depth.
 
-    stamp_ns is the exposure of the depth image. If `camera` equals the color camera and
+    stamp_ns is the time of exposure of the depth image. If `camera` equals the color camera and
     T_color_depth is the identity, depth is registered already. Otherwise, the service registers it
     to the color image.
     """

@@ -94,13 +94,14 @@ def _run_verb(words: Sequence[str], known: dict[str, Callable[..., None]]) -> No
 
 
 def _end_on_interrupts() -> None:
-    """Let SIGINT and SIGTERM end the process at once.
+    """Let SIGINT and SIGTERM end the process at once, with exit code 130.
 
     While the modules are imported, nothing needs an orderly end, and an exception that a signal
-    raises in the initialization of an extension becomes an ImportError.
+    raises in the initialization of an extension becomes an ImportError. The default action would
+    not do: the kernel ignores it in process 1, which is the service in a container.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_DFL)
+        signal.signal(number, lambda *_: os._exit(130))
 
 
 def _raise_on_interrupts() -> None:

@@ -101,7 +101,8 @@ class KeyframeSettings:
     # Maximum translation from the last keyframe, as a fraction of the median depth. Above it, a
     # keyframe is made.
     max_translation_ratio: PositiveFloat = 0.08
-    # Minimum number of frames between keyframes, which limits the load of the mapper.
+    # Minimum number of frames between keyframes. With 1, each frame may become one. A larger number
+    # limits the load of the mapper.
     min_interval_frames: PositiveInt = advanced(1)
     # Maximum number of frames between keyframes, if the camera moved at all.
     max_interval_frames: PositiveInt = advanced(30)
@@ -159,7 +160,8 @@ class QualitySettings:
     # Minimum fraction of the visible reference surface that is matched. Below it, a pose is WEAK.
     # Chosen on one apartment.
     weak_overlap: Ratio = advanced(0.15)
-    # Maximum ratio of the residual to its running median. Above it, a pose is WEAK.
+    # Maximum ratio of the residual to its running median. Above it, a pose is WEAK. A pose that
+    # features confirm closely may have a ratio of 6, and is LOST above 15.
     weak_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(2.5)
     # Maximum ratio of the residual to its running median. Above it, a pose is LOST.
     lost_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(5.0)

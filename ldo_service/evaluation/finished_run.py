@@ -46,8 +46,8 @@ class FrameCounts:
             return "No frame was tracked."
         return (
             f"{self.with_pose} of {self.frames} frames have a pose "
-            f"({self.with_pose / self.frames:.1%}), {self.ok} of them with status OK "
-            f"({self.ok / self.frames:.1%})."
+            f"({self.with_pose / self.frames:.1%}). Of these, {self.ok} have status OK "
+            f"({self.ok / self.frames:.1%} of all)."
         )
 
 

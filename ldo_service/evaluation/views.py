@@ -29,10 +29,10 @@ Depth L1: mean depth of the rendering, over pixels with measured depth and rende
 0.5; "of measured" is their fraction of the measured pixels. Cells: mean / median of frames.
 online: the map at the end of the stream, refitted after loop closures; refined: after the further
 iterations of --refine-iterations.
-A: held-out frames, tracked and never mapped; every pixel but the rim that rectification leaves
-black, which B leaves out too. The map has one brightness, that of the camera changes: its gain and
-bias per channel are interpolated between the keyframes before and after. Exposure fitted: to each
-evaluated frame itself, by least squares. No exposure: the map unchanged.
+A: held-out frames, tracked and never mapped. A and B leave out the rim that rectification leaves
+black; A uses every other pixel. The map has one brightness, that of the camera changes: its gain
+and bias per channel are interpolated between the keyframes before and after. Exposure fitted: to
+each evaluated frame itself, by least squares. No exposure: the map unchanged.
 B: the literature's: every 5th training frame, pixels without depth black in both images.
 LOST frames have no pose and are only counted, WEAK frames are evaluated."""
 
@@ -318,7 +318,8 @@ def evaluate_rendering(
     for done, frame in enumerate(judged.posed, 1):
         image = sequence[frame.index]
         for posed in maps:
-            view = view_of(image, posed, frame, threads, valid)
+            fits = valid is not None and valid.shape == image.depth_m.shape
+            view = view_of(image, posed, frame, threads, valid if fits else None)
             for protocol, errors in evaluate_view(view, frame.is_held_out, distance):
                 views[posed.name, protocol].append(errors)
         advance(done)

@@ -16,7 +16,6 @@ from .rows import ROW, aligned_rows, move_rows
 
 # Bytes of labels per Gaussian (see `semantics.gaussian_labels`); all zero without observations.
 LABEL_BYTES = 32
-_CHUNK = 65536  # Gaussians that are moved at a time, to stay in cache.
 
 
 class GaussianBatch(NamedTuple):
@@ -267,7 +266,7 @@ class GaussianMap:
     def move_anchors(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move the Gaussians of some anchor keyframes: mean <- T mean, quat <- q(T) quat.
 
-        The computing time is linear in the size N of the map. The computation uses float64.
+        The computing time is linear in the size N of the map.
 
         Args:
             T_new_old: Motion T [4, 4] in the map frame by id of the anchor keyframe:
@@ -286,9 +285,7 @@ class GaussianMap:
                 "T_new_old must have finite transforms of shape [4, 4]; at least one is not."
             )
         q = se3.quaternion(T[:, :3, :3])
-        for start in range(0, self._size, _CHUNK):
-            chunk = slice(start, min(start + _CHUNK, self._size))
-            move_rows(self._rows[chunk], self._anchors[chunk], keyframes, T, q)
+        move_rows(self._rows[: self._size], self._anchors[: self._size], keyframes, T, q)
         self.touch()
 
     def snapshot(self) -> dict[str, np.ndarray]:

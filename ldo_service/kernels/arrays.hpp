@@ -20,6 +20,7 @@ inline void require(bool condition, const std::string& message) {
 template <class T>
 const char* type_name() {
   if constexpr (std::is_same_v<T, float>) return "float32";
+  if constexpr (std::is_same_v<T, double>) return "float64";
   if constexpr (std::is_same_v<T, uint8_t>) return "uint8";
   if constexpr (std::is_same_v<T, int16_t>) return "int16";
   if constexpr (std::is_same_v<T, int32_t>) return "int32";

@@ -85,8 +85,8 @@ class Objects:
             undetectable: Labels that the detector does not know, [256] bool. An object with such a
                 label is missed only if the measured depth shows that it is gone.
             is_late: The keyframe was observed before, and the view has only regions with late
-                labels. It then counts for candidates that it has not been counted for, objects do
-                not change, and nothing is missed.
+                labels. It counts for a candidate only outside of the candidate's first to last
+                keyframe. Objects gain no observation, and nothing is missed.
 
         Returns:
             The changes of the objects.
@@ -309,7 +309,9 @@ class Objects:
         candidates = np.flatnonzero(self._table["id"] == CANDIDATE)
         excess = len(candidates) - self.config.max_candidates
         if excess > 0:
-            oldest = np.argsort(self._table["last"][candidates], kind="stable")[:excess]
+            # The new ones are at the end. With a late label, their keyframe may be old.
+            is_new = candidates >= len(self._table) - len(new)
+            oldest = np.lexsort((self._table["last"][candidates], is_new))[:excess]
             self._table = np.delete(self._table, candidates[oldest])
 
     # --- corrections ------------------------------------------------------------------------------

@@ -252,7 +252,7 @@ class SemanticMap:
 
     # --- label results ----------------------------------------------------------------------------
     def apply_label(self, region: int, keyframe: int, answer: RegionLabelResult) -> bool:
-        """Fuse a label result of the labeller for a region of a keyframe.
+        """Fuse a label result of the labeller for a region of a keyframe, and update the objects.
 
         If the images of the keyframe are no longer stored, the Gaussians of the region cannot be
         found, and nothing is fused.
@@ -274,7 +274,7 @@ class SemanticMap:
         at = self._map_view(view, made_by.indices, labelled.assigned.regions, detections)
         is_undetectable = self._is_labellers(int(detections.open_labels[0]))
         # A region that the detector found is observed with the detections of each keyframe.
-        if is_undetectable or detections.confidences[0] == 0:
+        if self.config.uses_labeller and (is_undetectable or detections.confidences[0] == 0):
             views = [at, *self._other_views(region, keyframe, is_labelled=is_undetectable)]
             for seen in sorted(views, key=lambda seen: seen.keyframe):
                 self.objects.observe(seen, is_late=True)

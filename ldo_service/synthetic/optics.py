@@ -35,7 +35,10 @@ def undistorted(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarra
 
 @lru_cache(maxsize=8)
 def max_displacement_px(camera: Camera) -> float:
-    """Return how far distortion moves a pixel of the border at most, pixels."""
+    """Return a bound of how far distortion moves a pixel, in pixels.
+
+    It is the largest displacement on the border of the image, plus one pixel.
+    """
     if not any(camera.distortion):
         return 0.0
     u, v = np.arange(float(camera.width)), np.arange(float(camera.height))

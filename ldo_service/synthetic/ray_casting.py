@@ -11,8 +11,9 @@ from .optics import max_displacement_px, undistorted
 from .solids import Solid, Vector, interval, vector
 
 NEAR_M = 0.05
-# A solid is projected with this many poses of a frame with a pose for each row.
-ROW_POSES = 5
+# Number of row poses at which a solid is projected, if each row has its own pose, and a margin for
+# solids that are in view at one of them only.
+ROW_POSES, ROW_MARGIN_PX = 5, 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +35,8 @@ class Hits:
 class RayCaster:
     """Ray caster of one camera pose, or of one pose for each row (rolling shutter).
 
-    Each solid is projected into the image once. A ray is tested against a solid only if its pixel
-    lies in the window around that projection.
+    Each solid is projected into the image at one pose, or at a few of the row poses. A ray is
+    tested against a solid only if its pixel lies in the window around that projection.
     """
 
     def __init__(
@@ -141,8 +142,8 @@ EMPTY = _Window(1, 0, 1, 0)
 def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
     """Return the window of a solid at one pose [4, 4], or at the poses of all rows [H, 4, 4].
 
-    The window of several poses contains those of a few of them, with the motion between two of
-    these as a margin. Lens distortion adds its largest displacement.
+    With one pose for each row, the window is the union over a few row poses, grown by the largest
+    motion between two of them. Lens distortion adds its largest displacement.
     """
     if T.ndim == 2 and not any(camera.distortion):
         return _window_at(solid, camera, T)
@@ -155,7 +156,11 @@ def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
     seen = np.array([(w.left, w.right, w.top, w.bottom) for w in windows if w != EMPTY])
     if not len(seen):
         return EMPTY
-    margins = margin + (np.abs(np.diff(seen, axis=0)).max(axis=0) if len(seen) > 1 else 0.0)
+    margins = (
+        margin
+        + ROW_MARGIN_PX
+        + (np.abs(np.diff(seen, axis=0)).max(axis=0) if len(seen) > 1 else 0.0)
+    )
     low, high = (seen - margins).min(axis=0), (seen + margins).max(axis=0)
     return _Window(low[0], high[1], low[2], high[3])
 

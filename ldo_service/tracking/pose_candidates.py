@@ -205,7 +205,8 @@ class InitialGuessAligner:
         if second is not None:
             candidates.append(align_hypothesis(keyframe, view, second, pose_source, self.align))
         chosen = select_hypothesis(candidates, second, keyframe, view, self.candidates, self.align)
-        if second is not None and pose_source == "features":
+        # A hypothesis that did not converge may still be where features put its initial guess.
+        if second is not None and pose_source == "features" and chosen.alignment.converged:
             distance_rad = hypothesis_distance_rad(chosen, second)
             chosen = replace(chosen, feature_distance_rad=distance_rad)
         if T_keyframe_reckoned is None:

@@ -47,10 +47,10 @@ class TrackingQualityConfig:
     weak_residual: float = 2.5  # Maximum residual of an OK frame, times the running median.
     lost_residual: float = 5.0  # A frame with a larger one is LOST, times the running median.
     lost_overlap: float = 0.08  # A frame with a smaller overlap is LOST.
-    # Limits of the residual, where they are larger, for a pose within confirmed_rad of that by
-    # features, unless tracking is LOST. Chosen on the ScanNet parts and freiburg1_rpy: of the
-    # frames above weak_residual, those within 0.03 rad were right to 0.01 rad, and those beyond
-    # erred by up to 0.07 rad.
+    # Limits of the residual for a pose within confirmed_rad of the pose by features. They apply if
+    # they are larger, and not while tracking is LOST. Chosen on the ScanNet parts and on
+    # freiburg1_rpy: of the frames above weak_residual, those within 0.03 rad were right to 0.01
+    # rad, and those beyond erred by up to 0.07 rad.
     confirmed_rad: float = 0.03
     confirmed_weak_residual: float = 6.0
     confirmed_lost_residual: float = 15.0
@@ -84,6 +84,11 @@ class TrackingQualityConfig:
                 f"weak_residual={self.weak_residual:g} must be above 1 and at most "
                 f"lost_residual={self.lost_residual:g}."
             )
+        if not self.confirmed_weak_residual <= self.confirmed_lost_residual:
+            raise ConfigError(
+                f"confirmed_weak_residual={self.confirmed_weak_residual:g} must be at most "
+                f"confirmed_lost_residual={self.confirmed_lost_residual:g}."
+            )
         if self.relocalized_residual < 1 or self.relocalized_residual_per_rad < 0:
             raise ConfigError(
                 f"relocalized_residual={self.relocalized_residual:g} must be at least 1, "
@@ -104,11 +109,27 @@ class ResidualHistory:
     depth_noise_scales: tuple[float, ...] = ()  # Times the sensor model.
 
     def extended(self, alignment: Alignment, config: TrackingQualityConfig) -> "ResidualHistory":
-        """Return the history with the noise of one more alignment."""
-        keep = config.history - 1
+        """Return the history with the noise of one more alignment.
+
+        A pose that features confirm may have much noise. It counts as at most `weak_residual` times
+        the running median, so that a few blurred frames do not hide a wrong pose after them.
+        """
+        keep, sigma = config.history - 1, exposure_corrected_sigma(alignment)
+        usual_sigma, usual_scale = self._usual(config)
+        most = config.weak_residual
+        scale = min(alignment.depth_noise_scale, most * usual_scale)
         return ResidualHistory(
-            (*self.intensity_sigmas[-keep:], exposure_corrected_sigma(alignment)),
-            (*self.depth_noise_scales[-keep:], alignment.depth_noise_scale),
+            (*self.intensity_sigmas[-keep:], min(sigma, most * usual_sigma)),
+            (*self.depth_noise_scales[-keep:], scale),
+        )
+
+    def _usual(self, config: TrackingQualityConfig) -> tuple[float, float]:
+        """Return the running medians of photometric and geometric noise."""
+        usual_sigma = median(self.intensity_sigmas or (config.first_intensity_sigma,))
+        usual_scale = median(self.depth_noise_scales or (config.first_depth_noise_scale,))
+        return (
+            max(usual_sigma, config.min_intensity_sigma),
+            max(usual_scale, config.min_depth_noise_scale),
         )
 
     def residual_ratio(self, alignment: Alignment, config: TrackingQualityConfig) -> float:
@@ -116,10 +137,7 @@ class ResidualHistory:
 
         Of the photometric and the geometric ratio, the larger one is returned.
         """
-        usual_sigma = median(self.intensity_sigmas or (config.first_intensity_sigma,))
-        usual_scale = median(self.depth_noise_scales or (config.first_depth_noise_scale,))
-        intensity = max(usual_sigma, config.min_intensity_sigma)
-        depth = max(usual_scale, config.min_depth_noise_scale)
+        intensity, depth = self._usual(config)
         return max(
             exposure_corrected_sigma(alignment) / intensity, alignment.depth_noise_scale / depth
         )

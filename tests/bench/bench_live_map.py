@@ -1,7 +1,8 @@
 """Accuracy of the live service's map beside the offline run of the same frames.
 
     python -m tests.bench.bench_live_map [--source synthetic:flat] [--stride 2] [--hz 1 2]
-                                         [--max-frames N] [--set SETTING ...] [--json FILE]
+                                         [--max-frames N] [--set SETTING ...] [--out DIR]
+                                         [--no-offline]
 
 Each live run starts the service over Zenoh and sends the frames at a fixed rate. Every fifth frame
 is held out. When the last frame is sent, the camera stands still, and the run waits until no
@@ -9,7 +10,7 @@ message and no refinement is pending. A subscriber of all topics writes the fold
 `ldo eval` compares with the truth, as the folder of `ldo run`.
 
 The backlog of the mapper is the number of keyframes that wait. It is flat if its mean in the last
-quarter of the walk is not above that in the second quarter by more than one.
+quarter of the walk exceeds that in the second quarter by at most one.
 """
 
 import argparse
@@ -104,8 +105,8 @@ def live(
         monitor, observer = Monitor(session, network), Observer(session, network, writer)
         assert client.wait_for_subscriber(60)
         sent_s, waiting = send(client, monitor, sequence, indices, hz)
-        poses = [status for _, status in monitor.poses]
         pending_s = wait_until_settled(monitor)
+        poses = [status for _, status in monitor.poses]
         service.send_signal(signal.SIGINT)
         if service.wait(300) != 0:
             raise SystemExit(Path(log.name).read_text()[-3000:])
@@ -166,7 +167,7 @@ def offline(folder: Path, options: argparse.Namespace, settings: list[str]) -> d
 
 
 def evaluate(folder: Path, source: str) -> dict[str, Any]:
-    """Return PSNR, ATE and mIoU of a run by `ldo eval`."""
+    """Return the results of `ldo eval` on the folder of a run."""
     program = [sys.executable, "-m", "ldo_service", "eval", folder, source, "--json"]
     done = subprocess.run(program, check=True, capture_output=True, text=True)
     return json.loads(done.stdout)
@@ -180,12 +181,13 @@ def main() -> None:
     parser.add_argument("--hz", type=float, nargs="*", default=[1.0])
     parser.add_argument("--set", nargs="+", dest="settings",
                         default=["detector.model=demo", "vlm_labeller.model=demo"])  # fmt: skip
-    parser.add_argument("--out", type=Path, required=True, help="folder for the runs")
+    parser.add_argument("--out", type=Path, help="folder for the runs; default: a temporary one")
     parser.add_argument("--no-offline", action="store_true")
     options = parser.parse_args()
     settings = [HOLD_OUT, *options.settings]
     sequence = open_sequence(options.source)
     indices = range(0, len(sequence), options.stride)[: options.max_frames]
+    options.out = options.out or Path(tempfile.mkdtemp())
     options.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, Any] = {}
     if not options.no_offline:

@@ -141,5 +141,5 @@ def test_signal_during_the_imports_ends_the_process_without_traceback(
 ) -> None:
     command = sys.executable, "-c", INTERRUPTED_IMPORT, str(int(number))
     ended = subprocess.run(command, capture_output=True, text=True)
-    assert ended.returncode == -number
+    assert ended.returncode == 130
     assert ended.stderr == ""

@@ -49,4 +49,4 @@ def test_counts_leave_out_frames_without_a_pose_in_the_map() -> None:
     posed = Trajectory(np.array([0.0, 0.1, 0.4]), np.tile(np.eye(4), (3, 1, 1)))
     run = FinishedRun(Path("run"), frames, {"final": posed}, ())
     assert run.counts() == FrameCounts(frames=5, with_pose=3, ok=2)
-    assert str(run.counts()).startswith("3 of 5 frames have a pose (60.0%), 2 of them")
+    assert str(run.counts()).startswith("3 of 5 frames have a pose (60.0%). Of these, 2 have")

@@ -7,7 +7,7 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.semantics.data_association import AssociationConfig
+from ldo_service.semantics.data_association import AssociationConfig, MapView
 from ldo_service.semantics.gaussian_labels import fields
 from ldo_service.semantics.object_landmarks import entropies, reliable_members, rows_of
 from ldo_service.semantics.objects import Objects
@@ -166,6 +166,38 @@ def test_candidates_and_objects_stay_below_their_limits() -> None:
         counts = labelled_map.objects.metrics()
         assert counts["objects"] <= 1
         assert counts["object_candidates"] <= 1
+
+
+# --- late labels ----------------------------------------------------------------------------------
+def late_view(labelled_map: LabelledMap, thing: SceneObject, keyframe: int) -> MapView:
+    """Return a view of an object as seen in an earlier keyframe."""
+    shot = shoot((thing,), FRONT_POSE, keyframe)
+    return replace(labelled_map.view(shot, shot.detections((thing,))), keyframe=keyframe)
+
+
+def test_late_view_counts_once_for_a_candidate_and_not_for_an_object() -> None:
+    labelled_map = LabelledMap()
+    labelled_map.show(shoot((BALL,), FRONT_POSE, 0), NO_DETECTIONS)
+    order = (1, 1, 3, 2, 0, 9)  # 1 again and 2 lie within the candidate's first to last keyframe.
+    updates = [
+        labelled_map.objects.observe(late_view(labelled_map, BALL, k), is_late=True) for k in order
+    ]
+    assert [update.created for update in updates] == [(), (), (), (), (0,), ()]
+    assert not any(update.observations or update.removed for update in updates)
+    (ball,) = labelled_map.objects.landmarks
+    assert (ball["seen"], ball["first"], ball["last"]) == (3, 0, 3)
+
+
+def test_late_candidate_is_kept_where_the_table_is_full() -> None:
+    labelled_map = LabelledMap(Objects(ObjectsConfig(max_candidates=1)))
+    labelled_map.keyframe = 50
+    shot = shoot((VASE,), FRONT_POSE, 50)
+    labelled_map.show(shot, shot.detections((VASE,)))
+    labelled_map.show(shoot((BALL,), FRONT_POSE, 51), NO_DETECTIONS)
+    for keyframe in (1, 2, 3):
+        view = late_view(labelled_map, BALL, keyframe)
+        update = labelled_map.objects.observe(view, is_late=True)
+    assert update.created == (0,)
 
 
 # --- misses ---------------------------------------------------------------------------------------

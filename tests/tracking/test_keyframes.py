@@ -34,6 +34,10 @@ def test_keyframe_is_needed_when_the_view_has_changed(
     assert needs_keyframe(T, overlap, median_depth_m, frames, CONFIG) is expected
 
 
+def test_each_frame_may_become_a_keyframe_by_default() -> None:
+    assert needs_keyframe(TURNED, 0.2, 2.0, 1, KeyframeConfig())
+
+
 def test_features_are_detected_once(room) -> None:
     keyframe = ReferenceKeyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), 0)
     assert keyframe.features(FeatureConfig()) is keyframe.features(FeatureConfig())

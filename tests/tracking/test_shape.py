@@ -71,8 +71,9 @@ def test_gicp_is_bitwise_reproducible(large_room) -> None:
 
 
 def track_white_walls(room, poses: Sequence[np.ndarray]) -> list:
+    """Track frames against the first one; each step to it is large."""
     odometry = Odometry(
-        OdometryConfig(keyframes=KeyframeConfig(mapping_only_ratio=2.0, min_frames=2))
+        OdometryConfig(keyframes=KeyframeConfig(mapping_only_ratio=2.0, min_frames=30))
     )
     return [odometry.process(white_view(room, T, index)) for index, T in enumerate(poses)]
 

@@ -115,6 +115,15 @@ def test_noisy_pose_is_ok_only_if_that_by_features_is_close() -> None:
     assert classify_tracking(wrong, HISTORY, ok, CONFIG) is lost
 
 
+def test_noisy_confirmed_frames_do_not_hide_a_wrong_pose_after_them() -> None:
+    history, noisy = ResidualHistory((4.0,) * 30, (1.0,) * 30), replace(SOUND, intensity_sigma=20.0)
+    for _ in range(10):
+        history = history.extended(noisy, CONFIG)
+    assert max(history.intensity_sigmas) == 10.0  # 2.5 times the median.
+    wrong = hypothesis(intensity_sigma=22.0)
+    assert classify_tracking(wrong, history, TrackingStatus.OK, CONFIG) is TrackingStatus.LOST
+
+
 def test_lost_camera_recovers_only_to_ok() -> None:
     assert status_of(TrackingStatus.LOST, overlap=0.3) is TrackingStatus.LOST
     assert status_of(TrackingStatus.LOST, overlap=0.4) is TrackingStatus.OK

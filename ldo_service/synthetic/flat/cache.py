@@ -63,7 +63,7 @@ class FrameCache:
             return self._unpacked(data)
         except (FrameError, struct.error, zstandard.ZstdError, ValueError) as error:
             log.warning(
-                "synthetic flat: cached frame %s is damaged (%s); it is rendered again, "
+                "synthetic: cached frame %s is damaged (%s); it is rendered again, "
                 "no action needed.",
                 self._path(index),
                 error,
@@ -78,7 +78,7 @@ class FrameCache:
             write_atomically(self._path(index), _packed(frame), unique=True)
         except OSError as error:
             log.warning(
-                "synthetic flat: cannot cache frame %s in %s (%s); it is rendered at each read. "
+                "synthetic: cannot cache frame %s in %s (%s); it is rendered at each read. "
                 "Free disk space, or set LDO_CACHE to another folder.",
                 index,
                 self.folder,

@@ -16,7 +16,7 @@ TARGET = 0.42  # Mean of an image that automatic exposure aims at.
 MIN_GAIN, MAX_GAIN = 0.4, 3.0
 # Fraction of the difference from the target that exposure and white balance correct in a frame.
 EXPOSURE_RATE, BALANCE_RATE = 0.3, 0.1
-MEMORY_FRAMES = 12  # Frames after which the exposure has forgotten its start.
+MEMORY_FRAMES = 12  # Frames that automatic exposure and white balance start before a frame.
 NOISE = 0.006  # Standard deviation at a gain of 1, fraction of full scale.
 
 
@@ -81,7 +81,7 @@ def projected_px(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels u and v, each [H, W], of all surfaces from another pose of their row.
 
-    Lens distortion bends the rays; the projection is without it, as differences are used.
+    The projection ignores lens distortion, because only differences of pixels are used.
 
     Args:
         depth_m: Depth [H, W], meters.

@@ -32,7 +32,7 @@ def parse_effects(text: str, name: str) -> Effects:
 
     Args:
         text: Nothing for all effects with a Kinect; or a colon and names joined by +. `all` and
-            `none` are names too, and the last depth camera counts.
+            `none` are names too. `all` includes `kinect`; the last depth camera counts.
         name: Name of the sequence, for an error.
 
     Raises:

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ldo_service.errors import DataError
+from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.sequence import FrameLabels, Sequence, TrueLabels
 from ldo_service.synthetic.flat.cache import CachedFrame, FrameCache
@@ -31,7 +31,7 @@ from .depth_sensors import DepthBias, measure
 from .effects import Effects, parse_effects
 from .motion import HandMotion, flat_motion, room_motion
 
-VERSION = 1  # Increase it with every change that alters a byte of any frame.
+VERSION = 2  # Increase it with every change that alters a byte of any frame.
 MARK = "-handheld"
 WIDTH_PX, HEIGHT_PX = 640, 480
 FOCAL_PX = 520.0  # Horizontal field of view of 63 degrees, as a Kinect's color camera.
@@ -40,7 +40,7 @@ READOUT_S = 0.025  # Time between the first row and the last one.
 EXPOSURE_S = 0.02
 # Delay of depth after color, drawn by the seed.
 MIN_DELAY_S, MAX_DELAY_S = 0.010, 0.020
-METERING_STEP = 16  # Automatic exposure measures every 16th pixel.
+METERING_STEP = 16  # Automatic exposure measures an image that is smaller by this factor.
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +54,10 @@ class ExactImages:
 
 
 class Scene(Protocol):
-    """Scene that can be rendered from poses of the rows at a time."""
+    """Scene that is rendered from one pose, or from one pose for each row."""
 
     def render(self, camera: Camera, T_world_camera: np.ndarray, time_s: float) -> ExactImages:
-        """Render from one pose [4, 4], or from one pose for each row, [H, 4, 4]."""
+        """Render what is there at a time, from poses [4, 4] or [H, 4, 4]."""
         ...
 
 
@@ -126,6 +126,12 @@ class HandheldConfig:
     effects: Effects = field(default_factory=Effects)
     seed: int = 0  # Seed of textures, hand shake, delay, bias and noise.
 
+    def __post_init__(self) -> None:
+        if self.walk not in WALKS:
+            raise ConfigError(f"walk={self.walk!r} must be one of {', '.join(WALKS)}.")
+        if self.seed < 0:
+            raise ConfigError(f"simulated camera: seed={self.seed} must be at least 0.")
+
 
 class HandheldSequence(Sequence):
     """Walk with a simulated camera; each frame is rendered once and cached on disk.
@@ -133,8 +139,6 @@ class HandheldSequence(Sequence):
     The stamp of a frame is the time at which the middle row of the color image is exposed, and the
     true pose is the pose at that time.
     """
-
-    class_names = CLASS_NAMES  # Names of the class ids of the flat.
 
     def __init__(self, config: HandheldConfig, name: str = "handheld") -> None:
         self.config, self._walk = config, WALKS[config.walk]
@@ -220,7 +224,10 @@ class HandheldSequence(Sequence):
         return self._walk.scene(self.config.seed)
 
     def exact(self, index: int, T_world_camera: np.ndarray) -> ExactImages:
-        """Return what a perfect camera would record from these row poses at a frame's time."""
+        """Return what a perfect camera would record from these row poses.
+
+        A person is where it is at the time of the frame, also for late rows and late depth.
+        """
         return self.scene.render(self.raw_camera, T_world_camera, self._time_s(index))
 
     def _labels(self, index: int) -> FrameLabels:
@@ -247,9 +254,19 @@ class HandheldSequence(Sequence):
         depth_m = measure(effects.depth, later.depth_m, later.light, FOCAL_PX, rng)
         if self.depth_bias is not None:
             depth_m = self.depth_bias.biased(depth_m, self.raw_camera)
-        return CachedFrame(
-            color.astype(np.uint8), depth_m.astype(np.float32), exact.class_ids, exact.instance_ids
-        )
+        ids = self._rectified_ids(index, exact)
+        return CachedFrame(color.astype(np.uint8), depth_m.astype(np.float32), *ids)
+
+    def _rectified_ids(self, index: int, exact: ExactImages) -> tuple[np.ndarray, np.ndarray]:
+        """Return the classes and the objects of the pixels of the rectified image, each [H, W].
+
+        Evaluation renders the map's labels by a pinhole camera at the true pose of the frame.
+        """
+        effects = self.config.effects
+        if self.config.walk == "flat" and (effects.distortion or effects.rolling_shutter):
+            pose = self.truth().T_world_camera[index]
+            exact = self.scene.render(self.camera, pose, self._time_s(index))
+        return exact.class_ids, exact.instance_ids
 
     def _color(self, index: int, exact: ExactImages, rng: np.random.Generator) -> np.ndarray:
         effects, light = self.config.effects, exact.light
