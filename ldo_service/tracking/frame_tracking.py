@@ -336,8 +336,9 @@ class FrameTracker:
         is_known = self.state.origin is KeyframeOrigin.KNOWN
         if is_known:  # The number of frames does not limit the use of a known keyframe.
             frames = min(frames, config.max_frames - 1)
-        alignment, depth_m = candidate.alignment, candidate.median_depth_m
-        if needs_keyframe(alignment.T_reference_camera, alignment.overlap, depth_m, frames, config):
+        a, depth_m = candidate.alignment, candidate.median_depth_m
+        left = needs_keyframe(a.T_reference_camera, a.overlap, depth_m, frames, config)
+        if left or self.state.is_relayed:
             return KeyframeKind.REFERENCE
         T_mapped_camera = se3.inverse(self.state.T_odom_last_mapped) @ T_odom_camera
         if not is_known and needs_mapping_keyframe(T_mapped_camera, depth_m, config):
@@ -385,9 +386,7 @@ class FrameTracker:
         if status is not before.status:
             log.info(
                 "tracker: tracking status changed from %s to %s at keyframe %d.",
-                before.status,
-                status,
-                keyframe.id,
+                *(before.status, status, keyframe.id),
             )
         self.state = replace(
             before,

@@ -29,6 +29,10 @@ class KeyframeConfig:
     min_frames: int = 1
     # Frames per keyframe at most: at least every 30th frame becomes one while the camera moves.
     max_frames: int = 30
+    # If no keyframe may be made, a frame beyond this multiple of max_rotation_rad or
+    # max_translation, or with an overlap below min_overlap divided by it, becomes a reference for
+    # tracking alone (`Relay`). With 1, each frame that is held out would add a link to the chain.
+    relay_ratio: float = 1.5
     # The camera stands still if the overlap is above still_overlap, and rotation (rad) and
     # translation (fraction of the median depth) are below still_motion.
     still_overlap: float = 0.97
@@ -51,6 +55,8 @@ class KeyframeConfig:
                 f"{self.max_translation:g} and "
                 f"mapping_only_ratio={self.mapping_only_ratio:g} must be positive."
             )
+        if not self.relay_ratio >= 1:
+            raise ConfigError(f"relay_ratio={self.relay_ratio:g} must be at least 1.")
         if not 0 <= self.min_overlap <= 1:
             raise ConfigError(f"min_overlap={self.min_overlap:g} must be within 0..1.")
         if not 1 <= self.min_frames <= self.max_frames:
@@ -60,9 +66,39 @@ class KeyframeConfig:
             )
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Relay:
+    """Pose of a reference that is no keyframe, in the last keyframe before it."""
+
+    T_keyframe_relay: np.ndarray  # [4, 4]
+    # [6, 6] for T_keyframe_relay * exp(xi), xi = (rotation rad, translation m).
+    covariance: np.ndarray
+
+    def pose_of(
+        self, T_relay_camera: np.ndarray, information: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pose of a camera in the keyframe, [4, 4], and its information, [6, 6].
+
+        Args:
+            T_relay_camera: Pose of the camera in the relay, [4, 4].
+            information: Its information, [6, 6]; zero for an unknown pose.
+        """
+        T_keyframe_camera = self.T_keyframe_relay @ T_relay_camera
+        if not information.any():
+            return T_keyframe_camera, information
+        J = se3.adjoint(se3.inverse(T_relay_camera))
+        covariance = J @ self.covariance @ J.T + covariance_of(information)
+        return T_keyframe_camera, np.linalg.inv(covariance)
+
+
+def covariance_of(information: np.ndarray) -> np.ndarray:
+    """Return the inverse of an information matrix [6, 6]; unobserved directions get 1 rad or m."""
+    return np.linalg.inv(information + np.eye(6))
+
+
 @dataclass(frozen=True, eq=False)
 class ReferenceKeyframe:
-    """Keyframe that frames are aligned to."""
+    """Keyframe that frames are aligned to, or a relay between a keyframe and the frames."""
 
     view: Pyramid
     T_odom_keyframe: np.ndarray  # [4, 4]
@@ -75,6 +111,8 @@ class ReferenceKeyframe:
     dynamic_class_mask: np.ndarray | None = None  # Objects of dynamic classes, [H, W] bool.
     # ORB features of a keyframe record; they come from a larger image than `view`.
     stored_features: Features | None = None
+    # The view is that of a frame after the keyframe `id`, which is no keyframe itself.
+    relay: Relay | None = None
 
     @cached_property
     def reference(self) -> ReferencePoints:
@@ -111,6 +149,7 @@ class ReferenceKeyframe:
             "left_out": self.ignore_mask,
             "movable": self.dynamic_class_mask,
             "features": None if features is None else asdict(features),
+            "relay": None if self.relay is None else asdict(self.relay),
         }
 
     @staticmethod
@@ -127,6 +166,7 @@ class ReferenceKeyframe:
             kept["left_out"],
             kept["movable"],
             features,
+            Relay(**kept["relay"]) if kept.get("relay") else None,
         )
 
 

@@ -17,6 +17,7 @@
 
 The caller decides with `may_map` whether step 4 may make a keyframe. It passes False while the
 mapper is too slow to take another one. Tracking then continues against the same reference keyframe.
+If that leaves the view, a frame becomes the reference without being a keyframe (`Relay`).
 Conventions: `ldo_service.geometry`.
 """
 
@@ -33,7 +34,7 @@ from ldo_service.geometry.keyframe_poses import RelativePose
 from .alignment import BrightnessModel
 from .frame_tracking import FrameTracker
 from .keyframe_database import KeyframeRecord, make_keyframe_record
-from .keyframes import ReferenceKeyframe, keyframe_dynamic_class_mask
+from .keyframes import ReferenceKeyframe, keyframe_dynamic_class_mask, limit_ratios
 from .map_frame import MapCorrection, MapFrame
 from .odometry_config import OdometryConfig
 from .odometry_prior import OdometryPriorBuffer, PriorPose
@@ -116,6 +117,11 @@ class Odometry:
         keyframe = None
         if needed is not None and may_map:
             keyframe = self._make_keyframe(frame, tracked, needed, known)
+        elif needed is KeyframeKind.REFERENCE and self._has_left_keyframe(tracked):
+            view, T_odom_camera = self._frames.view(frame), tracked.T_odom_camera
+            self._frames.state = self._frames.state.with_relay(
+                view, T_odom_camera, tracked.relay(), tracked.dynamic_mask
+            )
         # Compute odometry in the map, at the reference.
         reference = tracked.reference
         if reference is None and keyframe is not None:
@@ -151,13 +157,14 @@ class Odometry:
             boxes: Detections, in pixels of the keyframe's image.
         """
         state = self._frames.state
-        if state.keyframe is None or state.keyframe.id != keyframe:
+        reference = state.keyframe
+        if reference is None or reference.id != keyframe or reference.relay is not None:
             return
-        mask = keyframe_dynamic_class_mask(state.keyframe.view, boxes, self.config.movable)
+        mask = keyframe_dynamic_class_mask(reference.view, boxes, self.config.movable)
         if mask.any():
             self._frames.state = replace(
                 state,
-                keyframe=replace(state.keyframe, dynamic_class_mask=mask),
+                keyframe=replace(reference, dynamic_class_mask=mask),
                 database=state.database.without(mask, keyframe),
             )
 
@@ -198,6 +205,16 @@ class Odometry:
     def _is_connected_to_map(self) -> bool:
         """True if the reference is a reused keyframe or has a measured pose relative to one."""
         return self._frames.state.origin is not KeyframeOrigin.NEW
+
+    def _has_left_keyframe(self, tracked: TrackedFrame) -> bool:
+        """Return whether an OK frame is so far from its reference that tracking needs another."""
+        keyframe = self._frames.state.keyframe
+        if keyframe is None:
+            return False
+        T_reference_camera = se3.inverse(keyframe.T_odom_keyframe) @ tracked.T_odom_camera
+        config, depth_m = self.config.keyframes, keyframe.reference.median_depth_m
+        is_far = float(limit_ratios(T_reference_camera, depth_m, config)) > config.relay_ratio
+        return is_far or tracked.overlap < config.min_overlap / config.relay_ratio
 
     def _find_reusable_keyframe(
         self, frame: RgbdFrame, tracked: TrackedFrame

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from .keyframe_database import KeyframeDatabase, KeyframeDatabaseConfig, KeyframeRecord
-from .keyframes import ReferenceKeyframe
+from .keyframes import ReferenceKeyframe, Relay
 from .motion import ConstantVelocity
 from .motion_segmentation import MotionEvidence
 from .odometry_prior import DeadReckoningStart
-from .pyramid import PyramidConfig
+from .pyramid import Pyramid, PyramidConfig
 from .submaps import Submaps
 from .tracking_quality import ResidualHistory, TrackingStatus
 
@@ -49,6 +49,11 @@ class OdometryState:
     motion_evidence: MotionEvidence | None = None
     # The last OK frame, if the prior had a pose at its time.
     dead_reckoning_start: DeadReckoningStart | None = None
+
+    @property
+    def is_relayed(self) -> bool:
+        """True if the reference is no keyframe."""
+        return self.keyframe is not None and self.keyframe.relay is not None
 
     def with_new(
         self,
@@ -89,6 +94,34 @@ class OdometryState:
             origin=KeyframeOrigin.KNOWN,
             dynamic_mask=None,
         )
+
+    def with_relay(
+        self,
+        view: Pyramid,
+        T_odom_camera: np.ndarray,
+        relay: Relay,
+        ignore_mask: np.ndarray | None,
+    ) -> "OdometryState":
+        """Return the state with the frame just tracked as a reference that is no keyframe.
+
+        Args:
+            view: Pyramid of the frame.
+            T_odom_camera: Pose of the frame, [4, 4].
+            relay: Its pose in the last keyframe.
+            ignore_mask: Dynamic pixels of the frame, [H, W] bool at working resolution.
+        """
+        assert self.keyframe is not None
+        reference = ReferenceKeyframe(
+            replace(view, depth_m=view.depth_m.copy()),  # A camera may reuse its buffer.
+            T_odom_camera,
+            self.keyframe.id,
+            self.keyframe.submap,
+            moved_mask=self.dynamic_mask,
+            ignore_mask=ignore_mask,
+            relay=relay,
+        )
+        evidence = self.motion_evidence and self.motion_evidence.of_new_keyframe()
+        return replace(self, keyframe=reference, motion_evidence=evidence)
 
     def _against(self, keyframe: ReferenceKeyframe, T_odom_mapped: np.ndarray) -> "OdometryState":
         return replace(

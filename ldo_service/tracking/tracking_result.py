@@ -9,7 +9,7 @@ from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .alignment import Alignment
-from .keyframes import ReferenceKeyframe
+from .keyframes import ReferenceKeyframe, Relay, covariance_of
 from .submaps import SubmapMeasurement
 from .tracking_quality import TrackingStatus
 
@@ -75,14 +75,19 @@ class TrackedFrame:
             hypothesis_spread_rad: Spread of the supported hypotheses.
             dynamic_mask: Moving pixels, [H, W] bool at working resolution.
         """
+        T_reference_camera, information = alignment.T_reference_camera, alignment.information
+        if keyframe.relay is not None:
+            T_reference_camera, information = keyframe.relay.pose_of(
+                T_reference_camera, information
+            )
         return TrackedFrame(
             status,
             pose_source,
             T_odom_camera,
-            alignment.T_reference_camera,
+            T_reference_camera,
             keyframe.id,
             keyframe.submap,
-            information=alignment.information,
+            information=information,
             overlap=alignment.overlap,
             inlier_fraction=min(alignment.photometric_inliers, alignment.geometric_inliers),
             intensity_sigma=alignment.intensity_sigma,
@@ -92,6 +97,10 @@ class TrackedFrame:
             dynamic_mask=dynamic_mask,
             needed_keyframe=needed_keyframe,
         )
+
+    def relay(self) -> Relay:
+        """Return the pose of the frame in its keyframe, to align later frames to it."""
+        return Relay(self.T_reference_camera, covariance_of(self.information))
 
 
 @dataclass(frozen=True, slots=True)

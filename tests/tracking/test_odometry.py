@@ -65,6 +65,28 @@ def test_tracking_continues_when_no_keyframe_may_be_made(room, make_walk) -> Non
     assert all(r.denied_keyframe is KeyframeKind.REFERENCE for r in results[-5:])
 
 
+def test_camera_is_tracked_far_from_its_keyframe_when_no_keyframe_may_be_made(large_room) -> None:
+    """The camera turns by 130 degrees, until nothing of the keyframe is in view."""
+    truth = [se3.exp(np.array([0.0, 0.12 * k, 0.0, 0.0, 0.0, 0.0])) for k in range(20)]
+    frames = [large_room.view(T, index=k) for k, T in enumerate(truth)]
+    odometry, restored = Odometry(), Odometry()
+    odometry.process(frames[0])
+    results = [odometry.process(frame, may_map=False) for frame in frames[1:12]]
+    restored.restore(decode_state(encode_state(odometry.snapshot())))
+    results += [odometry.process(frame, may_map=False) for frame in frames[12:19]]
+    again = [restored.process(frame, may_map=False) for frame in frames[12:19]]
+    assert_bitwise_equal(again, results[11:])
+    assert {r.status for r in results} == {TrackingStatus.OK}
+    assert {r.reference for r in results} == {0}
+    assert largest_error_m(results, truth[1:19]) < 0.01
+    np.testing.assert_allclose(results[-1].T_reference_camera, truth[18], atol=0.01)
+    sigmas = [np.sqrt(np.linalg.inv(r.information).trace()) for r in results]
+    assert sigmas[-1] > 2 * sigmas[0]
+    last = odometry.process(frames[19])
+    assert became_reference(last)
+    assert last.reference == 0
+
+
 def test_every_usable_frame_is_first_until_a_keyframe_is_made(room) -> None:
     odometry = Odometry()
     assert odometry.process(room.blank()).status is TrackingStatus.LOST
