@@ -192,7 +192,7 @@ def test_motion_is_as_hard_as_stated(name: str) -> None:
     assert np.percentile(np.rad2deg(turns), 95) >= 60
     depth_m, camera = np.full((480, 640), 2.0), seq.raw_camera
     moved: dict[str, list[float]] = {"skew": [], "blur": [], "late": []}
-    for index in range(0, len(seq), len(seq) // 12):
+    for index in range(0, len(seq), len(seq) // 6):
         rows = seq.row_poses(index)
         first, last = (np.broadcast_to(rows[i], rows.shape) for i in (0, -1))
         start, end = (
