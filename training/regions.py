@@ -37,7 +37,7 @@ def regions(frame: FlatRendering, lens: Camera, rng: np.random.Generator) -> Ite
         rng: Source of the errors.
     """
     sharp = np.floor(np.clip(frame.light, 0, 1) * 255 + 0.5).astype(np.uint8)
-    measured_m = measured_depth_m(frame, lens.fx, rng)
+    measured_m = measured_depth_m(frame.depth_m, frame.light, lens.fx, rng)
     depth_m = np.where(measured_m > 0, measured_m, frame.depth_m).astype(np.float32)
     shown = segment_geometry(degrade(sharp, rng, BLUR_PX), depth_m, lens, TRIGGER.segments)
     visible_px = np.bincount(frame.instance_ids.ravel())
