@@ -14,10 +14,10 @@ struct Motions {
   int64_t count;
 };
 
-#define LDO_DECLARE(isa)                                                                     \
-  namespace isa {                                                                            \
-  void move_rows(float* rows, const int32_t* anchors, int64_t n, const Motions& motions,     \
-                 int threads);                                                               \
+#define LDO_DECLARE(isa)                                                                 \
+  namespace isa {                                                                        \
+  void move_rows(float* rows, const int32_t* anchors, int64_t n, const Motions& motions, \
+                 int threads);                                                           \
   }
 LDO_DECLARE(baseline)
 LDO_DECLARE(avx2)
