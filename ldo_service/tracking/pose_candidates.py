@@ -205,8 +205,9 @@ class InitialGuessAligner:
         if second is not None:
             candidates.append(align_hypothesis(keyframe, view, second, pose_source, self.align))
         chosen = select_hypothesis(candidates, second, keyframe, view, self.candidates, self.align)
-        # A hypothesis that did not converge may still be where features put its initial guess.
-        if second is not None and pose_source == "features" and chosen.alignment.converged:
+        # The hypothesis that started at the pose by features confirms it only if it converged.
+        is_independent = chosen.pose_source != "features" or chosen.alignment.converged
+        if second is not None and pose_source == "features" and is_independent:
             distance_rad = hypothesis_distance_rad(chosen, second)
             chosen = replace(chosen, feature_distance_rad=distance_rad)
         if T_keyframe_reckoned is None:

@@ -260,3 +260,21 @@ def test_forty_real_frames_stay_within_three_centimeters(data: Path) -> None:
     assert truth is not None
     estimate = Trajectory(kitchen.stamps_ns[:40] * 1e-9, T_odom_camera)
     assert evaluate_trajectory(estimate, truth).ate_m.rmse < 0.03
+
+
+@pytest.mark.parametrize("name", ["lounge_part", "office_part"])
+def test_real_camera_with_large_steps_or_in_a_dim_room_is_not_lost(data: Path, name: str) -> None:
+    """The thresholds were chosen on these sequences, so this test only keeps what was reached."""
+    folder = data / "scannet" / name
+    if not folder.is_dir():
+        pytest.skip(f"LDO_DATA has no scannet/{name}")
+    sequence = open_sequence(str(folder))
+    results = track(Odometry(), list(sequence))
+    statuses = [r.status for r in results]
+    assert TrackingStatus.LOST not in statuses
+    assert statuses.count(TrackingStatus.OK) >= 0.95 * len(statuses)
+    truth = sequence.truth()
+    assert truth is not None
+    T_odom_camera = np.array([r.T_odom_camera for r in results])
+    estimate = Trajectory(sequence.stamps_ns * 1e-9, T_odom_camera)
+    assert evaluate_trajectory(estimate, truth).ate_m.rmse < 0.02
