@@ -5,6 +5,7 @@ import logging
 import os
 import shutil
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,6 +53,14 @@ class FrameCache:
         key = hashlib.blake2b(identity.encode(), digest_size=10).hexdigest()
         self.folder = cache_root() / "synthetic-flat" / key
         self._size = (height, width)
+
+    def load_or_render(self, index: int, render: Callable[[int], CachedFrame]) -> CachedFrame:
+        """Return a frame from the cache, or render and store it."""
+        frame = self.load(index)
+        if frame is None:
+            frame = render(index)
+            self.store(index, frame)
+        return frame
 
     def load(self, index: int) -> CachedFrame | None:
         """Return the frame, or None if it is missing or damaged."""

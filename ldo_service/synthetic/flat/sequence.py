@@ -116,11 +116,7 @@ class FlatSequence(Sequence):
         return FlatRenderer(self._flat)
 
     def _frame(self, index: int) -> CachedFrame:
-        frame = self._cache.load(index)
-        if frame is None:
-            frame = self._rendered(index)
-            self._cache.store(index, frame)
-        return frame
+        return self._cache.load_or_render(index, self._rendered)
 
     def _rendered(self, index: int) -> CachedFrame:
         exact = self._renderer.render(self.raw_camera, self._T_world_camera[index])

@@ -238,11 +238,7 @@ class HandheldSequence(Sequence):
         return index / self._walk.rate_hz
 
     def _frame(self, index: int) -> CachedFrame:
-        frame = self._cache.load(index)
-        if frame is None:
-            frame = self._rendered(index)
-            self._cache.store(index, frame)
-        return frame
+        return self._cache.load_or_render(index, self._rendered)
 
     def _rendered(self, index: int) -> CachedFrame:
         effects, seed = self.config.effects, self.config.seed
