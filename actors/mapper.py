@@ -304,7 +304,7 @@ class Mapper(Actor):
             yield from self._refit_idly()
 
     def _refit_idly(self) -> Iterator[Output]:
-        self._refit.while_idle()
+        self._refit.while_idle(self.config.idle_thread_count())
         self._idle_steps += 1
         is_done = not self._refit.has_work()
         if is_done:

@@ -39,4 +39,9 @@ class MapperConfig:
             raise ConfigError(named(self, *counts) + " must be at least 1.")
 
     def thread_count(self) -> int:
+        """Return the threads of the renderer while the camera moves."""
         return self.threads or max(1, (os.cpu_count() or 1) - 1)
+
+    def idle_thread_count(self) -> int:
+        """Return the threads of the refit while no keyframe arrives: all cores by default."""
+        return self.threads or os.cpu_count() or 1

@@ -57,9 +57,8 @@ class Fitting:
         window: Settings of the choice after a new keyframe.
         views: Keyframes to fit the map to.
         is_resident: Function that returns whether all Gaussians that may be visible in a keyframe
-            are
-            in memory. Other keyframes are skipped, since the Gaussians in memory would otherwise
-            move to where offloaded Gaussians are missing.
+            are in memory. Other keyframes are skipped: the Gaussians in memory would move to where
+            offloaded Gaussians are missing.
         seed: Seed of the random choice of keyframes.
         threads: Threads of the renderer.
     """
@@ -79,6 +78,15 @@ class Fitting:
         self._seed = seed
         self.iterations = 0
         self.unusable = 0  # Keyframes that were chosen but skipped.
+
+    @property
+    def threads(self) -> int:
+        """Threads of the renderer and the optimizer; the results do not depend on them."""
+        return self._optimizer.threads
+
+    @threads.setter
+    def threads(self, count: int) -> None:
+        self._optimizer.threads = count
 
     def forget_view(self, keyframe: int) -> None:
         """Drop what the Gaussian optimizer stores for a keyframe."""

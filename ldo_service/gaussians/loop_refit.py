@@ -14,24 +14,31 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 
 from .map_builder import MapBuilder
 
+# Numbers cubes of space by one integer each; cubes within a million of the origin differ.
+CUBE_STRIDES = np.array([1 << 42, 1 << 21, 1], np.int64)
+
 
 @dataclass(frozen=True, slots=True)
 class LoopRefitConfig:
     """Settings of the deduplication and the refit after pose corrections."""
 
-    # A keyframe that moves farther is deduplicated: it may overlap surface that the map holds.
+    # A keyframe that moves farther against its surroundings is deduplicated and refitted. Normal
+    # iterations correct smaller motions.
     min_motion_m: float = 0.01
-    min_motion_rad: float = 0.01  # Normal iterations correct smaller motions.
+    min_motion_rad: float = 0.01
+    # Edge of the cubes in which motions are compared, meters. A correction of less than 0.5 % of
+    # the path bends the map by less than `min_motion_m` within a cube.
+    cube_m: float = 2.0
     # Keyframes deduplicated with each new keyframe; 100 moved ones take 50 keyframes.
     deduplicated_per_keyframe: int = 2
     deduplicated_at_end: int = 200  # Newest keyframes deduplicated at the end; takes some seconds.
     # Iterations after the deduplication of each, as for a new keyframe when many wait.
     deduplication_iterations: int = 3
-    # Refit iterations for a keyframe that a correction moves against the first one, half of them on
-    # other keyframes; as many as for a new keyframe.
+    # Refit iterations for a displaced keyframe, half of them on other keyframes; as many as for a
+    # new keyframe.
     iterations: int = 12
     # Pending refit iterations that run with each new keyframe while no other waits; mapping then
-    # takes 50 % longer. Offline runs do the rest at the end, `map/refine` does it on request.
+    # takes 50 % longer. The rest runs while no keyframe arrives, and at the end of offline runs.
     iterations_per_keyframe: int = 6
     # Pending refit iterations that run at once while no keyframe arrives. A new keyframe waits at
     # most so long: 0.8 s on two cores at 640x480.
@@ -40,17 +47,49 @@ class LoopRefitConfig:
     def __post_init__(self) -> None:
         if min(getattr(self, name) for name in self.__slots__) < 0:
             raise ConfigError(named(self, *self.__slots__) + " must not be negative.")
+        if self.cube_m == 0:
+            raise ConfigError(named(self, "cube_m") + " must be positive.")
+
+
+def displaced_mask(T_now: np.ndarray, T_before: np.ndarray, config: LoopRefitConfig) -> np.ndarray:
+    """Return which keyframes moved far against the oldest keyframe within the same cube.
+
+    Two grids of cubes are used, shifted by half an edge along each axis, since a boundary of one
+    grid may separate two passes through the same place.
+
+    Args:
+        T_now: Poses T_map_keyframe after the correction, [K, 4, 4], oldest first.
+        T_before: Poses before the correction, [K, 4, 4].
+        config: Settings.
+
+    Returns:
+        [K] bool.
+    """
+    motions = T_now @ se3.inverse(T_before)
+    is_displaced = np.zeros(len(T_now), bool)
+    for shift in (0.0, 0.5):
+        cubes = np.floor(T_now[:, :3, 3] / config.cube_m + shift).astype(np.int64)
+        _, oldest, cube = np.unique(cubes @ CUBE_STRIDES, return_index=True, return_inverse=True)
+        T_as_oldest = motions[oldest[cube]] @ T_before
+        is_displaced |= se3.transforms_differ(
+            T_now, T_as_oldest, config.min_motion_m, config.min_motion_rad
+        )
+    return is_displaced
 
 
 class LoopRefit:
     """Scheduler of the deduplication and refit iterations after pose corrections.
 
-    Deduplication. A correction that moves a keyframe far may place its surface on surface that the
-    map contains already. Such a keyframe is queued for deduplication.
+    The Gaussians of a keyframe move with it. A part of the map that a correction moves as a whole
+    stays as good as it was. Work is needed where keyframes that see the same surface move
+    differently, such as on both sides of a loop closure. A keyframe counts as displaced if it
+    moves far against the oldest keyframe within the same cube of space.
 
-    Refit. The map was fitted to the old relative poses. A keyframe that moves far relative to the
-    first keyframe therefore gets pending refit iterations. Half of them optimize against this
-    keyframe, the other half against random keyframes. Optimizing against moved keyframes alone
+    Deduplication. The surface of a displaced keyframe may lie on surface that the map contains
+    already. The keyframe is queued for deduplication.
+
+    Refit. A displaced keyframe gets pending refit iterations. Half of them optimize against this
+    keyframe, the other half against random keyframes. Optimizing against displaced keyframes alone
     would make the map worse in keyframes that did not move and show the same surface.
 
     This work is done in small amounts with each following keyframe, so that new keyframes are
@@ -65,7 +104,7 @@ class LoopRefit:
         self._pending: dict[int, int] = {}  # Pending refit iterations by keyframe.
 
     def mark_moved(self, T_map: KeyframePoses) -> None:
-        """Schedule deduplication and refit for the keyframes that a correction moves far.
+        """Schedule deduplication and refit for the keyframes that a correction displaces.
 
         Call it before `MapBuilder.move` applies the correction to the map.
 
@@ -73,16 +112,10 @@ class LoopRefit:
             T_map: The corrected poses of the keyframes.
         """
         placed, config = self._map.views.poses, self.config
-        keyframes = np.fromiter(placed, np.int64)
-        T_now, T_before = T_map.of(placed), placed.of(placed)
-        limits = config.min_motion_m, config.min_motion_rad
-        far = keyframes[se3.transforms_differ(T_now, T_before, *limits)]
-        if not len(far):
-            return
-        self._to_deduplicate = sorted({*self._to_deduplicate, *far.tolist()})
-        T_as_a_whole = T_now[0] @ se3.inverse(T_before[0])
-        displaced = keyframes[se3.transforms_differ(T_now, T_as_a_whole @ T_before, *limits)]
-        self._pending |= dict.fromkeys(displaced.tolist(), config.iterations)
+        is_displaced = displaced_mask(T_map.of(placed), placed.of(placed), config)
+        displaced = np.fromiter(placed, np.int64)[is_displaced].tolist()
+        self._to_deduplicate = sorted({*self._to_deduplicate, *displaced})
+        self._pending |= dict.fromkeys(displaced, config.iterations)
         self._forget()
 
     def _forget(self) -> None:
@@ -129,13 +162,21 @@ class LoopRefit:
         """
         return bool(self._to_deduplicate) or bool(self._resident_keyframes())
 
-    def while_idle(self) -> None:
-        """Do a part of the work while no keyframe arrives."""
-        config = self.config
-        self._deduplicate(config.deduplicated_per_keyframe, config.deduplication_iterations)
-        runnable = sum(self._pending[k] for k in self._resident_keyframes())
-        if runnable:
-            self.refine(min(config.iterations_while_idle, runnable))
+    def while_idle(self, threads: int) -> None:
+        """Do a part of the work while no keyframe arrives.
+
+        Args:
+            threads: Threads of the iterations. The tracker has little to do then.
+        """
+        config, fitting = self.config, self._map.fitting
+        usual, fitting.threads = fitting.threads, threads
+        try:
+            self._deduplicate(config.deduplicated_per_keyframe, config.deduplication_iterations)
+            runnable = sum(self._pending[k] for k in self._resident_keyframes())
+            if runnable:
+                self.refine(min(config.iterations_while_idle, runnable))
+        finally:
+            fitting.threads = usual
 
     def at_end(self) -> None:
         """Deduplicate at the end of the run, without iterations.

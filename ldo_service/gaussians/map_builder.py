@@ -61,7 +61,7 @@ class MapBuilder:
         self._confirmation = Confirmation(
             self.views.store, self._renderer, self.config.pruning, self.config.seed
         )
-        self._fitting = Fitting(
+        self.fitting = Fitting(
             self.config.optimizer,
             self.config.window,
             self.views,
@@ -108,8 +108,8 @@ class MapBuilder:
         self._newest = keyframe
         for forgotten in self.views.add(view):
             self._published.forget(forgotten)
-            self._fitting.forget_view(forgotten)
-        plan = self._fitting.plan(view, MAX_ITERATIONS_PER_EFFORT * iterations)
+            self.fitting.forget_view(forgotten)
+        plan = self.fitting.plan(view, MAX_ITERATIONS_PER_EFFORT * iterations)
         touched = self._fit(plan, effort=iterations)
         if len(self.views) % self.config.prune_keyframes == 0:
             self._prune_misshapen(touched)
@@ -215,14 +215,14 @@ class MapBuilder:
             if offloaded Gaussians may be visible in most keyframes.
         """
         self._renderer.forget()
-        before = self._fitting.iterations
-        self._fit(self._fitting.plan_refinement(iterations, first), rates, effort)
-        return self._fitting.iterations - before
+        before = self.fitting.iterations
+        self._fit(self.fitting.plan_refinement(iterations, first), rates, effort)
+        return self.fitting.iterations - before
 
     def _fit(
         self, plan: Iterable[int], rates: tuple[float, float] = (1.0, 1.0), effort: float = inf
     ) -> np.ndarray:
-        touched = self._fitting.fit(self.gaussians, plan, rates, effort)
+        touched = self.fitting.fit(self.gaussians, plan, rates, effort)
         self._log.changed(touched)
         return touched
 
@@ -362,11 +362,11 @@ class MapBuilder:
         return {
             "map": self.gaussians.snapshot(),
             "sleeping": self.offloaded.snapshot(),
-            "optimizer": self._fitting.snapshot(),
+            "optimizer": self.fitting.snapshot(),
             "views": self.views.snapshot(),
             "published": self._published.snapshot(),
             "newest": self._newest,
-            "iterations": self._fitting.iterations,
+            "iterations": self.fitting.iterations,
         }
 
     def saved(self) -> None:
@@ -376,7 +376,7 @@ class MapBuilder:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore the state of a snapshot. All of the map then counts as published."""
         self.gaussians = GaussianMap.restore(state["map"])
-        self._fitting.restore(state["optimizer"], state["iterations"])
+        self.fitting.restore(state["optimizer"], state["iterations"])
         self.views.restore(state["views"])
         self.offloaded.restore(state["sleeping"])
         self._published.restore(self.views.cameras, state["published"])
@@ -388,9 +388,9 @@ class MapBuilder:
         return {
             "gaussians": len(self.gaussians),
             "gaussians_pruned": self._pruned,
-            "iterations": self._fitting.iterations,
+            "iterations": self.fitting.iterations,
             # Chosen for fitting, but dropped, unreadable or with offloaded Gaussians in view.
-            "keyframes_skipped": self._fitting.unusable,
+            "keyframes_skipped": self.fitting.unusable,
             # Kept in memory beyond the limit, because recent keyframes may see them.
             "gaussians_over_limit": self._excess,
             **self.offloaded.metrics(),

@@ -141,11 +141,19 @@ class GaussianOptimizer:
 
     def __init__(self, config: GaussianOptimizerConfig | None = None, *, threads: int = 1) -> None:
         self.config = config or GaussianOptimizerConfig()
-        self.threads = threads
         self._adam = Adam(self.config.adam)
         self._poses = PoseAdam()
         self._rasterizer = Rasterizer(threads=threads)
         self._by_planes = np.empty((5, 0, 0), np.float32)
+
+    @property
+    def threads(self) -> int:
+        """Number of threads; it may change between calls."""
+        return self._rasterizer.threads
+
+    @threads.setter
+    def threads(self, count: int) -> None:
+        self._rasterizer.threads = count
 
     def optimize(
         self,

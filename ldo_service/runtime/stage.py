@@ -181,14 +181,20 @@ class Stage:
                       self.name)  # fmt: skip
 
     async def _next(self, mailbox: Mailbox) -> Delivery | StageCommand | None:
-        """Take the next delivery or command; save an unsaved state or work idly meanwhile."""
+        """Take the next delivery or command; save an unsaved state or work idly meanwhile.
+
+        Idle work starts after `Actor.idle_after_s` without a message. Its further steps follow at
+        once until a message arrives.
+        """
+        is_idle = False
         while True:
             is_unsaved = self._saver.is_unsaved
             has_work = not is_unsaved and self._has_idle_work(mailbox)
-            wait_s = self._actor.idle_after_s if has_work else CHECK_S
+            idle_wait_s = 0.0 if is_idle else self._actor.idle_after_s
             try:
-                return await mailbox.take(wait_s)
+                return await mailbox.take(idle_wait_s if has_work else CHECK_S)
             except TimeoutError:
+                is_idle = has_work
                 if is_unsaved:
                     await self._save_and_send([])
                 elif has_work:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.gaussians.loop_refit import LoopRefit, LoopRefitConfig
+from ldo_service.gaussians.loop_refit import LoopRefit, LoopRefitConfig, displaced_mask
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.geometry.point_records import PoseTable
@@ -70,3 +70,18 @@ def test_iterations_of_offloaded_keyframes_stay_pending() -> None:
         refit.with_keyframe(is_behind=False)
     assert map_.iterations == [4]
     assert refit.pending_iterations == 4
+
+
+def test_correction_that_bends_a_path_displaces_keyframes_only_where_it_returns() -> None:
+    """The camera goes 20 m ahead and back. The correction grows with the path, up to 8 cm."""
+    count = 81
+    ahead_m = np.r_[np.linspace(0.0, 20.0, 41), np.linspace(20.0, 0.0, 41)[1:]]
+    T_before = np.tile(np.eye(4), (count, 1, 1))
+    T_before[:, 2, 3] = ahead_m
+    T_now = T_before.copy()
+    T_now[:, 0, 3] += np.linspace(0.0, 0.08, count)
+    is_displaced = displaced_mask(T_now, T_before, LoopRefitConfig())
+    assert not is_displaced[:41].any()
+    # Near the turning point both passes have moved alike.
+    assert not is_displaced[41:44].any()
+    assert is_displaced[50:].all()
