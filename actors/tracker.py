@@ -24,6 +24,8 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.calibration.correction import read_correction
+from ldo_service.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
 from ldo_service.conversions.frames import (
     frame_from_message,
     keyframe_measurements_message,
@@ -109,6 +111,7 @@ class TrackerConfig:
 
     T_base_camera: CameraExtrinsics = field(default_factory=CameraExtrinsics)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
     # Folder of a finished run: track in its map, which does not change; empty: map.
     localize: str = ""
     hold_out: int = 0  # Every n-th frame is tracked but not mapped, to evaluate the map; 0: none.
@@ -143,6 +146,7 @@ class Tracker(Actor):
         self.config = config or TrackerConfig()
         self._T_base_camera = self.config.T_base_camera.matrix()
         self._odometry = _make_odometry(self.config, self._T_base_camera)
+        self._calibration = _make_calibration(self.config)
         self._correction = b""  # The last correction, encoded.
         self._prior = OdometryPriorBuffer()
         self._made = self._without_room = self._reused = 0  # Numbers of keyframes.
@@ -170,17 +174,25 @@ class Tracker(Actor):
         else:
             yield from self._track(frame_from_message(message))
 
-    def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe | KeyframeMeasurements]:
-        """Track a frame; yield its keyframe if it becomes one, then its pose."""
+    def _track(self, raw: RgbdFrame) -> Iterator[TrackedPose | Keyframe | KeyframeMeasurements]:
+        """Track a frame; yield its keyframe if it becomes one, then its pose.
+
+        The keyframe has the color and the depth that the self-calibration has corrected.
+        """
+        frame = self._calibration.correction.applied(raw)
         hold_out = self.config.hold_out
         is_held_out = hold_out > 0 and frame.index % hold_out == hold_out - 1
         may_map = not is_held_out and self.has_credit(KEYFRAME_NEW)
         result = self._odometry.process(frame, self._prior, may_map=may_map)
         self._count(frame, result, is_held_out)
+        change = self._calibration.observe(raw, self._odometry.motion)
+        if change is not None:
+            self._odometry.recorrect(change)
         if result.awaits_mapping:
             return  # Odometry starts with a later frame, when all consumers have credit.
         if result.keyframe is not None:
-            keyframe = keyframe_message(frame, result, result.keyframe)
+            correction = self._calibration.correction
+            keyframe = keyframe_message(frame, result, result.keyframe, correction)
             yield keyframe
             yield keyframe_measurements_message(keyframe)
         yield tracked_pose_message(frame, result, self._T_base_camera)
@@ -242,6 +254,7 @@ class Tracker(Actor):
             "graph_correction": self._correction,
             "now": {"odometry": state, "poses": poses, "localize": localize},
             "prior": self._prior.pack(),
+            **{f"calibration_{k}": part for k, part in self._calibration.snapshot().items()},
             **fix,
         }
 
@@ -267,6 +280,10 @@ class Tracker(Actor):
             None if correction is None else map_correction_of(correction),
         )
         self._prior, self._parts = OdometryPriorBuffer.unpack(state["prior"]), None
+        prefix = "calibration_"
+        saved = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+        if saved:  # A state of an earlier version has no calibration.
+            self._calibration.restore(saved)
 
     def metrics(self) -> dict[str, float]:
         """Return counters of keyframes, frames and prior poses."""
@@ -280,6 +297,7 @@ class Tracker(Actor):
             "frames_without_prior": self._without_prior,  # Since the first pose of the prior.
             "prior_rejected": refused,
             "prior_restarts": restarts,
+            **self._calibration.metrics(),
         }
 
 
@@ -292,6 +310,17 @@ def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry
     if not config.localize:
         return Odometry(config.odometry, T_base_camera)
     return Localizer(load_keyframe_database(Path(config.localize)), config.odometry, T_base_camera)
+
+
+def _make_calibration(config: TrackerConfig) -> SelfCalibration:
+    """Return a new self-calibration, or the finished one of the map of a finished run.
+
+    Raises:
+        DataError: The folder of the run has no usable keyframes.json.
+    """
+    if not config.localize:
+        return SelfCalibration(config.calibration)
+    return SelfCalibration.finished(read_correction(Path(config.localize)))
 
 
 def _box(detection: Detection) -> Box:

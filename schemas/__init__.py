@@ -23,6 +23,7 @@ from ldo_service.schemas.keyframe import (
     Keyframe,
     KeyframeMeasurements,
     KeyframeRefinement,
+    CameraCorrection,
     MeasuredPose,
 )
 from ldo_service.schemas.labels import AddLabel, LabelNames, LabelRequest, LabelResult
@@ -72,6 +73,7 @@ __all__ = [
     "MapObjects",
     "MapRendering",
     "MapSnapshot",
+    "CameraCorrection",
     "MeasuredPose",
     "Message",
     "ObjectObservation",

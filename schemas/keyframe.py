@@ -30,6 +30,32 @@ class MeasuredPose(msgspec.Struct, frozen=True, kw_only=True):
             )
 
 
+Terms = tuple[float, float, float]
+NO_TERMS: Terms = (0.0, 0.0, 0.0)
+
+
+class CameraCorrection(msgspec.Struct, frozen=True, kw_only=True):
+    """Correction of the camera that the self-calibration applied to color and depth.
+
+    With x = (u - cu) / (w/2) and y = (v - cv) / (w/2) around the image center, and r = 1 in the
+    corners:
+
+        1 / z = 1 / z_measured + b1 x^2 + b2 x y + b3 y^2
+        color_measured = V(r) color,  log V = a1 r^2 + a2 r^4 + a3 r^6 per channel
+
+    The colors are scaled by the smallest V, so that none of them is clipped.
+    """
+
+    depth_bias: Terms = NO_TERMS  # b1, b2, b3 in 1/m.
+    # a1, a2, a3 of red, green and blue.
+    vignetting: tuple[Terms, Terms, Terms] = (NO_TERMS, NO_TERMS, NO_TERMS)
+
+    def __post_init__(self) -> None:
+        require_finite("depth_bias", self.depth_bias)
+        for channel in self.vignetting:
+            require_finite("vignetting", channel)
+
+
 class Keyframe(Message, frozen=True, kw_only=True):
     """Frame to be mapped, with its pose relative to a reference keyframe.
 
@@ -59,6 +85,7 @@ class Keyframe(Message, frozen=True, kw_only=True):
     submap: int = 0  # Number of the submap; each loss of tracking starts a new one.
     # Poses of this keyframe in keyframes of submaps that its submap is merged with.
     submap_measurements: tuple[MeasuredPose, ...] = ()
+    camera_correction: CameraCorrection = CameraCorrection()  # Applied to `color` and `depth_m`.
 
     def check(self) -> None:
         require_rgbd(self.camera, self.color, self.depth_m)

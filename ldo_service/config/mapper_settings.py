@@ -167,8 +167,8 @@ class PublishSettings:
 class RefitSettings:
     """Refit of the map to keyframes that a correction has moved."""
 
-    # Refit iterations for each keyframe that a correction moves by more than 1 cm or 0.01 rad
-    # relative to the oldest keyframe within a cube of 2 m.
+    # Refit iterations for each keyframe that a correction moves by more than 1 cm or 0.01 rad. Its
+    # motion counts against the oldest keyframe within a cube of 2 m.
     iterations: NonNegativeInt = advanced(12)
     # Pending refit iterations that run with each new keyframe if no other keyframe is queued.
     iterations_per_keyframe: NonNegativeInt = advanced(6)

@@ -11,6 +11,7 @@ from ldo_service.actors.mapper_config import MapperConfig
 from ldo_service.actors.optimizer import OptimizerConfig
 from ldo_service.actors.topology import ActorParameters
 from ldo_service.actors.tracker import CameraExtrinsics, TrackerConfig
+from ldo_service.calibration.self_calibration import SelfCalibrationConfig
 from ldo_service.detection.dynamic_classes import DynamicClassConfig
 from ldo_service.gaussians.adam import AdamConfig
 from ldo_service.gaussians.densification import DensificationConfig
@@ -169,6 +170,9 @@ def _tracker(config: Config) -> TrackerConfig:
                 max_dead_reckoning_s=tracker.odometry_prior.max_dead_reckoning_s,
             ),
         ),
+        calibration=SelfCalibrationConfig()
+        if tracker.self_calibration
+        else SelfCalibrationConfig(views=()),
         localize=tracker.localization_map,
         hold_out=tracker.hold_out,
     )

@@ -217,6 +217,9 @@ class TrackerSettings:
     quality: QualitySettings = field(default_factory=QualitySettings)
     dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
     odometry_prior: OdometryPriorSettings = field(default_factory=OdometryPriorSettings)
+    # Estimates vignetting and smooth depth bias of the camera in the first seconds. They are
+    # corrected only if held-out frames confirm the estimate.
+    self_calibration: bool = advanced(True)
     # Folder of a finished run for localization in its map, which is not changed. Empty makes a new
     # map.
     localization_map: str = ""

@@ -1,8 +1,11 @@
 """Conversions between messages and internal types: cameras, frames, keyframes and masks."""
 
 import cv2
+import msgspec
 import numpy as np
 
+from ldo_service import schemas
+from ldo_service.calibration.correction import CameraCorrection
 from ldo_service.geometry import Camera, RawFrame, RgbdFrame, codecs
 from ldo_service.schemas import (
     Array,
@@ -101,8 +104,21 @@ def tracked_pose_message(
     )
 
 
-def keyframe_message(frame: RgbdFrame, result: TrackingResult, keyframe: NewKeyframe) -> Keyframe:
-    """Return the message of the keyframe that was made of a tracked frame."""
+def keyframe_message(
+    frame: RgbdFrame,
+    result: TrackingResult,
+    keyframe: NewKeyframe,
+    correction: CameraCorrection | None = None,
+) -> Keyframe:
+    """Return the message of the keyframe that was made of a tracked frame.
+
+    Args:
+        frame: The frame as it was tracked.
+        result: Its pose.
+        keyframe: The keyframe.
+        correction: Correction of the camera that was applied to the frame; None for none.
+    """
+    used = CameraCorrection() if correction is None else correction
     merge = keyframe.submap_measurement
     return Keyframe(
         stamp_ns=frame.stamp_ns,
@@ -120,7 +136,14 @@ def keyframe_message(frame: RgbdFrame, result: TrackingResult, keyframe: NewKeyf
         dynamic_mask=mask_to_array(result.dynamic_mask, frame.camera),
         submap=keyframe.submap,
         submap_measurements=() if merge is None else (relative_pose_to_message(merge),),
+        camera_correction=camera_correction_to_message(used),
     )
+
+
+def camera_correction_to_message(correction: CameraCorrection) -> schemas.CameraCorrection:
+    """Convert a correction of the camera to its message."""
+    values = {"depth_bias": correction.depth_bias, "vignetting": correction.vignetting}
+    return msgspec.convert(values, schemas.CameraCorrection)
 
 
 def keyframe_measurements_message(keyframe: Keyframe) -> KeyframeMeasurements:

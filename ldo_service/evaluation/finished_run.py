@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ldo_service.calibration.correction import CameraCorrection
 from ldo_service.errors import DataError
 from ldo_service.gaussians.exposure import Exposure
 from ldo_service.geometry import Trajectory
@@ -90,6 +91,7 @@ class PosedMap:
         trajectory: T_map_camera of the frames that are not LOST.
         exposures: Exposures of the keyframes.
         semantics: Labels of the Gaussians; None without a detector.
+        correction: Correction of the camera, to whose images the map was fitted.
     """
 
     name: str
@@ -97,6 +99,7 @@ class PosedMap:
     trajectory: Trajectory
     exposures: Exposures
     semantics: SavedSemantics | None = None
+    correction: CameraCorrection = field(default_factory=CameraCorrection)
 
     def T_map_camera(self, frame: RunFrame) -> np.ndarray:
         """Return the pose of a frame, [4, 4].

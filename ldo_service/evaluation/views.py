@@ -2,11 +2,12 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
+from ldo_service.calibration.correction import CameraCorrection
 from ldo_service.gaussians.exposure import Exposure, fit_exposure
 from ldo_service.gaussians.renderer import Rendering, render
 from ldo_service.geometry import RgbdFrame, se3, valid_pixels
@@ -140,6 +141,8 @@ class RenderedView:
     # Interpolated between keyframes, not fitted to the frame.
     exposure: Exposure = field(default_factory=Exposure)
     valid: np.ndarray | None = None  # Pixels of the camera image, [H, W] bool; None for all.
+    # Correction of the camera, to whose images the map was fitted. Renderings get its vignetting.
+    correction: CameraCorrection = field(default_factory=CameraCorrection)
 
     @property
     def seen(self) -> np.ndarray:
@@ -149,7 +152,13 @@ class RenderedView:
     @property
     def shown(self) -> np.ndarray:
         """Rendering at the exposure of the frame, [H, W, 3] float32, 0..1."""
-        return self.exposure.applied(self.rendering.color)
+        return self.vignetted(self.exposure.applied(self.rendering.color))
+
+    def vignetted(self, color: np.ndarray) -> np.ndarray:
+        """Return an image [H, W, 3] of the map as the camera with its vignetting would see it."""
+        if not self.correction.has_vignetting:
+            return color
+        return (color / self.correction.gain(self.frame.camera)).clip(0, 1)
 
     @property
     def picture(self) -> np.ndarray:
@@ -209,14 +218,14 @@ def every_pixel(view: RenderedView) -> Images:
 
 def exposure_fitted(view: RenderedView) -> Images:
     """Return camera image and rendering, with the exposure fitted to the camera image."""
-    shown, seen = view.rendering.color, view.seen
+    shown, seen = view.vignetted(view.rendering.color), view.seen
     fitted = fit_exposure(shown, seen, view.valid)
     return seen, fitted.applied(shown)
 
 
 def map_as_it_is(view: RenderedView) -> Images:
     """Return camera image and rendering, without any exposure correction of the rendering."""
-    return view.seen, view.rendering.color.clip(0, 1)
+    return view.seen, view.vignetted(view.rendering.color.clip(0, 1))
 
 
 def measured_pixels(view: RenderedView) -> Images:
@@ -277,7 +286,7 @@ def view_of(
     """Render the map at the pose of a frame.
 
     Args:
-        image: Color and depth of the frame, as it was mapped.
+        image: Color and depth of the frame, before the correction of the camera.
         posed: The map.
         frame: The frame of the run.
         threads: Threads of the renderer.
@@ -288,7 +297,10 @@ def view_of(
     """
     T_camera_map = se3.inverse(posed.T_map_camera(frame))
     rendering = render(posed.rows, image.camera, T_camera_map, threads=threads)
-    return RenderedView(image, rendering, posed.exposures.at(frame.stamp_ns), valid)
+    correction = posed.correction
+    depth_m = correction.corrected_depth(image.depth_m, image.camera)
+    exposure = posed.exposures.at(frame.stamp_ns)
+    return RenderedView(replace(image, depth_m=depth_m), rendering, exposure, valid, correction)
 
 
 def evaluate_rendering(

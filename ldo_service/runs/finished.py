@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.calibration.correction import read_correction
 from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap, RunFrame
 from ldo_service.gaussians.file_formats import read_ply
@@ -134,7 +135,8 @@ class MapFolder:
         """Return the map with its trajectory, exposures and labels, under this name."""
         rows = self.gaussians()
         labels = self._semantics(len(rows))
-        return PosedMap(name, rows, self.trajectory(), self.exposures(), labels)
+        correction = read_correction(self.folder)
+        return PosedMap(name, rows, self.trajectory(), self.exposures(), labels, correction)
 
 
 def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:

@@ -277,6 +277,7 @@ class RunWriter:
             "stamp_ns": keyframe.stamp_ns,
             "submap": keyframe.submap,
             "camera": {name: getattr(keyframe.camera, name) for name in CAMERA},
+            "camera_correction": msgspec.to_builtins(keyframe.camera_correction),
         }
 
     # --- at the end -------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from ldo_service.calibration.correction import CorrectionChange
 from ldo_service.errors import ConfigError, DataError, named
 from ldo_service.geometry import Camera, codecs, se3
 from ldo_service.storage.state_codec import decode_state
@@ -165,6 +166,18 @@ class KeyframeRecord:
             depth=_depth_bytes(self.depth_m, ignore_mask),
         )
 
+    def recorrected(self, change: CorrectionChange) -> "KeyframeRecord":
+        """Return a copy of the record as a changed correction of the camera would have made it."""
+        gray, depth_m = change.gray(self._gray, self.camera), self.depth_m
+        nothing = np.zeros(gray.shape, bool)
+        points = change.points(self.points_camera.astype(np.float64), self.camera)
+        return replace(
+            self,
+            points_camera=points.astype(np.float32),
+            gray=_gray_bytes(gray, nothing),
+            depth=_depth_bytes(change.depth_m(depth_m, self.camera), nothing),
+        )
+
     @property
     def _gray(self) -> np.ndarray:
         gray = cv2.imdecode(np.frombuffer(self.gray, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -293,6 +306,10 @@ class KeyframeDatabase:
         """
         records = (p.without(ignore_mask) if p.id == keyframe else p for p in self.all)
         return KeyframeDatabase(tuple(records))
+
+    def recorrected(self, change: CorrectionChange) -> "KeyframeDatabase":
+        """Return the database with all records as a changed correction would have made them."""
+        return replace(self, all=tuple(record.recorrected(change) for record in self.all))
 
     def in_submap(self, submap: int, without: Set[int] = frozenset()) -> tuple[KeyframeRecord, ...]:
         """Return the records of a submap, except for the ids in `without`."""

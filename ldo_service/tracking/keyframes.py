@@ -1,13 +1,14 @@
 """Reference keyframes and the decision to make one. Conventions: `ldo_service.geometry`."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from math import radians
 from typing import Any
 
 import numpy as np
 
+from ldo_service.calibration.correction import CorrectionChange
 from ldo_service.detection.dynamic_classes import Box, DynamicClassConfig, dynamic_class_mask
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
@@ -130,6 +131,19 @@ class ReferenceKeyframe:
         if "_features" not in self.__dict__:
             self.__dict__["_features"] = detect(self.view, config)
         return self.__dict__["_features"]
+
+    def recorrected(self, change: CorrectionChange, config: PyramidConfig) -> "ReferenceKeyframe":
+        """Return the keyframe as a changed correction of the camera would have made it."""
+        view, camera = self.view, self.view.camera
+        gray, depth_m = change.gray(view.gray, camera), change.depth_m(view.depth_m, camera)
+        features = self.stored_features
+        if features is not None:
+            features = replace(
+                features, points_camera=change.points(features.points_camera, camera)
+            )
+        return replace(
+            self, view=build_pyramid(gray, depth_m, camera, config), stored_features=features
+        )
 
     def pack(self) -> dict[str, Any]:
         """Return the keyframe as arrays and plain values; each call returns the same object."""

@@ -27,6 +27,8 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.calibration.correction import CorrectionChange
+from ldo_service.calibration.self_calibration import CameraMotion
 from ldo_service.detection.dynamic_classes import Box
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
@@ -147,6 +149,23 @@ class Odometry:
             True if the correction is newer than the last one. An older one changes nothing.
         """
         return self._map.correct(correction)
+
+    def recorrect(self, change: CorrectionChange) -> None:
+        """Continue with frames to which another correction of the camera is applied.
+
+        The known keyframes are changed as if it had been applied to them. Their poses stay.
+        """
+        state = self._frames.state
+        self._frames.restore(state.recorrected(change, self.config.pyramid))
+
+    @property
+    def motion(self) -> CameraMotion:
+        """Motion of the camera up to the last frame."""
+        state = self._frames.state
+        if state.keyframe is None or state.status is TrackingStatus.LOST:
+            return CameraMotion(None, 0.0)
+        depth_m = state.keyframe.reference.median_depth_m
+        return CameraMotion(state.motion.T_odom_camera, depth_m)
 
     def mask_dynamic_objects(self, keyframe: int, boxes: Sequence[Box]) -> None:
         """Mask objects of dynamic classes in the reference keyframe.

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.calibration.correction import CorrectionChange
+
 from .keyframe_database import KeyframeDatabase, KeyframeDatabaseConfig, KeyframeRecord
 from .keyframes import ReferenceKeyframe, Relay
 from .motion import ConstantVelocity
@@ -122,6 +124,20 @@ class OdometryState:
         )
         evidence = self.motion_evidence and self.motion_evidence.of_new_keyframe()
         return replace(self, keyframe=reference, motion_evidence=evidence)
+
+    def recorrected(self, change: CorrectionChange, config: PyramidConfig) -> "OdometryState":
+        """Return the state as a changed correction of the camera would have made its images.
+
+        The residuals of the frames before say nothing about those after the change.
+        """
+        keyframe, mapped = self.keyframe, self.mapping_keyframe
+        return replace(
+            self,
+            database=self.database.recorrected(change),
+            keyframe=None if keyframe is None else keyframe.recorrected(change, config),
+            mapping_keyframe=None if mapped is None else mapped.recorrected(change),
+            history=ResidualHistory(),
+        )
 
     def _against(self, keyframe: ReferenceKeyframe, T_odom_mapped: np.ndarray) -> "OdometryState":
         return replace(

@@ -1,0 +1,194 @@
+"""Correction of a frame for vignetting and for the smooth bias of the depth sensor."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ldo_service.errors import DataError
+from ldo_service.geometry import Camera, RgbdFrame
+
+BIAS_TERMS = 3  # x^2, x y, y^2.
+VIGNETTING_TERMS = 3  # r^2, r^4, r^6.
+# Gray level from which a pixel may be clipped. Its brightness is unknown, so it is not corrected.
+CLIPPED_GRAY = 250
+MIN_INVERSE_DEPTH = 0.02  # 1/m. A bias cannot move a surface beyond 50 m.
+MIN_TRANSMISSION = 0.3  # Darker corners would be amplified together with their noise.
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCorrection:
+    """Vignetting and depth bias of a camera, in its rectified image.
+
+    With x = (u - cu) / (w/2), y = (v - cv) / (w/2) around the image center, and r = 1 in the
+    corners:
+
+        1 / z_true = 1 / z_measured + b1 x^2 + b2 x y + b3 y^2
+        color_measured = V(r) color_true,  log V = a1 r^2 + a2 r^4 + a3 r^6 per channel
+
+    The bias has no constant and no linear term: these are a scale of the depth and a tilt, which
+    poses explain as well.
+    """
+
+    depth_bias: tuple[float, ...] = (0.0,) * BIAS_TERMS  # b1, b2, b3 in 1/m.
+    # a1, a2, a3 of red, green and blue.
+    vignetting: tuple[tuple[float, ...], ...] = ((0.0,) * VIGNETTING_TERMS,) * 3
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> "CameraCorrection":
+        """Restore a correction from its fields by name; they may be lists."""
+        return CameraCorrection(
+            tuple(values["depth_bias"]), tuple(tuple(a) for a in values["vignetting"])
+        )
+
+    def pack(self) -> dict[str, Any]:
+        """Return the fields by name, as lists of plain values."""
+        return {
+            "depth_bias": list(self.depth_bias),
+            "vignetting": [list(channel) for channel in self.vignetting],
+        }
+
+    @property
+    def has_depth_bias(self) -> bool:
+        return any(self.depth_bias)
+
+    @property
+    def has_vignetting(self) -> bool:
+        return any(any(channel) for channel in self.vignetting)
+
+    def applied(self, frame: RgbdFrame) -> RgbdFrame:
+        """Return the frame that a camera without vignetting and depth bias would have delivered.
+
+        Without a correction, this is the frame itself.
+
+        The colors are darkened to the level of the darkest pixel rather than brightened to the
+        level of the center, so that no pixel is clipped.
+
+        Args:
+            frame: Rectified frame, which is not changed.
+        """
+        color, depth_m = frame.color, self.corrected_depth(frame.depth_m, frame.camera)
+        if self.has_vignetting:
+            gain = _gain_image(self.vignetting, frame.camera)
+            even = (color * gain + np.float32(0.5)).astype(np.uint8)
+            is_clipped = color.max(axis=2, keepdims=True) >= CLIPPED_GRAY
+            color = np.where(is_clipped, color, even)
+        if color is frame.color and depth_m is frame.depth_m:
+            return frame
+        return replace(frame, color=color, depth_m=depth_m)
+
+    def corrected_depth(self, depth_m: np.ndarray, camera: Camera) -> np.ndarray:
+        """Return measured depth [H, W] in meters without the bias; 0 stays 0."""
+        return unbiased_depth(depth_m, self.bias(camera)) if self.has_depth_bias else depth_m
+
+    def gain(self, camera: Camera) -> np.ndarray:
+        """Return the factors [H, W, 3] float32 by which `applied` multiplies the colors."""
+        return _gain_image(self.vignetting, camera)
+
+    def bias(self, camera: Camera) -> np.ndarray:
+        """Return the bias of the inverse depth of each pixel, [H, W] float32, in 1/m."""
+        return _bias_image(self.depth_bias, camera)
+
+
+def read_correction(folder: Path) -> CameraCorrection:
+    """Return the correction of the newest keyframe of a finished run.
+
+    Raises:
+        DataError: keyframes.json of the folder cannot be read, or its content is invalid.
+    """
+    path = folder / "keyframes.json"
+    try:
+        kept = json.loads(path.read_text()) or [{}]
+        return CameraCorrection.of(kept[-1].get("camera_correction", NO_CORRECTION))
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
+
+
+NO_CORRECTION = CameraCorrection().pack()
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionChange:
+    """Replacement of a correction by another one, for images that the old one was applied to."""
+
+    old: CameraCorrection
+    new: CameraCorrection
+
+    def depth_m(self, depth_m: np.ndarray, camera: Camera) -> np.ndarray:
+        """Return depth [H, W] in meters as the new correction would have made it."""
+        return unbiased_depth(depth_m, self.new.bias(camera) - self.old.bias(camera))
+
+    def gray(self, gray: np.ndarray, camera: Camera) -> np.ndarray:
+        """Return a gray image [H, W] uint8 as the new correction would have made it.
+
+        Pixels that may be clipped, and black ones, which are invalid, stay.
+        """
+        if self.old.vignetting == self.new.vignetting:
+            return gray
+        gain = self.new.gain(camera).mean(axis=2) / self.old.gain(camera).mean(axis=2)
+        changed = np.clip(gray * gain + np.float32(0.5), 1, CLIPPED_GRAY - 1).astype(np.uint8)
+        return np.where((gray >= CLIPPED_GRAY) | (gray == 0), gray, changed)
+
+    def points(self, points_camera: np.ndarray, camera: Camera) -> np.ndarray:
+        """Return camera points [N, 3] in meters, measured at their pixels, with the new depth."""
+        u, v = camera.project(points_camera).T
+        bias = np.subtract(self.new.depth_bias, self.old.depth_bias)
+        z = points_camera[:, 2]
+        ratio = unbiased_depth(z, bias_basis(u, v, camera) @ bias) / z
+        return points_camera * ratio[:, None]
+
+
+def unbiased_depth(depth_m: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    """Add a bias to the inverse depth.
+
+    Args:
+        depth_m: Depth in meters, [...]; 0 where unknown, which stays 0.
+        bias: Bias of the inverse depth in 1/m, [...].
+
+    Returns:
+        Depth in meters, [...] in the type of `depth_m`.
+    """
+    inverse = 1.0 / np.maximum(depth_m, 0.1) + bias
+    corrected = 1.0 / np.maximum(inverse, MIN_INVERSE_DEPTH)
+    return np.where(depth_m > 0, corrected, 0.0).astype(depth_m.dtype)
+
+
+def bias_basis(u: np.ndarray, v: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the basis functions of the depth bias at pixels [...], as [..., 3]."""
+    x, y = _centered(u, v, camera)
+    return np.stack([x * x, x * y, y * y], axis=-1)
+
+
+def vignetting_basis(u: np.ndarray, v: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the basis functions of log V at pixels [...], as [..., 3]."""
+    x, y = _centered(u, v, camera)
+    r2 = (x * x + y * y) / (1.0 + (camera.height / camera.width) ** 2)
+    return np.stack([r2, r2**2, r2**3], axis=-1)
+
+
+def _centered(u: np.ndarray, v: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    half = camera.width / 2.0
+    x, y = (u - (camera.width - 1) / 2.0) / half, (v - (camera.height - 1) / 2.0) / half
+    return np.broadcast_arrays(x, y)  # type: ignore[return-value]
+
+
+def _pixels(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    return np.arange(camera.width)[None, :], np.arange(camera.height)[:, None]
+
+
+@lru_cache(maxsize=4)
+def _bias_image(coefficients: tuple[float, ...], camera: Camera) -> np.ndarray:
+    return (bias_basis(*_pixels(camera), camera) @ np.array(coefficients)).astype(np.float32)
+
+
+@lru_cache(maxsize=4)
+def _gain_image(coefficients: tuple[tuple[float, ...], ...], camera: Camera) -> np.ndarray:
+    log_V = vignetting_basis(*_pixels(camera), camera) @ np.array(coefficients).T
+    V = np.maximum(np.exp(log_V), MIN_TRANSMISSION)
+    return (V.min(axis=(0, 1)) / V).astype(np.float32)

@@ -1,0 +1,129 @@
+"""Self-calibration on exact frames to which a known vignetting and depth bias are added."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ldo_service.calibration.correction import (
+    CameraCorrection,
+    CorrectionChange,
+    unbiased_depth,
+)
+from ldo_service.calibration.self_calibration import (
+    CameraMotion,
+    SelfCalibration,
+    SelfCalibrationConfig,
+)
+from ldo_service.datasets import Sequence
+from ldo_service.geometry import RgbdFrame
+from ldo_service.storage.state_codec import decode_state, encode_state
+
+# Sizes of a PrimeSense camera: 70 to 210 mm at the sides, 3 m away, and corners at 0.65.
+TRUE = CameraCorrection(
+    (-0.017, -0.012, 0.008), ((-0.74, 0.47, -0.16), (-0.72, 0.44, -0.14), (-0.5, 0.2, -0.05))
+)
+COUNT = 60  # Frames.
+CONFIG = SelfCalibrationConfig(views=(6, 10))
+
+
+def measured(frame: RgbdFrame, truth: CameraCorrection) -> RgbdFrame:
+    """Return an exact frame as a camera with this vignetting and bias would measure it."""
+    camera = frame.camera
+    depth_m = unbiased_depth(frame.depth_m, -truth.bias(camera))
+    gain = truth.gain(camera)
+    V = gain.min(axis=(0, 1)) / gain
+    color = (frame.color * V + 0.5).astype(np.uint8)
+    return replace(frame, color=color, depth_m=depth_m)
+
+
+@pytest.fixture(scope="module")
+def frames(room: Sequence) -> list[RgbdFrame]:
+    return [room[index] for index in range(COUNT)]
+
+
+def motions(room: Sequence) -> list[CameraMotion]:
+    truth = room.truth()
+    assert truth is not None
+    return [CameraMotion(T, 2.0) for T in truth.T_world_camera[:COUNT]]
+
+
+def changes_of(
+    calibration: SelfCalibration, frames: list[RgbdFrame], moved: list[CameraMotion]
+) -> list[CorrectionChange]:
+    made = [calibration.observe(*both) for both in zip(frames, moved, strict=True)]
+    return [change for change in made if change is not None]
+
+
+def test_known_bias_and_vignetting_are_found(room: Sequence, frames: list[RgbdFrame]) -> None:
+    calibration = SelfCalibration()
+    changes = changes_of(calibration, [measured(f, TRUE) for f in frames], motions(room))
+    found, camera = calibration.correction, frames[0].camera
+    assert changes[-1].new == found
+    # The rows are less certain than the columns, because the camera mostly yaws.
+    error = found.bias(camera) - TRUE.bias(camera)
+    assert np.sqrt(np.mean(error**2)) < 0.2 * np.sqrt(np.mean(TRUE.bias(camera) ** 2))
+    np.testing.assert_allclose(found.gain(camera), TRUE.gain(camera), atol=0.06)
+
+
+def test_exact_camera_gets_no_correction(room: Sequence, frames: list[RgbdFrame]) -> None:
+    calibration = SelfCalibration()
+    assert changes_of(calibration, frames, motions(room)) == []
+    assert calibration.correction == CameraCorrection()
+    assert calibration.metrics()["depth_bias_corrected"] == 0
+
+
+def test_finished_calibration_drops_its_views(room: Sequence, frames: list[RgbdFrame]) -> None:
+    calibration = SelfCalibration(CONFIG)
+    changes_of(calibration, [measured(f, TRUE) for f in frames], motions(room))
+    assert calibration.is_finished
+    assert set(calibration.snapshot()) == {"now", "maker"}
+    assert calibration.correction.has_vignetting
+
+
+def test_camera_that_stands_still_is_not_calibrated(frames: list[RgbdFrame]) -> None:
+    calibration = SelfCalibration()
+    still = CameraMotion(np.eye(4), 2.0)
+    assert changes_of(calibration, [measured(frames[0], TRUE)] * 20, [still] * 20) == []
+    assert calibration.metrics()["calibration_views"] == 1
+
+
+@pytest.mark.parametrize("split", [3, 12, 17, 25, 40])
+def test_restored_calibration_continues_bitwise_equal(
+    room: Sequence, frames: list[RgbdFrame], split: int
+) -> None:
+    biased, moved = [measured(f, TRUE) for f in frames], motions(room)
+    first, second = SelfCalibration(CONFIG), SelfCalibration(CONFIG)
+    changes_of(first, biased[:split], moved[:split])
+    second.restore(decode_state(encode_state(first.snapshot())))
+    rest = biased[split:], moved[split:]
+    assert changes_of(first, *rest) == changes_of(second, *rest)
+    assert encode_state(first.snapshot()) == encode_state(second.snapshot())
+
+
+def test_correction_removes_what_the_camera_added(frames: list[RgbdFrame]) -> None:
+    exact = frames[0]
+    corrected = TRUE.applied(measured(exact, TRUE))
+    np.testing.assert_allclose(corrected.depth_m, exact.depth_m, rtol=1e-5)
+    V = TRUE.gain(exact.camera).min(axis=(0, 1))
+    np.testing.assert_allclose(corrected.color, exact.color * V, atol=1.5)
+    assert CameraCorrection().applied(exact) is exact
+
+
+def test_unmeasured_depth_stays_unmeasured(frames: list[RgbdFrame]) -> None:
+    depth_m = frames[0].depth_m.copy()
+    depth_m[:10] = 0.0
+    corrected = TRUE.applied(replace(frames[0], depth_m=depth_m))
+    assert np.array_equal(corrected.depth_m == 0, depth_m == 0)
+
+
+def test_changed_correction_equals_a_new_one(frames: list[RgbdFrame]) -> None:
+    frame, camera = frames[0], frames[0].camera
+    half = CameraCorrection(tuple(0.5 * b for b in TRUE.depth_bias))
+    old, new = half.applied(frame), TRUE.applied(frame)
+    change = CorrectionChange(half, TRUE)
+    np.testing.assert_allclose(change.depth_m(old.depth_m, camera), new.depth_m, rtol=1e-5)
+    u, v = np.array([20.0, 100.0]), np.array([30.0, 100.0])
+    z_old, z_new = old.depth_m[[30, 100], [20, 100]], new.depth_m[[30, 100], [20, 100]]
+    points = change.points(camera.points_at(u, v, z_old), camera)
+    np.testing.assert_allclose(points, camera.points_at(u, v, z_new), rtol=1e-5)
