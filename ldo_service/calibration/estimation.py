@@ -61,7 +61,7 @@ class Estimate:
 
     depth_bias: np.ndarray  # [3] 1/m
     vignetting: np.ndarray  # [3, 3] channel by term
-    pairs: list[ViewPair]  # Their T_second_first is that of the joint solution.
+    pairs: list[ViewPair]  # T_second_first is that of the joint solution.
     depth_check: Solution  # Of the dense depth alone, without features.
     color_checks: list[Solution]  # One per channel; empty if too few colors were compared.
 
