@@ -20,10 +20,11 @@ The factor s = 1/320 accounts for errors common to all observations of an object
 
 The weight w_kl reduces the effect of uncertain observations. It is exp(-2 H(q_kl)) if the entropy H
 is above 0.5 nats, else 1. The entropy of p_l is not used, since the weights would then change with
-the solution. The similarity of the paper has a direction from i to j, while pairs here have none.
-Therefore both directions are used with half the weight.
+the solution. In the paper, the similarity has a direction from landmark i to landmark j. Here a
+pair has no direction, so the cost contains both directions with half the weight each.
 
-No term contains both a p and a T or mu. Therefore the sum is minimal if both of these are minimal:
+No term contains both a p and a T or mu. Therefore the sum of all costs is minimal if these two
+parts are minimal:
 
     F(T, mu) = odometry + loops + projections      and
     G(p)     = lambda sum w KL(p_l || q_kl) + similarity
@@ -37,12 +38,13 @@ observations:
     d/dp_c [ sum_k w_k p_c log(p_c / q_kc) ] + nu = 0   =>   p_c ~ prod_k q_kc^(w_k / sum w)
 
 `condensation` limits the number of variables in a long run. Marginalization of old keyframes would
-leave a dense prior, linearized at their current poses. Later loop closures could not correct it,
-and no variables would remain to attach loop closures to. Instead, the first of every ten keyframes
-remains a variable, and the other nine are condensed. One relative measurement to the next such
-variable replaces their measurements. It does not depend on poses in the map, so it remains valid
-after corrections of any size.
+leave a dense prior, linearized at their current poses. Later loop closures could not correct this
+prior, and no variables would remain to attach loop closures to. Instead, the first of every ten
+keyframes remains a variable, and the other nine are condensed. One relative measurement from this
+variable to the next one replaces all measurements of the ten keyframes. The relative measurement
+does not depend on poses in the map, so it remains valid after corrections of any size.
 
-The pose of a condensed keyframe is interpolated between the variables before and after it. It
-becomes a variable again if a loop closure would change its pose relative to these two variables.
+The pose of a condensed keyframe is interpolated between the variables before and after it. The
+keyframe becomes a variable again if a loop closure would change its pose relative to these two
+variables.
 """

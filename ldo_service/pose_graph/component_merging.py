@@ -1,9 +1,9 @@
 """Bridge edges: loop closures that merged two components of the pose graph.
 
 A component is a set of keyframes connected by measurements. The first loop closure between two
-components is accepted as the bridge edge, since nothing exists to check it against. Later closures
-that contradict the bridge edge are rejected but stored. A rejected closure replaces the bridge edge
-as soon as more closures agree with the rejected one than with the bridge edge.
+components is accepted as the bridge edge, since no other measurement exists to check it against.
+Later closures that contradict the bridge edge are rejected but stored. A rejected closure replaces
+the bridge edge as soon as more closures agree with the rejected closure than with the bridge edge.
 """
 
 from collections import defaultdict
@@ -29,8 +29,8 @@ class BridgeEdge:
 
     Attributes:
         pair: Ids of the two keyframes that the edge connects.
-        connected_keyframes: Keyframes on the far side: without the edge, they would not be
-            connected to the first keyframe of the component.
+        connected_keyframes: Ids of the keyframes on the far side of the edge. Without the edge,
+            they would not be connected to the first keyframe of the component.
     """
 
     pair: Pair
@@ -49,8 +49,8 @@ def check_against_bridge(
     Args:
         known: The other measurements.
         closure: Loop closure between keyframes of one component.
-        start: Variables that the batch solver starts from.
-        initial: Values with which the variables were added to the graph.
+        start: Values from which the batch solver starts.
+        initial: Values with which the variables were added to the solver.
 
     Returns:
         The decision, and the variables of the resulting solution.
@@ -68,8 +68,8 @@ def T_new_old(measured: RelativePose, pose: Pose, *, moves_b: bool) -> np.ndarra
     Args:
         measured: Measured relative pose of the keyframes a and b.
         pose: Function that returns T_map_keyframe [4, 4].
-        moves_b: True: return T_map_a T_a_b T_map_b^-1, which moves b. False: return its inverse,
-            which moves a.
+        moves_b: True to move b: the result is T_map_a T_a_b T_map_b^-1. False to move a: the
+            result is the inverse of that product.
     """
     T = pose(measured.a) @ measured.T_a_b @ se3.inverse(pose(measured.b))
     return se3.orthonormalize(T if moves_b else se3.inverse(T))
@@ -78,8 +78,8 @@ def T_new_old(measured: RelativePose, pose: Pose, *, moves_b: bool) -> np.ndarra
 def conflicting_bridges(known: FactorStore, closure: RelativePose) -> list[BridgeEdge]:
     """Return the bridge edges that lie between the two keyframes of a closure.
 
-    If several components were merged one after the other, several edges lie between the keyframes.
-    Any of them may be wrong.
+    If several components were merged one after the other, several bridge edges may lie between the
+    keyframes. Any of these edges may be wrong.
     """
     bridges = (BridgeEdge(pair, _connected_by(known, pair)) for pair in known.bridges)
     return [bridge for bridge in bridges if bridge.is_across(pair_of(closure))]
@@ -107,13 +107,19 @@ def best_bridge_removal(
     variables: Variables,
     initial: Variables,
 ) -> tuple[BridgeEdge, FactorStore, Variables] | None:
-    """Choose the bridge edge that a rejected closure should replace, and replace it.
+    """Replace the bridge edge whose replacement by a rejected closure leaves the most closures.
 
-    Of all bridge edges that can be replaced, the choice leaves the most accepted closures.
+    Args:
+        known: Store of all measurements, which is not changed.
+        bridges: Bridge edges that may be replaced.
+        closure: Rejected closure that would become the bridge edge.
+        pose: Function that returns the current T_map_keyframe [4, 4].
+        variables: Current values of the variables.
+        initial: Values with which the variables were added to the solver.
 
     Returns:
-        The replaced bridge edge, then the factors and variables after the replacement. None if no
-        edge can be replaced, or if two choices leave equally many closures.
+        The replaced bridge edge, then the store and the variables after the replacement. None if no
+        edge can be replaced, or if two edges leave the same maximum number of accepted closures.
     """
     found = [
         (bridge, *other)
@@ -134,7 +140,7 @@ def replace_bridge_by_consensus(
     variables: Variables,
     initial: Variables,
 ) -> tuple[FactorStore, Variables] | None:
-    """Replace a bridge edge by a rejected closure if more closures agree with the latter.
+    """Replace a bridge edge by a rejected closure if more closures agree with the closure.
 
     Args:
         known: Store of all measurements, which is not changed.
@@ -142,11 +148,11 @@ def replace_bridge_by_consensus(
         closure: Rejected closure that would become the bridge edge.
         pose: Function that returns the current T_map_keyframe [4, 4].
         variables: Current values of the variables.
-        initial: Values with which the variables were added to the graph.
+        initial: Values with which the variables were added to the solver.
 
     Returns:
-        The factors and variables after the replacement. None if the number of agreeing closures is
-        not larger than for the old bridge edge.
+        The store and the variables after the replacement. None if the number of agreeing closures
+        is not larger than for the old bridge edge.
     """
     across = [c for pair, c in known.closures.accepted.items() if bridge.is_across(pair)]
     contradicting = [c for pair, c in known.contradicting.items() if bridge.is_across(pair)]
@@ -172,9 +178,10 @@ def replace_bridge_by_consensus(
 
 
 def _exchanged(known: FactorStore, bridge: BridgeEdge, closure: RelativePose) -> FactorStore:
-    """Return the factors with a closure in place of a bridge edge.
+    """Return a copy of the store with a closure in place of a bridge edge.
 
-    The other closures between the two sides of the edge are removed; the caller checks them again.
+    The accepted closures between the two sides of the edge are removed from the copy. The caller
+    checks them again.
     """
     other, pair = copy(known), pair_of(closure)
     across = [p for p in known.closures.accepted if bridge.is_across(p)]

@@ -37,8 +37,9 @@ class CondensedKeyframes:
         end_variables: Ids of the tails, [F].
         T_head: Measured T_head_keyframe, [F, 4, 4].
         T_tail: Measured T_tail_keyframe, [F, 4, 4].
-        fractions: Position between head (0) and tail (1), [F]. If the relative pose of head and
-            tail changes, a condensed keyframe moves by this fraction of the change.
+        fractions: Position of each keyframe between its head (0) and its tail (1), [F]. If the
+            relative pose of head and tail changes, the keyframe moves by this fraction of the
+            change.
     """
 
     keyframes: np.ndarray
@@ -55,7 +56,7 @@ class CondensedKeyframes:
         return CondensedKeyframes(ids, ids, ids, transforms, transforms, np.zeros(0))
 
     def merged_with(self, more: "CondensedKeyframes") -> "CondensedKeyframes":
-        """Return these condensed keyframes with others appended."""
+        """Return these condensed keyframes with those of `more` appended."""
         columns = (getattr(self, name) for name in self.__slots__)
         others = (getattr(more, name) for name in self.__slots__)
         return CondensedKeyframes(*map(np.concatenate, zip(columns, others, strict=True)))
@@ -82,7 +83,7 @@ class CondensedKeyframes:
 
         Args:
             row: Row of the keyframe.
-            pose: Function that returns T_map_keyframe [4, 4] of its head and of its tail.
+            pose: Function that returns T_map_keyframe [4, 4] of the head and of the tail, by id.
         """
         one = self.only(row)
         ends = int(one.start_variables[0]), int(one.end_variables[0])
@@ -107,16 +108,17 @@ class CondensedKeyframes:
         return keyframes[order], np.concatenate([T_map_variable, T_map])[order]
 
     def moved(self, row: int, T_head_keyframe: np.ndarray) -> "CondensedKeyframes":
-        """Return the condensed keyframes with a new measured pose [4, 4] in one row."""
+        """Return the condensed keyframes with a new T_head_keyframe [4, 4] in one row."""
         T_tail_head = self.T_tail[row] @ np.linalg.inv(self.T_head[row])
         T_head, T_tail = self.T_head.copy(), self.T_tail.copy()
         T_head[row], T_tail[row] = T_head_keyframe, T_tail_head @ T_head_keyframe
         return replace(self, T_head=T_head, T_tail=T_tail)
 
     def without_split(self, row: int) -> "CondensedKeyframes":
-        """Return the condensed keyframes after the one of a row became a variable again.
+        """Return the condensed keyframes without the keyframe of a row, now a variable again.
 
-        This divides its group: one part ends at the new variable, and the other part starts there.
+        The new variable divides its group: it is the tail of the first part and the head of the
+        second part.
         """
         of_group = (self.start_variables == self.start_variables[row]) & (
             self.end_variables == self.end_variables[row]
@@ -164,7 +166,7 @@ def condense_between(
         tail: Id of the second variable.
         keyframes: Ids of the n keyframes between both variables, in order.
         T_head: Measured T_head_keyframe, [n, 4, 4].
-        T_head_tail: Measured pose of the tail in the head, [4, 4].
+        T_head_tail: Measured pose of the second variable in the first one, [4, 4].
     """
     n = len(keyframes)
     return CondensedKeyframes(
@@ -192,24 +194,27 @@ def group_to_condense(
     size: int,
     window: int,
 ) -> list[int]:
-    """Choose the next keyframes to condense: the oldest chain of enough active keyframes.
+    """Choose the next group to condense: the oldest chain of at least `size` + 1 keyframes.
 
-    The result is a head, the keyframes to condense and a tail, or an empty list. The tail is the
-    head of the next group. Each keyframe of the group has an odometry measurement from an earlier
-    one of the group. The head or tail of an existing group must stay a variable, so it can only be
-    the head of a new group.
+    Each keyframe of the chain has an odometry measurement from an earlier keyframe of the chain.
+    The tail of a group is the head of the next group. The head or tail of an existing group must
+    stay a variable, so it can only be the head of a new group.
 
-    The keyframe that follows the tail should be measured from the tail. If it is measured only from
-    keyframes inside the group, that measurement would be transferred to one end of the group. A
-    correction would then move the keyframe with that end alone. To avoid this, the group grows up
-    to twice the size.
+    The keyframe that follows the tail should be measured from the tail. If it were measured only
+    from keyframes inside the group, its measurement would be transferred to one end of the group.
+    A correction would then move the following keyframe with that end alone. To avoid this, the
+    group grows to up to twice `size`.
 
     Args:
-        active: Variables that are not condensed, ascending.
+        active: Keyframes that may still be condensed, ascending (`FactorStore.active`).
         measured: Pairs of variables with an odometry measurement.
         heads: Ids of the heads and tails of existing groups.
         size: Number of keyframes in a group, without the tail.
         window: Number of newest keyframes that are never condensed.
+
+    Returns:
+        The head, the keyframes to condense and the tail, or an empty list if no chain is long
+        enough.
     """
     linked = {frozenset(pair) for pair in measured}
 
@@ -238,8 +243,8 @@ def condense(
 ) -> Condensed:
     """Condense a group: compute one measurement from its head to its tail.
 
-    The solution uses only the measurements and loop closures within the group, with the head fixed.
-    Therefore the result contains no information from outside, which would then count twice.
+    The measurement is computed only from the measurements and loop closures within the group, with
+    the head fixed. Information from outside the group would otherwise count twice.
 
     Args:
         group: Ids of the keyframes, in order; the last one is the tail.
@@ -277,12 +282,12 @@ def condense(
 def connecting_measurements(
     gone: Iterable[RelativePose], stays: Iterable[tuple[int, int]]
 ) -> list[RelativePose]:
-    """Return the removed measurements that must be kept, so that all variables stay connected.
+    """Select the measurements that must be kept so that all variables stay connected.
 
-    Of several possible measurements, the first one is kept.
+    If several measurements would connect the same parts, the first one is selected.
 
     Args:
-        gone: Measurements that are about to be removed.
+        gone: Measurements that are about to be removed, from which the function selects.
         stays: Pairs of variables between which another measurement remains.
     """
     root: dict[int, int] = {}
@@ -307,7 +312,7 @@ def transfer_measurement(
 ) -> RelativePose:
     """Convert a measurement between keyframes a and b to one between two other keyframes.
 
-    The first new keyframe is treated as rigidly attached to a, the second one to b.
+    The first new keyframe is treated as rigidly attached to a, and the second one to b.
 
     Args:
         measured: Measured pose of b in a.

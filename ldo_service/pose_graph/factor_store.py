@@ -34,34 +34,36 @@ from .solver import Name, Variables, point_key
 
 
 class FactorStore:
-    """Store of measurements by kind, all of them between variables.
+    """Store of all measurements by kind, which builds their factors.
 
-    A condensed keyframe is not a variable. A measurement of it is transferred to its head or its
-    tail, whichever is nearer (see `condensation.CondensedKeyframes`).
+    A factor connects variables, and a condensed keyframe is not a variable. Its measurements are
+    therefore transferred to its head or its tail, whichever is nearer: the last variable before it
+    or the first variable after it (see `condensation.CondensedKeyframes`).
     """
 
     def __init__(self, noise: NoiseConfig, closures: LoopClosureConfig) -> None:
         """Create an empty store."""
         self._noise = noise
         self.first_of: dict[int, int] = {}  # First keyframe of each keyframe's component.
-        self.active: list[int] = []  # Variables that are not condensed, ascending.
+        # Keyframes that may still be condensed, ascending: neither condensed nor head of a group.
+        self.active: list[int] = []
         self.odometry: dict[Pair, RelativePose] = {}  # Measurements between variables.
-        # Edges, each from the head of a group to its tail.
+        # Measurements that replace groups, each from the head of a group to its tail.
         self.condensed: dict[Pair, RelativePose] = {}
         self.bridges: dict[Pair, RelativePose] = {}  # Bridge edges between merged components.
         self.closures = LoopClosureSet(closures)
-        # Closures that contradict a bridge edge; the newest.
+        # Newest rejected closures that contradict a bridge edge, at most `max_contradicting`.
         self.contradicting: dict[Pair, RelativePose] = {}
         self.observations: dict[Pair, BoxObservation] = {}  # Observations by keyframe and landmark.
         self.interpolated = CondensedKeyframes.none()
-        self.rows: dict[int, int] = {}  # Row of each condensed keyframe.
+        self.rows: dict[int, int] = {}  # Row of each condensed keyframe in `interpolated`.
 
     # --- what changes -----------------------------------------------------------------------------
     def add_measurement(self, m: RelativePose) -> Name:
         """Store an odometry measurement and return the name of its factor.
 
-        It replaces an older measurement between the same variables. If it was transferred from
-        condensed keyframes, it does not replace an older one.
+        A measurement between variables replaces an older one of the same pair. A measurement that
+        was transferred from condensed keyframes is stored only if its pair of variables has none.
         """
         between = self.between_variables(m)
         pair = between.a, between.b
@@ -100,7 +102,10 @@ class FactorStore:
         return ("condensed", *pair)
 
     def _in_head_of_b(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> np.ndarray:
-        """Return the pose of keyframe b in the head of its group by a measurement, [4, 4]."""
+        """Return T_head_b [4, 4] according to a measurement of keyframe b from keyframe a.
+
+        If a is in another group than b, the pose between the groups is the current one in the map.
+        """
         (head_a, T_a), (head_b, _) = self.relative_to_start(m.a), self.relative_to_start(m.b)
         if head_a == head_b:
             return T_a @ m.T_a_b
@@ -111,8 +116,8 @@ class FactorStore:
 
         One measurement from the first to the last keyframe replaces all measurements and closures
         within the group. Measurements from condensed keyframes to keyframes outside the group are
-        dropped, since these usually have other measurements. Only measurements without which the
-        graph would fall apart are kept.
+        dropped, since the keyframes outside usually have other measurements. Measurements without
+        which the graph would not be connected are transferred to variables instead.
 
         Args:
             group: Ids of the keyframes, in order.
@@ -140,8 +145,8 @@ class FactorStore:
         """Make a condensed keyframe a variable again, between its head and its tail.
 
         Two measurements replace the one from head to tail: from the head to the keyframe, and from
-        the keyframe to the tail. Its covariance is divided between them by the fraction of the
-        keyframe.
+        the keyframe to the tail. The covariance of the replaced measurement is divided between them
+        in proportion to `CondensedKeyframes.fractions`.
         """
         row = self.rows[keyframe]
         head, tail = (
@@ -160,10 +165,18 @@ class FactorStore:
         self.rows = self.interpolated.index()
 
     def interpolation_error_sigmas(self, keyframe: int, variables: Variables) -> float:
-        """Return by how much the pose of a condensed keyframe differs, computed from its two ends.
+        """Return how far the poses of a condensed keyframe from its head and its tail differ.
 
-        The ends are its head and its tail. The difference is in standard deviations of a loop
-        closure, times the fraction of the way to the nearer end. It is 0 for a variable.
+        Each of the two poses is the pose of the head or tail times the measured relative pose.
+
+        Args:
+            keyframe: Id of the keyframe.
+            variables: Values of all variables.
+
+        Returns:
+            The largest of the six differences, in standard deviations of a loop closure, times the
+            fraction of the way to the nearer of head and tail, 0..0.5. It is 0 if the keyframe is a
+            variable.
         """
         row = self.rows.get(keyframe)
         if row is None:
@@ -201,9 +214,10 @@ class FactorStore:
         return int(self.interpolated.start_variables[row]), self.interpolated.T_head[row]
 
     def relative_to_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """Return the nearer one of head and tail of a keyframe, and T_variable_keyframe [4, 4].
+        """Return the head or the tail of a condensed keyframe, and T_variable_keyframe [4, 4].
 
-        For a keyframe that is a variable, return the keyframe itself and the identity.
+        The nearer one of the two is returned. For a keyframe that is a variable, return the
+        keyframe itself and the identity.
         """
         row = self.rows.get(keyframe)
         if row is None or self.interpolated.fractions[row] <= 0.5:
@@ -211,10 +225,10 @@ class FactorStore:
         return int(self.interpolated.end_variables[row]), self.interpolated.T_tail[row]
 
     def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
-        """Return the variables to which a measurement is transferred, one for each keyframe.
+        """Return the two variables that a measurement is transferred to, for its keyframes a and b.
 
-        These are the nearest variables of its two keyframes. If both are the same variable, the
-        heads of the keyframes are used instead.
+        For each keyframe this is the nearest variable. If it is the same for a and b, the heads of
+        both keyframes are used instead.
 
         Returns:
             For a, then for b: the id of the variable, and T_variable_keyframe [4, 4].
@@ -232,10 +246,11 @@ class FactorStore:
         return transfer_measurement(m, se3.inverse(T_a), se3.inverse(T_b), (a, b))
 
     def _ends_covariance(self, m: RelativePose) -> np.ndarray:
-        """Return the additional covariance [6, 6] of a measurement of condensed keyframes, at b.
+        """Return the covariance [6, 6] that transferring a measurement to variables adds, at b.
 
-        The pose of a condensed keyframe in its variable is uncertain. It adds the covariance of its
-        group, times the fraction of the way from that variable.
+        The pose of a condensed keyframe relative to its variable is uncertain. Each condensed
+        keyframe therefore adds the covariance of its group, times its distance from the variable as
+        a fraction of the way between head and tail. The result is zero if a and b are variables.
         """
         total = np.zeros((6, 6))
         T_b_end = se3.inverse(m.T_a_b), np.eye(4)
@@ -265,11 +280,11 @@ class FactorStore:
         yield from (("sight", *pair) for pair in self.observations)
 
     def factor(self, name: Name, initial: Variables) -> gtsam.NonlinearFactor:
-        """Return the factor of a name.
+        """Build the factor with a given name.
 
         Args:
             name: Name of the factor, as `names` yields it.
-            initial: Values with which the variables were added to the graph.
+            initial: Values with which the variables were added to the solver.
         """
         kind, pair = name[0], name[1:]
         match kind:
@@ -292,7 +307,7 @@ class FactorStore:
     def with_closures(
         self, closures: Iterable[RelativePose], initial: Variables
     ) -> list[gtsam.NonlinearFactor]:
-        """Return all factors, with these closures instead of the accepted ones.
+        """Return all factors, with the given closures instead of the accepted ones.
 
         The closures get no robust kernel, so that costs of different solutions can be compared.
         """
@@ -300,7 +315,12 @@ class FactorStore:
         return [*others, *(self._closure_factor(closure, 0.0) for closure in closures)]
 
     def closure_sigmas(self, variables: Variables, closure: RelativePose) -> float:
-        """Return the largest of the six whitened residuals of a closure."""
+        """Return the largest absolute value of the six whitened residuals of a closure, in sigmas.
+
+        Args:
+            variables: Values at which the residuals are computed.
+            closure: The closure.
+        """
         m = self._closure(closure)
         residual = closure_residual(variables[m.a], variables[m.b], m)
         return float(np.abs(np.linalg.cholesky(m.information).T @ residual).max())
@@ -323,17 +343,29 @@ class FactorStore:
     ) -> Variables:
         """Merge the younger of two components into the older one.
 
-        All keyframes of the younger component and their landmarks move by `T_new_old`.
+        All keyframes of the younger component and their landmarks move.
+
+        Args:
+            younger: First keyframe of the younger component.
+            older: First keyframe of the older component.
+            T_new_old: Motion of the younger component in the map, [4, 4].
+            variables: Values of all variables before the motion.
 
         Returns:
-            The variables after this motion.
+            The values of all variables after the motion.
         """
         theirs = {k for k, first in self.first_of.items() if first == younger}
         self.first_of.update(dict.fromkeys(theirs, older))
         return self.moved(theirs, T_new_old, variables)
 
     def moved(self, theirs: Set[int], T_new_old: np.ndarray, variables: Variables) -> Variables:
-        """Return the variables after some keyframes and the landmarks observed there were moved."""
+        """Return the variables after a motion of some keyframes and the landmarks they observe.
+
+        Args:
+            theirs: Ids of the keyframes that move.
+            T_new_old: Motion in the map, [4, 4].
+            variables: Values of all variables before the motion.
+        """
         points = {point_key(s.landmark) for s in self.observations.values() if s.keyframe in theirs}
         moved = {k: T_new_old @ variables[k] for k in variables.keys() & theirs}
         moved |= {k: se3.transform(T_new_old, variables[k]) for k in variables.keys() & points}

@@ -1,6 +1,6 @@
 """Factors of the pose graph and their noise; packing of measurements as arrays for checkpoints.
 
-Packing and unpacking a measurement does not change a bit of it.
+An unpacked measurement is bitwise equal to the measurement that was packed.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,31 +20,34 @@ from .solver import point_key
 class NoiseConfig:
     """Noise of measurements, in addition to the information matrix that a measurement contains."""
 
-    first_sigma: float = 1e-6  # rad and m; the first keyframe is the origin of its component.
-    # Upper bounds of the sigma in a degenerate direction, or the linear system becomes singular.
+    # Sigma of the prior that fixes the first keyframe of each component, rad and m.
+    first_sigma: float = 1e-6
+    # Upper bounds of the sigma in a degenerate direction; without them, the linear system would be
+    # singular.
     sigma_rotation_max_rad: float = 0.2
     sigma_translation_max_m: float = 0.5
     sigma_odometry_rad: float = 0.05  # Sigma of odometry over a missed keyframe.
     sigma_odometry_m: float = 0.1
-    # Alignment counts pixels as independent and models no bias. On a handheld Kinect, its
-    # relative poses are off by 7 sigma in the median. So a random walk is added: about 1 % and
-    # 0.5 deg/m after some meters. Without it no chain could change as far as a true loop closure
-    # requires.
+    # Alignment treats pixels as independent and models no bias, so its sigmas are too small: for a
+    # handheld Kinect, the median error of its relative poses is 7 sigma. Therefore the covariance
+    # of a random walk is added: about 1 % of the path and 0.5 deg/m after some meters. Without this
+    # covariance, a chain of measurements could not change as far as a true loop closure requires.
     drift_rad_per_sqrt_m: float = 0.02
     drift_m_per_sqrt_m: float = 0.02
     turn_m_per_rad: float = 0.5  # Path length with the same drift as a rotation of 1 rad in place.
-    # Dense refinement also counts pixels as independent. It does not model errors of calibration
-    # and exposure.
+    # Sigmas of the covariance that is added to a loop closure. The dense refinement of a closure
+    # also treats pixels as independent, and does not model errors of calibration and exposure.
     sigma_loop_rad: float = 0.01
     sigma_loop_m: float = 0.01
-    # The center of a box differs from the projected mean of an object's Gaussians. Occlusion and
-    # the visible side move it by a fraction of its size; the detector adds some pixels.
+    # Sigma of the center of a detected box, relative to the projected mean of the Gaussians of the
+    # object. The detector causes an error in pixels. Occlusion and the visible side of the object
+    # cause an error that is a fraction of the longer side of the box.
     sigma_box_px: float = 4.0
     sigma_box_share: float = 0.15
-    # Observations of an object from one side share that error, so N of them have less information
-    # than N independent ones. The maximum number per landmark (`landmarks.max_observations`)
-    # counts as a
-    # tenth of one. Counted as one, they moved odometry by 3 mm that was accurate to 2 mm
+    # Observations of an object from one side share this error, so N observations contain less
+    # information than N independent ones. Each counts as this fraction of an independent one, so
+    # 32 observations (`landmarks.max_observations`) count as a tenth of one. When 32 observations
+    # counted as one, they moved poses by 3 mm although odometry was accurate to 2 mm
     # (docs/decisions/0057-tenth-information.md).
     independent_observations: float = 1 / 320
     robust_sigmas: float = 2.385  # Cauchy kernel width: 95 % efficient on Gaussian noise.
@@ -67,7 +70,8 @@ class NoiseConfig:
     def drift(self, T: np.ndarray) -> np.ndarray:
         """Return the covariance [6, 6] of odometry drift over a relative pose T [4, 4].
 
-        Drift is modeled as a random walk along the path.
+        Drift is modeled as a random walk along the path. The covariance is in rad^2 and m^2,
+        rotation first.
         """
         path_m = np.linalg.norm(T[:3, 3]) + self.turn_m_per_rad * se3.rotation_angle(T)
         rates = [self.drift_rad_per_sqrt_m] * 3 + [self.drift_m_per_sqrt_m] * 3
@@ -83,7 +87,7 @@ class BoxObservation:
     center_px: np.ndarray  # Center of the box, [2].
     sigma_px: float
     intrinsics: np.ndarray  # fx, fy, cx, cy in pixels, [4].
-    weight: float = 1.0  # exp(-2 H) if the entropy H is high, else 1.
+    weight: float = 1.0  # exp(-2 H) if the entropy H of the observed classes is high, else 1.
 
 
 def information(sigma_rad: float, sigma_m: float) -> np.ndarray:
@@ -92,7 +96,10 @@ def information(sigma_rad: float, sigma_m: float) -> np.ndarray:
 
 
 def odometry_information(measured: RelativePose, noise: NoiseConfig) -> np.ndarray:
-    """Return the information [6, 6] of an odometry measurement, with drift and the lower bound."""
+    """Return the information [6, 6] of an odometry measurement.
+
+    `NoiseConfig.floor` is added to its own information, and then drift to the covariance.
+    """
     own = 0.5 * (measured.information + measured.information.T) + noise.floor
     return np.linalg.inv(np.linalg.inv(own) + noise.drift(measured.T_a_b))
 
@@ -102,10 +109,14 @@ def closure_information(
 ) -> np.ndarray:
     """Return the information [6, 6] of a loop closure.
 
+    `NoiseConfig.floor` is added to its own information, and then two terms to the covariance: that
+    of `sigma_loop_rad` and `sigma_loop_m`, and the argument `covariance`.
+
     Args:
         measured: The closure.
         noise: Noise of the measurements.
-        covariance: Additional covariance [6, 6] if a keyframe of the closure is condensed.
+        covariance: Covariance [6, 6] of transferring the closure from condensed keyframes to
+            variables; zero if both keyframes are variables.
     """
     own = 0.5 * (measured.information + measured.information.T) + noise.floor
     least = np.linalg.inv(information(noise.sigma_loop_rad, noise.sigma_loop_m))
@@ -121,7 +132,15 @@ def prior_factor(keyframe: int, T_map: np.ndarray, sigma: float) -> gtsam.Nonlin
 def between_factor(
     a: int, b: int, T_a_b: np.ndarray, information: np.ndarray, robust_sigmas: float = 0.0
 ) -> gtsam.NonlinearFactor:
-    """Return a relative-pose factor; `robust_sigmas` is the Cauchy kernel width, 0 for none."""
+    """Return a relative-pose factor between the keyframes a and b.
+
+    Args:
+        a: Id of the first keyframe.
+        b: Id of the second keyframe.
+        T_a_b: Measured pose of b in a, [4, 4].
+        information: Information matrix of the measurement, [6, 6], rotation first.
+        robust_sigmas: Width of the Cauchy kernel in sigmas; 0 for no robust kernel.
+    """
     noise = gtsam.noiseModel.Gaussian.Information(information)
     return gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(T_a_b), _robust(noise, robust_sigmas))
 
@@ -132,13 +151,12 @@ def box_factor(
     """Return the reprojection factor of an observation.
 
     Its cost is s rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2) with s = `independent_observations`. A
-    point
-    behind the camera has a constant cost and no gradient.
+    point behind the camera has a constant cost and no gradient.
 
     Args:
         observation: The observation.
-        variable: Id of the keyframe; if it is condensed, the id of its head or tail.
-        T_variable_keyframe: Pose of the keyframe in that variable, [4, 4].
+        variable: Id of the observing keyframe; if it is condensed, the id of its head or tail.
+        T_variable_keyframe: Pose of the observing keyframe in `variable`, [4, 4].
         noise: Noise of the measurements.
     """
     share = np.sqrt(noise.independent_observations)
@@ -163,7 +181,13 @@ def _robust(noise: gtsam.noiseModel.Base, robust_sigmas: float) -> gtsam.noiseMo
 
 
 def closure_residual(T_a: np.ndarray, T_b: np.ndarray, measured: RelativePose) -> np.ndarray:
-    """Return the residual log(T_ab^-1 T_a^-1 T_b) of a closure, [6]: rotation, then translation."""
+    """Return the residual log(T_ab^-1 T_a^-1 T_b) of a closure, [6]: rotation, then translation.
+
+    Args:
+        T_a: Pose of keyframe a in the map, [4, 4].
+        T_b: Pose of keyframe b in the map, [4, 4].
+        measured: The closure, with T_ab.
+    """
     return se3.log(se3.inverse(measured.T_a_b) @ se3.inverse(T_a) @ T_b)
 
 
@@ -171,7 +195,7 @@ Packed = dict[str, np.ndarray]
 
 
 def pack_relative(measured: Iterable[RelativePose]) -> Packed:
-    """Return measurements as arrays."""
+    """Pack measurements into arrays, by name."""
     measured = list(measured)
     return {
         "pairs": np.array([(m.a, m.b) for m in measured], np.int64).reshape(-1, 2),
@@ -191,7 +215,7 @@ def unpack_relative(packed: Mapping[str, np.ndarray]) -> list[RelativePose]:
 
 
 def pack_observations(observations: Iterable[BoxObservation]) -> Packed:
-    """Return observations as arrays."""
+    """Pack observations into arrays, by name."""
     observations = list(observations)
     return {
         "pairs": np.array([(s.keyframe, s.landmark) for s in observations], np.int64).reshape(

@@ -9,14 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import wrightomega
 
-# Minimum probability of a class that an observation does not name: rare, not impossible.
+# Minimum probability of a class in an observation: a class that it does not name is improbable, but
+# not impossible.
 FLOOR = 1e-6
-NEWTON_STEPS = 60  # It takes 5 to 15; the iteration is monotone, so it cannot cycle.
+# Maximum number of Newton steps; 5 to 15 are usual. The iteration is monotone, so it cannot cycle.
+NEWTON_STEPS = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Sums over all observations of a landmark.
+    """Observed class distributions of a landmark, summed over all its observations.
 
     The cost G(p) of `ldo_service.pose_graph` depends on the observations only through these sums:
 
@@ -28,7 +30,7 @@ class Evidence:
 
     @staticmethod
     def none(classes: int) -> "Evidence":
-        """Return the evidence of no observation."""
+        """Return the evidence of a landmark without observations, for a number of classes."""
         return Evidence(0.0, np.zeros(classes))
 
     def with_observed(self, q: np.ndarray, weight: float) -> "Evidence":
@@ -64,13 +66,14 @@ def fuse_labels(
     again. The result is deterministic.
 
     Args:
-        evidence: Observations of each landmark.
+        evidence: Evidence of each landmark, by its id.
         covisible: Pairs of landmarks that are observed in the same keyframe; each pair counts once.
         lambda_sem: Weight of the observations.
         w_sem: Weight of the similarity.
-        start: Start values by landmark. A landmark without one starts at the geometric mean of its
-            observations.
-        only: Landmarks to optimize; the others keep their start values. None optimizes all.
+        start: Start value [C] by landmark. A landmark without a start value starts at the geometric
+            mean of its observations.
+        only: Ids of the landmarks to optimize; the others keep their start values. None optimizes
+            all landmarks.
         sweeps: Maximum number of sweeps.
         tolerance: Sweeps end when no probability changes by more than this.
     """
@@ -130,15 +133,15 @@ def _minimum(
 ) -> np.ndarray:
     """Return the distribution [C] of one landmark that minimizes G while all others are fixed.
 
-    `alike` has the distributions of the n neighbors with the same argmax. The condition with the
-    Lagrange multiplier nu,
+    `alike` has the distributions of the n neighbors with the same argmax. At the minimum, this
+    condition with the Lagrange multiplier nu holds:
 
         a (log p_c + 1) - g_c - b_c / p_c + nu = 0,    a = lambda W + n w / 2,
         g = lambda L + w / 2 sum_j log p_j,            b = w / 2 sum_j p_j
 
-    is solved by p_c = (b_c / a) / omega(log(b_c / a) + 1 + (nu - g_c) / a). omega is Wright's
-    function: omega + log omega = x. The sum over c decreases with nu; Newton's method finds the nu
-    for which it is one.
+    Its solution is p_c = (b_c / a) / omega(log(b_c / a) + 1 + (nu - g_c) / a). Here omega is
+    Wright's function, with omega(x) + log omega(x) = x. The sum of p_c over c decreases with nu.
+    Newton's method finds the nu for which this sum is one.
     """
     half = 0.5 * w_sem
     a = lambda_sem * evidence.weight + half * len(alike)
@@ -147,7 +150,8 @@ def _minimum(
     g = lambda_sem * evidence.log_sum + half * np.sum(np.log(alike), axis=0)
     log_b = np.log(half * np.sum(alike, axis=0) / a)
     x = 1 - g / a + log_b
-    # Here sum_c p_c exceeds one, so that Newton approaches from one side of a convex function.
+    # The start value of nu makes sum_c p_c larger than one. The sum is a convex function of nu, so
+    # Newton's method approaches the solution from one side.
     nu = float(np.max(g / a)) - 1
     p = np.ones_like(g)
     for _ in range(NEWTON_STEPS):

@@ -1,4 +1,4 @@
-"""Object landmarks: their observations are added to the pose graph, and lost ones removed."""
+"""Object landmarks: adding their observations to the pose graph, and removing lost landmarks."""
 
 import itertools
 from collections.abc import Iterable, Mapping
@@ -43,24 +43,29 @@ class ObjectLandmarkConfig:
 
     lambda_sem: float = 0.5  # Weight of the observed labels (III.C).
     w_sem: float = 0.1  # Weight of the similarity (III.C).
-    # Entropy above which an observation has weight exp(-2 H) and a landmark is removed earlier
-    # (III.C).
+    # Entropy H above which an observation has weight exp(-2 H), and above which a landmark is
+    # uncertain, so that it is removed earlier (III.C).
     vague_nats: float = 0.5
     min_observations: int = 3  # Minimum observations of a landmark in the graph (III.C).
-    # Minimum parallax, 5 deg: an error of 12 px at 2 m and 525 px focal length is 0.5 m in depth.
+    # Minimum angle between two rays to a new landmark, 5 deg. At this angle, an error of 12 px
+    # changes a depth of 2 m by 0.5 m (focal length 525 px).
     min_parallax_rad: float = 0.09
-    # Maximum observations of a landmark in the graph; the first half of them is never replaced.
+    # Maximum observations of a landmark in the graph; newer observations never replace the first
+    # half of this number.
     max_observations: int = 32
     misses: int = 10  # Consecutive misses after which a landmark is removed (III.C).
-    vague_misses: int = 5  # The same for a landmark with high entropy.
-    vague_keyframes: int = 20  # Keyframes without observation after which such a one is removed.
-    # Maximum landmarks; beyond, the least recently observed ones are removed.
+    vague_misses: int = 5  # Consecutive misses after which an uncertain landmark is removed.
+    # Keyframes without an observation after which an uncertain landmark is removed.
+    vague_keyframes: int = 20
+    # Maximum landmarks; if there are more, the least recently observed ones are removed.
     max_landmarks: int = 1000
-    # adaptive: the graph takes observations in once their total weight reaches `due_weight`;
-    # fixed: at every keyframe with observations.
+    # The schedule `adaptive` adds waiting observations to the graph once their total weight reaches
+    # `due_weight`; `fixed` adds them at every keyframe with observations.
     schedule: Literal["adaptive", "fixed"] = "adaptive"
-    due_weight: float = 8.0  # Uncertain observations have less weight.
-    max_waiting: int = 256  # Maximum waiting observations, however small their weight.
+    # Total weight of waiting observations; an observation with low entropy weighs 1.
+    due_weight: float = 8.0
+    # Number of waiting observations at which they are added, however small their weight.
+    max_waiting: int = 256
 
     def __post_init__(self) -> None:
         counts = (
@@ -92,7 +97,7 @@ class ObjectLandmarkConfig:
 
 @dataclass(frozen=True, slots=True)
 class LandmarkObservation:
-    """Observation of an object in a keyframe, or a miss: not found where it should be visible."""
+    """Observation of an object in a keyframe; a miss if the visible object is not detected."""
 
     keyframe: int
     landmark: int
@@ -136,7 +141,7 @@ class Landmark:
     distribution: np.ndarray  # Fused class distribution, [C].
     observations: tuple[BoxObservation, ...] = ()
     misses: int = 0  # Consecutive misses.
-    last: int = -1  # Id of the last keyframe that observed it.
+    last: int = -1  # Id of the last keyframe that observed the landmark; -1 for none.
 
     def knows(self, keyframe: int) -> bool:
         """Return whether the landmark already has an observation in a keyframe."""
@@ -154,10 +159,9 @@ class Landmark:
 class ObjectLandmarks:
     """Landmarks of the pose graph, with their observations and fused class distributions.
 
-    The result is deterministic. There are at most `max_landmarks` landmarks, each with 4 kB and at
-    most
-    `max_observations` observations. Pairs of landmarks observed in the same keyframe take memory
-    too.
+    Equal observations in the same order give equal landmarks. There are at most `max_landmarks`
+    landmarks, each with 4 kB and at most `max_observations` observations. In addition, all pairs of
+    landmarks that are observed in the same keyframe are stored.
     """
 
     def __init__(self, config: ObjectLandmarkConfig, noise: NoiseConfig) -> None:
@@ -167,19 +171,22 @@ class ObjectLandmarks:
         self._waiting: list[LandmarkObservation] = []
         self._pairs: set[Pair] = set()  # Pairs of landmarks that a keyframe shows together.
         self._saved: dict[str, Any] = {}  # Cached part of the state.
-        self.skipped = 0  # Keyframes at which observations waited.
+        self.skipped = 0  # Number of keyframes at which waiting observations were not yet added.
 
     def observe(self, seen: LandmarkObservation) -> None:
         """Store an observation for the next `update_graph`."""
         self._waiting.append(seen)
 
     def weight(self, entropy: float) -> float:
-        """Return the weight of an observation with this entropy in nats."""
+        """Return the weight 0..1 of an observation, from the entropy of its classes in nats."""
         return float(np.exp(-2 * entropy)) if entropy > self._config.vague_nats else 1.0
 
     # --- into the graph ---------------------------------------------------------------------------
     def needs_update(self) -> bool:
-        """Return whether to call `update_graph` now; call this once per keyframe."""
+        """Return whether to call `update_graph` now.
+
+        Call this once per keyframe, since it counts `skipped` keyframes.
+        """
         config = self._config
         if not self._waiting:
             return False
@@ -207,7 +214,7 @@ class ObjectLandmarks:
                 self.known[seen.landmark] = replace(old, misses=old.misses + 1)
             return
         if old is not None and old.knows(seen.keyframe):
-            return  # Sent again after a restart.
+            return  # The observation was sent again after a restart.
         old = old or Landmark(Evidence.none(MAX_CLASSES), np.full(MAX_CLASSES, 1 / MAX_CLASSES))
         evidence = old.evidence.with_observed(seen.distribution, self.weight(seen.entropy))
         observations = (
@@ -262,9 +269,9 @@ class ObjectLandmarks:
         graph.remove_observations(gone)
 
     def _thinned(self, observations: list[BoxObservation]) -> tuple[BoxObservation, ...]:
-        """Return at most `max_observations` observations: the first ones and the newest ones.
+        """Return at most `max_observations` observations: half of them the first, half the newest.
 
-        The first ones limit the drift of the landmark.
+        The first observations limit the drift of the landmark.
         """
         half = self._config.max_observations // 2
         excess = len(observations) - self._config.max_observations
@@ -277,8 +284,9 @@ class ObjectLandmarks:
     ) -> np.ndarray | None:
         """Triangulate the point [3] in the map where the rays through the box centers meet.
 
-        Return None in these cases: too few observations, too little parallax, a point behind a
-        camera, or a point projected too far from the center of a box.
+        Return None if there are too few observations or too little parallax, or if the point lies
+        behind a camera or less than 0.1 m before it, or is projected more than 3 sigma from the
+        center of a box.
         """
         observations = list(observations)
         if len(observations) < self._config.min_observations:
@@ -302,7 +310,10 @@ class ObjectLandmarks:
 
     # --- labels -----------------------------------------------------------------------------------
     def _fuse(self, touched: set[int]) -> None:
-        """Fuse the distributions of the landmarks with new observations; others stay unchanged."""
+        """Fuse the class distributions of the landmarks `touched`, which have new observations.
+
+        The distributions of other landmarks do not change.
+        """
         pairs = [pair for pair in self._pairs if touched & set(pair)]
         near = touched | {k for pair in pairs for k in pair if k in self.known}
         p = fuse_labels(
@@ -319,9 +330,9 @@ class ObjectLandmarks:
     def _remove_lost(self, graph: PoseGraph) -> None:
         """Remove lost landmarks with their observations.
 
-        They are not marginalized. That would leave a dense factor between all keyframes that
-        observed the landmark. It would take much time for little information, and it would be
-        linearized at the current poses.
+        The landmarks are not marginalized. Marginalization would leave a dense factor between all
+        keyframes that observed the landmark. This factor would take much time for little
+        information, and it would be linearized at the current poses.
         """
         newest = graph.newest or 0
         gone = [k for k, landmark in self.known.items() if self._should_remove(landmark, newest)]

@@ -16,7 +16,10 @@ from .factors import pack_relative, unpack_relative
 from .solver import Variables
 
 Pair = tuple[int, int]
+# Function that solves the graph with some closures; it returns the variables and the sum of squared
+# residuals.
 Solve = Callable[[Collection[RelativePose]], tuple[Variables, float]]
+# Function that returns the largest whitened residual of a closure in a solution, in sigmas.
 Sigmas = Callable[[Variables, RelativePose], float]
 
 
@@ -24,20 +27,23 @@ Sigmas = Callable[[Variables, RelativePose], float]
 class LoopClosureConfig:
     """Limits for the acceptance of loop closures."""
 
-    # Maximum increase of the sum of squares by a closure: chi^2 of six numbers at 3 sigma
-    # (99.73 %). The residual of the closure alone is no criterion: a chain of 100 measurements
-    # moves by a meter and leaves a residual of 2 sigma.
+    # Maximum increase of the sum of squared residuals by a closure: the 99.73 % quantile (3 sigma)
+    # of chi^2 with six degrees of freedom. The residual of the closure alone is no criterion: a
+    # chain of 100 measurements moves by a meter, and the closure then has a residual of 2 sigma.
     max_cost: float = 20.06
     # Maximum residual of an accepted closure in any direction, in sigmas (RTAB-Map's guard).
     max_sigmas: float = 3.0
-    # Earlier closures to test for removal instead of a new one; worst fit first.
+    # Maximum number of earlier closures that are tested for removal instead of a new one; those
+    # with the largest residuals are tested.
     max_removal_tests: int = 3
-    # Maximum accepted closures, 1 kB each and one more factor to solve. Beyond, the older of the
-    # two most similar ones is removed.
+    # Maximum number of accepted closures; each needs 1 kB and one more factor in the solver. If
+    # there are more, the older of the two most similar closures is removed.
     max_closures: int = 500
-    # Rejected closures kept that contradict a bridge edge; two that agree replace it.
+    # Maximum number of stored closures that contradict a bridge edge. If two of them agree and no
+    # closure agrees with the edge, they replace it (see `component_merging`).
     max_contradicting: int = 16
-    max_rejected: int = 256  # Rejected and removed closures kept, each, for publication.
+    # Maximum number of rejected closures that are stored for publication, and of removed ones.
+    max_rejected: int = 256
 
     def __post_init__(self) -> None:
         if min(self.max_cost, self.max_sigmas) <= 0 or self.max_removal_tests < 0:
@@ -80,13 +86,14 @@ class LoopClosureSet:
         """Check a new closure against the accepted ones.
 
         The new closure is rejected if it increases the cost of the solution by more than
-        `max_cost`. There is one exception: an earlier closure was false if the cost is lower with
-        the new closure instead of it. The earlier one is then removed. At the end, all closures
-        with a residual above `max_sigmas` are removed.
+        `max_cost`. There is one exception: if the cost is lower with the new closure in place of an
+        earlier one, the earlier closure is regarded as false and removed. At the end, all closures
+        with a residual above `max_sigmas` are removed, the worst first.
 
         Args:
             closure: New closure.
-            solve: Function that returns the solution with some closures, and its sum of squares.
+            solve: Function that returns the solution with some closures, and its sum of squared
+                residuals.
             sigmas: Function that returns the largest whitened residual of a closure in a solution.
 
         Returns:
@@ -124,9 +131,9 @@ class LoopClosureSet:
         variables: Variables,
         sigmas: Sigmas,
     ) -> RelativePose | None:
-        """Return the earlier closure to remove, so that the new closure fits at the lowest cost.
+        """Return the earlier closure whose removal lets the new closure fit at the lowest cost.
 
-        Return None if the new closure fits with none of them removed.
+        Return None if the new closure fits after none of the tested removals.
         """
         fitting = sorted(before, key=lambda c: sigmas(variables, c), reverse=True)
         best, best_cost = None, cost_before
@@ -161,8 +168,8 @@ class LoopClosureSet:
     def _thinned(self, accepted: Mapping[Pair, RelativePose]) -> Mapping[Pair, RelativePose]:
         """Return at most `max_closures` closures.
 
-        If there is one more, the two closures with the most similar keyframe ids are redundant. The
-        older one of them is removed.
+        If there is one more, the two closures with the most similar keyframe ids are regarded as
+        redundant, and the older one of these two is removed.
         """
         if len(accepted) <= self.config.max_closures:
             return accepted
@@ -173,7 +180,10 @@ class LoopClosureSet:
         return {p: c for place, (p, c) in enumerate(accepted.items()) if place != older}
 
     def without(self, pairs: Collection[Pair]) -> "LoopClosureSet":
-        """Return the set without some closures, which were condensed into other measurements."""
+        """Return the set without the closures between some pairs of keyframes.
+
+        They are not listed as removed, since other measurements now contain their information.
+        """
         return replace(self, accepted={p: c for p, c in self.accepted.items() if p not in pairs})
 
     def with_replaced_bridge(self, bridge: Pair, closure: Pair) -> "LoopClosureSet":

@@ -45,7 +45,7 @@ class PoseGraph:
     def __init__(self, config: PoseGraphConfig | None = None) -> None:
         self._config = config = config or PoseGraphConfig()
         self._known = FactorStore(config.noise, config.closures)
-        self._initial: Variables = {}  # The value each variable was inserted with.
+        self._initial: Variables = {}  # Value with which each variable was added to the solver.
         self._solver = Solver()
         self._base = self._packed()
         self._changes: list[tuple[str, dict[str, Any]]] = []  # Since the last rebuild.
@@ -93,7 +93,7 @@ class PoseGraph:
         return self._known.first_of[keyframe]
 
     def add(self, measured: RelativePose, *more: RelativePose) -> None:
-        """Add a new keyframe `b`, measured from one or more known keyframes.
+        """Add a new keyframe `b` with its measurements from one or more known keyframes `a`.
 
         Raises:
             KeyError: A keyframe `a` is unknown.
@@ -125,9 +125,10 @@ class PoseGraph:
         self._update([name for name in names if name], [])
 
     def odometry_fallback(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
-        """Return a measurement from odometry poses, for keyframes between which others are missing.
+        """Return the odometry pose T_a_b [4, 4] between two keyframes as a measurement.
 
-        Its noise is larger than that of an alignment; see `NoiseConfig.sigma_odometry_m`.
+        It connects keyframes `a` and `b` if the keyframes between them were missed. Its noise is
+        larger than that of an alignment; see `NoiseConfig.sigma_odometry_m`.
         """
         noise = self._config.noise
         own = information(noise.sigma_odometry_rad, noise.sigma_odometry_m)
@@ -147,7 +148,7 @@ class PoseGraph:
         may replace it (see `component_merging`).
 
         Returns:
-            The decision, with the earlier closures that are removed.
+            The decision, which also names the earlier closures that are removed.
 
         Raises:
             KeyError: A keyframe is unknown.
@@ -156,10 +157,12 @@ class PoseGraph:
             self._merge_components(closure)
             return ClosureDecision(True)
         if pair_of(closure) in self._known.bridges:
-            return ClosureDecision(True)  # The same two images must not count twice.
+            # The bridge edge connects the same two images, which must not count twice.
+            return ClosureDecision(True)
         start, known = self._solver.variables(), self._known
         if known.relative_to_start(closure.a)[0] == known.relative_to_start(closure.b)[0]:
-            return self._reject(closure)  # Too late: both have the same head now.
+            # Both keyframes are condensed into one variable, so no factor can connect them.
+            return self._reject(closure)
         decision, variables = check_against_bridge(known, closure, start, self._initial)
         self.solved_times += 1
         if not decision.changes:
@@ -169,12 +172,17 @@ class PoseGraph:
         return decision
 
     def _with_ends(self, closure: RelativePose, variables: Variables) -> Variables:
-        """Make condensed keyframes of a closure variables again if they move too far.
+        """Turn condensed keyframes of a closure back into variables if the closure moves them far.
 
-        The limit is `max_interpolation_sigmas`, in standard deviations of a loop closure.
+        The limit is `max_interpolation_sigmas`, in standard deviations of a loop closure. A
+        keyframe stays condensed if there are too many groups (`keyframes_each`).
+
+        Args:
+            closure: Accepted loop closure.
+            variables: Variables of the solution with this closure.
 
         Returns:
-            The variables, with these keyframes included.
+            The variables, including the keyframes that are variables again.
         """
         known, config = self._known, self._config
         for keyframe in (closure.a, closure.b):
@@ -187,7 +195,7 @@ class PoseGraph:
         return variables
 
     def _merge_components(self, measured: RelativePose) -> None:
-        """Merge the two components of a measurement, and solve the graph again.
+        """Merge the components of the two measured keyframes, and solve the graph again.
 
         The younger component moves into the coordinate frame of the older one.
         """
@@ -199,9 +207,10 @@ class PoseGraph:
         self._restart_solver(moved)
 
     def _reject(self, closure: RelativePose) -> ClosureDecision:
-        """Reject a closure, unless more closures agree with it than with a bridge edge.
+        """Reject a closure, or replace a bridge edge that it contradicts.
 
-        In that case the closure replaces the bridge edge; see `best_bridge_removal`.
+        The closure replaces the bridge edge if more closures agree with this closure than with the
+        edge; see `best_bridge_removal`.
         """
         known, variables = self._known, self._solver.variables()
         known.closures = known.closures.with_decision(closure, ClosureDecision(False))
@@ -226,7 +235,8 @@ class PoseGraph:
 
         Args:
             boxes: The observations.
-            placed: Positions [3] in the map of the new landmarks among them, by id.
+            placed: Position [3] in the map, meters, of each new landmark that `boxes` observe, by
+                landmark id.
 
         Raises:
             KeyError: A keyframe is unknown.
@@ -241,7 +251,7 @@ class PoseGraph:
         self._update(names, [point_key(k) for k in placed])
 
     def remove_observations(self, pairs: Iterable[Pair]) -> None:
-        """Remove observations, and landmarks that have none left.
+        """Remove observations, and landmarks that have no observation left.
 
         Args:
             pairs: Keyframe and landmark of each observation; unknown pairs are ignored.
@@ -262,7 +272,7 @@ class PoseGraph:
         return point_key(landmark) in self._initial
 
     def landmarks(self) -> dict[int, np.ndarray]:
-        """Return the positions [3] of all landmarks in the map, by id."""
+        """Return the position [3] of each landmark in the map, meters, by id."""
         variables = self._solver.variables()
         return {
             k: variables[point_key(k)] for k in sorted({k for _, k in self._known.observations})
@@ -325,7 +335,7 @@ class PoseGraph:
             self._solver.update(factors, self._initial)
 
     def _condense(self) -> None:
-        """Condense the next group, if there is one.
+        """Condense the next group of keyframes, if enough keyframes have left the window.
 
         The solver is rebuilt after a condensation, and after `max_changes` changes.
         """

@@ -14,14 +14,20 @@ class PoseGraphConfig:
 
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     closures: LoopClosureConfig = field(default_factory=LoopClosureConfig)
-    # Keyframes per group; one stays a variable (paper, III.C: every 10).
+    # Keyframes per group (paper, III.C: 10). The first one stays a variable; the others are
+    # condensed.
     condense_keyframes: int = 10
-    window_keyframes: int = 20  # Newest keyframes, not condensed: their measurements still change.
-    # A condensed keyframe becomes a variable again if a closure changes it by more sigmas than
-    # this. There is at most one group per `keyframes_each` keyframes, to bound the solver's time.
+    # Number of newest keyframes that are not condensed, because their measurements still change.
+    window_keyframes: int = 20
+    # A condensed keyframe becomes a variable again, which splits its group, if a loop closure
+    # changes its pose relative to its two variables by more than this number of sigmas of a loop
+    # closure. No group is split if there is already one group per `keyframes_each` keyframes, to
+    # bound the solver's time.
     max_interpolation_sigmas: float = 0.1
     keyframes_each: int = 5
-    max_changes: int = 64  # Number between two rebuilds; a restored graph repeats them bit by bit.
+    # Maximum number of changes of the graph between two rebuilds of the solver. A restored graph
+    # repeats the changes since the last rebuild, with bitwise equal results.
+    max_changes: int = 64
 
     def __post_init__(self) -> None:
         counts = self.condense_keyframes, self.window_keyframes, self.max_changes

@@ -10,14 +10,14 @@ import gtsam
 import numpy as np
 
 Name = tuple[Any, ...]  # Name of a factor: its kind, then the ids of its ends.
-# Keyframes as T_map_keyframe [4, 4] and points [3] in the map, by key.
+# Value of each variable by its gtsam key: T_map_keyframe [4, 4], or a point [3] in the map, meters.
 Variables = dict[int, np.ndarray]
 
 
 class Solver:
     """Incremental minimization of a sum of named factors by iSAM2.
 
-    Variables that have moved are relinearized.
+    An update linearizes again at each variable that has moved by more than 0.01 rad or m.
     """
 
     def __init__(self) -> None:
@@ -44,8 +44,8 @@ class Solver:
         its last factor.
 
         Raises:
-            RuntimeError: The factors do not determine all variables. The solver cannot be used any
-                more.
+            RuntimeError: The factors do not determine all variables. After this error, the solver
+                can no longer be used.
         """
         out = {*gone, *factors} & self._places.keys()
         places = sorted(self._places.pop(name) for name in out)
@@ -67,7 +67,7 @@ def solve_batch(
     """Minimize the sum of factors by Levenberg-Marquardt from `start`.
 
     Returns:
-        The variables, and the remaining sum of |error / sigma|^2.
+        The variables at the minimum, and the sum of |error / sigma|^2 there.
 
     Raises:
         RuntimeError: The factors do not determine all variables.
@@ -108,5 +108,5 @@ def variables_of(values: gtsam.Values) -> Variables:
 
 
 def point_key(landmark: int) -> int:
-    """Return the key of a landmark's variable."""
+    """Return the gtsam key of a landmark's variable, from the id of the landmark."""
     return gtsam.symbol("o", landmark)
