@@ -1,9 +1,9 @@
 """Loop closing: subgraphs of keyframes, their descriptors, and the verification of loop candidates.
 
 Coarse step: `place_database` compares histograms of labels, of their layout and of visual words.
-Fine step: `verification` estimates the pose between two keyframes, and rejects it if any check
-fails. The checks are strict, because a false loop closure costs more than a missed one. Paper,
-III.C.
+Fine step: `verification` estimates the pose between two keyframes, and rejects the candidate if any
+check fails. The checks are strict, because a false loop closure damages the map more than a missed
+one. Paper, III.C.
 """
 
 from .loop_detector import LoopCandidateResult, LoopDetector, LoopsConfig

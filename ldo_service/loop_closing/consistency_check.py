@@ -27,11 +27,13 @@ class ConsistencyCheckConfig:
     drift: float = 0.1  # Additional drift per meter of path; ten times the drift of depth cameras.
     turn_rad: float = 0.35  # Allowed rotation drift on any path.
     turn_rad_per_m: float = 0.02  # Additional rotation drift per meter of path; 1.1 degrees.
-    # Maximum rotation between cameras that see one place, beyond the drift: the width of a view.
+    # Maximum pose difference of two cameras that see the same surfaces, to which the allowed drift
+    # is added: the rotation is at most the width of a view, the distance is in median depths.
     view_rad: float = 1.5
-    view_depths: float = 2.0  # Maximum distance between them beyond the drift, in median depths.
-    # A hypothesis is ambiguous if another one has this fraction of its inliers and differs by more
-    # than ambiguous_rad: 57 degrees, or one median depth.
+    view_depths: float = 2.0
+    # A hypothesis is ambiguous if another one has at least this fraction of its inliers, and if the
+    # two put the new keyframe at poses that differ by more than ambiguous_rad, rotation plus
+    # parallax. 1 rad is a rotation by 57 degrees or a distance of one median depth.
     ambiguous_inlier_ratio: float = 0.5
     ambiguous_rad: float = 1.0
 
@@ -72,7 +74,8 @@ class ConsistencyChecker:
 
         A keyframe is excluded if its distance or its rotation from the new one is too large. The
         limit is the maximum drift plus the largest pose difference of two cameras that see the same
-        surfaces (`view_depths`, `view_rad`).
+        surfaces (`view_depths`, `view_rad`). A keyframe without a known relative pose is not
+        excluded.
         """
         if new.keyframe not in self._poses:
             return np.ones(len(old), bool)
@@ -95,9 +98,10 @@ class ConsistencyChecker:
         return may
 
     def check_drift(self, proposal: LoopHypothesis) -> LoopHypothesis:
-        """Reject a hypothesis if it implies more drift than the path between its keyframes allows.
+        """Return a hypothesis, rejected if it implies more drift than the camera path allows.
 
-        The result is the hypothesis, with a rejected_reason if it is rejected.
+        A rejected hypothesis has a `rejected_reason`. A hypothesis whose keyframes have no known
+        relative pose is returned unchanged.
         """
         old, new = proposal.old, proposal.new
         if proposal.rejected_reason or not self._is_known(old, new):
@@ -113,10 +117,10 @@ class ConsistencyChecker:
         return proposal
 
     def reject_aliased(self, proposals: Sequence[LoopHypothesis]) -> list[LoopHypothesis]:
-        """Reject ambiguous hypotheses, and return all.
+        """Return all hypotheses of a new subgraph, with the ambiguous ones rejected.
 
-        A hypothesis is ambiguous if another one places the new keyframe far away from it and has
-        nearly as many inliers (`ambiguous_inlier_ratio`, `ambiguous_rad`).
+        A hypothesis is ambiguous if another one puts the new keyframe far away from where this one
+        puts it, and has nearly as many inliers (`ambiguous_rad`, `ambiguous_inlier_ratio`).
         """
         return [
             replace(proposal, rejected_reason="ambiguous: another place fits as well")
@@ -137,7 +141,7 @@ class ConsistencyChecker:
         return apart_rad > self._config.ambiguous_rad
 
     def _T_map(self, proposal: LoopHypothesis, new: SubgraphKeyframe) -> np.ndarray:
-        """Return T_map_keyframe [4, 4] of a new keyframe if the hypothesis is true."""
+        """Return the pose T_map_keyframe [4, 4] of keyframe `new` that a hypothesis implies."""
         T_new_odom = se3.inverse(proposal.new.place.T_odom_keyframe)
         T_map_newodom = self._poses[proposal.old.keyframe] @ proposal.T_old_new @ T_new_odom
         return T_map_newodom @ new.place.T_odom_keyframe
@@ -160,7 +164,7 @@ class ConsistencyChecker:
     def _drift(
         self, old: SubgraphKeyframe, new: SubgraphKeyframe, T_old_new: np.ndarray
     ) -> tuple[float, float]:
-        """Return the difference between a measured relative pose and the map, in m and rad."""
+        """Return the difference between a measured relative pose and that in the map, m and rad."""
         T_map_new = self._poses[old.keyframe] @ T_old_new
         T_gap = se3.inverse(T_map_new) @ self._poses[new.keyframe]
         return float(np.linalg.norm(T_gap[:3, 3])), se3.rotation_angle(T_gap)

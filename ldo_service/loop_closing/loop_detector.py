@@ -32,7 +32,8 @@ from .subgraph import (
 from .verification import LoopHypothesis, VerificationConfig, VerificationResult, Verifier
 
 BYTES = 32  # Length of an ORB descriptor.
-# The tracker needs 15; a closure is also verified by surfaces and by the pose graph.
+# Minimum feature inliers of a pose between two keyframes. The tracker requires 15; here 12 suffice,
+# because surfaces and the pose graph also verify a loop closure.
 LOOP_MIN_INLIERS = 12
 BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.int64)
 
@@ -41,8 +42,8 @@ BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1
 class VisualWordsConfig:
     """Parameters of the visual words."""
 
-    # Maximum words: 4 kB of counts per subgraph. 512 find 2 % fewer loops on kitchen and flat,
-    # 2048 no more.
+    # Maximum number of words; the counts of 1024 words need 4 kB per subgraph. In the sequences
+    # kitchen and flat, 512 words find 2 % fewer loops than 1024, and 2048 words find no more.
     count: int = 1024
     # A feature that differs from every word in more of its 256 bits becomes a word.
     apart_bits: int = 64
@@ -65,7 +66,7 @@ class VisualWords:
     """
 
     def __init__(self, config: VisualWordsConfig, words: np.ndarray | None = None) -> None:
-        """Start with `words` [n, 32], or without words."""
+        """Start with the words [n, 32] uint8 of a snapshot; None starts without words."""
         self._config = config
         self.words = np.zeros((0, BYTES), np.uint8) if words is None else words
 
@@ -94,7 +95,10 @@ class VisualWords:
         return np.bincount(nearest, minlength=self._config.count).astype(np.float32)
 
     def _distances(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the Hamming distances [N] to the nearest word, in bits; 256 without words."""
+        """Return the Hamming distance of each descriptor to its nearest word, [N], in bits.
+
+        All distances are 256 if there are no words.
+        """
         if not len(self.words):
             return np.full(len(descriptors), 8 * BYTES)
         return np.array([int(m.distance) for m in _matches(descriptors, self.words)])
@@ -108,8 +112,9 @@ def _matches(descriptors: np.ndarray, words: np.ndarray) -> tuple[cv2.DMatch, ..
 class LoopsConfig:
     """Parameters of loop detection."""
 
-    # two_stage: labels and images, then features or landmarks, and surfaces. The others are for
-    # comparison: geometric uses no labels, semantic no images (only the landmarks of III.C).
+    # Data that the coarse and the fine step use. two_stage: labels and images to find candidates,
+    # then features or landmarks, and surfaces, to verify them. The other values are for comparison.
+    # geometric: no labels; semantic: no images, only landmarks as in the paper (III.C).
     stages: Stages = "two_stage"
     subgraphs: SubgraphConfig = field(default_factory=SubgraphConfig)
     words: VisualWordsConfig = field(default_factory=VisualWordsConfig)
@@ -183,14 +188,15 @@ class LoopDetector:
         poses: KeyframePoses,
         merged: Mapping[int, int],
     ) -> list[LoopCandidateResult]:
-        """Add a keyframe; return the loop candidates if it completes a subgraph.
+        """Add a keyframe; return the loop candidates of the subgraph that it completes, if any.
 
         Args:
             place: Record of the keyframe, without pixels of dynamic classes.
             frame: Frame number of the camera.
             stamp_ns: Stamp of the keyframe.
             sightings: Detections as points; None if no detector ran.
-            poses: T_map_keyframe of the stored keyframes; unknown ones are not checked.
+            poses: T_map_keyframe of the stored keyframes. Loops of keyframes without a pose are not
+                checked for plausible drift.
             merged: Merged submaps, each with the older one that it is merged into.
         """
         results: list[LoopCandidateResult] = []
@@ -203,10 +209,10 @@ class LoopDetector:
         return results
 
     def flush(self, poses: KeyframePoses, merged: Mapping[int, int]) -> list[LoopCandidateResult]:
-        """Return the loop candidates of the unfinished subgraph if it is long enough.
+        """Complete the unfinished subgraph if it is long enough, and return its loop candidates.
 
-        Callers use it when no keyframe follows: at the end of a run and after a loss of tracking.
-        Loops are likely then. A run often ends where it began, and the newest keyframes are near
+        Call this when no keyframe follows: at the end of a run and after a loss of tracking. Loops
+        are likely then. A run often ends where it began, and the newest keyframes are near
         the place where tracking was lost.
         """
         if not self.can_flush:
@@ -238,9 +244,9 @@ class LoopDetector:
         )
 
     def _step_m(self, place: KeyframeRecord) -> float:
-        """Return the distance from the previous keyframe in meters.
+        """Return the distance of a keyframe from the previous keyframe in meters.
 
-        In a new submap it is unknown, and the result is 0.
+        The distance is unknown at the start of a submap, where the result is 0.
         """
         if self._last is None or self._last[0] != place.submap:
             return 0.0
@@ -268,10 +274,10 @@ class LoopDetector:
     def _findings(
         self, new: Subgraph, poses: KeyframePoses, merged: Mapping[int, int]
     ) -> list[LoopCandidateResult]:
-        """Return all loop candidates of a new subgraph.
+        """Return all loop candidates of a new subgraph, with the results of their verification.
 
-        They are verified in the order of their inliers, most first. The first accepted one becomes
-        the loop closure; the following ones are rejected.
+        The candidates with the most inliers are verified first. The first candidate that passes
+        becomes the loop closure, and all others are rejected.
         """
         known = ConsistencyChecker(poses, merged, self._config.plausibility)
         is_possible = known.possible_matches(
@@ -290,7 +296,7 @@ class LoopDetector:
         return [LoopCandidateResult(new, like, checks[index]) for index, like in enumerate(likely)]
 
     def _proposal(self, old: Subgraph, new: Subgraph, known: ConsistencyChecker) -> LoopHypothesis:
-        """Return a loop hypothesis for a candidate; it is rejected if no method finds a pose.
+        """Return the loop hypothesis of a candidate, marked as rejected if no method finds a pose.
 
         The methods are tried in the order features, landmarks, map. Poses from features are
         accurate to centimeters, and those from landmarks to decimeters. Poses from the map come
@@ -321,7 +327,8 @@ class LoopDetector:
     def snapshot(self) -> dict[str, Any]:
         """Return the state for a checkpoint.
 
-        The entries of `subgraphs` and `views` are never modified later. The other values are small.
+        The entries of the lists `subgraphs` and `views` are never modified later. The other values
+        are small.
         """
         return {
             "subgraphs": [subgraph.pack() for subgraph in self._memory.subgraphs],

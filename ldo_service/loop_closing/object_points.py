@@ -16,22 +16,26 @@ from ldo_service.semantics.distributions import dense, divergence, entropy, spar
 from ldo_service.semantics.gaussian_labels import MAX_LABELS, OTHER
 
 LAYOUT_WORDS = 512  # Bins that pairs of labels and their distances are hashed to.
-DISTANCE_BIN_M = 0.5  # Bin width of the distances; each one counts in its two nearest bins.
-HIDDEN_NAMES = OTHER + 1  # Background and other do not describe a place.
+DISTANCE_BIN_M = 0.5  # Bin width of the distances; a distance counts in its two nearest bins.
+# Labels below this index, background and `other`, are ignored: they do not describe a place.
+HIDDEN_NAMES = OTHER + 1
 
 
 @dataclass(frozen=True, slots=True)
 class LandmarkConfig:
-    """Parameters of the landmarks of a subgraph; III.C refers to the paper."""
+    """Parameters of the landmarks of a subgraph; III.C is a section of the paper."""
 
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
-    # Detections with the same label that are closer belong to one object: half a chair.
+    # Detections with the same label belong to one object if their distance is smaller than this,
+    # which is half a chair.
     same_m: float = 0.4
     # Maximum KL divergence of matching landmarks in both directions, nats (III.C).
     max_divergence: float = 0.3
-    # Maximum distance of matched landmarks; the boxes may show different sides of an object.
+    # Maximum distance of matched landmarks. It is large because the boxes may show different sides
+    # of an object.
     reach_m: float = 0.25
-    min_inliers: int = 4  # Three points determine a pose but do not confirm it.
+    # Minimum landmarks that agree with a pose; three determine a pose but do not confirm it.
+    min_inliers: int = 4
     iterations: int = 200  # Iterations of RANSAC.
 
     def __post_init__(self) -> None:
@@ -63,7 +67,7 @@ class DetectionPoints:
 
     @staticmethod
     def none() -> "DetectionPoints":
-        """Return no detections."""
+        """Return an instance without detections."""
         nowhere = np.zeros((0, 3), np.float32)
         return DetectionPoints(np.zeros(0, np.uint8), np.zeros(0, np.float32), nowhere)
 
@@ -221,10 +225,12 @@ def layout_histogram(landmarks: SubgraphLandmarks) -> np.ndarray:
 class LandmarkAgreement:
     """Agreement of the landmarks of two subgraphs after alignment by a relative pose."""
 
-    count: int  # Pairs with matching distributions.
-    contradicted: int  # New landmarks where all old ones nearby have other labels.
+    count: int  # Number of pairs with matching distributions.
+    # Number of new landmarks that have old landmarks nearby, but none with the same label or a
+    # similar distribution.
+    contradicted: int
     divergence: float  # Mean KL divergence over the matching pairs, nats.
-    entropy: float  # Mean entropy over both landmarks of the matching pairs, nats.
+    entropy: float  # Mean entropy of the landmarks in the matching pairs, nats.
 
 
 def possible_pairs(
@@ -240,7 +246,14 @@ def possible_pairs(
 def compare_landmarks(
     old: SubgraphLandmarks, new: SubgraphLandmarks, pairs: np.ndarray, contradicted: int = 0
 ) -> LandmarkAgreement:
-    """Return the agreement of matched landmarks, given as index pairs [M, 2]."""
+    """Return the agreement of matched landmarks.
+
+    Args:
+        old: Landmarks of the old subgraph.
+        new: Landmarks of the new subgraph.
+        pairs: Index pairs (old, new) of the matched landmarks, [M, 2].
+        contradicted: Number of contradicting landmarks, which is stored in the result.
+    """
     if not len(pairs):
         return LandmarkAgreement(0, contradicted, 0.0, 0.0)
     gaps = _divergences(old, new)[pairs[:, 0], pairs[:, 1]]
@@ -274,6 +287,6 @@ def compare_landmarks_at(
 
 
 def _divergences(a: SubgraphLandmarks, b: SubgraphLandmarks) -> np.ndarray:
-    """Return for each pair of landmarks the larger KL divergence of its two directions, [K, L]."""
+    """Return the larger of both KL divergences for each pair of landmarks, [K, L], nats."""
     p, q = a.distributions[:, None], b.distributions[None]
     return np.maximum(divergence(p, q), divergence(q, p))

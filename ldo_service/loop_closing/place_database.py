@@ -1,4 +1,4 @@
-"""Place database: stored subgraphs, and the search for those similar to a new one (coarse step).
+"""Place database: stored subgraphs, and the search for those that resemble a new one (coarse step).
 
 Histograms are compared by TF-IDF. The weight of a word comes from the number of stored subgraphs
 that contain it.
@@ -22,9 +22,9 @@ class Histograms:
 
     similarity of rows a, b = cos(a * idf, b * idf),  idf_w = log(1 + N / n_w)
 
-    n_w of the N rows contain word w (Sivic and Zisserman 2003). Without the 1, words that are in
-    all rows would have no weight, which matters while there are few rows. Sums are computed in a
-    fixed order, on one thread.
+    n_w of the N rows contain word w (Sivic and Zisserman 2003). Without the 1 in idf_w, a word that
+    is in all rows would have no weight, which matters while there are few rows. Sums are computed
+    in a fixed order on one thread, so that equal tables give bitwise equal similarities.
 
     >>> known = Histograms(2)
     >>> known.add(np.array([1.0, 0.0]))
@@ -34,7 +34,7 @@ class Histograms:
     """
 
     def __init__(self, words: int) -> None:
-        """Create an empty table for histograms of a number of words."""
+        """Create an empty table for histograms of `words` words."""
         self._rows = np.zeros((16, words), np.float32)
         self._count = 0
         self._frequency = np.zeros(words, np.int64)
@@ -68,7 +68,7 @@ class Histograms:
     def cosines(self, row: np.ndarray) -> np.ndarray:
         """Return the similarity 0..1 of a histogram [W] with each row, [N] float32.
 
-        It is 0 if one of the two is empty.
+        The similarity is 0 if the histogram or the row is empty.
         """
         weight = self.idf() ** 2
         product = np.einsum("nw,w->n", self.rows, weight * row.astype(np.float32))
@@ -83,15 +83,18 @@ Stages = Literal["two_stage", "semantic", "geometric"]
 
 @dataclass(frozen=True, slots=True)
 class RetrievalConfig:
-    """Parameters of the search; III.C refers to the paper."""
+    """Parameters of the search; III.C is a section of the paper."""
 
-    exclude_frames: int = 100  # Camera frames, not keyframes; nearer subgraphs are no loop (III.C).
+    # Minimum distance of two subgraphs in camera frames, not keyframes; nearer subgraphs are no
+    # loop (III.C).
+    exclude_frames: int = 100
     candidates: int = 5  # K, the maximum number of candidates (III.C).
     min_similarity: float = 0.75  # theta_loop, the minimum cosine of the label histograms (III.C).
-    # Minimum cosine of the visual words at which labels are not required: a detector that misses
-    # two objects of five is below theta_loop. Above 1: always require labels, as in the paper.
+    # Cosine of the visual words from which on similar labels are not required. If a detector misses
+    # two of five objects, the cosine of the labels is below theta_loop. With a value above 1,
+    # similar labels are always required, as in the paper.
     min_appearance: float = 0.35
-    count: int = 1000  # Maximum stored subgraphs; beyond, the path is thinned.
+    count: int = 1000  # Maximum stored subgraphs; if there are more, the path is thinned.
 
     def __post_init__(self) -> None:
         if self.exclude_frames < 0 or self.candidates < 1 or self.count < 3:
@@ -119,7 +122,7 @@ class RetrievalMatch:
 
 
 class PlaceDatabase:
-    """Stored subgraphs in the order of insertion, with tables of their histograms.
+    """Stored subgraphs in the order of insertion, with tables of the histograms of the subgraphs.
 
     If there are more than `count` subgraphs, the one whose neighbors along the camera path are
     nearest is removed. A long run in one building thus thins the path evenly, and each part of the
@@ -127,7 +130,13 @@ class PlaceDatabase:
     """
 
     def __init__(self, words: int, stages: Stages, config: RetrievalConfig) -> None:
-        """Create an empty database for histograms of `words` visual words."""
+        """Create an empty database.
+
+        Args:
+            words: Number of visual words.
+            stages: Descriptors to compare: labels and images, or only one of them.
+            config: Parameters of the search.
+        """
         self._stages, self._config = stages, config
         self.subgraphs: list[Subgraph] = []
         self._names = Histograms(MAX_LABELS)
@@ -158,7 +167,7 @@ class PlaceDatabase:
 
         Args:
             new: Subgraph to search for.
-            is_possible: Subgraphs to consider, [S] bool.
+            is_possible: For each of the S stored subgraphs, whether to consider it, [S] bool.
         """
         if not self.subgraphs:
             return []
@@ -185,10 +194,16 @@ class PlaceDatabase:
     ) -> np.ndarray:
         """Return the scores of all stored subgraphs, [S]; 0 for those that are no candidates.
 
-        A subgraph is a candidate if its labels or its visual words are similar to the new one. The
-        score is a mean of the similarities of labels, layout and visual words. If either of the two
-        subgraphs has no detections, visual words alone select and rank. The setting `stages` may
-        also switch off labels or images.
+        A stored subgraph is a candidate if its labels or its visual words are similar to those of
+        the new subgraph. The score is the mean of two similarities: that of the visual words, and
+        the mean of labels and layout. If either of the two subgraphs has no detections, only the
+        visual words are used. The setting `stages` may also exclude labels or images.
+
+        Args:
+            new: New subgraph.
+            similarity: Cosine of the label histograms of each stored subgraph, [S].
+            layout: Cosine of the layout histograms, [S].
+            appearance: Cosine of the visual-word histograms, [S].
         """
         config = self._config
         has_similar_images = appearance >= config.min_appearance
@@ -205,8 +220,9 @@ class PlaceDatabase:
     def _are_far(self, new: Subgraph) -> np.ndarray:
         """Return which subgraphs are more than `exclude_frames` before the new one, [S] bool.
 
-        Subgraphs more than `exclude_frames` after the new one are included too, because frame
-        numbers start at 0 again after a restart of the camera.
+        Subgraphs with frame numbers more than `exclude_frames` above those of the new one are
+        included too. They are older, because frame numbers start at 0 again after a restart of the
+        camera.
         """
         first = np.array([subgraph.first_frame for subgraph in self.subgraphs])
         last = np.array([subgraph.last_frame for subgraph in self.subgraphs])

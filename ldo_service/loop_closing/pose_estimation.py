@@ -11,7 +11,8 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.se3 import fit_rigid_transform
 
-# Meters; minimum spread of three points about a line, below which the rotation about it is free.
+# Minimum height of a triangle of points over its longest side, meters. Three points that are closer
+# to a line do not determine the rotation about this line.
 SPREAD = 0.1
 
 
@@ -20,8 +21,8 @@ class RansacResult:
     """Result of RANSAC.
 
     Attributes:
-        T_a_b: Estimated transform, [4, 4].
-        inliers: Correspondences that agree with it, [M] bool.
+        T_a_b: Estimated transform from frame b to frame a, [4, 4].
+        inliers: For each correspondence, whether it agrees with the transform, [M] bool.
     """
 
     T_a_b: np.ndarray
@@ -36,21 +37,22 @@ def ransac_rigid(
     iterations: int,
     rng: np.random.Generator,
 ) -> RansacResult | None:
-    """Return the rigid motion that most correspondences agree with, by RANSAC over triples.
+    """Return the rigid transform that most correspondences agree with, by RANSAC over triples.
 
-    The result is fitted again to its inliers.
+    The transform of the best triple is fitted again to its inliers.
 
     Args:
-        p_a: Points, [K, 3], meters.
-        p_b: Points, [L, 3], meters.
-        pairs: Indices (a, b) of possible correspondences, [M, 2]. A point may be in several pairs;
-            only the one with the smallest distance can be an inlier.
+        p_a: Points in frame a, [K, 3], meters.
+        p_b: Points in frame b, [L, 3], meters.
+        pairs: Indices (a, b) of possible correspondences, [M, 2]. A point may be in several pairs,
+            but only in one inlier; pairs with smaller distances take precedence.
         limit_m: Maximum distance of an inlier, meters.
         iterations: Number of triples to try.
         rng: Source of random triples.
 
     Returns:
-        The result, or None if no triple is a triangle of the same shape in both sets.
+        The result, or None if no triple of pairs forms the same triangle in both sets, or if the
+        best such triple has fewer than three inliers.
     """
     best: RansacResult | None = None
     if len(pairs) < 3:
@@ -69,7 +71,11 @@ def ransac_rigid(
 
 
 def _are_congruent(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
-    """Return whether two triangles [3, 3] have equal sides, within 2 limit_m, and some area."""
+    """Return whether two triangles [3, 3] are congruent and determine a transform.
+
+    Their sides must be equal within 2 `limit_m`, and the first triangle must be at least `SPREAD`
+    high.
+    """
     sides_a, sides_b = (np.linalg.norm(p - np.roll(p, 1, axis=0), axis=1) for p in (p_a, p_b))
     if np.abs(sides_a - sides_b).max() > 2 * limit_m:
         return False
@@ -80,7 +86,7 @@ def _are_congruent(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
 def _supported(
     p_a: np.ndarray, p_b: np.ndarray, pairs: np.ndarray, T_a_b: np.ndarray, limit_m: float
 ) -> RansacResult:
-    """Find the inliers of a transform; each point is in at most one inlier pair."""
+    """Return a transform with its inliers; each point is in at most one inlier pair."""
     gaps_m = np.linalg.norm(p_a[pairs[:, 0]] - se3.transform(T_a_b, p_b[pairs[:, 1]]), axis=1)
     inliers = np.zeros(len(pairs), bool)
     used: tuple[set[int], set[int]] = set(), set()
@@ -99,13 +105,14 @@ class DepthConsistencyConfig:
 
     # Distance along the ray beyond which two depths belong to different surfaces.
     gate_m: float = 0.1
-    # Added to gate_m as a fraction of the depth: the noise of structured light at 5 m.
+    # Fraction of the depth that is added to gate_m: the noise of structured light at 5 m.
     gate_share: float = 0.02
     # Minimum fraction of the new surface that the old keyframe also sees.
     min_overlap: float = 0.2
-    max_rmse_m: float = 0.03  # Along the normals.
-    # Maximum fraction of the points in the old view that lie in its free space. Objects that moved
-    # cause some; a wrong pose puts walls into free space.
+    # Maximum root mean square distance of the two surfaces along the normals.
+    max_rmse_m: float = 0.03
+    # Maximum conflict: of the new points in the old view, the fraction that lies in the free space
+    # of the old camera. Moved objects cause some conflict; a wrong pose puts walls into free space.
     max_conflict: float = 0.15
 
     def __post_init__(self) -> None:
@@ -124,7 +131,8 @@ class DepthConsistency:
 
     overlap: float  # Fraction of the new surface's points that the old keyframe also measured.
     rmse_m: float  # Root mean square distance of these points along their normals.
-    conflict: float  # Fraction of the points in the old view that lie in its free space.
+    # Fraction of the new points in the old view that lie in the free space of the old camera.
+    conflict: float
 
 
 def check_depth_consistency(
@@ -147,7 +155,10 @@ def check_depth_consistency(
         T_old_new: Pose of the new keyframe in the old one, [4, 4].
         old_depth_m: Depth of the old keyframe, [H, W], meters; 0 where unknown.
         camera: Intrinsics of the old keyframe.
-        config: Limits.
+        config: Limits, of which `gate_m` and `gate_share` are used.
+
+    Returns:
+        The comparison; all values are 0 if no point projects to a pixel with depth.
     """
     p = se3.transform(T_old_new, points[:3].T.astype(float))
     normals = points[4:7].T.astype(float) @ T_old_new[:3, :3].T

@@ -17,19 +17,18 @@ from .object_points import DetectionPoints, SubgraphLandmarks
 
 @dataclass(frozen=True, slots=True)
 class SubgraphConfig:
-    """Size of subgraphs; III.C refers to the paper."""
+    """Limits of subgraphs; III.C is a section of the paper."""
 
     min_keyframes: int = 3  # Minimum keyframes (III.C).
     max_keyframes: int = 5  # Maximum keyframes (III.C).
-    # Rotation plus parallax from the first to the last keyframe that makes `min_keyframes`
-    # keyframes
-    # enough. Half of the view of a depth camera is new then.
+    # Rotation plus parallax from the first to the last keyframe above which a subgraph is complete
+    # with `min_keyframes` keyframes. Half of the view of a depth camera is then new.
     turned_rad: float = 0.5
     # Rotation plus parallax between two keyframes above which a new subgraph begins. Consecutive
     # keyframes are 0.35 rad apart, unless frames were dropped.
     gap_rad: float = 1.5
-    # Stored keyframes per subgraph, 0.13 MB each at 640x480. More did not find more loops on flat
-    # and kitchen.
+    # Stored keyframes per subgraph, 0.13 MB each at 640x480. A larger number did not find more
+    # loops in the sequences flat and kitchen.
     kept_views: int = 2
 
     def __post_init__(self) -> None:
@@ -54,8 +53,8 @@ class SubgraphKeyframe:
         place: Record of the keyframe.
         frame: Frame number of the camera.
         stamp_ns: Stamp of the keyframe.
-        path_m: Length of the camera path up to this keyframe.
-        has_detections: True if a detector ran.
+        path_m: Length of the camera path up to this keyframe, meters.
+        has_detections: True if a detector ran on the keyframe, even if it found nothing.
         sightings: Detections as points.
         words: Counts of visual words, [W] float32.
     """
@@ -74,7 +73,7 @@ class SubgraphKeyframe:
         return self.place.id
 
     def pack(self) -> dict[str, Any]:
-        """Return arrays and plain values, the same object each time."""
+        """Return the fields as arrays and plain values; repeated calls return the same object."""
         return self._packed
 
     @cached_property
@@ -102,10 +101,10 @@ class Subgraph:
         first_frame: Smallest frame number.
         last_frame: Largest frame number.
         stamp_ns: Stamp of the newest keyframe.
-        path_m: Length of the camera path up to the newest keyframe.
+        path_m: Length of the camera path up to the newest keyframe, meters.
         has_detections: True if a detector ran on one of the keyframes.
         landmarks: Landmarks in the odometry frame of the submap.
-        names: Histogram of labels, [C] float32.
+        names: Histogram of labels, weighted by the detection scores, [C] float32.
         layout: Histogram of pairs of labels and distances, [512] float32.
         words: Histogram of visual words, [W] float32.
     """
@@ -128,7 +127,7 @@ class Subgraph:
         return self.views[0].place.submap
 
     def pack(self) -> dict[str, Any]:
-        """Return arrays and plain values, the same object each time."""
+        """Return the fields as arrays and plain values; repeated calls return the same object."""
         return self._packed
 
     @cached_property
@@ -149,10 +148,15 @@ class Subgraph:
 
 
 def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfig) -> bool:
-    """Return whether a keyframe continues the subgraph of the previous one.
+    """Return whether a keyframe belongs to the same subgraph as the previous keyframe.
 
-    It must be near the previous keyframe and in the same submap. They are far apart if the tracker
-    reused old keyframes between them.
+    This is the case if both keyframes are in the same submap and at most `gap_rad` apart. Two
+    consecutive keyframes are far apart if the tracker used old keyframes between them.
+
+    Args:
+        before: Record of the previous keyframe.
+        place: Record of the new keyframe.
+        config: Limits of subgraphs.
     """
     moved = se3.inverse(before.T_odom_keyframe) @ place.T_odom_keyframe
     is_near = image_motion_rad(moved, before.median_depth_m) <= config.gap_rad
@@ -160,10 +164,10 @@ def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfi
 
 
 def is_complete(views: Sequence[SubgraphKeyframe], config: SubgraphConfig) -> bool:
-    """Return whether keyframes complete a subgraph.
+    """Return whether the keyframes `views` form a complete subgraph.
 
-    It is complete with `max_keyframes` keyframes, or with `min_keyframes` if the camera moved
-    enough (`turned_rad`).
+    A subgraph is complete with `max_keyframes` keyframes, or with `min_keyframes` if the camera
+    moved enough (`turned_rad`).
     """
     if len(views) < config.min_keyframes:
         return False

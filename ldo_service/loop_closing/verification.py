@@ -40,9 +40,10 @@ from .subgraph import Subgraph, SubgraphKeyframe
 
 NOTHING = LandmarkAgreement(0, 0, 0.0, 0.0)
 Evidence = Literal["", "landmarks", "features", "map"]
-# Function of an old and a new keyframe; it returns T_old_new [4, 4], or None if unknown.
+# Function of an old and a new keyframe that returns T_old_new [4, 4], or None if it is unknown.
 KnownPose = Callable[[SubgraphKeyframe, SubgraphKeyframe], np.ndarray | None]
-OPENED = 12  # Keyframes kept ready for alignment, 3 MB each: a query and some candidates.
+# Decompressed keyframes in the cache, 3 MB each: those of a new subgraph and of some candidates.
+OPENED = 12
 FIT_LEVEL = 1  # Pyramid level of 160 pixels width: 19,200 points suffice for the overlap.
 
 
@@ -55,23 +56,29 @@ class VerificationConfig:
     # Minimum feature inliers of the best pair of keyframes. A confirming keyframe of the new
     # subgraph only needs `features.min_inliers`.
     min_inliers: int = 20
-    confirming_landmarks: int = 3  # Matching landmarks that confirm a pose instead of a keyframe.
-    # Maximum rotation plus parallax between a pose and its confirmation.
+    # Minimum number of matching landmarks that confirm a pose from features, if no second keyframe
+    # does.
+    confirming_landmarks: int = 3
+    # Maximum rotation plus parallax between two poses from features that confirm each other.
     confirmation_rad: float = 0.08
     pairs: int = 15  # Maximum pairs of keyframes for feature matching, 3 ms each.
     map_pairs: int = 3  # Maximum pairs of keyframes aligned at their poses in the map, 15 ms each.
     # Minimum overlap of both surfaces if the pose does not come from features.
     blind_overlap: float = 0.35
-    # Maximum difference of two poses from the map: half a centimeter in a room.
+    # Maximum rotation plus parallax between two refined poses from the map that confirm each other;
+    # 0.02 rad is a distance of 4 cm at a depth of 2 m.
     map_confirmation_rad: float = 0.02
-    # Maximum change of a pose from features or the map by the refinement on the images.
+    # Maximum rotation plus parallax by which the refinement on the images may change a pose from
+    # features or from the map.
     refined_rad: float = 0.1
-    # The same for a pose from landmarks; their centers are inaccurate.
+    # The same limit for a pose from landmarks. It is larger because their centers are inaccurate.
     refined_landmarks_rad: float = 0.4
-    # Maximum condition of the information in median depths, as in the tracker.
+    # Maximum condition number of the information matrix, with translations in median depths, as in
+    # the tracker.
     max_condition: float = 1e5
-    max_gain: float = 3.0  # Maximum ratio of brightness, either way.
-    # Maximum contradicting landmarks, unless more landmarks match.
+    max_gain: float = 3.0  # Maximum ratio of the brightness of both images, in either direction.
+    # Maximum number of landmarks that contradict a pose. If more landmarks match, as many may
+    # contradict as match.
     max_contradictions: int = 3
 
     def __post_init__(self) -> None:
@@ -105,10 +112,10 @@ class LoopHypothesis:
         old: Keyframe of the old subgraph.
         new: Keyframe of the new subgraph.
         T_old_new: Pose of the new keyframe in the old one, [4, 4].
-        evidence: Source of the pose; "" if there is none.
-        inliers: Features or landmarks that agree with the pose.
+        evidence: Source of the pose; "" if no pose was found.
+        inliers: Number of features or landmarks that agree with the pose.
         semantics: Agreement of the landmarks at this pose.
-        rejected_reason: Reason of a rejection; "" if there is none.
+        rejected_reason: Reason of the rejection; "" if the hypothesis is not rejected.
     """
 
     old: SubgraphKeyframe
@@ -122,7 +129,15 @@ class LoopHypothesis:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class VerificationResult:
-    """Result of verifying a hypothesis; `closure` is None if it was rejected."""
+    """Result of verifying a hypothesis.
+
+    Attributes:
+        proposal: The hypothesis.
+        overlap: Fraction of the new surface that the old keyframe also sees, 0..1.
+        rmse_m: Root mean square distance of both surfaces along the normals, meters.
+        rejected_reason: Reason of the rejection; "" if the hypothesis is accepted.
+        closure: Loop closure with the refined pose; None if the hypothesis was rejected.
+    """
 
     proposal: LoopHypothesis
     overlap: float = 0.0
@@ -134,8 +149,8 @@ class VerificationResult:
 class Verifier:
     """Verifier of loop candidates.
 
-    Equal subgraphs give bitwise equal results. The verifier caches the keyframes that it
-    decompressed last.
+    Equal subgraphs give bitwise equal results. The verifier caches the keyframes that were
+    decompressed most recently.
     """
 
     def __init__(
@@ -151,9 +166,10 @@ class Verifier:
 
     # --- hypotheses -------------------------------------------------------------------------------
     def hypothesis_from_features(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
-        """Return the pose from feature matches, if another keyframe of `new` gives the same pose.
+        """Return the pose from feature matches that a second keyframe of `new` confirms.
 
-        If none does, `_from_single_keyframe` looks for another confirmation.
+        If no two keyframes of `new` give the same pose, `_from_single_keyframe` tries to confirm
+        the best pose in another way.
         """
         found: list[LoopHypothesis] = []
         for a, b in islice(_likely_pairs(old, new), self._config.pairs):
@@ -172,11 +188,15 @@ class Verifier:
     def _from_single_keyframe(
         self, found: list[LoopHypothesis], old: Subgraph, new: Subgraph
     ) -> LoopHypothesis:
-        """Return the pose with most inliers; it is rejected if nothing confirms it.
+        """Return the pose with the most inliers, rejected if it is not confirmed.
 
-        It is confirmed by at least `confirming_landmarks` matching landmarks, or by another
-        keyframe
-        of `new` whose images pass the verification at this pose.
+        The pose is confirmed by at least `confirming_landmarks` matching landmarks, or by another
+        keyframe of `new` whose images pass the verification at this pose.
+
+        Args:
+            found: Poses from feature matches.
+            old: Old subgraph.
+            new: New subgraph.
         """
         best = max(found, key=lambda proposal: proposal.inliers, default=None)
         if best is None:
@@ -201,7 +221,10 @@ class Verifier:
     def _is_confirmed_by_any(
         self, best: LoopHypothesis, found: list[LoopHypothesis], within_rad: float
     ) -> bool:
-        """Return whether the hypothesis of another new keyframe gives the same pose."""
+        """Return whether the hypothesis of another new keyframe gives the same pose as `best`.
+
+        The poses are the same if they differ by less than `within_rad`, rotation plus parallax.
+        """
         return any(
             image_motion_rad(se3.inverse(best.T_old_new) @ _as_seen_by(best, other), _depth(best))
             < within_rad
@@ -210,9 +233,10 @@ class Verifier:
         )
 
     def hypothesis_from_landmarks(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
-        """Return the relative pose of the subgraphs that most landmarks agree with.
+        """Return the relative pose of the two subgraphs that most landmarks agree with.
 
-        It is expressed as the pose between the two keyframes that it brings nearest to each other.
+        It is returned as the pose between two keyframes: those that are nearest to each other at
+        this relative pose.
         """
         config = self._config.landmarks
         pairs = possible_pairs(old.landmarks, new.landmarks, config)
@@ -231,11 +255,16 @@ class Verifier:
     def hypothesis_from_map(
         self, old: Subgraph, new: Subgraph, T_old_new: KnownPose
     ) -> LoopHypothesis:
-        """Return a pose refined from the map, if two new keyframes give the same result.
+        """Return the pose in the map, refined on the images, if two new keyframes confirm it.
 
-        Images of a place from different viewpoints have few features in common. The pose in the map
-        is therefore the initial guess, and the images refine it. After a large drift, this finds no
-        loop. It adds closures between nearby keyframes before they drift apart.
+        Images of a place from different viewpoints have few features in common. Therefore the pose
+        in the map is the initial guess of the refinement. This finds loop closures between nearby
+        keyframes before they drift apart, but finds none after a large drift.
+
+        Args:
+            old: Old subgraph.
+            new: New subgraph.
+            T_old_new: Function that returns the relative pose of two keyframes in the map.
         """
         found: list[LoopHypothesis] = []
         for a, b, T in islice(_nearest_pairs(old, new, T_old_new), self._config.map_pairs):
@@ -251,7 +280,7 @@ class Verifier:
     def _check_overlap(self, proposal: LoopHypothesis) -> VerificationResult | None:
         """Verify a hypothesis if the overlap of the surfaces is large enough in both directions.
 
-        Return None, without an alignment, if it is not.
+        If the overlap is too small, return None without an alignment.
         """
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         T_old_new, least = proposal.T_old_new, self._config.blind_overlap
@@ -271,7 +300,7 @@ class Verifier:
 
     # --- verification -----------------------------------------------------------------------------
     def verify(self, proposal: LoopHypothesis) -> VerificationResult:
-        """Refine a pose on the images, and check the surfaces and landmarks at the result."""
+        """Refine a pose on the images, and check surfaces and landmarks at the refined pose."""
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         alignment = align(old.reference, new.view, se3.inverse(proposal.T_old_new), self._align)
         fit = self._fit(old, new, alignment.T_reference_camera)
@@ -315,7 +344,8 @@ class Verifier:
             proposal: The hypothesis with the pose before refinement.
             alignment: Result of the refinement on the images.
             fit: Comparison of the new surface with the old depth at the refined pose.
-            shared: Overlap of the surfaces, the smaller one of both directions.
+            shared: Smaller one of two overlaps, 0..1: of the new surface in the old view, and of
+                the old surface in the new view.
         """
         config, by_landmarks = self._config, proposal.evidence == "landmarks"
         moved = se3.inverse(proposal.T_old_new) @ alignment.T_reference_camera
@@ -342,7 +372,10 @@ class Verifier:
 def _likely_pairs(
     old: Subgraph, new: Subgraph
 ) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe]]:
-    """Iterate over all pairs of an old and a new keyframe, most common visual words first."""
+    """Iterate over all pairs of an old and a new keyframe.
+
+    The pairs with the most visual words in common come first.
+    """
     pairs = list(product(old.views, new.views))
     shared = [float(np.minimum(a.words, b.words).sum()) for a, b in pairs]
     return (pairs[index] for index in np.argsort(-np.array(shared), kind="stable"))
@@ -351,9 +384,9 @@ def _likely_pairs(
 def _nearest_pairs(
     old: Subgraph, new: Subgraph, T_old_new: KnownPose
 ) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe, np.ndarray]]:
-    """Yield each new keyframe with its nearest old keyframe and T_old_new [4, 4].
+    """Yield each new keyframe with its nearest old one, as (old, new, T_old_new [4, 4]).
 
-    The nearest pairs come first. Keyframes without a known relative pose are skipped.
+    The nearest pairs come first. Pairs without a known relative pose are skipped.
     """
     nearest = []
     for b in new.views:
@@ -369,19 +402,22 @@ def _nearest_pairs(
 def _between(
     old: SubgraphKeyframe, new: SubgraphKeyframe, T_oldodom_newodom: np.ndarray
 ) -> np.ndarray:
-    """Return T_old_new [4, 4] of two keyframes, given the pose between their odometry frames."""
+    """Return T_old_new [4, 4] of two keyframes from the transform between their odometry frames."""
     T_odom_old, T_odom_new = old.place.T_odom_keyframe, new.place.T_odom_keyframe
     return se3.orthonormalize(se3.inverse(T_odom_old) @ T_oldodom_newodom @ T_odom_new)
 
 
 def _odometry_frames(proposal: LoopHypothesis) -> np.ndarray:
-    """Return the pose between the odometry frames of both subgraphs that a hypothesis implies."""
+    """Return T_oldodom_newodom [4, 4], the transform that a hypothesis implies.
+
+    It maps the odometry frame of the new subgraph to that of the old subgraph.
+    """
     T_odom_old = proposal.old.place.T_odom_keyframe
     return T_odom_old @ proposal.T_old_new @ se3.inverse(proposal.new.place.T_odom_keyframe)
 
 
 def _as_seen_by(best: LoopHypothesis, other: LoopHypothesis) -> np.ndarray:
-    """Return T_old_new [4, 4] between the keyframes of `best`, according to another hypothesis."""
+    """Return T_old_new [4, 4] of the two keyframes of `best`, as the hypothesis `other` implies."""
     return _between(best.old, best.new, _odometry_frames(other))
 
 
