@@ -5,14 +5,15 @@ from typing import NamedTuple
 
 from ldo_service.schemas import LabelRequest, decode, encode
 
-# Maximum waiting requests, some 10 kB each: three for each of 32 regions, as the map has pending.
+# Maximum number of waiting requests, some 10 kB each. It equals the maximum number of requests that
+# the map keeps pending, three for each of 32 regions.
 MAX_WAITING = 96
-# Regions of which the shown surface is remembered, 16 bytes each.
+# Maximum number of regions whose shown surface is stored, 16 bytes each.
 MAX_REGIONS = 4096
 
 
 class WaitingRequest(NamedTuple):
-    """Label request and the surface that its view shows, square meters."""
+    """Label request, and the area of its region's surface that the view shows, square meters."""
 
     request: LabelRequest
     surface_m2: float
@@ -21,24 +22,29 @@ class WaitingRequest(NamedTuple):
 class LabelRequestQueue:
     """Queue of label requests, at most one for each region.
 
-    A labeller that is faster than the map gets every request in order. A slower one gets the
-    request whose view shows the most surface of its region that no earlier request showed. The
-    rate of requests therefore follows the speed of the labeller, and large objects get their label
-    first.
+    A labeller that has room for all waiting requests gets them in order. A slower labeller gets the
+    requests with the most new surface: the area that the view shows, minus the largest area that an
+    earlier request of the region showed. The rate of requests therefore follows the speed of the
+    labeller, and large objects get their label first.
     """
 
     def __init__(self) -> None:
         self._waiting: dict[int, WaitingRequest] = {}  # By region, the oldest first.
-        self._shown_m2: dict[int, float] = {}  # Largest surface that a sent request showed.
+        # Largest surface that a sent request showed, by region, square meters.
+        self._shown_m2: dict[int, float] = {}
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def add(self, request: LabelRequest, surface_m2: float) -> list[LabelRequest]:
-        """Add a request, and return the requests that it displaces.
+        """Add a request, and return the requests that it displaces from the queue.
 
-        It replaces an earlier request of the region. If the queue is full, the request with the
-        least new surface is displaced.
+        The new request replaces an earlier one of its region. If the queue is full, the request
+        with the least new surface is displaced.
+
+        Args:
+            request: Label request of a region.
+            surface_m2: Area of the region's surface that the view of the request shows.
         """
         replaced = self._waiting.pop(request.region, None)
         self._waiting[request.region] = WaitingRequest(request, surface_m2)
@@ -53,7 +59,7 @@ class LabelRequestQueue:
         if room >= len(self._waiting):
             chosen = list(self._waiting.values())
         else:
-            # The sort is stable: of equal ones, the oldest comes first.
+            # The sort is stable: of requests with equal new surface, the oldest comes first.
             best = sorted(self._waiting.values(), key=lambda one: -self._new_m2(one))
             chosen = best[: max(0, room)]
         for one in chosen:

@@ -35,7 +35,8 @@ NO_GAUSSIANS = gaussians_message(NOTHING)
 def piece_of(message: Gaussians) -> GaussianBatch:
     """Convert a message to a batch.
 
-    The arrays are read-only views of the message. If its `labels` is empty, a new array is made.
+    The arrays are read-only views of the message. If `labels` of the message is empty, the batch
+    has a new array of labels without an observed class.
     """
     ids, labels = message.ids.numpy(), message.labels.numpy()
     labels = labels if len(labels) else new_labels(len(ids))
@@ -43,7 +44,7 @@ def piece_of(message: Gaussians) -> GaussianBatch:
 
 
 def rechunk(pieces: Iterable[GaussianBatch], parts: int, size: int) -> Iterator[Gaussians]:
-    """Regroup batches into exactly `parts` messages of at most `size` Gaussians.
+    """Regroup the batches `pieces` into exactly `parts` messages of at most `size` Gaussians.
 
     All messages have `size` Gaussians except for the last ones, which may be smaller or empty.
     """

@@ -15,11 +15,12 @@ class ObjectMatch:
 
     id: int
     name: str
-    score: float  # 0..1, see `semantics.text_search`.
+    score: float  # Similarity of name and query, 0..1, see `semantics.text_search`.
     center: tuple[float, float, float]  # Center of the object's box.
     size: tuple[float, float, float]  # Size along the axes of the box.
-    T_map_object: Pose  # Axes of the box.
-    distance: float | None  # Distance to the camera or, after the run, to its last pose.
+    T_map_object: Pose  # Center and axes of the box.
+    # Distance to the camera or, after the run, to its last pose; None if no pose is known.
+    distance: float | None
 
 
 def find_objects(
@@ -31,9 +32,9 @@ def find_objects(
     synonym, `encode` is used to find names of similar meaning.
 
     Args:
-        text: The text.
+        text: Text query.
         found: The objects of the map.
-        eye: Camera position in the map frame, [3], or None if unknown.
+        eye: Camera position in the map frame, [3], meters; None if unknown.
         encode: Text encoder; None compares names and synonyms only.
 
     Raises:
@@ -61,5 +62,5 @@ def find_objects(
 
 def _nothing(text: str, names: list[str]) -> str:
     if not names:
-        return "the map has no objects yet: a detector has to find one in three keyframes."
-    return f"none of {len(names)} objects answers to {text!r}. {suggest_names(text, names)}"
+        return "the map has no objects yet: a detector must detect an object in three keyframes."
+    return f"none of {len(names)} objects matches {text!r}. {suggest_names(text, names)}"

@@ -1,6 +1,6 @@
 """Publication of the map and its objects, in messages of bounded size.
 
-Receivers build a copy of the map by the module `replica`.
+Receivers build a copy of the map with the module `replica`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,8 +28,8 @@ from ldo_service.semantics.objects import Objects
 
 from .messages import NO_GAUSSIANS, NO_IDS, gaussians_message, rechunk, split_changes
 
-# Added to the version of a checkpoint. A restored mapper must not reuse a version that replicas may
-# hold, and a mapper publishes fewer versions between two checkpoints.
+# Number that a restored mapper adds to the version in its checkpoint. It must not reuse a version
+# that replicas may have, and publishes fewer versions than this number between two checkpoints.
 VERSIONS_IN_A_CHECKPOINT = 1 << 20
 
 
@@ -37,16 +37,18 @@ VERSIONS_IN_A_CHECKPOINT = 1 << 20
 class PublishConfig:
     """Settings of the size and the rate of map messages."""
 
-    # A message of so many Gaussians has 1.2 MB, 1.8 MB with labels: it blocks no other one long.
+    # 16,384 Gaussians have 1.2 MB, or 1.8 MB with labels. A larger message would delay other
+    # messages longer.
     max_gaussians_per_message: int = 16_384
-    # Keyframes between deltas of changed Gaussians; all Gaussians in view change at every keyframe.
+    # Number of keyframes between two deltas of changed Gaussians. All Gaussians in view change at
+    # every keyframe.
     update_interval_keyframes: int = 5
     snapshot_interval_keyframes: int = 10  # Minimum number of keyframes between two snapshots.
-    # A snapshot is published when the map has grown by this fraction since the previous one. All
-    # snapshots together then cost at most a few times as much as the deltas.
+    # A snapshot is published when the map has grown by this fraction since the previous snapshot.
+    # All snapshots together then have at most a few times the size of all deltas.
     min_snapshot_growth: float = 0.25
-    # A snapshot is published after so many keyframes whatever the growth: a subscriber that missed
-    # a delta waits for it.
+    # A snapshot is published after this number of keyframes even without growth, because a
+    # subscriber that missed a delta waits for the next snapshot.
     max_snapshot_interval_keyframes: int = 200
 
     def __post_init__(self) -> None:
@@ -89,7 +91,7 @@ class MapPublisher:
         self._names_published = 0
         # The first keyframe publishes a snapshot.
         self._since_snapshot = self.config.snapshot_interval_keyframes
-        self._since_changed = 0
+        self._since_changed = 0  # Keyframes since the last delta with changed Gaussians.
         self._in_snapshot = 0  # Number of Gaussians in the last snapshot.
 
     def on_keyframe(self, now: MessageContext) -> Iterator[MapDelta]:
@@ -103,8 +105,9 @@ class MapPublisher:
 
         Args:
             now: Context of the messages.
-            with_changed: Include changes of published Gaussians. Excess Gaussians are offloaded
-                afterwards (`MapBuilder.offload_excess`).
+            with_changed: True: include changes of published Gaussians, then offload excess
+                Gaussians (`MapBuilder.offload_excess`). False: include only new and removed
+                Gaussians.
         """
         changes = self._map.changes(with_changed=with_changed)
         for part in split_changes(changes, self.config.max_gaussians_per_message):
@@ -127,8 +130,8 @@ class MapPublisher:
         Args:
             keyframe: Message of a keyframe of the map.
             now: Context of the message.
-            contributions: Compute the contributions too, because `MapBuilder.visible_contributions`
-                will need them.
+            contributions: True to also compute the contributions, which
+                `MapBuilder.visible_contributions` needs afterwards.
         """
         views, k = self._map.views, keyframe.keyframe
         rendering = self._map.render_keyframe(k, contributions=contributions)
@@ -178,8 +181,9 @@ class MapPublisher:
     def snapshot_if_due(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
         """Yield a snapshot if enough keyframes have passed since the last one.
 
-        Call it once per keyframe. A snapshot is due after `snapshot_keyframes` keyframes if the map
-        has grown by the fraction `snapshot_growth`, else after `snapshot_keyframes_max`.
+        Call this once per keyframe. A snapshot is due after `snapshot_interval_keyframes` keyframes
+        if the map has grown by the fraction `min_snapshot_growth`, else after
+        `max_snapshot_interval_keyframes`.
         """
         self._since_snapshot += 1
         config, growth = self.config, self._map.size() - self._in_snapshot
@@ -193,7 +197,7 @@ class MapPublisher:
     def publish_snapshot(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
         """Yield the deltas with all unpublished changes, then a snapshot of the whole map.
 
-        Replicas that applied the deltas then equal new replicas that start from the snapshot.
+        After the deltas, an existing replica equals a new replica that starts from the snapshot.
         """
         yield from self.deltas(now, with_changed=True)
         self._since_snapshot, self._in_snapshot = 0, self._map.size()
@@ -241,7 +245,8 @@ class ObjectPublisher:
     """
 
     def __init__(self) -> None:
-        self._made: dict[int, tuple[bytes, MapObject]] = {}  # Landmark and message by id.
+        # Landmark row as bytes, and the message made from it, by object id.
+        self._made: dict[int, tuple[bytes, MapObject]] = {}
 
     def message(
         self,
@@ -255,7 +260,7 @@ class ObjectPublisher:
 
         Args:
             objects: The objects.
-            names: Names of the vocabulary, which may grow between calls.
+            names: Names of the vocabulary, by label index; the vocabulary may grow between calls.
             version: Version of the map.
             graph_version: Version of the pose graph.
             stamp_ns: Stamp of the newest keyframe.

@@ -20,8 +20,8 @@ class RelativeMeasurements:
     """Table of the relative-pose measurements that tracking made, by pair of keyframes.
 
     All measurements of the newest `recent` keyframes are stored. For an older keyframe, only the
-    measurement relative to its reference keyframe is stored, in 100 bytes. The pose-graph optimizer
-    has dropped the other measurements by then, since it has condensed the keyframe.
+    measurement relative to its reference keyframe is stored, in 100 bytes. By then, the pose-graph
+    optimizer has condensed the older keyframe and dropped its other measurements.
     """
 
     def __init__(self, poses: KeyframePoses, recent: int) -> None:
@@ -30,7 +30,7 @@ class RelativeMeasurements:
         self._recent: dict[int, dict[int, Matrix6]] = {}
         self._older = RecordTable(LINK)
         self._refinements = 0  # Number of published refinements.
-        # Last refinement by keyframe that no pose correction includes yet.
+        # Number of each keyframe's last refinement, unless a pose correction already includes it.
         self._unacknowledged: dict[int, int] = {}
 
     def add(self, message: Keyframe) -> None:
@@ -49,10 +49,10 @@ class RelativeMeasurements:
     def refined(self, moved: Mapping[int, np.ndarray], stamp_ns: int) -> KeyframeRefinement | None:
         """Recompute the measurements of keyframes that the Gaussian optimizer moved.
 
-        These are all measurements in which at least one of the two keyframes moved.
+        A measurement is recomputed if at least one of its two keyframes moved.
 
         Args:
-            moved: New poses T_map_keyframe, by keyframe.
+            moved: New poses T_map_keyframe [4, 4], by keyframe.
             stamp_ns: Stamp of the message.
 
         Returns:
@@ -89,7 +89,8 @@ class RelativeMeasurements:
     def _measured(self, keyframe: int, reference: int, information: Matrix6) -> MeasuredPose:
         """Return the relative pose of two keyframes at their current poses, as a measurement.
 
-        It keeps the information matrix of the tracker, since the image loss yields none.
+        The information matrix remains that of the tracker, since the optimization of the Gaussians
+        gives no information matrix.
         """
         T_reference_keyframe = se3.inverse(self._poses[reference]) @ self._poses[keyframe]
         return MeasuredPose(
@@ -100,7 +101,9 @@ class RelativeMeasurements:
         )
 
     def acknowledged(self, refinements: int) -> KeysView[int]:
-        """Return the keyframes with refined poses that a pose correction does not include yet.
+        """Note the refinements that a pose correction includes, and return the other keyframes.
+
+        Returns the keyframes whose refined poses the correction does not include yet.
 
         Args:
             refinements: Number of the last refinement message that the correction includes.

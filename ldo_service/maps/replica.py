@@ -10,7 +10,8 @@ from ldo_service.schemas import MapDelta, MapSnapshot
 from .messages import piece_of
 
 NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)  # Gains and biases of a camera, [2, 3].
-SLACK = 1.25  # Size relative to the limit at which a bounded replica is cut to the limit.
+# A bounded replica is reduced to its limit when its size exceeds the limit by this factor.
+SLACK = 1.25
 
 
 class MapReplica:
@@ -20,9 +21,9 @@ class MapReplica:
     delta, it sets `is_behind` and does not change until it has received a complete snapshot.
 
     A bounded replica has at most `max_gaussians`, plus up to a quarter more for a short time. It
-    keeps the Gaussians with the largest weight. After a missed delta it applies further deltas, so
-    it may have errors until the next snapshot. It applies each part of a snapshot on arrival: the
-    Gaussians of the part replace all Gaussians in the same range of ids.
+    keeps the Gaussians with the largest weight. After a missed delta, it sets `is_behind` and still
+    applies further deltas, so it may have errors until the next snapshot. It applies each part of a
+    snapshot on arrival: the Gaussians of the part replace all Gaussians in the same range of ids.
 
     Args:
         max_gaussians: Limit of a bounded replica; None for an exact one.
@@ -40,11 +41,13 @@ class MapReplica:
         self.label_names: tuple[str, ...] = ()  # Names of the labels, by index.
         self._exposures: dict[int, np.ndarray] = {}
         self._next_id = 0  # Greater than all ids received so far.
-        self._was_cut = False  # Removed Gaussians may have a larger weight by now.
+        # Gaussians were removed because of the limit. Their weight may have grown since, so that a
+        # snapshot of the same version must be applied too.
+        self._was_cut = False
         # Parts of the incomplete snapshot of an exact replica.
         self._parts: dict[int, MapSnapshot] = {}
         self._last_ids: dict[int, int] = {}  # Last id of each part that a bounded replica applied.
-        self._applied_version = 0  # Version of these parts.
+        self._applied_version = 0  # Version of the parts in `_last_ids`.
 
     def exposure(self, keyframe: int) -> np.ndarray:
         """Return the gains and biases [2, 3] of a keyframe's image, from the last snapshot.
@@ -99,7 +102,7 @@ class MapReplica:
         self.map.touch(where.astype(np.uint32))
 
     def _add(self, added: GaussianBatch) -> None:
-        """Append new Gaussians; those that a snapshot has added before are skipped."""
+        """Append the Gaussians with new ids; skip those that an earlier message contained."""
         new = added.at(added.ids >= self._next_id)
         self.map.append(*new)
         self._next_id = max(self._next_id, int(new.ids[-1]) + 1 if len(new.ids) else 0)
@@ -111,7 +114,7 @@ class MapReplica:
 
     # --- snapshots --------------------------------------------------------------------------------
     def _collect_part(self, part: MapSnapshot) -> bool:
-        """Store a part of a snapshot; once all parts are there, replace the map by the snapshot."""
+        """Store a part of a snapshot; when it was the last missing part, replace the map."""
         self._note_exposures(part)
         if part.version < self.version or (part.version == self.version and not self.is_behind):
             return False
@@ -129,7 +132,7 @@ class MapReplica:
         return True
 
     def _apply_part(self, part: MapSnapshot) -> bool:
-        """Replace the Gaussians in the id range of a part."""
+        """Replace all Gaussians in the id range of a snapshot part by those of the part."""
         self._note_exposures(part)
         is_news = self.is_behind or self._was_cut or part.version > self.version
         if part.version < self.version or not is_news:

@@ -19,7 +19,8 @@ from ldo_service.storage.atomic_write import UNFINISHED
 
 from .mcap_file import FILES_SUFFIX, RecordConfig, recording_bytes
 
-# A recording may come from another machine: its paths must not lead out of a folder.
+# Form of a path in a recording. A recording may come from another machine, so its paths must not
+# lead out of the actor's folder.
 PATH = re.compile(r"\w+/\d+\.\w+")
 CHECKSUM = re.compile(r"[0-9a-f]{8}")
 
@@ -30,7 +31,7 @@ class ActorFiles:
 
     Attributes:
         folder: Folder of the actor; it need not exist.
-        patterns: Glob patterns `<folder>/<pattern>` of the files below it.
+        patterns: Glob patterns of the files, relative to `folder`, such as `images/*.keyframe`.
     """
 
     folder: Path
@@ -49,7 +50,7 @@ class FileArchive:
     """Recorded files of one actor, in the folder `<actor>.files` of a recording."""
 
     def __init__(self, journal: Path) -> None:
-        """Name the folder, which `add` creates.
+        """Determine the folder of the files; `add` creates it.
 
         Args:
             journal: MCAP file of a process of the actor, in the folder of the recording.
@@ -60,11 +61,11 @@ class FileArchive:
     def add(self, files: ActorFiles, config: RecordConfig) -> dict[str, str]:
         """Add the current files of an actor.
 
-        They become hard links, or copies if the recording is on another disk. A link is safe,
-        because the actor replaces its files and never changes them.
+        The files become hard links, or copies if the recording is on another disk. A link is safe,
+        because the actor replaces its files and never changes their content.
 
         Args:
-            files: Files of the actor, which nothing else may change meanwhile.
+            files: Files of the actor, which must not change during the call.
             config: Limits of the recording.
 
         Returns:
@@ -136,9 +137,10 @@ class FileArchive:
         return self.folder / f"{name.replace('/', '.')}.{checksum}"
 
     def _known(self) -> dict[tuple[str, int, int], str]:
-        """Return the checksum of each recorded file by name, size and time of its last change.
+        """Return the checksum of each recorded file, by its name, size and modification time.
 
-        A link and a copy keep this time, so an unchanged file is not read again at the next start.
+        Links and copies keep the modification time, so an unchanged file is not read again at the
+        next start.
         """
         known: dict[tuple[str, int, int], str] = {}
         if self.folder.exists():

@@ -1,9 +1,9 @@
 """MCAP files of a recording: written message by message, and indexed for reading.
 
-Records are not chunked, because chunks make writing cost five times as much. A killed process or a
-full disk may cut off a file. It is then readable up to its last whole record. `McapIndex` accepts
-such a file, unlike the readers of the library `mcap`. The index needs no summary, and reads bodies
-from the disk only on request.
+Records are not chunked, because writing chunks costs five times as much. If a killed process or a
+full disk cuts off a file, the file is readable up to its last whole record. `McapIndex` accepts
+such a file, unlike the readers of the library `mcap`. The index does not need the summary at the
+end of the file, and reads message bodies from the disk only on request.
 Format: https://mcap.dev/spec
 """
 
@@ -36,19 +36,21 @@ log = logging.getLogger(__name__)
 RECORD = struct.Struct("<BQ")  # Opcode, length of the content.
 MESSAGE = struct.Struct("<HIQQ")  # Channel, sequence, log time, publish time; the body follows.
 
-# Maximum size of a chunk. This service writes no chunks; other tools use 1 or 4 MB.
+# Maximum size of a chunk that is read. This service writes no chunks; other tools write chunks of 1
+# or 4 MB.
 MAX_CHUNK_BYTES = 1 << 28
 UNREADABLE = (
     *(OSError, struct.error, McapError, ZstdError, ValueError, LookupError),
-    *(MemoryError, OverflowError),  # A damaged length is too large.
+    *(MemoryError, OverflowError),  # Raised if a length in a damaged file is too large.
 )
 
 FILES_SUFFIX = ".files"  # Suffix of the folder with the files of an actor.
 ABOUT = "ldo/recording"  # Name of the metadata record.
-# Version of the messages, states and journal entries in a recording, a field of its metadata. A
-# change after which an older recording no longer replays increments it. Version 1 had no number.
+# Version of the messages, states and journal entries in a recording. It is a field of the metadata;
+# recordings of version 1 lack the field. Increment the version with every change after which older
+# recordings can no longer be replayed.
 RECORDING_VERSION = 3
-# Bytes between two checks of the limits: 10 ms of a fast disk.
+# Bytes written between two checks of the limits; a fast disk writes them in 10 ms.
 CHECK_EVERY_BYTES = 64_000_000
 
 
@@ -57,11 +59,11 @@ class MessageLocation:
     """Location of a message body: bytes [start, start + size) of the file or of a chunk in it."""
 
     topic: str
-    number: int
+    number: int  # Sequence number in the MCAP file.
     stamp_ns: int
     start: int
     size: int
-    chunk: int | None  # Offset of the chunk in the file; None: not in a chunk.
+    chunk: int | None  # Offset of the chunk in the file; None if the message is not in a chunk.
 
 
 @dataclass
@@ -72,7 +74,7 @@ class McapIndex:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     # Sorted by position in the file.
     locations: list[MessageLocation] = field(default_factory=list)
-    is_whole: bool = False  # The file was closed; it was not cut off.
+    is_whole: bool = False  # True if the file was closed and not cut off.
 
     def __post_init__(self) -> None:
         """Read the index.
@@ -92,7 +94,7 @@ class McapIndex:
             ) from error
 
     def body(self, place: MessageLocation) -> bytes:
-        """Read the body of a message."""
+        """Read the encoded body of a message."""
         with self.path.open("rb") as file:
             if place.chunk is None:
                 file.seek(place.start)
@@ -134,10 +136,10 @@ class McapIndex:
 
 
 def require_version(index: McapIndex) -> None:
-    """Check that a recording has the version that this service replays.
+    """Check that a recording has the version that this service replays, `RECORDING_VERSION`.
 
     Raises:
-        DataError: Another version of the service wrote the recording.
+        DataError: The recording has another version.
     """
     version = index.metadata.get(ABOUT, {}).get("version", "1")
     if version != str(RECORDING_VERSION):
@@ -149,9 +151,9 @@ def require_version(index: McapIndex) -> None:
 
 
 def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, content offset and content length of each whole record.
+    """Yield opcode, content offset and content length of each whole record in a stream.
 
-    The stream is at the content of the yielded record.
+    At each yield, the position of the stream is the start of the record's content.
     """
     while size - stream.tell() >= RECORD.size:
         opcode, length = RECORD.unpack(stream.read(RECORD.size))
@@ -176,9 +178,10 @@ def _read_chunk(file: BinaryIO) -> bytes:
 class RecordConfig:
     """Limits of a recording. A camera with 640x480 at 30 Hz needs 100 MB/s."""
 
-    max_gb: float = 50.0  # Maximum size of the folder; recording stops there.
-    min_free_gb: float = 1.0  # Disk space left for other files, such as the actors' states.
-    # Queue of each actor in memory: 2 s of frames while the disk is busy.
+    max_gb: float = 50.0  # Size of the recording's folder at which recording stops.
+    # Free disk space below which recording stops, for other files such as the actors' states.
+    min_free_gb: float = 1.0
+    # Maximum size of each actor's queue in memory. It holds 2 s of frames while the disk is busy.
     queue_mb: float = 256.0
 
     def __post_init__(self) -> None:
@@ -194,13 +197,13 @@ def recording_bytes(folder: Path) -> int:
     total = 0
     for name in (path for path in folder.iterdir() if path.suffix in (".mcap", FILES_SUFFIX)):
         for file in os.scandir(name) if name.is_dir() else (name,):
-            with suppress(FileNotFoundError):  # A copy got its final name.
+            with suppress(FileNotFoundError):  # A file was renamed to its final name meanwhile.
                 total += file.stat().st_size
     return total
 
 
 class RecordingFile:
-    """New MCAP file, written by one thread.
+    """New MCAP file, which only one thread may write.
 
     After an error or a limit, the file is closed and further messages are ignored.
     """
@@ -224,7 +227,7 @@ class RecordingFile:
         self._file.flush()
         self._channels: dict[str, int] = {}
         self._log_ns = 0  # Log time of the last record.
-        self._unchecked = 0
+        self._unchecked = 0  # Bytes written since the last check of the limits.
         self.is_open = True
 
     def add_entry(self, entry: Entry) -> None:
@@ -235,12 +238,20 @@ class RecordingFile:
     def add(
         self, topic: str, kind: type, body: bytes | memoryview, number: int, stamp_ns: int
     ) -> None:
-        """Append an encoded message of type `kind`; its publish time is `stamp_ns`."""
+        """Append an encoded message.
+
+        Args:
+            topic: Topic of the message.
+            kind: Type of the message.
+            body: Encoded message.
+            number: Sequence number of the message in the file.
+            stamp_ns: Stamp of the message, which becomes the MCAP publish time.
+        """
         if not self.is_open:
             return
-        data = cast(bytes, body)  # A view is written without a copy.
+        data = cast(bytes, body)  # A memoryview is written without a copy.
         try:
-            self._log_ns = max(time.time_ns(), self._log_ns + 1)  # Tools sort by it.
+            self._log_ns = max(time.time_ns(), self._log_ns + 1)  # Tools sort by log time.
             self._writer.add_message(
                 self._channel(topic, kind), self._log_ns, data, stamp_ns, number
             )
@@ -272,7 +283,7 @@ class RecordingFile:
     def close(self) -> None:
         """Write the summary and close the file.
 
-        With the summary, tools open the file without reading all of it.
+        The summary lets other tools open the file without reading all of it.
         """
         if not self.is_open:
             return
@@ -292,5 +303,5 @@ class RecordingFile:
     def abandon(self) -> None:
         """Close the file without a summary and ignore further messages."""
         self.is_open = False
-        with suppress(OSError):  # A failed flush.
+        with suppress(OSError):  # Closing flushes the file, which may fail.
             self._file.close()

@@ -1,4 +1,4 @@
-"""Journal that a thread of its own writes to a file, so that no step waits for the disk."""
+"""Journal of an actor, written by a separate thread so that no step waits for the disk."""
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
@@ -33,12 +33,12 @@ from .mcap_file import RecordConfig, RecordingFile
 
 log = logging.getLogger(__name__)
 
-ENTRY_BYTES = 1000  # Memory of an entry in addition to its body.
+ENTRY_BYTES = 1000  # Estimated memory of a queued entry in addition to its body.
 
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """Recorded input of the next step, and of its repetition if the step fails."""
+    """Recorded input of the next step; a failed step is repeated with the same input."""
 
     number: int
     stamp_ns: int
@@ -48,8 +48,8 @@ class Taken:
 class Recorder(Journal):
     """Journal of one actor that is written to a file.
 
-    The queue to the writing thread is limited to `queue_mb`. While it is full, inputs and their
-    steps are not recorded. The gap is recorded and logged once; the actor is not affected.
+    The queue to the writing thread is limited to `queue_mb`. While the queue is full, inputs and
+    their steps are not recorded. Each such gap is recorded and logged; the actor is not affected.
     """
 
     def __init__(
@@ -83,12 +83,12 @@ class Recorder(Journal):
         self._steps = self._numbers = 0
         self._taken: Taken | None = None  # The last input; None if it was not recorded.
         self._lost = 0  # Messages dropped in the current gap.
-        self._lost_before = 0
+        self._lost_before = 0  # Messages dropped in earlier gaps.
         self._closed: Future[None] | None = None
 
     # --- called by the stage ----------------------------------------------------------------------
     def record_files(self) -> None:
-        """Record the files of the actor, which the next start needs if it restores a state."""
+        """Record the current files of the actor, which a start with a saved state needs."""
         if self._files is None or not self._file.is_open:
             return
         try:
@@ -104,7 +104,10 @@ class Recorder(Journal):
             )
 
     def record_start(self, state: State | None) -> None:
-        """Record the start of an actor with its state."""
+        """Record the start of an actor with its restored state; None for a start without a state.
+
+        If the state or a file cannot be recorded, a gap is recorded instead.
+        """
         try:
             parts = None if state is None else {k: encode_state(v) for k, v in state.items()}
         except (NotImplementedError, TypeError) as error:
@@ -140,7 +143,14 @@ class Recorder(Journal):
         produced: Iterable[Produced] = (),
         error: str = "",
     ) -> None:
-        """Record a finished step, unless its input was dropped."""
+        """Record a finished step, unless its input was dropped.
+
+        Args:
+            kind: What the actor did, and whether it succeeded.
+            situation: Credits and backlog that the actor had during the step.
+            produced: Outputs of the step.
+            error: Error of a failed step; "" if it succeeded.
+        """
         takes_none = kind in WITHOUT_INPUT
         taken = None if takes_none else self._taken
         if taken is None and (not takes_none or self._lost):
@@ -158,7 +168,7 @@ class Recorder(Journal):
         self._submit(sum(len(out.body) for out in made), self._write_step, step, taken, made)
 
     def close(self) -> "Future[None]":
-        """Stop recording; the future is done when the file is closed."""
+        """Stop recording, and return a future that is done when the file is closed."""
         if self._closed is None:
             self._mark_gap()
             self._closed = self._writer.submit(self._file.close)

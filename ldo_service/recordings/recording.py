@@ -34,14 +34,14 @@ class JournalFile:
 
     @property
     def about(self) -> Mapping[str, str]:
-        """Metadata: actor, robot, configuration, instruction set, versions."""
+        """Metadata by name: actor, robot, configuration, instruction set, versions."""
         return self._index.metadata.get(ABOUT, {})
 
     def require_version(self) -> None:
-        """Check that this service can replay the file.
+        """Check that the file has the recording version that this service can replay.
 
         Raises:
-            DataError: Another version of the service recorded the file.
+            DataError: The file has another recording version.
         """
         require_version(self._index)
 
@@ -71,11 +71,11 @@ class JournalFile:
                 ) from error
 
     def body(self, message: MessageLocation) -> bytes:
-        """Read the body of a message."""
+        """Read the encoded body of a message."""
         return self._index.body(message)
 
     def taken(self, step: StepRecord) -> bytes:
-        """Read the input of a step.
+        """Read the encoded input message of a step.
 
         Raises:
             DataError: The message is missing.

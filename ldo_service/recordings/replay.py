@@ -1,8 +1,8 @@
 """Replay of a recorded actor with the same inputs, flow status and restarts.
 
-The outputs must have the digests of the recording. A step that failed when recorded had no effect
-on the actor's state. The replay therefore accepts that such a step succeeds now, and counts those
-that fail again.
+The outputs must have the digests of the recording. A step that failed when it was recorded had no
+effect on the actor's state. If such a step succeeds in the replay, the replay therefore continues.
+It counts the steps that fail again.
 """
 
 from collections import Counter
@@ -36,20 +36,21 @@ Make = Callable[[Mapping[str, str]], Actor]  # Creates an actor from the metadat
 
 @dataclass
 class ReplayReport:
-    """Result of a replay; the replay ends at the first difference to the recording."""
+    """Result of a replay, which ends at the first difference from the recording."""
 
     actor: str
-    starts: int = 0  # Starts of the actor, new or restored.
-    restored: int = 0  # Starts with a saved state.
-    steps: int = 0
-    failures: int = 0  # Steps that failed when recorded.
-    failures_repeated: int = 0  # Steps that failed again.
-    dead_lettered: int = 0
+    starts: int = 0  # Number of starts of the actor, with or without a saved state.
+    restored: int = 0  # Number of starts with a saved state.
+    steps: int = 0  # Number of replayed steps.
+    failures: int = 0  # Steps that failed when they were recorded.
+    failures_repeated: int = 0  # Steps that failed when recorded and failed again in the replay.
+    dead_lettered: int = 0  # Messages that became dead letters.
     taken: Counter[str] = field(default_factory=Counter)  # Number of inputs by topic.
     made: Counter[str] = field(default_factory=Counter)  # Number of outputs by topic.
     notes: list[str] = field(default_factory=list)  # Sentences for the user.
-    is_complete: bool = True  # The recording has no gap.
-    difference: ReplayDiverged | None = None
+    # False if the recording has a gap, other than its end at the size limit.
+    is_complete: bool = True
+    difference: ReplayDiverged | None = None  # First difference; None if there is none.
 
     def verify(self) -> None:
         """Check that all steps were replayed without a difference.
@@ -79,10 +80,10 @@ def replay(
     Args:
         actor: Name of the actor.
         files: Recorded files of the actor, in the order of its processes.
-        make: Function that creates a new actor.
-        advance: Called after each step.
-        folder: Temporary folder with the files of the actor; None if the actor has no files. The
-            files of a recorded start replace its content.
+        make: Function that creates a new actor from the metadata of a file.
+        advance: Function that is called after each step.
+        folder: Temporary folder for the files of the actor; None if the actor has no files. At each
+            recorded start, the recorded files replace the content of the folder.
 
     Returns:
         The counters and the first difference, if there is one.
@@ -111,8 +112,9 @@ class ReplaySession:
         folder: Path | None = None,
     ) -> None:
         self._file, self._make, self._replayed, self._folder = file, make, replayed, folder
-        self._actor: Actor | None = None  # Steps are skipped while it is None.
-        self._last: StepRecord | None = None
+        # The actor is None until the next recorded start; steps are skipped meanwhile.
+        self._actor: Actor | None = None
+        self._last: StepRecord | None = None  # Last replayed step.
 
     def steps(self) -> Iterator[StepRecord]:
         """Replay the steps one by one and yield the record of each.
@@ -138,7 +140,7 @@ class ReplaySession:
     def _under_way(self) -> str:
         """Describe the last input if its step was not recorded; else return an empty string.
 
-        The step may have killed the process.
+        In that case, the step may have killed the process.
         """
         taken = self._file.messages
         if not taken or (self._last and self._last.taken == taken[-1].number):
@@ -204,7 +206,7 @@ class ReplaySession:
             case "done":
                 message = self._message(actor, step)
                 self._compare(step, self._produce(step, actor, actor.handle(message)))
-                actor.snapshot()  # The stage does so too, and it may change the actor's caches.
+                actor.snapshot()  # The stage takes one too; it may change caches.
                 actor.on_saved()
             case "failed":
                 self._fail(step, actor, actor.handle(self._message(actor, step)))
