@@ -42,9 +42,9 @@ class MeasuredKeyframe:
 class FinalPoses:
     """Final poses T_map_camera of frames, computed from the final poses of keyframes.
 
-    A frame was aligned to keyframe r. Keyframe a is the last one before the frame that was aligned
-    to r as well, or r itself. Keyframe b is the first such keyframe after the frame. Each of the
-    two gives a pose of the camera:
+    A frame was aligned to keyframe r. Keyframe a is the last keyframe before the frame that was
+    also aligned to r, or r itself. Keyframe b is the first keyframe after the frame that was
+    aligned to r. Each of a and b gives a pose of the camera:
 
         T_a = T_map_a T_r_a^-1 T_r_camera,    T_b = T_map_b T_r_b^-1 T_r_camera.
 
@@ -62,7 +62,7 @@ class FinalPoses:
 
         Args:
             measured: The keyframe.
-            reference: Keyframe to which it was aligned; None if there was none.
+            reference: Id of the keyframe to which `measured` was aligned; None if there was none.
         """
         itself = MeasuredKeyframe(measured.stamp_ns, measured.keyframe, np.eye(4))
         self._measured[measured.keyframe] = [itself]
@@ -77,7 +77,8 @@ class FinalPoses:
             T_map: Final pose T_map_keyframe of each keyframe, [4, 4].
 
         Returns:
-            T_map_camera, [N, 4, 4]. A frame without a known reference keeps its published pose.
+            T_map_camera, [N, 4, 4]. A frame without a known reference keyframe keeps the pose that
+            was published during the run.
         """
         before, after, shares = [], [], []
         for frame in frames:
@@ -91,7 +92,11 @@ class FinalPoses:
     def _around(
         self, frame: FramePose
     ) -> tuple[MeasuredKeyframe | None, MeasuredKeyframe | None, float]:
-        """Return the keyframes a and b of a frame, and the time of the frame between them, 0..1."""
+        """Return the keyframes a and b of a frame, and the time of the frame between them, 0..1.
+
+        Both keyframes are None if the reference of the frame is unknown. If there is no b, a is
+        returned twice.
+        """
         measured = self._measured.get(frame.reference, []) if frame.reference is not None else []
         if not measured:
             return None, None, 0.0

@@ -49,7 +49,7 @@ def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
 
 
 def vlm_calls(folder: Path) -> int | None:
-    """Return the number of requests to the labeller; None if summary.json lacks the number."""
+    """Return the number of requests to the labeller; None if summary.json does not contain it."""
     path = folder / "summary.json"
     try:
         found = json.loads(path.read_text())["labeller_requests"] if path.is_file() else None
@@ -103,7 +103,10 @@ class MapFolder:
         return read_ply(self.folder / "map.ply")
 
     def semantics(self) -> SavedSemantics | None:
-        """Return the labels of the Gaussians, row by row; None if the run had no detector."""
+        """Return the labels of the Gaussians, in the order of `gaussians`.
+
+        Return None if the run had no detector.
+        """
         return self._semantics(len(self.gaussians()))
 
     def _semantics(self, gaussians: int) -> SavedSemantics | None:
@@ -115,11 +118,11 @@ class MapFolder:
         return Trajectory.load(require_file(self.folder, "trajectory.txt"))
 
     def viewpoints(self) -> list[Viewpoint]:
-        """Return the viewpoints of all keyframes in the frame of the map."""
+        """Return the viewpoints of all keyframes that are in the frame of the map."""
         return list(read_viewpoints(self.folder).values())
 
     def exposures(self) -> Exposures:
-        """Return the exposures of the keyframes that have one; older versions wrote none."""
+        """Return the exposures in keyframes.json, which older versions did not write."""
         with _keyframes(self.folder) as (_, keyframes):
             exposed = [keyframe for keyframe in keyframes if "exposure" in keyframe]
             stamps_ns = np.array([int(keyframe["stamp_ns"]) for keyframe in exposed], np.int64)
@@ -132,7 +135,11 @@ class MapFolder:
             return {int(k["keyframe"]): int(k["frame_index"]) for k in keyframes}
 
     def posed(self, name: str) -> PosedMap:
-        """Return the map with its trajectory, exposures and labels, under this name."""
+        """Return the map with its trajectory, exposures and labels.
+
+        Args:
+            name: Name of the map in the evaluation, "online" or "refined".
+        """
         rows = self.gaussians()
         labels = self._semantics(len(rows))
         correction = read_correction(self.folder)
@@ -140,9 +147,9 @@ class MapFolder:
 
 
 def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:
-    """Return the viewpoints of all keyframes in the frame of the map, by id.
+    """Return the viewpoints of all keyframes that are in the frame of the map, by keyframe id.
 
-    The folder needs only keyframes.json.
+    The folder must contain keyframes.json and needs no map.
     """
     with _keyframes(folder) as (path, keyframes):
         mapped = [k for k in keyframes if _submap(k) == 0]
@@ -159,9 +166,10 @@ def _submap(keyframe: dict[str, Any]) -> int:
 
 @contextmanager
 def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
-    """Open a context with the path and the content of keyframes.json.
+    """Open a context that provides the path and the content of keyframes.json.
 
-    Errors of the code inside the context are reported as errors of the file.
+    Errors of the code inside the context, which interprets the content, are reported as errors of
+    the file.
 
     Raises:
         DataError: The file cannot be read, or its content is invalid.

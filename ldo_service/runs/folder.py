@@ -14,9 +14,9 @@ config.yaml                effective configuration
 summary.json               counts, speed, memory, versions
 refined/                   trajectory, keyframes and map after further iterations
 
-Submaps that were never merged with the first one are not in the frame of the map. The trajectories
-lack their frames, and the map lacks their Gaussians and objects. semantics.npz and objects.json
-exist only if a detector ran, front_end.mcap and refined/ only if they were requested.
+Submaps that were never merged with the first one are not in the frame of the map. Their frames are
+not in the trajectories, and their Gaussians and objects are not in the map. semantics.npz and
+objects.json exist only if a detector ran, front_end.mcap and refined/ only if they were requested.
 
 A run with `--localize` makes no map. Its keyframes.json, map.ply and keyframe_database.msgpack are
 in the folder that config.yaml names in tracker.localization_map.
@@ -71,7 +71,7 @@ from .records import LOOPS, OBJECTS, LoopRecord, write_objects
 
 MAP_FILES = ("map.ply", "trajectory.txt", "keyframes.json")
 SEMANTICS = "semantics.npz"
-REFINED = "refined"  # Subfolder of a run with its own files of these names.
+REFINED = "refined"  # Subfolder with the files of the refined map, which have the same names.
 EXPORTED = {  # Files of `ldo export` for each format.
     "ply": ("gaussians.ply",),
     "splat": ("gaussians.splat",),
@@ -211,7 +211,7 @@ class RunWriter:
 
         Args:
             message: Output of an actor.
-            step_ms: Duration of the step that produced it.
+            step_ms: Duration of the step that produced the message, milliseconds.
         """
         match message:
             case TrackedPose():
@@ -330,12 +330,15 @@ class RunWriter:
         self._database.save(self.folder / DATABASE_FILE, self._poses, self._merged_submaps)
 
     def online(self) -> Trajectory:
-        """Return T_map_camera of each frame as it was published."""
+        """Return the published T_map_camera of each frame of the first submap, if not LOST."""
         frames = [frame for frame in self._tracked if frame.submap == 0]
         return _trajectory(frames, [frame.T_map_camera_online for frame in frames])
 
     def final(self) -> Trajectory:
-        """Return T_map_camera of each frame, computed from final keyframe poses (`FinalPoses`)."""
+        """Return T_map_camera of each frame, computed from final keyframe poses (`FinalPoses`).
+
+        Frames that were LOST or are not in the frame of the map are omitted.
+        """
         frames = [frame for frame in self._tracked if self._root(frame.submap) == 0]
         T_map = {keyframe: self._poses[keyframe] for keyframe in self._poses}
         return _trajectory(frames, self._final_poses.of(frames, T_map))
@@ -356,7 +359,7 @@ class RunWriter:
         ]
 
     def _placed_objects(self, found: MapObjects) -> MapObjects:
-        """Return the objects first observed from a keyframe in the frame of the map."""
+        """Return the objects whose first observing keyframe is in the frame of the map."""
         keyframes = self._keyframes
         placed = tuple(
             one for one in found.objects if self._root(keyframes[one.first_keyframe]["submap"]) == 0

@@ -60,8 +60,8 @@ DETECTOR_LATENCY = "offline.latency_frames.detector"
 class FrontEndRecord:
     """Recorder of the front end of a run, used as a context manager.
 
-    An incomplete recording is useless. It is deleted if the run fails, if it exceeds
-    `recording.max_gb` or if the disk is full.
+    An incomplete recording cannot be used. Therefore the file is deleted if the run fails, if the
+    recording exceeds `recording.max_gb`, or if less than `recording.min_free_gb` is free.
     """
 
     def __init__(
@@ -77,7 +77,12 @@ class FrontEndRecord:
         self._file = RecordingFile(folder / FRONT_END, about, recording_parameters(config))
 
     def observe(self, message: Message, tick: int) -> None:
-        """Record a message of the front end; ignore other messages."""
+        """Record a message if it is an output of the front end; ignore other messages.
+
+        Args:
+            message: Output of an actor.
+            tick: Tick of the logical clock at which it was produced.
+        """
         topic = TOPICS.get(type(message))
         if topic is None:
             return
@@ -111,7 +116,7 @@ class FrontEnd:
     """Recorded front end of a finished run, for a run over the same frames.
 
     Attributes:
-        rejected: Number of frames that could not be used.
+        rejected: Number of selected frames for which the recording has no pose.
     """
 
     rejected: int
@@ -157,7 +162,10 @@ class FrontEnd:
         return cls(frames - len(stamps_ns), index)
 
     def __iter__(self) -> Iterator[tuple[Message, ...]]:
-        """Yield the messages of each tick of the logical clock, up to the last recorded message."""
+        """Yield the messages of each tick of the logical clock, up to the last recorded message.
+
+        The tuple of a tick without messages is empty.
+        """
         tick = 0
         for number, locations in groupby(self._index.locations, lambda place: place.number):
             while tick < number:

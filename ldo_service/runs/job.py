@@ -12,7 +12,7 @@ from ldo_service.geometry.sequence import Sequence
 from .front_end import FrontEnd
 from .source import Selection, Warn, require_overlap
 
-REFINE_ITERATIONS = 25  # Maximum iterations per request to the mapper, about a second.
+REFINE_ITERATIONS = 25  # Maximum iterations per refinement request, which takes about a second.
 
 
 class Advance(Protocol):
@@ -20,8 +20,8 @@ class Advance(Protocol):
 
     Args:
         done: Number of finished frames and refinement requests.
-        total: Number of all of them, or None if it has not changed. It grows if corrections of the
-            pose graph require a refit.
+        total: Number of all frames and refinement requests; None if it has not changed. The number
+            grows if corrections of the pose graph require a refit.
     """
 
     def __call__(self, done: int, total: int | None = None, /) -> None: ...
@@ -36,9 +36,10 @@ class RunOptions:
         folder: Folder for the results.
         config: Configuration.
         selection: Selected frames of the sequence.
-        warn: Receives warnings for the user.
+        warn: Function that receives warnings for the user.
         refine: Number of iterations of the Gaussian optimizer after the last frame.
-        prior: Poses T_odom_base of the robot's base from another odometry, in its own frame.
+        prior: Poses T_odom_base of the robot's base in the frame of another odometry; None if there
+            is no other odometry.
         front_end: Recorded outputs that replace frame source, tracker and detector; None to run
             these actors.
         keep_front_end: Record the front end of this run.
@@ -62,7 +63,7 @@ class RunOptions:
 
     @property
     def work(self) -> int:
-        """Number of frames and refinement requests."""
+        """Number of selected frames and of refinement requests, the total of the progress."""
         return len(self.selection.indices(self.sequence)) + requests(self.refine)
 
 

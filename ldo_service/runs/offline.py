@@ -19,7 +19,8 @@ from .job import REFINE_ITERATIONS, Advance, RunOptions, requests
 from .source import FrameReader, interleave_prior
 from .summary import Percentiles, Usage, percentiles, summarize
 
-# Final fraction of the learning rates in a refinement, which decay to let the map settle.
+# Learning rates at the end of a refinement, as a fraction of those at the start. They decay so that
+# the map converges.
 LAST_RATE = 0.05
 
 
@@ -33,7 +34,7 @@ def run_offline(job: RunOptions, advance: Advance) -> RunWriter:
 
     Args:
         job: Options of the run.
-        advance: Receives the progress.
+        advance: Function that receives the progress.
 
     Raises:
         DataError: Too few frames can be read.
@@ -84,7 +85,7 @@ class OfflineRun:
         self._clock.__exit__(*error)
 
     def stream(self) -> None:
-        """Process every frame."""
+        """Process every selected frame, and record the front end if `keep_front_end` is set."""
         job = self._job
         frames = interleave_prior(self._reader, job.prior)
         with ExitStack() as kept:
@@ -103,7 +104,7 @@ class OfflineRun:
         self._is_finished = True
 
     def close(self) -> None:
-        """Write all results so far."""
+        """Write the results and the summary of all frames processed so far."""
         used = Usage.now().since(self._started)
         facts = self._actors["optimizer"].metrics() | self._actors["mapper"].metrics()
         stage_ms = self._stage_ms or self._step_percentiles()
@@ -148,7 +149,8 @@ class OfflineRun:
 def with_all_cores(config: Config) -> Config:
     """Return the configuration with a renderer that may use every CPU core.
 
-    A live service leaves one core to the tracker. An offline run need not, since no frame is late.
+    In a live service, the renderer leaves one core to the tracker. An offline run does not need
+    this, since no frame can be late.
     """
     threads = config.mapper.threads or os.cpu_count() or 1
     return replace(config, mapper=replace(config.mapper, threads=threads))
@@ -181,7 +183,7 @@ def require_usable(record: RunWriter, max_rejected: float) -> None:
         max_rejected: Maximum fraction of rejected frames.
 
     Raises:
-        DataError: More frames were rejected.
+        DataError: A larger fraction of frames was rejected.
     """
     frames, rejected = record.summary["frames"], record.summary["frames_rejected"]
     if rejected > max_rejected * frames:

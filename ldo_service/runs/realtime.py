@@ -1,4 +1,4 @@
-"""Real-time run over a sequence: frames are paced by their stamps, and late ones are dropped."""
+"""Real-time run over a sequence: frames arrive at the times of their stamps and may be dropped."""
 
 import asyncio
 import time
@@ -33,10 +33,10 @@ def run_realtime(job: RunOptions, advance: Advance) -> RunWriter:
 
     Args:
         job: Options of the run.
-        advance: Receives the progress.
+        advance: Function that receives the progress.
 
     Raises:
-        ConfigError: A refinement is requested; a live service refines on `map/refine`.
+        ConfigError: `job.refine` is not 0. Only an offline run refines the map after its end.
         DataError: Too few frames can be read.
         StageError: An actor fails.
     """
@@ -98,7 +98,7 @@ class _RealTimeRun:
         )
 
     async def _feed(self, transport: MemoryTransport) -> None:
-        """Send each frame at the time of its stamp, after the earlier odometry-prior poses."""
+        """Send each frame at the time of its stamp, after the prior poses that precede it."""
         camera = transport.publisher(data_key(CAMERA_RGBD.name))
         odometry = transport.publisher(data_key(ODOMETRY_PRIOR.name))
         first_ns = int(self._sequence.stamps_ns[self._indices[0]])

@@ -43,10 +43,12 @@ class LoopRecord:
     """Record of loop candidates, loop closures and their acceptance."""
 
     def __init__(self) -> None:
-        # Each with the milliseconds of its whole step.
+        # Candidates, each with the duration in milliseconds of the step that compared it. One step
+        # may compare several candidates.
         self._candidates: list[tuple[LoopCandidate, float]] = []
         self._closures: list[LoopClosure] = []
-        self._rejected: set[tuple[int, int]] = set()  # Pairs of reference and keyframe.
+        # Reference and keyframe of each closure that the pose graph rejected.
+        self._rejected: set[tuple[int, int]] = set()
 
     def observe(
         self, message: LoopCandidate | LoopClosure | GraphCorrection, step_ms: float
@@ -59,7 +61,7 @@ class LoopRecord:
         """
         match message:
             case GraphCorrection():
-                # A correction lists the newest rejected closures, and all accepted ones.
+                # A correction lists only the newest rejected closures, but all accepted ones.
                 self._rejected |= set(message.rejected_closures)
                 self._rejected -= set(message.accepted_closures)
             case LoopClosure():
@@ -69,7 +71,7 @@ class LoopRecord:
 
     @property
     def accepted(self) -> int:
-        """Number of loop closures that the pose graph accepts."""
+        """Number of loop closures that the pose graph accepts after the last correction."""
         return sum(map(self._is_accepted, self._closures))
 
     @property

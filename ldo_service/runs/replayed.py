@@ -35,7 +35,7 @@ class RecordedActor:
         """Replay the recording with a new actor.
 
         Args:
-            advance: Called after each step.
+            advance: Function that is called after each step.
 
         Raises:
             DataError: A file cannot be read.
@@ -100,7 +100,7 @@ def _caveats(about: Mapping[str, str]) -> list[str]:
     if isa != ours:
         lines.append(
             f"recorded with the instruction set {isa}, replayed with {ours}: the last bits may "
-            f"differ. Force the former by LDO_ISA={isa} on a machine that has it."
+            f"differ. Set LDO_ISA={isa} on a machine with that instruction set."
         )
     now = versions()
     for name, version in _versions_of(about).items():

@@ -46,7 +46,7 @@ class Digests:
 def simulate_graph(
     sequence: Sequence, config: Config, selection: Selection, warn: Warn, advance: Advance
 ) -> dict[str, ActorDigest]:
-    """Run all actors over the selected frames and return the digest of each one.
+    """Run all actors over the selected frames and return the digest of each actor, by its name.
 
     The digests do not depend on the load of the machine or on the number of threads, see
     `runtime.logical_clock`.

@@ -98,14 +98,17 @@ class FrameReader:
 def interleave_prior(
     frames: Iterable[CameraRgbd], prior: Trajectory | None
 ) -> Iterator[tuple[Message, ...]]:
-    """Yield the frames together with the poses of the odometry prior.
+    """Yield each frame with the poses of the odometry prior that precede it.
 
-    Each frame follows the poses that a live service would receive before it. These are all poses up
-    to the first one that is not older than the frame.
+    A live service would receive these poses before the frame: all remaining poses up to and
+    including the first pose that is not older than the frame.
 
     Args:
         frames: The frames.
-        prior: Poses T_odom_base of another odometry, if there is one.
+        prior: Poses T_odom_base of another odometry; None if there is none.
+
+    Yields:
+        For each frame: the messages of the poses, then the frame.
     """
     poses = iter(() if prior is None else map(_prior_message, prior.stamps_s, prior.T_world_camera))
     last_ns = -1
@@ -122,10 +125,10 @@ def _prior_message(stamp_s: float, T_odom_base: np.ndarray) -> OdometryPrior:
 
 
 def require_overlap(prior: Trajectory, sequence: Sequence, indices: range) -> None:
-    """Check that the odometry prior has poses at the time of the frames.
+    """Check that the odometry prior has a pose between the first and the last selected frame.
 
     Raises:
-        DataError: The prior has no pose in that time.
+        DataError: The prior has no such pose.
     """
     first_s, last_s = (1e-9 * float(sequence.stamps_ns[indices[end]]) for end in (0, -1))
     if not np.any((prior.stamps_s >= first_s) & (prior.stamps_s <= last_s)):
@@ -170,7 +173,12 @@ class RecordedMessage:
 
 @dataclass(frozen=True, slots=True)
 class RecordedFrame:
-    """Frame in a recording; `depth` is None if the message `color` contains both images."""
+    """Frame in a recording.
+
+    Attributes:
+        color: Message with the color image, or with both images.
+        depth: Message with the depth image; None if `color` contains both images.
+    """
 
     color: RecordedMessage
     depth: RecordedMessage | None = None
@@ -241,5 +249,7 @@ def _frames(messages: Iterator[RecordedMessage]) -> Iterator[RecordedFrame]:
                     yield from (RecordedFrame(*pair) for pair in pairing.add_a(stored))
                 case CAMERA_DEPTH.name:
                     yield from (RecordedFrame(*pair) for pair in pairing.add_b(stored))
-        except FrameError:  # The stamp goes back: the frame was received again after a crash.
+        except FrameError:
+            # The stamp is not later than the previous one: the frame was received again after a
+            # crash.
             continue

@@ -18,7 +18,7 @@ Percentiles = dict[str, float]  # Values of p50 and p95.
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Time that this process has used."""
+    """Elapsed time and CPU time of this process, seconds."""
 
     wall_s: float
     cpu_s: float
@@ -51,7 +51,7 @@ def summarize(
         frames: Number of selected frames.
         rejected: Number of frames that could not be used.
         stage_ms: Percentiles of the step durations of each actor.
-        drops: Number of dropped messages, by key "actor topic".
+        drops: Number of dropped messages, by consumer and topic: "ACTOR TOPIC".
         facts: Metrics of the pose-graph optimizer and the mapper.
     """
     in_map = record.in_map()
