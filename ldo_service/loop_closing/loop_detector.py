@@ -1,6 +1,7 @@
 """Loop detector: groups keyframes into subgraphs and finds earlier subgraphs of the same place.
 
-Visual words are clusters of ORB features. They are learned during the run, from the first image on.
+Visual words are ORB descriptors that represent all similar descriptors. They are learned during the
+run, from the first image on.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -150,7 +151,7 @@ class LoopCandidateResult:
 
 
 class LoopDetector:
-    """Detector that groups keyframes into subgraphs and finds similar earlier subgraphs of each."""
+    """Detector that groups keyframes into subgraphs and compares each with earlier subgraphs."""
 
     def __init__(self, config: LoopsConfig) -> None:
         """Start with an empty place database."""
@@ -212,8 +213,8 @@ class LoopDetector:
         """Complete the unfinished subgraph if it is long enough, and return its loop candidates.
 
         Call this when no keyframe follows: at the end of a run and after a loss of tracking. Loops
-        are likely then. A run often ends where it began, and the newest keyframes are near
-        the place where tracking was lost.
+        are likely then. A run often ends where it began, and after a loss, the newest keyframes are
+        near the place where tracking was lost.
         """
         if not self.can_flush:
             return []

@@ -72,7 +72,7 @@ class DetectionPoints:
         return DetectionPoints(np.zeros(0, np.uint8), np.zeros(0, np.float32), nowhere)
 
     def histogram(self) -> np.ndarray:
-        """Return the sum of the scores of each label, [C] float32."""
+        """Return the sum of the scores of each label, [C] float32; 0 for background and `other`."""
         counts = np.bincount(self.labels, self.scores, MAX_LABELS).astype(np.float32)
         counts[:HIDDEN_NAMES] = 0
         return counts
@@ -188,9 +188,9 @@ def _same(
     names: Sequence[int],
     limit_m: float,
 ) -> int:
-    """Return the index of the nearest landmark with this label.
+    """Return the index of the nearest landmark with a label.
 
-    If none is within `limit_m`, return the number of landmarks.
+    If no landmark with the label is within `limit_m`, return the number of landmarks.
     """
     gaps_m = [
         float(np.linalg.norm(place / count - p_odom)) if name == label else np.inf

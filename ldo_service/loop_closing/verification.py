@@ -1,9 +1,9 @@
 """Verification of loop candidates: the pose between two keyframes of two subgraphs (fine step).
 
-A pose comes from ORB features, from landmarks or from the map. Direct alignment refines it on the
-images. The pose is accepted if a second keyframe of the new subgraph or landmarks confirm it, and
-if the refinement changes it little. The surfaces must also overlap without conflict, and the
-detections must not contradict. Conventions: `ldo_service.geometry`.
+A pose comes from ORB features, from landmarks or from the map. It must be confirmed by landmarks or
+by a second keyframe of the new subgraph. Direct alignment refines the pose on the images, and may
+change it only a little. At the refined pose, the surfaces must overlap without conflict, and the
+landmarks must not contradict each other. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Callable, Iterator

@@ -101,7 +101,7 @@ class MapPublisher:
         yield from self.deltas(now, with_changed=is_time)
 
     def deltas(self, now: MessageContext, *, with_changed: bool) -> Iterator[MapDelta]:
-        """Yield the deltas with all unpublished changes.
+        """Yield the deltas with the unpublished changes of the map.
 
         Args:
             now: Context of the messages.
@@ -125,7 +125,7 @@ class MapPublisher:
     def rendering(
         self, keyframe: Keyframe, now: MessageContext, *, contributions: bool
     ) -> MapRendering:
-        """Return the map rendered at a keyframe.
+        """Render the map at the pose of a keyframe, and return the message.
 
         Args:
             keyframe: Message of a keyframe of the map.
@@ -155,7 +155,15 @@ class MapPublisher:
         changed: Gaussians = NO_GAUSSIANS,
         added: Gaussians = NO_GAUSSIANS,
     ) -> MapDelta:
-        """Return a delta with the next version."""
+        """Return a delta with the next version of the map.
+
+        Args:
+            now: Context of the message.
+            motions: Motions of anchor keyframes, with which their Gaussians move.
+            removed: Ids of the removed Gaussians, [N] int64.
+            changed: Gaussians that replace published ones with the same ids.
+            added: New Gaussians.
+        """
         self.version += 1
         return MapDelta(
             stamp_ns=now.stamp_ns,

@@ -58,7 +58,7 @@ class FactorStore:
         self.interpolated = CondensedKeyframes.none()
         self.rows: dict[int, int] = {}  # Row of each condensed keyframe in `interpolated`.
 
-    # --- what changes -----------------------------------------------------------------------------
+    # --- changes ----------------------------------------------------------------------------------
     def add_measurement(self, m: RelativePose) -> Name:
         """Store an odometry measurement and return the name of its factor.
 
@@ -76,15 +76,15 @@ class FactorStore:
     ) -> Name | None:
         """Replace a measurement and return the name of the factor that changed.
 
-        If the measured keyframe is condensed, only its pose relative to its head and tail changes,
-        and no factor does.
+        If the measured keyframe b is condensed, its pose relative to its head and tail changes, but
+        no factor changes.
 
         Args:
             m: New measurement.
-            pose: Function that returns T_map_keyframe [4, 4].
+            pose: Function that returns the current T_map_keyframe [4, 4] of a keyframe.
 
         Returns:
-            Name of the changed factor, or None if a condensed keyframe moved.
+            Name of the changed factor, or None if keyframe b is condensed.
         """
         row = self.rows.get(m.b)
         if row is not None:

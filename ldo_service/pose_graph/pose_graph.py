@@ -36,8 +36,8 @@ class PoseGraph:
     measurement between two components merges them into the coordinate frame of the older one.
 
     The state of iSAM2 cannot be saved, and a new solver with the same measurements differs in the
-    last digits. Therefore a snapshot has the values at the last rebuild of the solver and all
-    changes since. A restored graph repeats these changes and gives bitwise equal results. The
+    last digits. Therefore a snapshot contains the values at the last rebuild of the solver and all
+    changes since then. A restored graph repeats these changes and gives bitwise equal results. The
     solver is rebuilt when keyframes are condensed, after `max_changes` changes, and when an update
     of iSAM2 fails. The same calls in the same order give bitwise equal results.
     """
@@ -48,7 +48,7 @@ class PoseGraph:
         self._initial: Variables = {}  # Value with which each variable was added to the solver.
         self._solver = Solver()
         self._base = self._packed()
-        self._changes: list[tuple[str, dict[str, Any]]] = []  # Since the last rebuild.
+        self._changes: list[tuple[str, dict[str, Any]]] = []  # Changes since the last rebuild.
         self.solved_times = 0
 
     def __contains__(self, keyframe: int) -> bool:
@@ -369,7 +369,7 @@ class PoseGraph:
         return {"base": self._base, "changes": list(self._changes)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a snapshot with bitwise equal results."""
+        """Restore a snapshot; later results are bitwise equal to those of the saved graph."""
         self._base, self._changes = state["base"], []
         values = [v.reshape(4, 4) if v.size == 16 else v for v in self._base["values"]]
         self._initial = dict(zip(self._base["keys"], values, strict=True))

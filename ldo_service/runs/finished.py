@@ -64,9 +64,10 @@ def newest_map(folder: Path) -> "MapFolder":
 
 
 def has_refined(folder: Path) -> bool:
-    """Return whether the run has a complete refined map.
+    """Return whether the run has a refined map.
 
-    A refinement writes the map file last, so its existence shows that all files are complete.
+    A refinement writes map.ply after the trajectory and the keyframes. If map.ply exists, these two
+    files are therefore complete.
     """
     return (folder / REFINED / "map.ply").is_file()
 
@@ -180,7 +181,10 @@ def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
+        raise DataError(
+            f"{path} is not what `ldo run` writes: {error!r}. Give "
+            "the folder of a finished `ldo run`."
+        ) from error
 
 
 def _viewpoint(path: Path, keyframe: dict[str, Any]) -> Viewpoint:

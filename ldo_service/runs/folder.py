@@ -1,7 +1,7 @@
 """Folder that a run writes.
 
-trajectory_online.txt      poses as published, one line per frame that is not LOST
-trajectory.txt             poses of the same frames after the last correction
+trajectory_online.txt      published poses of the frames of the first submap that are not LOST
+trajectory.txt             poses after the last correction, also of submaps merged with the first
 frames.csv                 status, residuals, milliseconds and submap of every frame
 keyframes.json             id, frame, stamp, camera and pose of every keyframe
 map.ply                    Gaussians anchored to keyframes in the frame of the map
@@ -149,8 +149,8 @@ def prepare(folder: Path, overwrite: bool) -> None:
 
     Args:
         folder: The folder.
-        overwrite: Delete the files of an earlier run. If the folder has other files too, nothing is
-            deleted and ConfigError is raised.
+        overwrite: True to delete the files of an earlier run first. If the folder has other files
+            too, nothing is deleted and ConfigError is raised. False if the folder must be empty.
 
     Raises:
         ConfigError: The folder is not empty or cannot be written.
@@ -197,7 +197,7 @@ class RunWriter:
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.loops = LoopRecord()
         self.boxes = 0  # Number of detections.
-        self.labeller_calls = 0  # Number of label results.
+        self.labeller_calls = 0  # Number of label results that a labeller gave.
         self.newest_stamp_ns = 0
         self.summary: dict[str, Any] = {}
 
@@ -330,7 +330,7 @@ class RunWriter:
         self._database.save(self.folder / DATABASE_FILE, self._poses, self._merged_submaps)
 
     def online(self) -> Trajectory:
-        """Return the published T_map_camera of each frame of the first submap, if not LOST."""
+        """Return the published T_map_camera of each frame of the first submap that is not LOST."""
         frames = [frame for frame in self._tracked if frame.submap == 0]
         return _trajectory(frames, [frame.T_map_camera_online for frame in frames])
 

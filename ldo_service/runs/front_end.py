@@ -145,7 +145,10 @@ class FrontEnd:
             )
         index = McapIndex(path)
         if not index.is_whole:
-            raise DataError(f"{path} is not complete because its run was killed. Repeat that run.")
+            raise DataError(
+                f"{path} is not complete because its run was killed or the disk was full. Repeat "
+                "that run."
+            )
         require_version(index)
         about = index.metadata.get(ABOUT, {})
         _require_settings(path, about, config)
@@ -178,7 +181,10 @@ class FrontEnd:
         try:
             return tuple(decode(self._index.body(p), MESSAGES[p.topic]) for p in locations)
         except (msgspec.DecodeError, LookupError, OSError) as error:
-            raise DataError(f"{self._index.path}, frame {locations[0].number}: {error}.") from error
+            raise DataError(
+                f"{self._index.path}: the messages of tick {locations[0].number} cannot be read: "
+                f"{error}. Repeat the run that recorded the file."
+            ) from error
 
 
 def front_end_settings(config: Config) -> dict[str, object]:

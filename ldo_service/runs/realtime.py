@@ -27,9 +27,9 @@ from .summary import Usage, summarize
 def run_realtime(job: RunOptions, advance: Advance) -> RunWriter:
     """Run every actor over the selected frames in real time, as the live service does.
 
-    All actors run in this process. Frames arrive at the times of their stamps. A frame that arrives
-    before the tracker has finished the previous one is dropped and counted. Therefore the result
-    depends on the speed and the load of the machine.
+    All actors run in this process. Frames arrive at the times of their stamps. If several frames
+    arrive while the tracker is busy, only the newest is tracked; the others are dropped and
+    counted. Therefore the result depends on the speed and the load of the machine.
 
     Args:
         job: Options of the run.

@@ -137,7 +137,10 @@ def read_loops(folder: Path) -> FoundLoops | None:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
+        raise DataError(
+            f"{path} is not what `ldo run` writes: {error!r}. Give the folder of a finished "
+            "`ldo run`."
+        ) from error
 
 
 def _compared(row: dict[str, Any]) -> ComparedPair:
@@ -193,4 +196,7 @@ def read_objects(folder: Path) -> MapObjects:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise DataError(f"{path} is not what `ldo run` writes: {error}.") from error
+        raise DataError(
+            f"{path} is not what `ldo run` writes: {error}. Give the folder of a finished "
+            "`ldo run`."
+        ) from error

@@ -79,7 +79,10 @@ def _config_of(about: Mapping[str, str]) -> Config:
     try:
         return config_of(load_yaml(about.get("config", "")) or {})
     except yaml.YAMLError as error:
-        raise DataError(f"the configuration in the recording cannot be read: {error}.") from error
+        raise DataError(
+            f"the configuration in the recording cannot be read: {error}. Copy the recording "
+            "again, or make a new one."
+        ) from error
 
 
 def _versions_of(about: Mapping[str, str]) -> dict[str, str]:
@@ -91,7 +94,10 @@ def _versions_of(about: Mapping[str, str]) -> dict[str, str]:
     try:
         return msgspec.json.decode(about.get("versions", "{}"), type=dict[str, str])
     except msgspec.DecodeError as error:
-        raise DataError(f"the versions in the recording cannot be read: {error}.") from error
+        raise DataError(
+            f"the versions in the recording cannot be read: {error}. Copy the recording again, or "
+            "make a new one."
+        ) from error
 
 
 def _caveats(about: Mapping[str, str]) -> list[str]:
@@ -117,8 +123,8 @@ def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedAct
         only: Names of actors to return; empty returns all.
 
     Raises:
-        DataError: The folder has no recording, a recording without steps, or one of another format
-            version.
+        DataError: The folder has no recording, the recording has no steps, or it has another
+            recording version.
         ConfigError: An actor is not in the recording.
     """
     found = recorded_actors(folder)
@@ -137,5 +143,7 @@ def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedAct
             file.require_version()
     if not any(actor.steps for actor in actors):
         names = ", ".join(only) or "any actor"
-        raise DataError(f"{folder} has no recorded step of {names}. Record again with frames.")
+        raise DataError(
+            f"{folder} has no recorded step of {names}. Make a new recording with camera frames."
+        )
     return actors

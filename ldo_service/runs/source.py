@@ -133,8 +133,9 @@ def require_overlap(prior: Trajectory, sequence: Sequence, indices: range) -> No
     first_s, last_s = (1e-9 * float(sequence.stamps_ns[indices[end]]) for end in (0, -1))
     if not np.any((prior.stamps_s >= first_s) & (prior.stamps_s <= last_s)):
         raise DataError(
-            f"the prior has no pose between {first_s:.3f} s and {last_s:.3f} s, the stamps of "
-            f"{sequence.name}. Its stamps must be of the same clock as those of the frames."
+            f"the odometry prior has no pose between {first_s:.3f} s and {last_s:.3f} s, the first "
+            f"and the last frame of {sequence.name}. The stamps of prior and frames must come from "
+            "the same clock."
         )
 
 
