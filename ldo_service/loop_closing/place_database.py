@@ -124,9 +124,9 @@ class RetrievalMatch:
 class PlaceDatabase:
     """Stored subgraphs in the order of insertion, with tables of the histograms of the subgraphs.
 
-    If there are more than `count` subgraphs, the one whose neighbors along the camera path are
-    nearest is removed. A long run in one building thus thins the path evenly, and each part of the
-    path keeps some subgraphs.
+    If there are more than `count` subgraphs, one is removed: the subgraph whose previous and next
+    subgraph along the camera path are nearest to each other. A long run in one building thus thins
+    the path evenly, and each part of the path keeps some subgraphs.
     """
 
     def __init__(self, words: int, stages: Stages, config: RetrievalConfig) -> None:

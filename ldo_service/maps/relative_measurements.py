@@ -101,12 +101,13 @@ class RelativeMeasurements:
         )
 
     def acknowledged(self, refinements: int) -> KeysView[int]:
-        """Note the refinements that a pose correction includes, and return the other keyframes.
-
-        Returns the keyframes whose refined poses the correction does not include yet.
+        """Mark refinements as included in a pose correction, and return the remaining keyframes.
 
         Args:
             refinements: Number of the last refinement message that the correction includes.
+
+        Returns:
+            The keyframes whose last refined pose the correction does not include yet.
         """
         self._unacknowledged = {
             k: number for k, number in self._unacknowledged.items() if number > refinements

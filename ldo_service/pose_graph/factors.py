@@ -98,7 +98,7 @@ def information(sigma_rad: float, sigma_m: float) -> np.ndarray:
 def odometry_information(measured: RelativePose, noise: NoiseConfig) -> np.ndarray:
     """Return the information [6, 6] of an odometry measurement.
 
-    `NoiseConfig.floor` is added to its own information, and then drift to the covariance.
+    `NoiseConfig.floor` is added to the information of `measured`, then the drift to the covariance.
     """
     own = 0.5 * (measured.information + measured.information.T) + noise.floor
     return np.linalg.inv(np.linalg.inv(own) + noise.drift(measured.T_a_b))
@@ -109,8 +109,8 @@ def closure_information(
 ) -> np.ndarray:
     """Return the information [6, 6] of a loop closure.
 
-    `NoiseConfig.floor` is added to its own information, and then two terms to the covariance: that
-    of `sigma_loop_rad` and `sigma_loop_m`, and the argument `covariance`.
+    `NoiseConfig.floor` is added to the information of `measured`. Then two terms are added to the
+    covariance: that of `sigma_loop_rad` and `sigma_loop_m`, and the argument `covariance`.
 
     Args:
         measured: The closure.

@@ -62,8 +62,8 @@ def fuse_labels(
              + w_sem / 2 sum_ij (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j]
 
     The method is Gauss-Seidel (paper, III.C): each sweep minimizes over one landmark after the
-    other, in the order of their ids. Before each sweep, the pairs with equal argmax are determined
-    again. The result is deterministic.
+    other, in the order of their ids. The neighbors with equal argmax are determined again each time
+    that a landmark is minimized. The result is deterministic.
 
     Args:
         evidence: Evidence of each landmark, by its id.
@@ -95,7 +95,7 @@ def fuse_labels(
 
 
 def geometric_mean(evidence: Evidence) -> np.ndarray:
-    """Return argmin_p sum_k w_k KL(p || q_k) = prod q_k^(w_k / W), normalized."""
+    """Return the distribution [C] argmin_p sum_k w_k KL(p || q_k) ~ prod_k q_k^(w_k / W)."""
     mean = evidence.log_sum / max(evidence.weight, np.finfo(float).tiny)
     p = np.exp(mean - mean.max())
     return p / p.sum()

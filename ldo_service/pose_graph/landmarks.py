@@ -50,8 +50,8 @@ class ObjectLandmarkConfig:
     # Minimum angle between two rays to a new landmark, 5 deg. At this angle, an error of 12 px
     # changes a depth of 2 m by 0.5 m (focal length 525 px).
     min_parallax_rad: float = 0.09
-    # Maximum observations of a landmark in the graph; newer observations never replace the first
-    # half of this number.
+    # Maximum observations of a landmark in the graph. If there are more, the first half of this
+    # number and the newest observations are kept.
     max_observations: int = 32
     misses: int = 10  # Consecutive misses after which a landmark is removed (III.C).
     vague_misses: int = 5  # Consecutive misses after which an uncertain landmark is removed.
@@ -62,7 +62,8 @@ class ObjectLandmarkConfig:
     # The schedule `adaptive` adds waiting observations to the graph once their total weight reaches
     # `due_weight`; `fixed` adds them at every keyframe with observations.
     schedule: Literal["adaptive", "fixed"] = "adaptive"
-    # Total weight of waiting observations; an observation with low entropy weighs 1.
+    # Total weight of waiting observations at which `adaptive` adds them; an observation with low
+    # entropy weighs 1.
     due_weight: float = 8.0
     # Number of waiting observations at which they are added, however small their weight.
     max_waiting: int = 256
@@ -97,13 +98,16 @@ class ObjectLandmarkConfig:
 
 @dataclass(frozen=True, slots=True)
 class LandmarkObservation:
-    """Observation of an object in a keyframe; a miss if the visible object is not detected."""
+    """Observation of an object in a keyframe, or a miss.
+
+    In case of a miss, the object should be visible in the keyframe but was not detected.
+    """
 
     keyframe: int
     landmark: int
     box_px: np.ndarray  # x0, y0, x1, y1 in pixels, [4].
     distribution: np.ndarray  # Class distribution [C], sums to one.
-    entropy: float  # Nats.
+    entropy: float  # Entropy of `distribution`, nats.
     is_miss: bool
     camera: np.ndarray  # Width, height, fx, fy, cx, cy in pixels, [6].
 
@@ -170,7 +174,7 @@ class ObjectLandmarks:
         self.known: dict[int, Landmark] = {}
         self._waiting: list[LandmarkObservation] = []
         self._pairs: set[Pair] = set()  # Pairs of landmarks that a keyframe shows together.
-        self._saved: dict[str, Any] = {}  # Cached part of the state.
+        self._saved: dict[str, Any] = {}  # Entry `known` of the snapshot; empty if outdated.
         self.skipped = 0  # Number of keyframes at which waiting observations were not yet added.
 
     def observe(self, seen: LandmarkObservation) -> None:
@@ -271,7 +275,7 @@ class ObjectLandmarks:
     def _thinned(self, observations: list[BoxObservation]) -> tuple[BoxObservation, ...]:
         """Return at most `max_observations` observations: half of them the first, half the newest.
 
-        The first observations limit the drift of the landmark.
+        Keeping the first observations limits the drift of the landmark.
         """
         half = self._config.max_observations // 2
         excess = len(observations) - self._config.max_observations

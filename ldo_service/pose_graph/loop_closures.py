@@ -86,8 +86,8 @@ class LoopClosureSet:
         """Check a new closure against the accepted ones.
 
         The new closure is rejected if it increases the cost of the solution by more than
-        `max_cost`. There is one exception: if the cost is lower with the new closure in place of an
-        earlier one, the earlier closure is regarded as false and removed. At the end, all closures
+        `max_cost`. There is one exception: if replacing an earlier closure by the new one lowers
+        the cost, the earlier closure is regarded as false and removed. At the end, all closures
         with a residual above `max_sigmas` are removed, the worst first.
 
         Args:

@@ -1,8 +1,8 @@
 """Files of an actor in a recording: keyframe images and offloaded Gaussians of the mapper.
 
-A saved state of the mapper refers to files in the mapper's folder, so a restored mapper needs both.
-The folder `<actor>.files` of a recording holds these files. `Started.files` lists those of a start,
-each with its CRC-32. A file that several starts need is stored once.
+A saved state of the mapper refers to files in the mapper's folder, so a restored mapper needs the
+state and the files. The folder `<actor>.files` of a recording holds these files. `Started.files`
+lists the files of one start, each with its CRC-32. A file that several starts need is stored once.
 """
 
 import errno
@@ -27,7 +27,7 @@ CHECKSUM = re.compile(r"[0-9a-f]{8}")
 
 @dataclass(frozen=True, slots=True)
 class ActorFiles:
-    """Files of an actor.
+    """Files to which the saved state of an actor refers.
 
     Attributes:
         folder: Folder of the actor; it need not exist.

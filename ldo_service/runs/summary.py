@@ -75,7 +75,7 @@ def summarize(
         "loops_rejected": record.loops.rejected,
         "labeller_requests": record.labeller_calls,
         "optimizations": int(facts.get("optimizations", 0)),
-        # Postponed optimizations.
+        # Keyframes at which the optimization for landmark observations was postponed.
         "optimizations_skipped": int(facts.get("optimizations_skipped", 0)),
         "iterations": int(facts.get("iterations", 0)),  # Iterations of the Gaussian optimizer.
         # Refit iterations still pending.
