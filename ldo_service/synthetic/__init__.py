@@ -1,21 +1,22 @@
 """Synthetic RGB-D sequences with exact poses and depth, bitwise equal on every machine.
 
 A ray caster renders scenes of simple solids, so depth is exact and consistent between views.
-Exact values use only + - * / and square roots of float64 in a fixed order. IEEE 754 rounds these
-operations identically everywhere; sines, logarithms and matrix products differ between machines.
+Poses, colors and exact depth are computed with + - * / and square roots of float64 alone, in a
+fixed order. IEEE 754 rounds these operations identically everywhere; sines, logarithms and matrix
+products differ between machines.
 
 Sequences:
 
 - `room`, `tour`: One furnished room, rendered when read.
 - `person`: The same room, with a person who walks through it.
-- `room-noisy`, `tour-noisy`, `person-noisy`: The same, with the depth errors of a Kinect.
+- `room-noisy`, `tour-noisy`, `person-noisy`: The sequences above with the depth errors of a Kinect.
 - `flat`: Two rooms and a corridor with ground-truth labels, designed to be hard.
 - `flat-exact`: The same flat without sensor noise.
 - `room-handheld`, `tour-handheld`, `person-handheld`, `flat-handheld`: Faster motion, seen by a
-  simulated camera with all effects of real ones. `:` and names joined by `+` choose some of them:
-  `tour-handheld:rolling-shutter+stereo`.
+  camera with simulated effects of real cameras, such as motion blur. All effects are on by default.
+  A colon and effect names joined by `+` select some: `tour-handheld:rolling-shutter+stereo`.
 
-A number after @ is the seed of textures, hand shake and noise: `room@3`.
+A number after @ is the seed of textures, hand shake and noise, as in `room@3`; the default is 0.
 """
 
 from ldo_service.errors import DataError
@@ -41,7 +42,10 @@ SCENES = (*room_sequence.NAMED, *flat.NAMED, *handheld.NAMED)  # Names of all bu
 
 
 def open_synthetic(name: str) -> SyntheticSequence | FlatSequence | HandheldSequence:
-    """Return the sequence `synthetic:name`, or `synthetic:name@seed`.
+    """Return the sequence `synthetic:NAME`.
+
+    Args:
+        name: Name of a sequence, with an optional `@SEED`; the module docstring lists the names.
 
     Raises:
         DataError: If the name is unknown (the message lists the known ones) or the seed is not

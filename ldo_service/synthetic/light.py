@@ -8,10 +8,10 @@ from .room import Room
 from .solids import Solid, Vector, interval, vector
 
 LAMP_GRID = 4  # The lamp is an area of 4x4 points, so its shadows are soft.
-LIGHT_CELL_M = 0.06
+LIGHT_CELL_M = 0.06  # Cell size of the grids of light on walls, floors and ceilings.
 AMBIENT = 0.42  # Light that comes from all directions, 0..1.
 LAMP = 0.55  # Light of the lamp at normal incidence, before falloff.
-SIDE = 0.06  # Fraction of the ambient light that depends on direction; more from +x.
+SIDE = 0.06  # Fraction of the ambient light by which a surface that faces +x gets more.
 
 
 def shade(
@@ -26,7 +26,7 @@ def shade(
         point: Points of the surface, [P], meters.
         normal: Unit normals at the points.
         lit: Visible fraction of the lamp, 0..1.
-        side: Fraction of the ambient light that depends on direction.
+        side: Fraction of the ambient light by which a surface that faces +x gets more.
 
     Returns:
         Light [P]; 1 leaves the albedo unchanged.
@@ -80,12 +80,19 @@ def lit_share(
     solids: tuple[Solid, ...],
     point: Vector,
 ) -> np.ndarray:
-    """Return the fraction [P] of a square lamp that is visible from each point past the solids."""
+    """Return the fraction [P] of a square lamp, 0..1, that is visible from each point.
+
+    Args:
+        lamp_center_m: Center of the lamp.
+        lamp_side_m: Side of the lamp.
+        solids: Solids that can hide the lamp.
+        point: Points [P], meters.
+    """
     lamps = _lamp_points(lamp_center_m, lamp_side_m)
     is_hidden = np.zeros((LAMP_GRID**2, len(point[0])), bool)
     for solid in solids:
-        # A ray to any point of the lamp can meet the solid only where the ray to the lamp's center
-        # meets the enlarged solid.
+        # If the enlarged solid does not hide the lamp's center from a point, the solid hides no
+        # part of the lamp from that point.
         larger = _enlarged(solid, lamp_side_m)
         near = np.flatnonzero(_is_between(larger, point, vector(lamp_center_m)))
         x, y, z = (component[near] for component in point)
@@ -102,7 +109,10 @@ def _lamp_points(center_m: tuple[float, float, float], side_m: float) -> Vector:
 
 
 def _enlarged(solid: Solid, lamp_side_m: float) -> Solid:
-    """Return a box that contains the solid moved horizontally by up to half a lamp diagonal."""
+    """Return a box that still contains the solid after a shift of up to half a lamp diagonal.
+
+    The shift is horizontal, in any direction.
+    """
     x, y, z = solid.size_m
     diagonal_m = 1.001 * np.sqrt(2) * lamp_side_m
     return replace(solid, shape="box", size_m=(x + diagonal_m, y + diagonal_m, z + 1e-6))

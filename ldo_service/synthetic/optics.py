@@ -6,7 +6,7 @@ import numpy as np
 
 from ldo_service.geometry import Camera
 
-ITERATIONS = 20  # The error of the fixed point shrinks by a factor of 3 or more in each.
+ITERATIONS = 20  # Each iteration reduces the error by a factor of 3 or more.
 
 
 def undistorted(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -16,8 +16,11 @@ def undistorted(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarra
 
     Args:
         camera: Intrinsics, with at most the coefficients k1, k2, p1, p2, k3.
-        u: Columns [P], pixels.
-        v: Rows [P], pixels.
+        u: Columns, pixels, an array of any shape.
+        v: Rows, pixels, in the shape of u.
+
+    Returns:
+        x and y of the rays at z = 1 in the camera frame, each in the shape of u.
     """
     bent_x, bent_y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     if not any(camera.distortion):
@@ -35,9 +38,9 @@ def undistorted(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarra
 
 @lru_cache(maxsize=8)
 def max_displacement_px(camera: Camera) -> float:
-    """Return a bound of how far distortion moves a pixel, in pixels.
+    """Return an upper bound, in pixels, of the displacement by lens distortion.
 
-    It is the largest displacement on the border of the image, plus one pixel.
+    The bound is the largest displacement on the border of the image, plus one pixel.
     """
     if not any(camera.distortion):
         return 0.0

@@ -91,13 +91,13 @@ LINGER = Path(
     ),
 )
 
-SWAY_FRAMES = 8  # Frames per knot of the sway; a hand moves in fractions of a second.
+SWAY_FRAMES = 8  # Frames per knot of the hand's sway, 0.27 s at 30 Hz.
 SWAY_EYE_M = 0.008
 SWAY_TARGET_M = 0.03
 
 
 def poses(path: Path, count: int, seed: int) -> np.ndarray:
-    """Return T_world_camera [count, 4, 4] on splines through the path, with hand shake."""
+    """Return T_world_camera [count, 4, 4] once around; `seed` determines the hand shake."""
     rng = np.random.default_rng(seed)
     along = np.arange(count) * (len(path.eyes_m) / count)
     eyes = closed_spline(path.eyes_m, along) + _sway(rng, count, SWAY_EYE_M)

@@ -7,9 +7,9 @@ import numpy as np
 from .solids import Shape, Solid
 
 SPEED_M_S = 1.0
-STEP_M = 0.7  # Distance between the feet of one step.
-SWING_M = 0.28  # Amplitude of a foot, ahead of the hips and behind them.
-ARM_SWING_M = 0.2
+STEP_M = 0.7  # Length of a step.
+SWING_M = 0.28  # Amplitude of a foot along the path, relative to the hips.
+ARM_SWING_M = 0.2  # Amplitude of a forearm along the path, relative to the hips.
 # Path of the feet on the floor, x and y in meters: through the left wall, past the sofa,
 # out through the right wall.
 WAY_M = np.array([[-3.1, 0.9], [0.6, 0.9], [1.3, 0.25], [3.2, 0.0]])
@@ -78,7 +78,7 @@ def _placed(time_s: float) -> tuple[np.ndarray, tuple[float, float], float]:
 def _swing(steps: float) -> float:
     """Return the phase of the swing, -1..1, with a period of two steps.
 
-    It consists of parabolas, because the bits of a sine differ between machines.
+    The curve consists of parabolas, because the bits of a sine differ between machines.
     """
     phase = steps % 2.0
     side, t = (1.0, phase) if phase < 1 else (-1.0, phase - 1.0)

@@ -1,4 +1,4 @@
-"""Ray casting of a camera against solids within a shell, with exact depth."""
+"""Ray casting of a camera image with exact depth; a box, the shell, encloses the scene."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from .optics import max_displacement_px, undistorted
 from .solids import Solid, Vector, interval, vector
 
 NEAR_M = 0.05
-# Number of row poses at which a solid is projected, if each row has its own pose, and a margin for
-# solids that are in view at one of them only.
+# If each row has its own pose, a solid is projected at ROW_POSES of them. ROW_MARGIN_PX is for
+# solids that are in view at only one of these poses, so that their motion is not measured.
 ROW_POSES, ROW_MARGIN_PX = 5, 4.0
 
 
@@ -20,11 +20,11 @@ ROW_POSES, ROW_MARGIN_PX = 5, 4.0
 class Hits:
     """Nearest surfaces along P rays."""
 
-    depth_m: np.ndarray  # Depth [P], z in the camera.
-    surface: np.ndarray  # Index [P] of the surface: 0-5 for the faces of the shell, then solids.
+    depth_m: np.ndarray  # Depth [P], z in the camera frame.
+    surface: np.ndarray  # Index [P] of the surface: 0-5 are the shell's faces, 6 + k is solid k.
 
     def by_surface(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield each surface that was hit, with the indices of its rays."""
+        """Yield the index of each surface that was hit, and the indices of the rays that hit it."""
         order = np.argsort(self.surface, kind="stable")
         met, starts = np.unique(self.surface[order], return_index=True)
         bounds = np.append(starts, len(order))
@@ -49,7 +49,7 @@ class RayCaster:
         """Project the solids into the image.
 
         Args:
-            shell: Solid that contains the camera.
+            shell: Box that contains the camera; rays that hit no solid end on its faces.
             solids: All other solids.
             camera: Intrinsics; lens distortion bends the rays.
             T_world_camera: Camera pose [4, 4], or one pose for each row of the image, [H, 4, 4].
@@ -80,7 +80,7 @@ class RayCaster:
         return Hits(depth_m, surface)
 
     def points(self, u: np.ndarray, v: np.ndarray, depth_m: np.ndarray) -> Vector:
-        """Return the world points of pixels at a depth."""
+        """Return the world points [P] of pixels u, v [P] at depth [P]; v is in ascending order."""
         d, o = self._directions(u, v), self._origins(v)
         return o[0] + d[0] * depth_m, o[1] + d[1] * depth_m, o[2] + d[2] * depth_m
 
@@ -129,7 +129,7 @@ class _Window:
     bottom: float
 
     def covered(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the indices of the pixels in the window; v must ascend."""
+        """Return the indices of the pixels u, v [P] in the window; v must be in ascending order."""
         first = int(np.searchsorted(v, self.top))
         stop = int(np.searchsorted(v, self.bottom, side="right"))
         u = u[first:stop]
@@ -143,14 +143,15 @@ def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
     """Return the window of a solid at one pose [4, 4], or at the poses of all rows [H, 4, 4].
 
     With one pose for each row, the window is the union over a few row poses, grown by the largest
-    motion between two of them. Lens distortion adds its largest displacement.
+    motion between two consecutive ones. With lens distortion, the window also grows by the largest
+    displacement of a pixel.
     """
     if T.ndim == 2 and not any(camera.distortion):
         return _window_at(solid, camera, T)
     pinhole = camera.rectified()
     rows = np.linspace(0, len(T) - 1, ROW_POSES).astype(np.int64)
     poses = T[None] if T.ndim == 2 else T[rows]
-    # A wider image, because distortion moves surfaces from beyond its border into it.
+    # The margin widens the image, because distortion moves surfaces from outside into the image.
     margin = max_displacement_px(camera)
     windows = [_window_at(solid, pinhole, pose, margin) for pose in poses]
     seen = np.array([(w.left, w.right, w.top, w.bottom) for w in windows if w != EMPTY])

@@ -11,8 +11,8 @@ from .ray_casting import Hits, RayCaster, outline
 from .room import Room
 from .solids import Solid, Vector, vector
 
-SHELL_FACES = 6  # The faces of the shell are the surfaces 0-5 of a cast.
-# Offsets of the four rays of a pixel on an outline: the centers of its quarters.
+SHELL_FACES = 6  # A ray cast numbers the faces of the shell 0-5 and the solids from 6 on.
+# Offsets of four rays per pixel, used at the outlines of surfaces: the centers of its quarters.
 QUARTERS_PX = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 
@@ -42,7 +42,8 @@ class Renderer:
     ) -> RoomRendering:
         """Render the room from one camera pose, or from one pose for each row.
 
-        The color of a pixel on an outline is the mean of four rays; depth never mixes surfaces.
+        The light of a pixel at the outline of a surface is the mean of four rays. Depth comes from
+        one ray through the pixel center, so it never mixes surfaces.
 
         Args:
             camera: Intrinsics.

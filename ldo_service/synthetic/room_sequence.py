@@ -22,7 +22,8 @@ DISPARITY_SIGMA_STEPS = 0.5
 NEAREST_M, FARTHEST_M = 0.4, 8.0
 
 RATE_HZ = 30
-FOCAL_PER_WIDTH = 0.8125  # Horizontal field of view of 63 degrees, as a Kinect's color camera.
+# Focal length in image widths: a horizontal field of view of 63 degrees, as in a Kinect.
+FOCAL_PER_WIDTH = 0.8125
 
 PATHS = {"look_around": path.LOOK_AROUND, "tour": path.TOUR, "linger": path.LINGER}
 
@@ -49,7 +50,7 @@ def kinect_depth(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _is_shadowed(depth_m: np.ndarray) -> np.ndarray:
     """Return a mask [H, W] of the pixels that the light of the Kinect's projector does not reach.
 
-    They are on the far side of depth jumps along a row.
+    These pixels are on the far side of depth jumps along a row.
     """
     jump = np.diff(depth_m, axis=1, prepend=depth_m[:, :1])
     return jump > 0.05 * depth_m
@@ -74,7 +75,9 @@ class SyntheticConfig:
                 "pixels must have at least 1 frame of 8x8 pixels."
             )
         if self.path not in PATHS:
-            raise ConfigError(f"path={self.path!r} must be one of {', '.join(PATHS)}.")
+            raise ConfigError(
+                f"synthetic sequence: path={self.path!r} must be one of {', '.join(PATHS)}."
+            )
 
 
 NAMED = {
@@ -102,7 +105,7 @@ class SyntheticSequence(Sequence):
 
     @staticmethod
     def named(name: str, **changes: int | bool) -> "SyntheticSequence":
-        """Return the sequence `synthetic:name`, with fields of its config replaced by keywords.
+        """Return the sequence `synthetic:NAME`, with the config fields in `changes` replaced.
 
         Raises:
             DataError: If the name is unknown.

@@ -9,9 +9,12 @@ from typing import Literal
 
 import numpy as np
 
-Vector = tuple[np.ndarray, np.ndarray, np.ndarray]  # Components x, y, z: each [P], or [] for one.
+# Components x, y, z: each [P] for P vectors, or [] for a single vector.
+Vector = tuple[np.ndarray, np.ndarray, np.ndarray]
+# A wheel is a cylinder along x; the other cylinders and the cones are along z.
 Shape = Literal["box", "ball", "cylinder", "wheel", "cone", "bucket", "lampshade"]
-# Parameters (m, k) of the shapes with radius m + k z. A cone's apex is up; a bucket widens upward.
+# Parameters (m, k) of the shapes with radius m + k z in the local frame. The apex of a cone is up,
+# a bucket widens upward, and a lampshade narrows upward.
 TAPERS = {"cone": (0.5, -0.5), "bucket": (0.8125, 0.1875), "lampshade": (0.75, -0.25)}
 
 
@@ -25,7 +28,8 @@ def vector(components: Iterable[np.ndarray | float]) -> Vector:
 class Solid:
     """Convex solid that stands upright in the world, z up.
 
-    Its local frame is aligned with it, and scaled so that its bounding box is the cube -1..1.
+    The local frame of a solid is aligned with the solid and scaled so that the solid fills the cube
+    -1..1.
     """
 
     shape: Shape
@@ -56,7 +60,7 @@ class Solid:
             q: Points [P] on the surface, in the local frame.
 
         Returns:
-            Unit normals in the world, and the index [P] of the solid's axis nearest to each.
+            Unit normals in the world, and the index [P] of the solid's axis nearest to each normal.
         """
         n = _NORMALS[self.shape](q)
         n = tuple(component * (2 / size) for component, size in zip(n, self.size_m, strict=True))

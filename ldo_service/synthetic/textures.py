@@ -20,7 +20,13 @@ class Texture:
     size_m: float  # Side of the tile.
 
     def sample(self, u_m: np.ndarray, v_m: np.ndarray, footprint_m: np.ndarray) -> np.ndarray:
-        """Return colors [P, 3] at surface coordinates [P], averaged over `footprint_m` [P]."""
+        """Return colors [P, 3] in 0..1 at surface coordinates [P].
+
+        Args:
+            u_m: Coordinates [P] along the rows of the tile.
+            v_m: Coordinates [P] along the columns of the tile.
+            footprint_m: Size [P] of a pixel on the surface, over which the texture is averaged.
+        """
         level = _log2(footprint_m * (TILE_TEXELS / self.size_m))
         top = TILE_TEXELS.bit_length() - 1
         level = np.clip(level, 0.0, top)
@@ -30,12 +36,15 @@ class Texture:
         return (1 - weight) * self._at(u, v, lower) + weight * self._at(u, v, lower + 1)
 
     def _at(self, u: np.ndarray, v: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Return bilinearly interpolated colors [P, 3] in one level per point.
+        """Return bilinearly interpolated colors [P, 3].
 
-        The coordinates u and v are in tiles.
+        Args:
+            u: Coordinates [P] along the rows, in tiles.
+            v: Coordinates [P] along the columns, in tiles.
+            level: Mipmap level [P] of each point, an integer.
         """
         size = TILE_TEXELS >> level
-        start = (TILE_TEXELS**2 - size**2) // 3 * 4  # n^2 + (n/2)^2 + ... before this level.
+        start = (TILE_TEXELS**2 - size**2) // 3 * 4  # Texels of all levels before.
         x, y = u * size - 0.5, v * size - 0.5
         x0, y0 = np.floor(x), np.floor(y)
         fx, fy = (x - x0)[:, None], (y - y0)[:, None]
@@ -55,7 +64,10 @@ def _log2(x: np.ndarray) -> np.ndarray:
 
 
 def mipmapped(tile: np.ndarray, size_m: float) -> Texture:
-    """Return the texture of a tile [TILE_TEXELS, TILE_TEXELS, 3], clipped to 0..1."""
+    """Return the texture of a tile [TILE_TEXELS, TILE_TEXELS, 3] with mipmaps, clipped to 0..1.
+
+    The tile covers a square of `size_m` on a surface.
+    """
     levels = [np.clip(tile, 0.0, 1.0)]
     while len(levels[-1]) > 1:
         a = levels[-1]
@@ -68,8 +80,8 @@ def noise(
 ) -> np.ndarray:
     """Return a tile of noise in -1..1, [TILE_TEXELS, TILE_TEXELS].
 
-    Each octave has half the amplitude of the one before, which resembles the spectra of
-    photographs.
+    Each octave has half the amplitude of the octave before. The spectra of photographs fall in a
+    similar way.
 
     Args:
         rng: Source of the noise.

@@ -38,12 +38,16 @@ class Contents:
 
     @property
     def coco_classes(self) -> int:
-        """Number of visible classes that COCO has."""
+        """Number of COCO classes among the visible objects."""
         return sum(name in CLASS_NAMES[:COCO_COUNT] for name in self.objects_per_class)
 
 
 def motion(T_world_camera: np.ndarray) -> MotionSpeeds:
-    """Return the speeds and turn rates of a trajectory [N, 4, 4] at the frame rate of the walk."""
+    """Return the speeds and turn rates of a trajectory.
+
+    Args:
+        T_world_camera: Camera poses [N, 4, 4], RATE_HZ of them per second.
+    """
     steps_m = np.diff(T_world_camera[:, :3, 3], axis=0)
     before, after = T_world_camera[:-1, :3, :3], T_world_camera[1:, :3, :3]
     cosines = (np.einsum("nij,nij->n", before, after) - 1) / 2

@@ -6,16 +6,16 @@ from ldo_service.synthetic.solids import Solid
 
 from .scene_object import CEILING, FLOOR, WALL, Placement
 
-WALL_M = 0.06  # Thickness of the layer that each room has; two layers make a wall.
+WALL_M = 0.06  # Thickness of a wall layer; a wall between two rooms has one layer of each room.
 HEIGHT_M = 2.5
 DOOR_WIDTH_M, DOOR_HEIGHT_M = 0.9, 2.05
 ROOM_SIZE_M = (4.4, 3.8)
 CORRIDOR_SIZE_M = (6.4, 1.6)
-DOOR_X_M = -0.1  # Center of the doorway in the room's frame, from the middle of its door wall.
+DOOR_X_M = -0.1  # Position of the doorway's center along the door wall, in the frame of a room.
 LAMP_SIDE_M = 0.5
 SHELL = Solid("box", (0.0, 0.0, 1.2), (8.0, 11.0, 4.0), "")  # Encloses the flat; never visible.
 
-# Frames of the rooms: origin on the floor at the middle of the door wall, y into the room.
+# Frames of the two rooms: origin on the floor at the middle of the door wall, y into the room.
 ROOM_A = Placement((-1.0, CORRIDOR_SIZE_M[1] / 2 + 2 * WALL_M, 0.0))
 ROOM_B = Placement((1.0, -CORRIDOR_SIZE_M[1] / 2 - 2 * WALL_M, 0.0), (-1.0, 0.0))
 CORRIDOR = Placement((0.0, 0.0, 0.0))
@@ -23,12 +23,12 @@ CORRIDOR = Placement((0.0, 0.0, 0.0))
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Slab of the building; shadows are computed for the one face that its room sees."""
+    """Slab of a wall, floor or ceiling; shadows are computed only on the face toward its room."""
 
     solid: Solid
     class_id: int
-    face: int  # Face that the room sees: 0-5 for the slab's sides -x, +x, -y, +y, -z, +z.
-    room: int  # Index 0-2 of the room, and of the lamp that lights the slab.
+    face: int  # Face toward the room: 0-5 for the slab's sides -x, +x, -y, +y, -z, +z.
+    room: int  # Index of the room, whose lamp lights the slab: 0 room A, 1 room B, 2 corridor.
 
 
 def lamp_centers_m() -> tuple[tuple[float, float, float], ...]:
@@ -60,7 +60,10 @@ def _room(placed: Placement, room: int, paint: str, floor: str) -> list[Panel]:
 
 
 def _corridor() -> list[Panel]:
-    """Return one side with a doorway and one end wall; a half turn gives the other two."""
+    """Return the panels of the corridor.
+
+    A half turn about z copies one side wall with a doorway and one end wall to the opposite ones.
+    """
     length, width = CORRIDOR_SIZE_M
     door_m = ROOM_A.origin_m[0] + DOOR_X_M
     slabs = [
@@ -95,7 +98,10 @@ def _level(
     size_m: tuple[float, float],
     floor: str,
 ) -> list[Panel]:
-    """Return the floor and ceiling; they extend under the walls to cover the doorways too."""
+    """Return the floor and the ceiling of a room.
+
+    Both extend to the outer faces of the walls, so that the floor also covers the doorways.
+    """
     extent = (size_m[0] + 2 * WALL_M, size_m[1] + 2 * WALL_M, 0.1)
     below = placed(Solid("box", (*center_m, -0.05), extent, floor))
     above = placed(Solid("box", (*center_m, HEIGHT_M + 0.05), extent, "ceiling"))

@@ -19,7 +19,8 @@ from ldo_service.storage.atomic_write import write_atomically
 
 log = logging.getLogger(__name__)
 
-LIMIT_BYTES = 3 << 30  # Maximum size of all sequences together; one of 640x480 takes 0.3-0.9 GB.
+# Maximum size of all sequences together; a sequence of 640x480 pixels takes 0.3-0.9 GB.
+LIMIT_BYTES = 3 << 30
 _HEADER = struct.Struct("<16s4I")  # Digest of the body, then the lengths of its four images.
 _DIGEST_BYTES = 16
 
@@ -35,7 +36,10 @@ class CachedFrame:
 
 
 def cache_root() -> Path:
-    """Return the folder LDO_CACHE, or ldo-slam in the user's cache folder."""
+    """Return the folder named by the environment variable LDO_CACHE.
+
+    If LDO_CACHE is not set, the folder is `ldo-slam` in the user's cache folder.
+    """
     if folder := os.environ.get("LDO_CACHE"):
         return Path(folder).expanduser()
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ldo-slam"
@@ -44,12 +48,19 @@ def cache_root() -> Path:
 class FrameCache:
     """Disk cache of the frames of one sequence.
 
-    The folder's name is a hash of the identity, which determines the bytes of all frames. The cache
-    deletes the oldest sequences when all of them together exceed LIMIT_BYTES. A cache that cannot
-    be written is not an error: the sequence then renders each frame whenever it is read.
+    The cache deletes the oldest sequences when all of them together exceed LIMIT_BYTES. A cache
+    that cannot be written is not an error: the sequence then renders a frame each time it is read.
     """
 
     def __init__(self, identity: str, width: int, height: int) -> None:
+        """Choose the folder of the sequence; nothing is written yet.
+
+        Args:
+            identity: Text that determines the bytes of all frames: the version of the renderer and
+                the parameters of the sequence. The folder's name is its hash.
+            width: Width of the images, pixels.
+            height: Height of the images, pixels.
+        """
         key = hashlib.blake2b(identity.encode(), digest_size=10).hexdigest()
         self.folder = cache_root() / "synthetic-flat" / key
         self._size = (height, width)
@@ -98,9 +109,9 @@ class FrameCache:
         return self.folder / f"{index:04d}.frame"
 
     def _make_room(self) -> None:
-        """Delete the sequences written longest ago until the rest fits.
+        """Delete the oldest sequences until the others and this sequence fit in LIMIT_BYTES.
 
-        This runs once per sequence, before its folder exists.
+        Nothing is deleted once the folder of this sequence exists.
         """
         if self.folder.exists() or not self.folder.parent.exists():
             return
@@ -117,7 +128,9 @@ class FrameCache:
         digest, *lengths = _HEADER.unpack_from(data)
         body = data[_HEADER.size :]
         if len(body) != sum(lengths) or _digest(body) != digest:
-            raise FrameError(f"the digest of {len(data)} bytes does not match.")
+            raise FrameError(
+                f"its {len(data)} bytes do not match the length or digest in its header."
+            )
         parts, start = [], 0
         for length in lengths:
             parts.append(memoryview(body)[start : start + length])

@@ -1,6 +1,6 @@
-"""Furniture of the flat: one row per object with class, shape, position and heading.
+"""Furniture of the flat: one row per object with class, shape number, position and heading.
 
-Positions and headings are in the frame of the room.
+Positions, in meters, and headings are in the frame of the room.
 """
 
 import numpy as np
@@ -13,8 +13,8 @@ from .scene_object import Heading, Placement, SceneObject
 
 Row = tuple[str, int, tuple[float, float, float], Heading]
 
-# Headings, named by the wall that an object's front (-y) faces in the room: the door wall (-y), the
-# back wall (+y), +x and -x.
+# Headings, named after the wall that the front (-y) of an object faces: DOOR the door wall at -y,
+# BACK the back wall at +y, RIGHT the wall at +x, LEFT the wall at -x. ASKEW and TURNED are oblique.
 DOOR, BACK, RIGHT, LEFT = (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)
 ASKEW, TURNED = (0.96, 0.28), (0.8, -0.6)
 
@@ -118,7 +118,8 @@ HALL: tuple[Row, ...] = (
     ("cardboard box", 0, (-0.35, -0.6, 0), BACK),
 )
 
-# Rows in the frame of an end: origin on the floor at the middle of the end wall, y into the wall.
+# Rows in the frame of a corridor end: origin on the floor at the middle of the end wall, y into the
+# wall.
 CORRIDOR_END: tuple[Row, ...] = (
     ("cabinet", 0, (-0.22, -0.24, 0), DOOR),
     ("vase", 1, (-0.5, -0.24, 0.84), DOOR),
@@ -135,7 +136,10 @@ ENDS = (Placement((_HALF_M, 0, 0), LEFT), Placement((-_HALF_M, 0, 0), RIGHT))
 
 
 def things(seed: int) -> tuple[tuple[SceneObject, int], ...]:
-    """Return every object of the flat in the world, with its room: 0, 1, or 2 for the corridor."""
+    """Return every object of the flat in the world frame, with the index of its room.
+
+    Index 0 is room A, the living room; 1 is room B, the kitchen; 2 is the corridor.
+    """
     paint = Materials(np.random.default_rng([seed, 0]))
     rooms = ((LIVING_ROOM, ROOM_A, 0), (KITCHEN, ROOM_B, 1), (HALL, CORRIDOR, 2))
     furnished = [
@@ -149,7 +153,7 @@ def things(seed: int) -> tuple[tuple[SceneObject, int], ...]:
 
 
 def _built(rows: tuple[Row, ...], paint: Materials) -> list[SceneObject]:
-    """Build the objects of the rows in the frame of their room."""
+    """Build the objects that the rows list, in the frame of their room."""
     made = [(label, CATALOG[label](paint, shape), at, way) for label, shape, at, way in rows]
     return [
         SceneObject(label, tuple(Placement(at, way)(solid) for solid in solids))

@@ -1,4 +1,4 @@
-"""Materials of the flat: one seeded pool per kind, independent of the object's class."""
+"""Materials of the flat: a pool of random textures per kind, shared by all classes of objects."""
 
 from dataclasses import dataclass
 
@@ -7,13 +7,14 @@ import numpy as np
 from ldo_service.synthetic import textures
 from ldo_service.synthetic.textures import TILE_TEXELS, Color, Texture, mipmapped
 
+# Number of different textures of each kind.
 KINDS = {"fabric": 8, "wood": 8, "plastic": 10, "metal": 5, "print": 6, "ceramic": 6, "leaves": 3}
 KINDS |= {"books": 2, "picture": 5, "screen": 3}
 
 
 @dataclass
 class Materials:
-    """Random choice of material names of a kind, such as "wood 3"."""
+    """Random choice of materials; called with the kind "wood", it returns a name like "wood 3"."""
 
     rng: np.random.Generator
 
@@ -22,7 +23,7 @@ class Materials:
 
 
 def materials(seed: int) -> dict[str, Texture]:
-    """Return every texture of the flat by name."""
+    """Return every texture of the flat by name; `seed` determines the textures."""
     rng = np.random.default_rng([seed, 1])
     painted = {f"{kind} {i}": _PAINTERS[kind](rng) for kind, n in KINDS.items() for i in range(n)}
     return painted | _building(rng)
@@ -50,7 +51,7 @@ def _building(rng: np.random.Generator) -> dict[str, Texture]:
 def _texture(tile: np.ndarray, size_m: float) -> Texture:
     """Return the texture of a tile in single precision.
 
-    This halves the memory traffic and is far finer than 8 bits.
+    Single precision halves the memory traffic and is far finer than the 8 bits of an image.
     """
     texture = mipmapped(tile, size_m)
     return Texture(texture.texels.astype(np.float32), texture.size_m)

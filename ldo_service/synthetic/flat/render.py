@@ -14,15 +14,24 @@ from .building import LAMP_SIDE_M, SHELL, Panel, lamp_centers_m
 from .scene import Flat, surfaces
 from .scene_object import WALL
 
-EXPOSURE = 1.15  # A white wall near the lamp is just below saturation.
-SHELL_FACES = 6  # The faces of the shell are the surfaces 0-5 of a cast.
+EXPOSURE = 1.15  # Factor on the light: a white wall near the lamp is just below saturation.
+SHELL_FACES = 6  # A ray cast numbers the faces of the shell 0-5 and the solids from 6 on.
 
 
 Point = tuple[float, float, float]
 
 
 def light_on_panel(panel: Panel, lamp_center_m: Point, solids: tuple[Solid, ...]) -> np.ndarray:
-    """Return the light [rows, columns] on a grid over the face of the panel that its room sees."""
+    """Return the light on the face of a panel toward its room.
+
+    Args:
+        panel: The panel.
+        lamp_center_m: Center of the lamp in the world frame.
+        solids: Solids that can cast a shadow on the panel.
+
+    Returns:
+        Light [rows, columns] on a grid with cells of LIGHT_CELL_M; 1 leaves the albedo unchanged.
+    """
     point, (rows, columns) = _grid_on_face(panel)
     lit = lit_share(lamp_center_m, LAMP_SIDE_M, _between(panel, lamp_center_m, solids), point)
     light = shade(vector(lamp_center_m), point, _normal(panel), lit, side=0.0)
@@ -30,16 +39,27 @@ def light_on_panel(panel: Panel, lamp_center_m: Point, solids: tuple[Solid, ...]
 
 
 def interpolated_on_panel(panel: Panel, grid: np.ndarray, local: Vector) -> np.ndarray:
-    """Return the grid's values [P] at points of the face in the solid's local frame."""
+    """Interpolate the light on a panel.
+
+    Args:
+        panel: The panel.
+        grid: Light [rows, columns] on the face, from `light_on_panel`.
+        local: P points on the face, in the local frame of the panel's solid.
+
+    Returns:
+        Light [P] at the points.
+    """
     a, b = plane_axes(panel.face // 2)
     u_m, v_m = ((local[i] + 1) * (panel.solid.size_m[i] / 2) for i in (a, b))
     return interpolated(grid, u_m, v_m)
 
 
 def is_on_face(panel: Panel, local: Vector) -> np.ndarray:
-    """Return which points [P] of a panel lie on the face that its room sees.
+    """Return a mask [P] of the points that lie on the face of a panel toward its room.
 
-    The points are in the solid's local frame.
+    Args:
+        panel: The panel.
+        local: P points on the panel's solid, in the solid's local frame.
     """
     return np.abs(local[panel.face // 2] - _side(panel)) < 1e-6
 
@@ -49,7 +69,7 @@ def _side(panel: Panel) -> float:
 
 
 def _between(panel: Panel, lamp_center_m: Point, solids: tuple[Solid, ...]) -> tuple[Solid, ...]:
-    """Return the solids that intersect the bounding box of panel and lamp.
+    """Return the solids that intersect the common bounding box of the panel and the lamp.
 
     No other solid can cast a shadow on the panel.
     """
@@ -90,7 +110,7 @@ class FlatRendering:
     """Exact images of one frame, before the sensor model."""
 
     light: np.ndarray  # Light [H, W, 3] float64 in 0..1.
-    depth_m: np.ndarray  # Depth [H, W] float64, z at pixel centers.
+    depth_m: np.ndarray  # Depth [H, W] float64, z of the surface at the pixel center.
     class_ids: np.ndarray  # Class per pixel [H, W] uint8.
     instance_ids: np.ndarray  # Object per pixel [H, W] uint16; 0 for the building.
 
@@ -109,10 +129,14 @@ class FlatRenderer:
         ]
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> FlatRendering:
-        """Render the flat from one camera pose [4, 4], or from one for each row, [H, 4, 4].
+        """Render the flat.
 
-        The light of a pixel on an outline is the mean of four rays. Depth and labels never mix
-        surfaces.
+        The light of a pixel at the outline of a surface is the mean of four rays. Depth and labels
+        come from one ray through the pixel center, so they never mix surfaces.
+
+        Args:
+            camera: Intrinsics.
+            T_world_camera: Camera pose [4, 4], or one for each row, [H, 4, 4].
         """
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
         view = RayCaster(SHELL, self._table.solids, camera, T_world_camera)

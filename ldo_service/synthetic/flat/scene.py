@@ -19,7 +19,7 @@ class Flat:
 
     panels: tuple[Panel, ...]
     things: tuple[SceneObject, ...]
-    rooms: tuple[int, ...]  # Room of each object; the lamp of that room lights it.
+    rooms: tuple[int, ...]  # Room index of each object; the lamp of that room lights the object.
     textures: dict[str, Texture]
 
 
@@ -34,7 +34,7 @@ class SurfaceTable:
     """Table of all S solids of the flat, the panels first."""
 
     solids: tuple[Solid, ...]
-    rooms: np.ndarray  # Room [S]; its lamp lights the solid.
+    rooms: np.ndarray  # Room index [S]; the lamp of that room lights the solid.
     class_ids: np.ndarray  # Class [S] uint8.
     instance_ids: np.ndarray  # Object [S] uint16; 0 for the building.
 

@@ -1,6 +1,7 @@
 """Object of the flat: its class and its solids.
 
-The classes are those of COCO in their usual order, then others, then the parts of the building.
+The list of classes starts with those of COCO in their usual order. Other classes of objects follow,
+then the parts of the building.
 """
 
 from dataclasses import dataclass, replace
@@ -39,10 +40,10 @@ class Placement:
     """Pose of an upright frame in an outer frame, z up in both."""
 
     origin_m: tuple[float, float, float]  # Origin in the outer frame.
-    heading: Heading = (1.0, 0.0)  # Unit vector (x, y) of its x axis in the outer frame.
+    heading: Heading = (1.0, 0.0)  # x axis of the upright frame as a unit vector (x, y) outside.
 
     def __call__(self, solid: Solid) -> Solid:
-        """Return the solid in the outer frame."""
+        """Transform a solid from the upright frame to the outer frame."""
         (x, y, z), (px, py, pz) = solid.center_m, self.origin_m
         (c, s), (hx, hy) = self.heading, solid.heading
         center_m = (px + (c * x - s * y), py + (s * x + c * y), pz + z)
@@ -51,14 +52,14 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """Object of one class, as solids in one frame."""
+    """Class name and solids of one object; all solids are in one frame."""
 
     label: str
     solids: tuple[Solid, ...]
 
     @property
     def bounds_m(self) -> tuple[np.ndarray, np.ndarray]:
-        """Center [3] and size [3] of the bounding box along the axes of its frame, meters."""
+        """Center [3] and size [3], meters, of the bounding box along the axes of that frame."""
         corners = np.concatenate([solid.corners_m() for solid in self.solids])
         low, high = corners.min(axis=0), corners.max(axis=0)
         return (low + high) / 2, high - low

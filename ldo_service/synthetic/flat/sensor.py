@@ -10,33 +10,37 @@ from ldo_service.synthetic.room_sequence import DISPARITY_SIGMA_STEPS, DISPARITY
 from .render import FlatRendering
 from .walk import FRAMES, RATE_HZ, CameraPath, closed_spline
 
-SHUTTER_S = 0.02  # Indoors in the evening: 11 pixels of blur at 60 degrees per second.
-BLUR_TAPS = 7  # Samples per pixel along its motion.
-EXPOSURE_S, EXPOSURE_SPREAD = 3.0, 0.2  # The gain drifts by +-20 % within seconds.
+# Exposure time indoors in the evening; a turn of 60 degrees per second blurs 11 of 640 pixels.
+SHUTTER_S = 0.02
+BLUR_TAPS = 7  # Samples along the motion of each pixel.
+# Time between the knots of the gain's random drift, and its largest deviation as a fraction.
+EXPOSURE_S, EXPOSURE_SPREAD = 3.0, 0.2
 NOISE = 0.008  # Standard deviation as a fraction of full scale: 2 gray levels.
 
 NEAREST_M, FARTHEST_M = 0.4, 5.0
-BASELINE_PX_M = 0.075  # Baseline of projector and camera, to be multiplied by the focal length.
+BASELINE_PX_M = 0.075  # Baseline of projector and camera in meters, for a focal length of 1 pixel.
 DARK = 0.12  # Brightness below which the camera begins to lose the projected pattern.
 PATCH_PX = 8  # Size of the holes on dark surfaces.
 WINDOW_PX = 6  # Size of the matching windows, in which neighbors have similar errors.
-# Shared and individual fractions of the disparity noise; their squares sum to 1.
+# Standard deviations of the disparity noise that a matching window shares and of the noise of a
+# single pixel, as fractions of the total; their squares sum to 1.
 SHARED_NOISE, OWN_NOISE = 0.8, 0.6
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Camera on a walk; `seed` determines the drift of its gain."""
+    """Kinect-like camera on a walk; `seed` determines the drift of the camera's gain."""
 
     camera: Camera
     walk: CameraPath
     seed: int
 
     def color(self, frame: int, rendering: FlatRendering, rng: np.random.Generator) -> np.ndarray:
-        """Return the recorded light [H, W, 3] with motion blur, gain and noise.
+        """Return the light [H, W, 3] that the camera records, with motion blur, gain and noise.
 
-        Motion during the exposure is approximated as linear: a pixel averages the sharp image
-        along the path of its surface. Surfaces that the motion uncovers are not modeled.
+        Motion during the exposure is approximated as linear: a pixel averages the sharp image along
+        the image path of the surface point it shows. Surfaces that the motion uncovers are not
+        modeled. Full scale is 1; values are not clipped.
         """
         gain = 1 + EXPOSURE_SPREAD * self._drift(frame)
         blurred = blur(rendering.light, *self.motion_px(frame, rendering.depth_m))
@@ -47,7 +51,7 @@ class Sensor:
         return measured_depth_m(rendering.depth_m, rendering.light, self.camera.fx, rng)
 
     def motion_px(self, frame: int, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the image motion in u and v, each [H, W], while the shutter is open."""
+        """Return the image motion in u and v, each [H, W] pixels, while the shutter is open."""
         half = SHUTTER_S * RATE_HZ / 2
         T_world_camera = self.walk.pose(frame)
         opened, closed = (
@@ -57,7 +61,7 @@ class Sensor:
         return closed[0] - opened[0], closed[1] - opened[1]
 
     def _drift(self, frame: int) -> float:
-        """Return a slowly varying value in -1..1."""
+        """Return the drift of the gain in -1..1, which varies slowly over the frames."""
         count = int(FRAMES / RATE_HZ / EXPOSURE_S)
         knots = np.random.default_rng([self.seed, 3]).random((count, 1)) * 2 - 1
         drift = closed_spline(knots, np.array([frame / FRAMES * count]))[0, 0]
@@ -69,14 +73,14 @@ def measured_depth_m(
 ) -> np.ndarray:
     """Return depth with the errors of a Kinect-like camera.
 
-    The depth has steps of 2.85e-3 z^2 (Khoshelham and Elberink, Sensors 2012), noise of half a
-    step that neighbors share, and ragged edges. There is no measurement in the projector's shadow,
-    on dark patches and outside 0.4-5 m.
+    The depth has steps of 2.85e-3 z^2 for z in meters (Khoshelham and Elberink, Sensors 2012),
+    ragged edges, and noise of half a step, most of which neighboring pixels share. There is no
+    measurement in the projector's shadow, on dark patches and outside 0.4-5 m.
 
     Args:
         exact_m: Exact depth [H, W], meters.
         light: Light [H, W, 3] in 0..1.
-        focal_px: Focal length.
+        focal_px: Focal length, pixels.
         rng: Source of the noise.
 
     Returns:
@@ -93,7 +97,8 @@ def measured_depth_m(
 def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     """Return nearly normal numbers of unit variance, bitwise equal on every machine.
 
-    They are sums of uniform numbers, which need no logarithm.
+    Each number is a sum of three uniform numbers. Exact normal numbers need logarithms, whose bits
+    differ between machines.
     """
     total = rng.random(shape) + rng.random(shape) + rng.random(shape)  # Variance 3 / 12.
     return 2 * (total - 1.5)
@@ -118,12 +123,12 @@ def blur(light: np.ndarray, du_px: np.ndarray, dv_px: np.ndarray) -> np.ndarray:
 def is_shadowed(depth_m: np.ndarray, baseline_px_m: float) -> np.ndarray:
     """Return a mask [H, W] of the pixels that the projector does not reach.
 
-    The projector is to the left of the camera. Pixel u with depth z lies at u + b f / z in its
-    image, and it lights only the nearest surface there.
+    The projector is to the left of the camera. Pixel u with depth z lies at u + b f / z in the
+    projector's image, and the projector lights only the nearest surface there.
 
     Args:
         depth_m: Exact depth [H, W], meters.
-        baseline_px_m: Baseline times focal length, b f.
+        baseline_px_m: Baseline in meters times focal length in pixels, b f.
     """
     height, width = depth_m.shape
     shift = baseline_px_m / np.maximum(depth_m, NEAREST_M)
@@ -137,7 +142,7 @@ def is_shadowed(depth_m: np.ndarray, baseline_px_m: float) -> np.ndarray:
 def _ragged(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Replace each depth by that of a pixel in the same row, at most two pixels away.
 
-    This models the inexact matching at edges.
+    This models the inexact matching of the projected pattern at edges.
     """
     shift = np.floor(0.7 * normal(rng, depth_m.shape) + 0.5).astype(np.int64)
     column = np.clip(np.arange(depth_m.shape[1]) + shift, 0, depth_m.shape[1] - 1)
@@ -145,14 +150,17 @@ def _ragged(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def is_too_dark(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return a mask [H, W] of pixels without measurement, more of them on darker surfaces."""
+    """Return a random mask [H, W] of the pixels that are too dark to be measured.
+
+    Holes have the size PATCH_PX. The darker a surface is, the more of its pixels are masked.
+    """
     brightness = (light[..., 0] + light[..., 1] + light[..., 2]) / 3
     patches = _enlarged(rng.random(_coarse(brightness.shape, PATCH_PX)), PATCH_PX, brightness.shape)
     return brightness < DARK * patches * (0.5 + rng.random(brightness.shape))
 
 
 def matching_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Return noise [H, W] of unit variance, most of it shared within a window."""
+    """Return noise [H, W] of unit variance, most of it shared by the pixels of a window."""
     shared = _enlarged(normal(rng, _coarse(shape, WINDOW_PX)), WINDOW_PX, shape)
     # Interpolation keeps 2/3 of the variance along each axis, hence the factor 1.5.
     return SHARED_NOISE * 1.5 * shared + OWN_NOISE * normal(rng, shape)
@@ -171,7 +179,7 @@ def _enlarged(coarse: np.ndarray, cell_px: int, shape: tuple[int, ...]) -> np.nd
 def _projected(
     camera: Camera, T_world_other: np.ndarray, T_world_camera: np.ndarray, depth_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Project the pixels of one camera pose into another.
+    """Project the surface points of a depth image into the image at another camera pose.
 
     Sums have a fixed order, so that the result is bitwise equal on every machine.
 
@@ -196,7 +204,7 @@ def _dot(a: np.ndarray, b: np.ndarray | list) -> np.ndarray:
 
 
 def _sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return bilinear values [H, W, C] at pixels, clamped to the border of the image."""
+    """Interpolate an image [H, W, C] bilinearly at pixels u, v, clamped to the image border."""
     height, width = image.shape[:2]
     u, v = np.clip(u, 0, width - 1.001), np.clip(v, 0, height - 1.001)
     left, top = u.astype(np.int64), v.astype(np.int64)

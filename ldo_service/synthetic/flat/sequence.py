@@ -20,8 +20,9 @@ from .scene_object import CLASS_NAMES, SceneObject
 from .sensor import Sensor
 from .walk import FRAMES, RATE_HZ, hand_held
 
-VERSION = 1  # Increase it with every change that alters a byte of any frame.
-FOCAL_PER_WIDTH = 0.8125  # Horizontal field of view of 63 degrees, as a Kinect's color camera.
+VERSION = 1  # Part of the cache's identity; increase it if a change alters a byte of any frame.
+# Focal length in image widths: a horizontal field of view of 63 degrees, as in a Kinect.
+FOCAL_PER_WIDTH = 0.8125
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +31,9 @@ class FlatConfig:
 
     width_px: int = 640
     height_px: int = 480
-    noise: bool = True  # Blur, exposure drift and a Kinect's depth; sharp and exact otherwise.
+    noise: bool = (
+        True  # Motion blur, exposure drift, noise and a Kinect's depth errors; else exact.
+    )
     seed: int = 0  # Seed of textures, materials, hand shake and noise.
 
     def __post_init__(self) -> None:
@@ -64,7 +67,7 @@ class FlatSequence(Sequence):
 
     @staticmethod
     def named(name: str, **changes: int | bool) -> "FlatSequence":
-        """Return the sequence `synthetic:name`, with fields of its config replaced by keywords.
+        """Return the sequence `synthetic:NAME`, with the config fields in `changes` replaced.
 
         Raises:
             DataError: If the name is unknown.
@@ -82,7 +85,7 @@ class FlatSequence(Sequence):
 
     @cached_property
     def things(self) -> tuple[SceneObject, ...]:
-        """Objects in the world; instance id i is `things[i - 1]`, id 0 the building."""
+        """Objects in the world frame; instance id i is `things[i - 1]`, id 0 is the building."""
         return self._flat.things
 
     def read(self, index: int) -> RawFrame:

@@ -1,4 +1,4 @@
-"""Walk with a hand-held camera that visits each room twice through the corridor."""
+"""Walk with a hand-held camera: each room is visited twice, with the corridor between the rooms."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,9 @@ from ldo_service.synthetic.path import closed_spline, lengths, looking
 RATE_HZ = 15
 FRAMES = 640
 
-# Knots from room A's door to room B's: camera position x, y, z in meters and gaze x, y, z. A half
-# turn about the world's z axis gives the way back from B to A.
+# Knots of a way around room A and along the corridor to the door of room B. Each has the camera
+# position x, y, z in meters and the viewing direction x, y, z. A half turn about the world's z axis
+# gives the way around room B and back to the door of room A.
 FIRST_HALF = np.array(
     [
         # Room A, from left to right.
@@ -50,24 +51,27 @@ SECOND_HALF = np.array(
 HALF_TURN = np.array([-1, -1, 1, -1, -1, 1])
 KNOTS = np.concatenate([FIRST_HALF, FIRST_HALF * HALF_TURN, SECOND_HALF, SECOND_HALF * HALF_TURN])
 
-# Speeds of walking and turning; their times per step are combined as a root sum of squares.
+# Relative speeds of walking and turning. A step lasts the root sum of squares of the times for its
+# length and for its turn.
 WALK_M_S, TURN_RAD_S = 0.63, 1.02
 STEPS_PER_KNOT = 64  # Resolution of the table that maps time to a position on the path.
 
-# Period and amplitudes of the hand's slow drift and of its quick tremor.
+# Hand shake, as a slow sway and a quick tremor: period in seconds, amplitude of the camera center
+# in meters, and amplitude of the viewing direction.
 SWAY_S, SWAY_EYE_M, SWAY_GAZE = 0.6, 0.012, 0.022
 TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE = 0.2, 0.0015, 0.004
 
 
 @dataclass(frozen=True, slots=True)
 class CameraPath:
-    """Camera motion as a function of time, a closed curve with `FRAMES` frames."""
+    """Closed camera path that takes `FRAMES` frames once around."""
 
-    along: np.ndarray  # Positions [M + 1] on the knots at equal time steps.
-    shakes: tuple[np.ndarray, ...]  # Knots [K, 7] of closed splines added to eye, gaze and roll.
+    along: np.ndarray  # Spline parameter [M + 1], in knots, at equal time steps.
+    # Knots [K, 7] of closed splines that are added to camera center, viewing direction and roll.
+    shakes: tuple[np.ndarray, ...]
 
     def pose(self, frame: float) -> np.ndarray:
-        """Return T_world_camera [4, 4] at `frame`, which may be fractional."""
+        """Return T_world_camera [4, 4] at the time `frame`, in frames; fractions are allowed."""
         turn = frame / FRAMES % 1.0
         x = turn * (len(self.along) - 1)
         cell = int(x)
@@ -92,9 +96,10 @@ def _shake(rng: np.random.Generator, period_s: float, eye_m: float, gaze: float)
 
 
 def timed_positions() -> np.ndarray:
-    """Return positions on the knots at equal time steps.
+    """Return the spline parameter [M + 1], in knots, at equal time steps around the walk.
 
-    Neither the walking speed nor the turn rate is exceeded for long.
+    Steps with a long way or a large turn take more time, in proportion to WALK_M_S and TURN_RAD_S.
+    The sequence scales all times to its own duration.
     """
     place = np.arange(len(KNOTS) * STEPS_PER_KNOT + 1) / STEPS_PER_KNOT
     state = closed_spline(KNOTS, place[:-1])

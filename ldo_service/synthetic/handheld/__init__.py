@@ -1,4 +1,6 @@
-"""Simulator of a hand-held RGB-D camera: motion and effects of real cameras, with exact truth.
+"""Simulator of a hand-held RGB-D camera with the effects of real cameras and exact ground truth.
+
+Examples of sequence names:
 
 synthetic:tour-handheld              all effects, with a Kinect's depth
 synthetic:tour-handheld:blur         motion blur alone, with exact depth

@@ -8,20 +8,21 @@ from ldo_service.geometry import Camera
 from ldo_service.synthetic.flat.sensor import blur, normal
 from ldo_service.synthetic.optics import undistorted
 
-# Vignetting of the green channel of an ASUS Xtion (Bonn RGB-D Dynamic, `crowd`): 0.73 in the middle
-# of a side and 0.65 in the corner, where r = 1; other channels by factors on the loss.
-VIGNETTING = (-0.62, 0.42, -0.15)  # Coefficients of r^2, r^4, r^6.
-CHANNEL_LOSS = (1.06, 1.0, 0.88)  # Red, green, blue.
-TARGET = 0.42  # Mean of an image that automatic exposure aims at.
+# Vignetting of the green channel of an ASUS Xtion (Bonn RGB-D Dynamic, `crowd`). The radius r is 1
+# in the corners. The factor on the light is 0.65 there and 0.73 in the middle of the left side.
+VIGNETTING = (-0.62, 0.42, -0.15)  # Coefficients of r^2, r^4, r^6 in the factor minus 1.
+CHANNEL_LOSS = (1.06, 1.0, 0.88)  # Red, green, blue: scales the factor minus 1.
+TARGET = 0.42  # Mean gray value, 0..1, that automatic exposure aims at.
 MIN_GAIN, MAX_GAIN = 0.4, 3.0
-# Fraction of the difference from the target that exposure and white balance correct in a frame.
+# Fraction of the difference from the target that exposure and white balance correct per frame.
 EXPOSURE_RATE, BALANCE_RATE = 0.3, 0.1
-MEMORY_FRAMES = 12  # Frames that automatic exposure and white balance start before a frame.
-NOISE = 0.006  # Standard deviation at a gain of 1, fraction of full scale.
+# Exposure and white balance of a frame are simulated over this number of frames before the frame.
+MEMORY_FRAMES = 12
+NOISE = 0.006  # Standard deviation at a gain of 1, as a fraction of full scale.
 
 
 def vignetting(camera: Camera) -> np.ndarray:
-    """Return the factor of each pixel and channel, [H, W, 3]."""
+    """Return the factor of the vignetting on the light of each pixel and channel, [H, W, 3]."""
     half_w, half_h = camera.width / 2, camera.height / 2
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     x, y = u - (camera.width - 1) / 2, v - (camera.height - 1) / 2
@@ -32,10 +33,10 @@ def vignetting(camera: Camera) -> np.ndarray:
 
 
 def automatic_gains(means: np.ndarray) -> np.ndarray:
-    """Return the gain of each channel [3] after frames with these mean colors.
+    """Return the channel gains [3] of automatic exposure and white balance after some frames.
 
     Args:
-        means: Mean light of the last frames and channels, [N, 3], oldest first.
+        means: Mean light of each channel in each frame, [N, 3], oldest first; N is at least 1.
     """
     gain, balance = None, None
     for mean in means:
@@ -51,18 +52,18 @@ def automatic_gains(means: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class RowPoses:
-    """Camera poses T_world_camera [H, 4, 4] of the image rows at three times of their exposure."""
+    """Poses T_world_camera of all image rows, each [H, 4, 4], at three times of the exposure."""
 
-    opened: np.ndarray  # The shutter opens.
-    middle: np.ndarray
-    closed: np.ndarray  # The shutter closes.
+    opened: np.ndarray  # Poses at the start of the exposure.
+    middle: np.ndarray  # Poses at the middle of the exposure.
+    closed: np.ndarray  # Poses at the end of the exposure.
 
 
 def blurred(light: np.ndarray, depth_m: np.ndarray, camera: Camera, rows: RowPoses) -> np.ndarray:
     """Return the light [H, W, 3] averaged over the exposure of each row.
 
-    A pixel averages the sharp image along the path of its surface. Surfaces that the motion
-    uncovers are not modeled.
+    A pixel averages the sharp image along the image path of the surface point it shows. Surfaces
+    that the motion uncovers are not modeled.
     """
     return blur(light, *exposure_motion_px(depth_m, camera, rows))
 
@@ -70,7 +71,7 @@ def blurred(light: np.ndarray, depth_m: np.ndarray, camera: Camera, rows: RowPos
 def exposure_motion_px(
     depth_m: np.ndarray, camera: Camera, rows: RowPoses
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the image motion in u and v during the exposure, each [H, W]."""
+    """Return the image motion in u and v during the exposure, each [H, W] pixels."""
     start = projected_px(depth_m, camera, rows.middle, rows.opened)
     end = projected_px(depth_m, camera, rows.middle, rows.closed)
     return end[0] - start[0], end[1] - start[1]
@@ -79,7 +80,7 @@ def exposure_motion_px(
 def projected_px(
     depth_m: np.ndarray, camera: Camera, T_world_camera: np.ndarray, T_world_other: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels u and v, each [H, W], of all surfaces from another pose of their row.
+    """Project the surface point of each pixel into the image at another pose of the pixel's row.
 
     The projection ignores lens distortion, because only differences of pixels are used.
 
@@ -87,7 +88,10 @@ def projected_px(
         depth_m: Depth [H, W], meters.
         camera: Intrinsics.
         T_world_camera: Poses [H, 4, 4] of the rows of depth_m.
-        T_world_other: Poses [H, 4, 4] of the rows to project into.
+        T_world_other: Poses [H, 4, 4] that the rows are projected into.
+
+    Returns:
+        Pixel coordinates u and v, each [H, W].
     """
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     x, y = undistorted(camera, u, v)
@@ -107,6 +111,6 @@ def projected_px(
 
 
 def recorded(light: np.ndarray, gains: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the light [H, W, 3] with the gains [3] of the channels and noise."""
+    """Apply the gains [3] of the channels to the light [H, W, 3] and add sensor noise."""
     noise = NOISE * (0.5 + 0.5 * gains) * normal(rng, light.shape)
     return gains * light + noise

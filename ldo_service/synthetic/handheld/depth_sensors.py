@@ -1,6 +1,6 @@
 """Depth cameras: structured light, time of flight and stereo, with a smooth bias.
 
-All functions use + - * / and square roots alone, so they are bitwise equal on every machine.
+All functions use + - * / and square roots alone, so results are bitwise equal on every machine.
 """
 
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ from ldo_service.synthetic.flat.sensor import (
 
 from .effects import DepthSensor
 
-# Time of flight: noise of 3 mm at 0 m and 1.2 mm/m^2 on a white surface, as of an Azure Kinect.
+# Time of flight, as in an Azure Kinect: on a white surface, the noise is 3 mm + 1.2 mm/m^2 * z^2.
 TOF_FLOOR_M, TOF_GROWTH_PER_M = 0.003, 0.0012
 TOF_NEAREST_M, TOF_FARTHEST_M = 0.3, 5.5
-EDGE = 1.05  # Ratio of depths of neighboring pixels on two surfaces.
-# Stereo: baseline and matching error of a RealSense D435, and its subpixel steps.
+EDGE = 1.05  # Neighboring pixels are on two surfaces if their depths have at least this ratio.
+# Stereo, as in a RealSense D435: baseline, matching error and subpixel steps of the disparity.
 STEREO_BASELINE_M, STEREO_SIGMA_PX, STEREO_STEP_PX = 0.05, 0.08, 1 / 32
-STEREO_WINDOW_PX = 5  # A near surface covers the far one by half of the matching window.
+STEREO_WINDOW_PX = 5  # Matching window; near surfaces appear wider by half a window on each side.
 STEREO_NEAREST_M, STEREO_FARTHEST_M = 0.3, 8.0
 
 
@@ -33,8 +33,9 @@ STEREO_NEAREST_M, STEREO_FARTHEST_M = 0.3, 8.0
 class DepthBias:
     """Smooth error of inverse depth, 1 / z' = 1 / z + c20 x^2 + c11 x y + c02 y^2.
 
-    x and y are pixels from the center of the image in half image widths. The sizes are those of the
-    ASUS Xtion of the sequence `crowd` of Bonn RGB-D Dynamic, 70 to 210 mm at the sides in 3 m.
+    x and y are the offset of a pixel from the image center, in half image widths. The coefficients
+    have the size of those of the ASUS Xtion in the sequence `crowd` of Bonn RGB-D Dynamic. At 3 m,
+    that camera errs by 70 to 210 mm at the sides of the image.
     """
 
     c20_per_m: float
@@ -43,7 +44,7 @@ class DepthBias:
 
     @staticmethod
     def of_seed(seed: int) -> "DepthBias":
-        """Return the bias of one camera, with signs and sizes drawn by the seed."""
+        """Return the bias of one camera; the seed determines signs and sizes."""
         c20, c11, c02 = np.random.default_rng([seed, 11]).random(3)
         signs = np.where(np.random.default_rng([seed, 12]).random(3) < 0.5, -1.0, 1.0)
         sizes = np.array([0.010 + 0.010 * c20, 0.008 + 0.010 * c11, 0.006 + 0.010 * c02])
@@ -57,7 +58,7 @@ class DepthBias:
         return self.c20_per_m * x * x + self.c11_per_m * x * y + self.c02_per_m * y * y
 
     def biased(self, depth_m: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return measured depth [H, W] with the bias; 0 stays 0."""
+        """Add the bias to measured depth [H, W], meters; unknown depth, 0, stays 0."""
         inverse = 1 / np.where(depth_m > 0, depth_m, 1.0) + self.inverse_per_m(camera)
         return np.where((depth_m > 0) & (inverse > 0), 1 / np.maximum(inverse, 1e-6), 0.0)
 
@@ -75,7 +76,7 @@ def measure(
         sensor: Kind of camera.
         exact_m: Exact depth [H, W], meters.
         light: Light [H, W, 3] in 0..1.
-        focal_px: Focal length.
+        focal_px: Focal length, pixels.
         rng: Source of the noise.
     """
     if sensor == "kinect":
@@ -88,7 +89,10 @@ def measure(
 
 
 def _time_of_flight(exact_m: np.ndarray, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return depth with noise that grows on dark surfaces, and flying pixels at edges."""
+    """Return depth [H, W] with noise that grows on dark surfaces, and flying pixels at edges.
+
+    A flying pixel measures a depth between those of two neighboring surfaces.
+    """
     small = exact_m.astype(np.float32)
     near_m, far_m = (f(small, np.ones((3, 3))).astype(float) for f in (cv2.erode, cv2.dilate))
     share = rng.random(exact_m.shape)
@@ -104,7 +108,10 @@ def _time_of_flight(exact_m: np.ndarray, light: np.ndarray, rng: np.random.Gener
 def _stereo(
     exact_m: np.ndarray, light: np.ndarray, focal_px: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return depth from disparity, with widened near surfaces and occlusions."""
+    """Return depth [H, W] computed from noisy disparity.
+
+    Near surfaces are widened, and pixels that one of the two cameras does not see have depth 0.
+    """
     window = np.ones((STEREO_WINDOW_PX, STEREO_WINDOW_PX))
     widened_m = cv2.erode(exact_m.astype(np.float32), window).astype(float)
     scale = focal_px * STEREO_BASELINE_M

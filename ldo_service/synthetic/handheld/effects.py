@@ -19,7 +19,7 @@ class Effects:
     vignetting: bool = False  # The corners of the color image are darker.
     exposure: bool = False  # Automatic exposure and white balance, and sensor noise.
     depth_bias: bool = False  # Smooth depth error over the image.
-    depth: DepthSensor = "exact"  # Noise, holes and edges of a depth camera.
+    depth: DepthSensor = "exact"  # Depth camera, which determines noise, holes and errors at edges.
 
 
 ALL = Effects(True, True, True, True, True, True, True, "kinect")
@@ -31,12 +31,13 @@ def parse_effects(text: str, name: str) -> Effects:
     """Return the effects that are listed after `-handheld`, such as `:blur+tof`.
 
     Args:
-        text: Nothing for all effects with a Kinect; or a colon and names joined by +. `all` and
-            `none` are names too. `all` includes `kinect`; the last depth camera counts.
-        name: Name of the sequence, for an error.
+        text: Empty for all effects with a Kinect, or a colon and names joined by `+`. `all` and
+            `none` are names too, and `all` includes `kinect`. Of several depth cameras, the last
+            one is used.
+        name: Name of the sequence, for the error message.
 
     Raises:
-        DataError: A name is unknown.
+        DataError: If an effect is unknown.
     """
     if not text:
         return ALL

@@ -7,23 +7,24 @@ import numpy as np
 from ldo_service.synthetic.flat.walk import KNOTS, timed_positions
 from ldo_service.synthetic.path import Path, closed_spline, lengths, looking
 
-# Period of the hand's slow drift and of its quick tremor, seconds, and their amplitudes: of the
-# camera center in meters, and of gaze and roll in radians.
+# Hand shake, as a slow sway and a quick tremor: period in seconds, amplitude of the camera center
+# in meters, and amplitude of viewing direction and roll in radians.
 SWAY_S, SWAY_EYE_M, SWAY_RAD = 0.6, 0.02, 0.06
 TREMOR_S, TREMOR_EYE_M, TREMOR_RAD = 0.2, 0.002, 0.008
 
 
 @dataclass(frozen=True, slots=True)
 class HandMotion:
-    """Motion along a closed curve, once in `duration_s`."""
+    """Closed camera path that takes `duration_s` once around."""
 
-    knots: np.ndarray  # Camera center and gaze, [M, 6].
-    along: np.ndarray  # Positions [K + 1] on the knots at equal time steps.
+    knots: np.ndarray  # Camera center in meters and viewing direction, [M, 6].
+    along: np.ndarray  # Spline parameter [K + 1], in knots, at equal time steps.
     duration_s: float
-    shakes: tuple[np.ndarray, ...]  # Knots [K, 7] of closed splines added to eye, gaze and roll.
+    # Knots [S, 7] of closed splines that are added to camera center, viewing direction and roll.
+    shakes: tuple[np.ndarray, ...]
 
     def poses(self, times_s: np.ndarray) -> np.ndarray:
-        """Return T_world_camera [N, 4, 4] at times [N]."""
+        """Return T_world_camera [N, 4, 4] at times [N], seconds."""
         turn = times_s / self.duration_s
         turn = turn - np.floor(turn)
         x = turn * (len(self.along) - 1)
@@ -39,7 +40,7 @@ class HandMotion:
 
 
 def room_motion(path: Path, duration_s: float, seed: int) -> HandMotion:
-    """Return the motion along a path through the room, with the shake of a hand."""
+    """Return the motion along a path through the room; `seed` determines the hand shake."""
     knots = np.concatenate([path.eyes_m, path.targets_m - path.eyes_m], axis=1)
     knots[:, 3:] /= lengths(knots[:, 3:])[:, None]
     along = np.arange(len(knots) + 1.0)
@@ -47,7 +48,7 @@ def room_motion(path: Path, duration_s: float, seed: int) -> HandMotion:
 
 
 def flat_motion(duration_s: float, seed: int) -> HandMotion:
-    """Return the walk through the flat, with the shake of a hand."""
+    """Return the walk through the flat; `seed` determines the hand shake."""
     return HandMotion(KNOTS, timed_positions(), duration_s, _shakes(duration_s, seed))
 
 

@@ -1,4 +1,4 @@
-"""Sequences of a hand-held camera with the effects of real ones, and exact truth."""
+"""Sequences of a simulated hand-held camera with the effects of real cameras and ground truth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -31,16 +31,17 @@ from .depth_sensors import DepthBias, measure
 from .effects import Effects, parse_effects
 from .motion import HandMotion, flat_motion, room_motion
 
-VERSION = 2  # Increase it with every change that alters a byte of any frame.
+VERSION = 2  # Part of the cache's identity; increase it if a change alters a byte of any frame.
 MARK = "-handheld"
 WIDTH_PX, HEIGHT_PX = 640, 480
-FOCAL_PX = 520.0  # Horizontal field of view of 63 degrees, as a Kinect's color camera.
-DISTORTION = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)  # The Kinect of TUM's freiburg1.
-READOUT_S = 0.025  # Time between the first row and the last one.
+FOCAL_PX = 520.0  # Horizontal field of view of 63 degrees, as in a Kinect's color camera.
+# k1, k2, p1, p2, k3 of the Kinect of the TUM RGB-D sequences freiburg1.
+DISTORTION = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+READOUT_S = 0.025  # Rolling shutter: time between the first row and the last row.
 EXPOSURE_S = 0.02
-# Delay of depth after color, drawn by the seed.
+# Bounds of the delay of depth after color; the seed determines the delay.
 MIN_DELAY_S, MAX_DELAY_S = 0.010, 0.020
-METERING_STEP = 16  # Automatic exposure measures an image that is smaller by this factor.
+METERING_STEP = 16  # Automatic exposure measures an image whose sides are smaller by this factor.
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,15 +50,21 @@ class ExactImages:
 
     light: np.ndarray  # [H, W, 3] float64 in 0..1.
     depth_m: np.ndarray  # [H, W] float64.
-    class_ids: np.ndarray  # [H, W] uint8.
-    instance_ids: np.ndarray  # [H, W] uint16.
+    class_ids: np.ndarray  # [H, W] uint8; 0 in scenes without labels.
+    instance_ids: np.ndarray  # [H, W] uint16; 0 for the building and in scenes without labels.
 
 
 class Scene(Protocol):
     """Scene that is rendered from one pose, or from one pose for each row."""
 
     def render(self, camera: Camera, T_world_camera: np.ndarray, time_s: float) -> ExactImages:
-        """Render what is there at a time, from poses [4, 4] or [H, 4, 4]."""
+        """Render the scene.
+
+        Args:
+            camera: Intrinsics.
+            T_world_camera: Camera pose [4, 4], or one for each row, [H, 4, 4].
+            time_s: Time since the first frame, which determines where moving objects are.
+        """
         ...
 
 
@@ -98,8 +105,8 @@ class FlatScene:
 class Walk:
     """Scene with the motion of the camera through it."""
 
-    scene: Callable[[int], Scene]  # By seed.
-    motion: Callable[[int], HandMotion]  # By seed.
+    scene: Callable[[int], Scene]  # Creates the scene of a seed.
+    motion: Callable[[int], HandMotion]  # Creates the motion of a seed.
     frames: int
     rate_hz: int
 
@@ -128,7 +135,9 @@ class HandheldConfig:
 
     def __post_init__(self) -> None:
         if self.walk not in WALKS:
-            raise ConfigError(f"walk={self.walk!r} must be one of {', '.join(WALKS)}.")
+            raise ConfigError(
+                f"simulated camera: walk={self.walk!r} must be one of {', '.join(WALKS)}."
+            )
         if self.seed < 0:
             raise ConfigError(f"simulated camera: seed={self.seed} must be at least 0.")
 
@@ -156,10 +165,14 @@ class HandheldSequence(Sequence):
 
     @staticmethod
     def named(name: str, **changes: int | bool) -> "HandheldSequence":
-        """Return the sequence `synthetic:name`, such as `tour-handheld:blur+kinect`.
+        """Return the sequence `synthetic:NAME`, with the config fields in `changes` replaced.
+
+        Args:
+            name: Name with optional effects, such as `tour-handheld:blur+kinect`.
+            **changes: Values of fields of the config, such as `seed`.
 
         Raises:
-            DataError: The scene or an effect is unknown.
+            DataError: If the scene or an effect is unknown.
         """
         scene, _, effects = name.partition(MARK)
         if scene not in WALKS or (effects and not effects.startswith(":")):
@@ -176,11 +189,11 @@ class HandheldSequence(Sequence):
         return Trajectory(times_s, self._motion.poses(times_s))
 
     def row_poses(self, index: int, *, shift_s: float = 0.0) -> np.ndarray:
-        """Return T_world_camera [H, 4, 4] when the rows of a color image are exposed.
+        """Return T_world_camera [H, 4, 4] in the middle of the exposure of each color image row.
 
         Args:
-            index: Number of the frame.
-            shift_s: Time that is added.
+            index: Index of the frame.
+            shift_s: Time that is added to the times of all rows.
         """
         readout_s = READOUT_S if self.config.effects.rolling_shutter else 0.0
         rows = (np.arange(HEIGHT_PX) - (HEIGHT_PX - 1) / 2) / (HEIGHT_PX - 1)
@@ -189,8 +202,8 @@ class HandheldSequence(Sequence):
     def depth_row_poses(self, index: int) -> np.ndarray:
         """Return T_world_camera [H, 4, 4] when the rows of a depth image are measured.
 
-        Structured light has a rolling shutter as the color camera has; other cameras measure all
-        rows at once.
+        Time of flight and stereo measure all rows at once. Exact depth and a Kinect's depth have
+        the same shutter as the color camera.
         """
         if self.config.effects.depth in ("tof", "stereo"):
             time_s = np.full(HEIGHT_PX, self._time_s(index) + self.depth_delay_s)
@@ -199,7 +212,7 @@ class HandheldSequence(Sequence):
 
     @property
     def depth_bias(self) -> DepthBias | None:
-        """Bias of the depth camera; None without the effect."""
+        """Bias of the depth camera; None if the effect `depth-bias` is off."""
         return DepthBias.of_seed(self.config.seed) if self.config.effects.depth_bias else None
 
     def exposure_rows(self, index: int) -> RowPoses:
@@ -220,13 +233,18 @@ class HandheldSequence(Sequence):
 
     @cached_property
     def scene(self) -> Scene:
-        """Scene of the sequence."""
+        """Scene that the camera moves through."""
         return self._walk.scene(self.config.seed)
 
     def exact(self, index: int, T_world_camera: np.ndarray) -> ExactImages:
-        """Return what a perfect camera would record from these row poses.
+        """Return the images that a perfect camera would record from given row poses.
 
-        A person is where it is at the time of the frame, also for late rows and late depth.
+        The person stands where it is at the stamp of the frame, even in rows and depth images that
+        are recorded earlier or later.
+
+        Args:
+            index: Index of the frame.
+            T_world_camera: Poses of the image rows, [H, 4, 4].
         """
         return self.scene.render(self.raw_camera, T_world_camera, self._time_s(index))
 
@@ -254,9 +272,10 @@ class HandheldSequence(Sequence):
         return CachedFrame(color.astype(np.uint8), depth_m.astype(np.float32), *ids)
 
     def _rectified_ids(self, index: int, exact: ExactImages) -> tuple[np.ndarray, np.ndarray]:
-        """Return the classes and the objects of the pixels of the rectified image, each [H, W].
+        """Return the class ids and instance ids of the rectified image's pixels, each [H, W].
 
-        Evaluation renders the map's labels by a pinhole camera at the true pose of the frame.
+        They are compared with labels that evaluation renders from the map, with a pinhole camera at
+        the true pose of the frame.
         """
         effects = self.config.effects
         if self.config.walk == "flat" and (effects.distortion or effects.rolling_shutter):
