@@ -1,4 +1,4 @@
-"""Data of a finished run for evaluation. `ldo_service.runs.finished` reads it from a folder."""
+"""Data of a finished run for evaluation; `ldo_service.runs.finished` reads them from a folder."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from ldo_service.semantics.semantics_file import SavedSemantics
 
 from .loops import FoundLoops
 
-# The files hold stamps with nanoseconds, which float64 seconds cannot represent exactly.
+# Stamps that differ less are equal: float64 seconds cannot represent the nanoseconds of the files.
 STAMP_TOLERANCE_S = 1e-6
 
 
@@ -30,13 +30,13 @@ class RunFrame:
 
     @property
     def is_lost(self) -> bool:
-        """True for a frame without a pose."""
+        """True if the tracking status is LOST; such a frame has no pose."""
         return self.status == "LOST"
 
 
 @dataclass(frozen=True, slots=True)
 class FrameCounts:
-    """Numbers of the tracked frames of a run by their pose and tracking status."""
+    """Numbers of tracked frames of a run: all, those with a pose, and those with status OK."""
 
     frames: int
     with_pose: int  # Frames with a pose in the map; frames of unmerged submaps have none.
@@ -57,8 +57,8 @@ class Exposures:
     """Exposures of the keyframes.
 
     Attributes:
-        stamps_ns: [K], ascending.
-        matrices: Gains and biases, [K, 2, 3].
+        stamps_ns: Stamps of the keyframes, [K], ascending.
+        matrices: Gains (row 0) and biases (row 1) of the three color channels, [K, 2, 3].
     """
 
     stamps_ns: np.ndarray
@@ -67,8 +67,8 @@ class Exposures:
     def at(self, stamp_ns: int) -> Exposure:
         """Return the exposure at a stamp, interpolated linearly between the neighboring keyframes.
 
-        Without keyframes, return the default exposure, which leaves the colors of the map
-        unchanged.
+        If there are no keyframes, the result is the default exposure, which does not change the
+        colors of the map.
         """
         if len(self.stamps_ns) == 0:
             return Exposure()
@@ -102,10 +102,10 @@ class PosedMap:
     correction: CameraCorrection = field(default_factory=CameraCorrection)
 
     def T_map_camera(self, frame: RunFrame) -> np.ndarray:
-        """Return the pose of a frame, [4, 4].
+        """Return T_map_camera of a frame, [4, 4].
 
         Raises:
-            DataError: The trajectory has no pose for the frame.
+            DataError: If the trajectory has no pose for the frame.
         """
         gaps_s = np.abs(self.trajectory.stamps_s - frame.stamp_ns * 1e-9)
         if len(gaps_s) == 0 or gaps_s.min() > STAMP_TOLERANCE_S:
@@ -118,20 +118,17 @@ class PosedMap:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FinishedRun:
-    """A finished run.
+    """A finished run."""
 
-    `estimates` holds T_map_camera as published during the run ("online") and after the last
-    correction of the pose graph ("final"). If the map was optimized further after the run, it also
-    holds the poses after that ("refined"). Pictures are saved to `folder`.
-    """
-
-    folder: Path
+    folder: Path  # Folder of the run; pictures are saved here.
     frames: tuple[RunFrame, ...]  # Tracked frames of the run.
+    # Trajectories T_map_camera: "online" as published during the run, "final" after the last
+    # correction of the pose graph, and "refined" if the map was optimized further after the run.
     estimates: dict[str, Trajectory]
-    # Maps at the final and, if there are any, at the refined poses. A localization run has none.
+    # Maps at the final poses and, if there are any, at the refined poses; none after localization.
     maps: tuple[PosedMap, ...]
     vlm_calls: int | None = None  # Calls of the labeller; None if the run did not record them.
-    loops: FoundLoops | None = None  # Missing if loop closing was off.
+    loops: FoundLoops | None = None  # Found loops; None if loop closing was off.
     keyframes: Mapping[int, int] = field(default_factory=dict)  # Frame index by keyframe id.
 
     def frame(self, index: int) -> RunFrame:
@@ -139,17 +136,21 @@ class FinishedRun:
         return next(frame for frame in self.frames if frame.index == index)
 
     def counts(self) -> FrameCounts:
-        """Return how many frames have a pose in the map, and how many of these are OK."""
+        """Count the frames, those with a pose in the map, and those of them with status OK."""
         final = self.estimates["final"]
         ok = at_stamps(final, self.stamps_s("OK"))
         return FrameCounts(len(self.frames), len(final.stamps_s), len(ok.stamps_s))
 
     def stamps_s(self, status: str) -> np.ndarray:
-        """Return the stamps of the frames with a tracking status, [M], ascending."""
+        """Return the stamps of all frames with the given tracking status, [M] s, ascending."""
         return np.array([f.stamp_ns * 1e-9 for f in self.frames if f.status == status])
 
     def require_source(self, sequence: Sequence) -> None:
-        """Raise DataError if a frame of the run is not in the sequence with the same stamp."""
+        """Check that the sequence has every frame of the run, with the same index and stamp.
+
+        Raises:
+            DataError: If a frame is missing or has another stamp.
+        """
         for frame in self.frames:
             is_there = 0 <= frame.index < len(sequence)
             if not is_there or sequence.stamps_ns[frame.index] != frame.stamp_ns:
@@ -160,7 +161,12 @@ class FinishedRun:
 
 
 def at_stamps(trajectory: Trajectory, stamps_s: np.ndarray) -> Trajectory:
-    """Return the poses with a stamp among `stamps_s` [M], ascending."""
+    """Select the poses of a trajectory at some stamps.
+
+    Args:
+        trajectory: The trajectory.
+        stamps_s: Stamps to select, [M], ascending.
+    """
     if len(stamps_s) == 0:
         return Trajectory(trajectory.stamps_s[:0], trajectory.T_world_camera[:0])
     nearest = np.searchsorted(stamps_s, trajectory.stamps_s - STAMP_TOLERANCE_S)

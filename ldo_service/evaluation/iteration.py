@@ -30,8 +30,8 @@ def bench_camera(width: int, height: int) -> Camera:
 def walls(n: int, camera: Camera, seed: int = 0) -> np.ndarray:
     """Return flat Gaussians, rows [n, 16], on the walls of a room around the camera.
 
-    They are ordered by image row. Each Gaussian covers about as many pixels as the image has per
-    Gaussian. A tenth of the Gaussians lies outside of the image.
+    The rows are sorted by the image row of the Gaussians. A Gaussian covers about W H / n pixels of
+    the image. A tenth of the Gaussians lies outside of the image.
     """
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-0.65, 0.65, n), np.sort(rng.uniform(-0.5, 0.5, n))
@@ -79,7 +79,7 @@ class Iteration:
         self._by_planes = np.empty_like(self._planes)
 
     def forward(self) -> np.ndarray:
-        """Render the planes [5, H, W] as `Rasterizer.render` does."""
+        """Render the planes [5, H, W] of the image: color, weighted depth and opacity."""
         self._planes = self._rasterizer.render(
             self.gaussians.rows, self.camera, np.eye(4), bounds=self.gaussians.bounds
         )
@@ -92,7 +92,7 @@ class Iteration:
         return self._by_planes
 
     def backward(self) -> RowGradients:
-        """Compute the derivatives with respect to rows and pose, without a step of Adam."""
+        """Compute the derivatives of the loss by rows and pose, without a step of Adam."""
         return self._rasterizer.gradients(self._by_planes)
 
     def descent(self) -> VisibleGaussians:
@@ -108,8 +108,8 @@ class Iteration:
 class IterationTimes:
     """Median times of the steps of an iteration in milliseconds.
 
-    The step of Adam runs inside the backward pass. `adam_ms` is the time of the backward pass with
-    it, minus that of the backward pass without it.
+    The step of Adam runs inside the backward pass. `adam_ms` is the time that the step adds to the
+    backward pass.
     """
 
     forward_ms: float
@@ -167,7 +167,10 @@ def _shares(n: int, largest: int) -> list[int]:
 
 
 def _turned_away(keyframes: Sequence[int]) -> dict[int, np.ndarray]:
-    """Return rotations about the vertical, by angles from a quarter to three quarters of a turn."""
+    """Return a rotation [4, 4] about the vertical axis per keyframe id, away from the camera.
+
+    The angles are evenly spread from a quarter to three quarters of a turn.
+    """
     angles = np.linspace(0.5 * np.pi, 1.5 * np.pi, max(len(keyframes), 2))
     return {
         keyframe: se3.exp(np.array([0, angle, 0, 0, 0, 0]))

@@ -1,4 +1,4 @@
-"""Label lists: the classes of an evaluation, and mappings of data-set and map labels to them."""
+"""Lists of label names for evaluation, and mappings of data-set and map labels to them."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -10,8 +10,9 @@ from ldo_service.errors import DataError
 from ldo_service.geometry.sequence import VOID_NAMES
 
 BACKGROUND = "background"
-BUILDING = frozenset({BACKGROUND, "wall", "floor", "ceiling"})  # Names that no map uses.
-VOID, UNKNOWN = 255, 254  # Ignored ground truth; a name of the map that is not in the list.
+BUILDING = frozenset({BACKGROUND, "wall", "floor", "ceiling"})  # Names evaluated as background.
+# Indices for ground truth that is ignored, and for a name of the map that is not in the list.
+VOID, UNKNOWN = 255, 254
 MAX_NAMES = UNKNOWN
 
 
@@ -56,7 +57,7 @@ def coco_list(class_names: Iterable[str]) -> LabelSet:
     """Return the list of background and the COCO classes that a data set contains.
 
     The table of synonyms maps names of the data set to COCO classes. Names without a COCO class map
-    to background. The name `other` is not in the list.
+    to background, except `other`: that name of a map is not in the list.
     """
     mapped = {coco_class(name) for name in class_names}
     return LabelSet("COCO", (BACKGROUND, *(n for n in COCO if n in mapped)), _in_coco)
@@ -68,7 +69,7 @@ def full_list(class_names: Iterable[str]) -> LabelSet:
     An object that has a COCO class is listed under the name of that class.
 
     Raises:
-        DataError: There are more names than a label image can hold.
+        DataError: If there are more names than a label image can hold.
     """
     placed = (place_of_object(name) for name in class_names if not is_void(name))
     names = tuple(dict.fromkeys((BACKGROUND, *placed)))
@@ -98,8 +99,8 @@ def is_void(name: str) -> bool:
 def place_of_object(name: str) -> str:
     """Map a label name to the corresponding name in the full list.
 
-    This is its COCO class if there is one. Otherwise, it is background for parts of the building,
-    and the name itself for any other object.
+    Parts of the building map to background. Any other name maps to its COCO class, or to its
+    canonical form if there is no such class.
     """
     plain = canonical(name)
     return BACKGROUND if plain in BUILDING else coco_class(plain) or plain

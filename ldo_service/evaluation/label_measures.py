@@ -11,10 +11,10 @@ from ldo_service.geometry.sequence import FrameLabels
 
 from .label_lists import BACKGROUND, VOID, LabelSet, place_of_object
 
-NEAREST_M = 0.05  # Least depth in the second camera.
-SAME_SURFACE = 0.02  # Largest relative depth difference on one surface.
+NEAREST_M = 0.05  # Minimum depth in the second camera of a point that is compared.
+SAME_SURFACE = 0.02  # Maximum relative difference of two depths that show one surface.
 
-MIN_SHARE = 0.005  # Least fraction of the pixels of a view; smaller objects are ignored.
+MIN_SHARE = 0.005  # Minimum size of an object that counts, as a fraction of the pixels of a view.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -42,9 +42,9 @@ class Agreement:
 
     @property
     def share(self) -> float:
-        """Fraction of the pixels in `objects` that agree; NaN if there are none.
+        """Fraction of the pixels in `objects` that agree; NaN if `objects` is 0.
 
-        Pixels that are background in both images are excluded, because they agree almost always.
+        Pixels that show background in both images are excluded, because most of them agree.
         """
         return self.same / self.objects if self.objects else float("nan")
 
@@ -55,8 +55,8 @@ def correspondences(
     """Return the corresponding pixels of two views.
 
     A pixel of the first view is projected into the second view with its measured depth, and rounded
-    to the nearest pixel. The two pixels correspond if the depth measured there differs by at most
-    2 % from the projected depth, so that both show one surface.
+    to the nearest pixel. The two pixels correspond if the measured depth of the second pixel
+    differs by less than 2 % from the projected depth, so that both show one surface.
 
     Args:
         first: The first view.
@@ -77,7 +77,13 @@ def correspondences(
 
 
 def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) -> Agreement:
-    """Count the corresponding pixels of two label images [H, W] that agree; 0 is background."""
+    """Count the corresponding pixels with an object, and those of them with equal labels.
+
+    Args:
+        first: Labels of the first view, [H, W]; 0 is background.
+        second: Labels of the second view, [H, W].
+        pixels: Corresponding pixels of the views.
+    """
     here, there = first.ravel()[pixels.first], second.ravel()[pixels.second]
     objects = (here > 0) | (there > 0)
     return Agreement(int(np.sum((here == there) & objects)), int(np.sum(objects)))
@@ -85,7 +91,7 @@ def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) ->
 
 @dataclass(frozen=True, slots=True)
 class DetectionCounts:
-    """Recall and precision of names, over objects or over pixels."""
+    """Counts of objects or of pixels with a name, and the recall and precision of the names."""
 
     right: int = 0  # Named correctly in the map.
     wanted: int = 0  # Named in the ground truth.
@@ -110,32 +116,33 @@ class DetectionCounts:
 class OpenNames:
     """Scores of names without a COCO class, over pixels and over objects, added view by view.
 
-    An object is an instance of the data set. The map's name for it is the one that most of its
-    pixels have, over all views in which it fills at least 0.5 % of the image. Parts of the building
-    are included, because the map may give a wall the name of an object.
+    An object is an instance of the data set. The map's name of an object is the name of most of the
+    object's pixels, over all views in which the object fills at least 0.5 % of the image. Parts of
+    the building count as objects here, because the map may give a wall the name of an object.
     """
 
     def __init__(self, labels: LabelSet, map_names: Sequence[str]) -> None:
         """Start with no views.
 
         Args:
-            labels: The full list of a data set.
-            map_names: Names by label of the map.
+            labels: The full list of a data set, see `label_lists.full_list`.
+            map_names: Names of the map's labels, by label.
         """
         self.pixels = DetectionCounts()
         self._of_map = labels.of_map(map_names)
         self._is_named = _table(map_names)
         self._is_wanted = _table(labels.names)
-        self._votes: dict[int, np.ndarray] = {}  # Pixels by label of the map [256], by instance.
-        self._truth: dict[int, int] = {}  # Index in the list, by instance.
+        # Number of pixels with each label of the map, [256], by instance id.
+        self._votes: dict[int, np.ndarray] = {}
+        self._truth: dict[int, int] = {}  # True index in the list, by instance id.
 
     def add(self, frame: FrameLabels, truth: np.ndarray, shown: np.ndarray) -> None:
         """Add a view.
 
         Args:
             frame: Ground-truth labels of the view.
-            truth: Index in the list or VOID, [H, W] uint8.
-            shown: Label of the map, [H, W] uint8.
+            truth: True index in the list, or VOID, [H, W] uint8.
+            shown: Labels of the map, [H, W] uint8.
         """
         self._add_pixels(truth, shown)
         sizes = np.bincount(frame.instance_ids.ravel())
@@ -166,12 +173,12 @@ class OpenNames:
 
 
 def is_beyond_coco(name: str) -> bool:
-    """Return whether a name is the name of an object that has no COCO class."""
+    """Return whether a name denotes an object without a COCO class; `other` does not."""
     return place_of_object(name) not in (BACKGROUND, "other", *COCO)
 
 
 def _table(names: Sequence[str]) -> np.ndarray:
-    """Return which names are beyond COCO, [256] bool by index."""
+    """Return which of some names denote objects without a COCO class, [256] bool by index."""
     table = np.zeros(256, bool)
     table[: len(names)] = [is_beyond_coco(name) for name in names]
     return table
@@ -182,11 +189,11 @@ class Segmentation:
     """Segmentation metrics, 0..1; NaN if no pixel is evaluated."""
 
     classes: int  # Number of evaluated classes.
-    pixel_accuracy: float  # Accuracy over all pixels that count.
-    mean_accuracy: float
-    mean_iou: float
-    object_iou: float  # Mean IoU without background.
-    weighted_iou: float  # Mean IoU weighted by frequency.
+    pixel_accuracy: float  # Fraction of all pixels with ground truth that is right.
+    mean_accuracy: float  # Mean over the evaluated classes.
+    mean_iou: float  # Mean over the evaluated classes.
+    object_iou: float  # Mean over the evaluated classes except background.
+    weighted_iou: float  # Mean IoU, weighted by the number of true pixels of each class.
 
 
 def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
@@ -199,9 +206,9 @@ def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
     [[1, 1, 0], [0, 0, 1]]
 
     Args:
-        truth: Index in a list of C names, [H, W] uint8; VOID is ignored.
-        shown: Index in the list, [H, W] uint8; larger values are unknown.
-        classes: C.
+        truth: True index in a list of C names, [H, W] uint8; VOID is ignored.
+        shown: Index of the name in the map, [H, W] uint8; values from C on are unknown names.
+        classes: Number of names, C.
 
     Returns:
         Pixels by true class and shown class, [C, C + 1] int64; the last column is unknown.
@@ -217,10 +224,11 @@ def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
 
         accuracy = right / true,  IoU = right / (true + shown - right)
 
-    for each class, with `true` pixels of the class, `shown` pixels labelled with it, and `right`
-    pixels in both. The means are over the classes that have more than the fraction `gate` of the
-    pixels. Pixels shown with an unknown name are wrong. Pixel accuracy, mean accuracy, mean IoU and
-    frequency-weighted IoU are those of Long et al., CVPR 2015, section 5.
+    for each class, with `true` pixels of the class in the ground truth, `shown` pixels with the
+    label of the class in the map, and `right` pixels in both. The means are over the classes that
+    have more than the fraction `gate` of the true pixels. Pixels with an unknown name in the map
+    are wrong. Pixel accuracy, mean accuracy, mean IoU and frequency-weighted IoU are those of Long
+    et al., CVPR 2015, section 5.
 
     Example: a cup has two pixels, of which one is found, and one pixel of the wall is labelled cup.
 
@@ -246,7 +254,7 @@ def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
 def class_ious(counts: np.ndarray) -> np.ndarray:
     """Return the IoU of each class of a confusion matrix [C, C + 1], [C].
 
-    It is NaN for a class that is neither in the ground truth nor shown.
+    The IoU is NaN for a class that is neither in the ground truth nor in the map.
     """
     right = np.diag(counts)
     union = counts.sum(axis=1) + counts.sum(axis=0)[:-1] - right

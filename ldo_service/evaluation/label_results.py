@@ -21,7 +21,7 @@ from .sheet import VIEWS, shrunk
 CAPTIONS = ["camera", "truth", "map", "error"]
 PAINT = 0.65  # Opacity of a label's color over the gray camera image.
 GOLDEN_RATIO = 0.618033988749895
-SHADES = ((0.95, 1.0), (0.55, 1.0), (0.85, 0.65))  # Saturation, value.
+SHADES = ((0.95, 1.0), (0.55, 1.0), (0.85, 0.65))  # Saturation and value, 0..1, of each shade.
 VOID_COLOR, UNKNOWN_COLOR = (0, 0, 0), (255, 255, 255)
 RIGHT, MISSED, BEYOND = (46, 160, 67), (31, 111, 235), (178, 205, 245)
 INVENTED, CONFUSED = (207, 34, 46), (240, 190, 30)
@@ -33,7 +33,7 @@ ERRORS = {
     "another object": CONFUSED,
 }
 
-MIN_OBJECTS = 0.02  # Least fraction of object pixels in a frame of the sheet.
+MIN_OBJECTS = 0.02  # Minimum fraction of object pixels in a frame of the sheet.
 FIGURES = ("mean_iou", "object_iou", "weighted_iou", "mean_accuracy", "pixel_accuracy")
 
 
@@ -50,11 +50,19 @@ def label_sheet(
 ) -> np.ndarray:
     """Draw a row [camera, truth, map, error] per picture, and a legend of the names that occur.
 
-    The legend has the names of `label_lists.full_list`. Pixels of background show the camera
-    image in gray. The result is uint8 RGB.
+    Pixels of background show the camera image in gray.
+
+    Args:
+        pictures: Views to draw.
+        map_names: Names of the map's labels, by label.
+        class_names: Names of the data set's classes, by class id. The legend has the names of
+            their `label_lists.full_list`.
+
+    Returns:
+        The sheet, RGB [H, W, 3] uint8.
 
     Raises:
-        ValueError: There is no picture.
+        ValueError: If there is no picture.
     """
     labels = full_list(class_names)
     of_truth, of_map = labels.of_truth(class_names), labels.of_map(map_names)
@@ -86,7 +94,8 @@ def _pictures(
 def label_colors(indices: abc.Sequence[int]) -> np.ndarray:
     """Return a color table [256, 3] uint8 with different colors for the given label indices.
 
-    From one index to the next, the hue advances by the golden ratio, in three shades.
+    From one index to the next, the hue advances by the golden ratio and the shade is the next of
+    SHADES.
     """
     colors = np.zeros((256, 3), np.uint8)
     for place, index in enumerate(indices):
@@ -97,7 +106,16 @@ def label_colors(indices: abc.Sequence[int]) -> np.ndarray:
 
 
 def painted(color: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Draw each object in its color over the gray image, [H, W, 3] uint8."""
+    """Draw the objects of a label image over the gray camera image.
+
+    Args:
+        color: Camera image, RGB [H, W, 3] uint8.
+        labels: Label indices, [H, W] uint8; 0 is background and stays gray.
+        colors: Color of each label, [256, 3] uint8.
+
+    Returns:
+        The picture, RGB [H, W, 3] uint8.
+    """
     gray = _gray(color)
     mixed = (1 - PAINT) * gray + PAINT * colors[labels]
     return np.where(labels[..., None] > 0, np.round(mixed), gray).astype(np.uint8)
@@ -106,9 +124,19 @@ def painted(color: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
 def error_colors(
     color: np.ndarray, truth: np.ndarray, shown: np.ndarray, labels: LabelSet
 ) -> np.ndarray:
-    """Draw the errors in the colors of `ERRORS`, [H, W, 3] uint8.
+    """Draw the label errors in the colors of `ERRORS`.
 
-    Pixels are gray where both images show background, and black where ground truth is void.
+    Pixels are gray where both label images have background, and black where the ground truth is
+    void.
+
+    Args:
+        color: Camera image, RGB [H, W, 3] uint8.
+        truth: True indices in the list, [H, W] uint8.
+        shown: Indices of the map's names in the list, [H, W] uint8.
+        labels: The list.
+
+    Returns:
+        The picture, RGB [H, W, 3] uint8.
     """
     is_object, is_shown = truth > 0, shown > 0
     picture = _gray(color).astype(np.uint8)
@@ -138,7 +166,9 @@ def sheet_of_labels(
 ) -> np.ndarray | None:
     """Draw the contact sheet of some frames, including those with most and fewest label errors.
 
-    Return None if no frame has an object.
+    Returns:
+        The sheet, RGB [H, W, 3] uint8. None if the source has no true labels, or if no frame has
+        enough object pixels.
     """
     truth = sequence.true_labels()
     chosen = frames_to_show(errors.lists[0])
@@ -157,15 +187,15 @@ def sheet_of_labels(
 def frames_to_show(errors: ListErrors, count: int = VIEWS) -> list[tuple[int, str]]:
     """Choose frames with objects, spread from the worst to the best.
 
-    A frame is ranked by the fraction of its object pixels that is right. Frames with few object
-    pixels are not chosen.
+    Frames are ranked by the fraction of their object pixels with the right label. Frames in which
+    at most MIN_OBJECTS of the pixels show an object are not chosen.
 
     Args:
         errors: Errors of one list of names.
         count: Number of frames.
 
     Returns:
-        Frames in ascending order, each with the label above its row.
+        Index of each frame and the text above its row of the sheet, ascending by index.
     """
     shares = {}
     for frame, counts in zip(errors.frames, errors.confusions, strict=True):

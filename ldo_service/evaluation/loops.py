@@ -12,28 +12,29 @@ from .trajectory import ASSOCIATION_TOLERANCE_S
 
 APART_FRAMES = 100
 MIN_OVERLAP = 0.3
-KEPT_ACROSS, ASKED_ACROSS = 160, 40  # Pixels per row: of the stored depth, of those compared.
+KEPT_ACROSS, ASKED_ACROSS = 160, 40  # Pixels per row of the stored depth and of the comparison.
 # Two depths show one surface if they differ by less than SAME_M plus SAME_SHARE of the depth.
 SAME_M, SAME_SHARE = 0.05, 0.03
-LEFTOVER, LEAST = 5, 3  # Maximum and minimum keyframes of a subgraph missing in loops.json.
+LEFTOVER, LEAST = 5, 3  # Maximum and minimum keyframes of a subgraph that loops.json does not list.
 
 PROTOCOL = """\
-Loops: a pair of subgraphs is true if a keyframe of one and a keyframe of the other overlap and are
-more than 100 frames apart. They overlap if each sees more than 30 % of the other's measured pixels,
-by the source's depth (within 5 cm + 3 %) and true poses. Precision: true closures of all closures.
-Recall: newer subgraphs that closed a true pair, of those that have one. Keyframes that loops.json
-puts into no subgraph form subgraphs of five; fewer than three are ignored. Errors: pose of each
-closure against the true one. Time: of the whole search over its candidates, per candidate."""
+Loops: two keyframes overlap if each sees more than 30 % of the other's measured pixels, by the
+source's depth (within 5 cm + 3 %) and true poses. A pair of subgraphs is true if a keyframe of one
+overlaps a keyframe of the other, and these two are more than 100 frames apart. Precision: fraction
+of the closures that connect a true pair. Recall: of the subgraphs in a true pair with an older
+subgraph, the fraction that a closure connects to such an older subgraph. Keyframes that are in no
+subgraph of loops.json form subgraphs of five; fewer than three are ignored. Errors: pose of each
+closure against the true pose. Time: of a search, divided by its number of candidates."""
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedPair:
-    """Two compared subgraphs, by the ids of their keyframes."""
+    """Loop candidate: two subgraphs that were compared, by the ids of their keyframes."""
 
     newer: tuple[int, ...]
     older: tuple[int, ...]
-    is_closure: bool
-    ms: float | None  # Missing if not measured.
+    is_closure: bool  # False if the candidate was rejected.
+    ms: float | None  # Duration of the comparison; None if not measured.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -84,13 +85,13 @@ class LoopErrors:
 
     closures: int
     true_closures: int
-    queries: int  # Subgraphs with a true partner.
-    closed_queries: int
+    queries: int  # Subgraphs that form a true pair with an older subgraph.
+    closed_queries: int  # Queries with a closure to such an older subgraph.
     candidates: int
-    position_errors_m: tuple[float, ...]  # One per closure.
-    rotation_errors_deg: tuple[float, ...]  # One per closure.
-    ms: tuple[float, ...]  # One per measured candidate.
-    retrieved_queries: int = 0  # Queries with a true partner among their candidates.
+    position_errors_m: tuple[float, ...]  # One per closure whose keyframes have true poses.
+    rotation_errors_deg: tuple[float, ...]  # One per closure whose keyframes have true poses.
+    ms: tuple[float, ...]  # Duration of the comparison of each candidate that was timed.
+    retrieved_queries: int = 0  # Queries with such an older subgraph among their candidates.
 
     @property
     def precision(self) -> float | None:
@@ -99,7 +100,7 @@ class LoopErrors:
 
     @property
     def recall(self) -> float | None:
-        """Fraction of the queries that have a loop closure with a true partner."""
+        """Fraction of the queries that a closure connects to an older subgraph of a true pair."""
         return self.closed_queries / self.queries if self.queries else None
 
 
@@ -109,9 +110,9 @@ def seen_keyframes(
     """Return the keyframes that have a true pose within 20 ms of their stamp, by id.
 
     Args:
-        frames: Frame index of each keyframe, by id.
+        frames: Frame index of each keyframe, by keyframe id.
         sequence: The sequence.
-        truth: True poses.
+        truth: True poses T_world_camera.
     """
     stamps_s = 1e-9 * sequence.stamps_ns[list(frames.values())]
     pairs = associate(stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
@@ -147,7 +148,7 @@ def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> 
 
     Args:
         found: Candidates and closures of a run.
-        keyframes: Keyframes with a true pose, by id; the others are ignored.
+        keyframes: Keyframes with a true pose, by id. Keyframes that are not here are ignored.
     """
     subgraphs = _subgraphs(found, keyframes)
     index = {subgraph: number for number, subgraph in enumerate(subgraphs)}
@@ -171,7 +172,7 @@ def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> 
 
 
 def overlap(new: SeenKeyframe, old: SeenKeyframe) -> float:
-    """Return the fraction of the measured pixels of `new` whose surface `old` measured too.
+    """Return the fraction of the measured pixels of `new` whose surface is also measured in `old`.
 
     For speed, only about 40 pixels per row are compared.
     """

@@ -10,17 +10,17 @@ LAYOUT = (
     "two inputs float32 [1, 3, H, W], RGB in -1..1, and one output with a single number, as "
     "torch.onnx.export writes lpips.LPIPS(net='alex')"
 )
-OF_EQUAL_IMAGES = 1e-4  # Largest distance of an image to itself.
+OF_EQUAL_IMAGES = 1e-4  # Maximum distance of an image to itself, by which the network is checked.
 
 
 class Lpips:
-    """LPIPS of two images, by an ONNX network with the inputs and outputs of `LAYOUT`.
+    """LPIPS of two images, computed by an ONNX network with the inputs and outputs of `LAYOUT`.
 
     Height and width of the network may be dynamic.
 
     Raises:
-        ConfigError: The file is no network with that layout. The error occurs on opening it or at
-            the first pair of images.
+        ConfigError: If the file is no network with that layout. The constructor or the first call
+            raises the error.
     """
 
     def __init__(self, path: Path, *, threads: int = 1) -> None:
@@ -29,7 +29,7 @@ class Lpips:
         self.path = path
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        options.log_severity_level = 4  # The exception has the message already.
+        options.log_severity_level = 4  # Turns the log off: the exception has the message.
         try:
             if not path.is_file():
                 raise FileNotFoundError("there is no such file")
@@ -37,13 +37,15 @@ class Lpips:
                 str(path), options, providers=["CPUExecutionProvider"]
             )
         except Exception as error:  # The exceptions of onnxruntime have no common base class.
-            raise ConfigError(f"--lpips {path} cannot be opened: {_first_line(error)}.") from error
+            raise ConfigError(
+                f"--lpips {path} cannot be opened: {_first_line(error)}. Expected: {LAYOUT}."
+            ) from error
         self._names = [node.name for node in self._session.get_inputs()]
         self._require_layout()
         self._is_checked = False
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
-        """Return the distance of two images [H, W, 3] in 0..1."""
+        """Return the LPIPS distance of two images, each [H, W, 3] in 0..1."""
         if not self._is_checked:
             self._require_distance(a)
             self._is_checked = True

@@ -21,10 +21,13 @@ NAMES = "xyz"
 
 
 def trajectory_picture(estimate: Trajectory, truth: Trajectory | None) -> np.ndarray:
-    """Draw the estimate (blue) and the truth (gray) from above and from the side, [H, W, 3].
+    """Draw the estimate (blue) and the truth (gray) from above and from the side.
 
-    The estimate is aligned to the truth if at least three poses have a partner. The world axes are
-    sorted by the extent of the camera motion: the two longest span the view from above.
+    If at least three poses have a true pose within 20 ms, the estimate is aligned to the truth. The
+    view from above shows the two world axes with the largest extent of the camera motion.
+
+    Returns:
+        The picture, RGB [H, W, 3] uint8.
     """
     lines = [] if truth is None else [_Line(truth.T_world_camera[:, :3, 3], TRUTH, "ground truth")]
     lines.append(_Line(_aligned_positions(estimate, truth), ESTIMATE, "estimate"))
@@ -38,11 +41,14 @@ def trajectory_picture(estimate: Trajectory, truth: Trajectory | None) -> np.nda
 
 
 def depth_picture(depth_m: np.ndarray, range_m: tuple[float, float] | None = None) -> np.ndarray:
-    """Draw depth [H, W] in Turbo colors, [H, W, 3]: near is red, far is blue, missing is black.
+    """Draw depth in Turbo colors: near is red, far is blue, unknown is black.
 
     Args:
-        depth_m: [H, W].
-        range_m: Nearest and farthest depth; None for those of `depth_range`.
+        depth_m: Depth [H, W]; 0 or not finite where unknown.
+        range_m: Nearest and farthest depth of the color scale; None for those of `depth_range`.
+
+    Returns:
+        The picture, RGB [H, W, 3] uint8.
     """
     seen = np.isfinite(depth_m) & (depth_m > 0)
     if not seen.any():
@@ -56,7 +62,7 @@ def depth_picture(depth_m: np.ndarray, range_m: tuple[float, float] | None = Non
 
 
 def depth_range(depth_m: np.ndarray) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of the measured depth [H, W]; zeros if there is none."""
+    """Return the 2nd and 98th percentile of the known depth [H, W]; zeros if all is unknown."""
     seen = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
     if seen.size == 0:
         return 0.0, 0.0
@@ -74,15 +80,15 @@ def contact_sheet(
 ) -> np.ndarray:
     """Arrange images in rows, with a caption above each column and a label above each row.
 
-    All images are scaled to the height of the first.
+    All images are scaled to fit into the size of the first image.
 
     Args:
         rows: Images [H, W, 3] uint8.
         captions: A caption for each column.
-        labels: A label for each row, or None.
+        labels: A label for each row; None for no labels.
 
     Raises:
-        ValueError: The table is empty, or a row has another length.
+        ValueError: If there is no image, or the numbers of images, captions and labels differ.
     """
     if not rows or any(len(row) != len(captions) for row in rows) or not captions:
         raise ValueError("a contact sheet must have at least one row, with one image per caption")
@@ -105,7 +111,7 @@ def contact_sheet(
 
 
 def legend(entries: list[tuple[str, Color]], width_px: int) -> np.ndarray:
-    """Draw names with their colors in as many lines as necessary, [H, width, 3] uint8."""
+    """Draw names with their colors, in as many lines as necessary; [H, width_px, 3] uint8."""
     places, x, line = [], MARGIN_PX // 2, 0
     for name, _ in entries:
         wide = 34 + 9 * len(name)
@@ -231,7 +237,7 @@ def save_picture(path: Path, image: np.ndarray) -> None:
     """Write an RGB image [H, W, 3] uint8; the file suffix determines the format.
 
     Raises:
-        OSError: The file cannot be written.
+        OSError: If the file cannot be written.
     """
     if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
         raise OSError(f"{path} cannot be written")

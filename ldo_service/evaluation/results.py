@@ -29,15 +29,15 @@ NO_LABELS = "The map has no labels to evaluate. Run with a detector: --set detec
 class Results:
     """Scores and pictures of a run."""
 
-    trajectories: dict[str, TrajectoryErrors] | None  # Missing without ground truth.
+    trajectories: dict[str, TrajectoryErrors] | None  # By estimate; None without ground truth.
     evaluated: EvaluatedFrames
     renderings: list[RenderingErrors]
-    labels: list[LabelErrors]  # Errors of maps with labels, if the source has true labels.
+    labels: list[LabelErrors]  # One per map with labels; empty if the source has no true labels.
     unlabelled: str  # Reason why labels are not evaluated, or empty.
-    counts: FrameCounts  # Frames with a pose.
-    vlm_calls_per_frame: float | None  # Missing if the run did not record them.
-    pictures: list[Path]
-    loops: LoopErrors | None = None  # Missing without ground truth or loop closing.
+    counts: FrameCounts  # Numbers of frames with a pose.
+    vlm_calls_per_frame: float | None  # Labeller calls; None if the run did not record them.
+    pictures: list[Path]  # Files that were written.
+    loops: LoopErrors | None = None  # Loop errors; None without ground truth or loop closing.
 
 
 def evaluate_run(
@@ -52,15 +52,15 @@ def evaluate_run(
 
     Args:
         run: The run.
-        sequence: Its source, with ground truth and true labels if known.
+        sequence: Source of the run, with ground truth and true labels if known.
         advance: Progress function, called with the number of frames done so far; `work` returns
             the total.
-        distance: LPIPS, see `views.evaluate_rendering`.
+        distance: LPIPS, see `views.evaluate_rendering`; None to omit LPIPS.
         threads: Threads of the renderer.
 
     Raises:
-        DataError: A file of the run does not fit the sequence, or nothing can be evaluated.
-        ConfigError: A picture cannot be written.
+        DataError: If a file of the run does not fit the sequence, or nothing can be evaluated.
+        ConfigError: If a picture cannot be written.
     """
     evaluated, truth = EvaluatedFrames.of(run.frames), sequence.truth()
     if truth is None and not (evaluated.posed and run.maps):
@@ -92,7 +92,7 @@ def evaluate_run(
 
 
 def work(run: FinishedRun, sequence: Sequence) -> int:
-    """Return the number of frames to render plus the number of frames to label."""
+    """Return the total number of frames of `evaluate_run`: to render, plus to label."""
     labelled = has_labels(run) and sequence.true_labels() is not None
     return len(EvaluatedFrames.of(run.frames).posed) * (1 + labelled)
 
@@ -105,7 +105,7 @@ def has_labels(run: FinishedRun) -> bool:
 def missing_labels(run: FinishedRun, sequence: Sequence) -> str:
     """Return the reason why labels are not evaluated, as a text.
 
-    The text is empty if they are evaluated. It is also empty if the run has no map, or if
+    The text is empty if the labels are evaluated. It is also empty if the run has no map, or if
     neither the map nor the source has labels.
     """
     has_truth = sequence.true_labels() is not None
@@ -129,7 +129,12 @@ def run_loop_errors(run: FinishedRun, sequence: Sequence, truth: Trajectory) -> 
 
 
 def compare(run: FinishedRun, truth: Trajectory) -> dict[str, TrajectoryErrors]:
-    """Score each estimate: over all frames with a pose, and over those with status OK."""
+    """Score each estimated trajectory against the truth.
+
+    Returns:
+        Errors over all frames with a pose, by name of the estimate. If some of these frames do not
+        have the status OK, the key "NAME, OK frames" has the errors over the frames that do.
+    """
     rows = {}
     for name, estimate in run.estimates.items():
         rows[name] = evaluate_trajectory(estimate, truth)
@@ -142,9 +147,9 @@ def compare(run: FinishedRun, truth: Trajectory) -> dict[str, TrajectoryErrors]:
 def sheet_of_newest(
     run: FinishedRun, sequence: Sequence, renderings: list[RenderingErrors], threads: int
 ) -> np.ndarray:
-    """Draw renderings of the newest map and their frames.
+    """Draw the contact sheet of the newest map, [H, W, 3] uint8.
 
-    The frames are held-out ones, or training frames if no frame was held out.
+    The sheet shows held-out frames, or training frames if no frame was held out.
     """
     newest = run.maps[-1]
 
@@ -155,7 +160,11 @@ def sheet_of_newest(
 
 
 def draw(folder: Path, pictures: dict[str, np.ndarray]) -> list[Path]:
-    """Save pictures by name and return their paths."""
+    """Save pictures to a folder, by file name, and return their paths.
+
+    Raises:
+        ConfigError: If a file cannot be written.
+    """
     try:
         for name, picture in pictures.items():
             save_picture(folder / name, picture)

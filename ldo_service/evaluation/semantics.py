@@ -1,4 +1,4 @@
-"""Evaluation of the labels of a map: rendered at the poses of frames, compared with the truth."""
+"""Evaluation of a map's labels, which are rendered at the poses of frames, against true labels."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,24 +28,27 @@ from .label_measures import (
 )
 from .views import EvaluatedFrames
 
-APART = 3  # Frames between the two views of a pair.
-GATES = {"from 0.2 %": 0.002, "all": 0.0}  # Least fraction of the pixels of an evaluated class.
-SAME_STAMP_S = 0.02  # Largest stamp difference to a true pose, as for trajectories.
+APART = 3  # Difference of the frame indices of the two views of a pair.
+GATES = {"from 0.2 %": 0.002, "all": 0.0}  # Minimum fraction of pixels of an evaluated class.
+SAME_STAMP_S = 0.02  # Maximum difference of a frame's stamp to a true pose, as for trajectories.
 
 PROTOCOL = """\
-Labels are rendered for the frames of A and B above, at the same poses: a pixel has the label s of
-the largest sum_i w_i p_i(s) over its Gaussians. Pixels of all frames are pooled. Pixels without a
-true label are ignored; a name that is not in the list is wrong wherever it is shown.
-COCO: background and the classes of COCO among those of the source, by detection/synonyms.yaml; all
-other classes are background. All names: background (wall, floor, ceiling) and every object of the
-source, by the name of its COCO class or else by its own. mIoU, accuracy and IoU by frequency are
-means over classes: those with 0.2 % of the pixels, and all that occur. Pixel accuracy is over all
-pixels. Per image: the mean over frames of mIoU over the classes that are in the frame.
-Consistency: fraction of equal labels among pixels with an object in at least one of two frames 3
-apart, warped by measured depth and true poses (by the run's own poses if no true ones are known).
-Beyond COCO: objects with a name that has no COCO class, in frames where they have 0.5 % of the
-pixels. The name of an object is that of most of its pixels. Recall is over the objects with such
-a true name, precision over those with such a name in the map; the next line counts pixels."""
+Labels are rendered for the frames of A and B above, at the same poses. A pixel has the label s with
+the largest sum_i w_i p_i(s) over its Gaussians i. Pixels of all frames are pooled. Pixels without a
+true label are ignored. A name of the map that is not in the list is always wrong.
+COCO: the list of background and the COCO classes of the source, by detection/synonyms.yaml; all
+other classes are background. All names: the list of background (wall, floor, ceiling) and every
+object name of the source; an object with a COCO class has the name of that class. mIoU, accuracy
+and IoU by frequency are means over classes: those with more than 0.2 % of the pixels, and all that
+occur. Pixel accuracy is over all pixels. Per image: mIoU over the classes of a frame, averaged over
+the frames.
+Consistency: fraction of equal labels in two frames 3 apart, among the pixels that show an object in
+at least one of them. Pixels correspond by measured depth and true poses, or by the run's final
+poses if no true poses are known.
+Beyond COCO: objects whose name has no COCO class, in frames where they have 0.5 % of the pixels.
+The map's name of an object is the name of most of its pixels. Recall is over the objects with such
+a true name, precision over the objects with such a name in the map. The next line counts pixels
+instead of objects."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -72,7 +75,7 @@ class ListErrors:
         return segmentation(self.pooled, gate)
 
     def per_image_iou(self) -> float:
-        """Return the mean IoU of each frame, averaged over frames; NaN without frames."""
+        """Compute the mean IoU of each frame and return the average; NaN without frames."""
         ious = [segmentation(counts).mean_iou for counts in self.confusions]
         return float(np.nanmean(ious)) if np.any(np.isfinite(ious)) else float("nan")
 
@@ -85,8 +88,8 @@ class LabelErrors:
     lists: tuple[ListErrors, ...]
     consistency: Agreement
     pairs: int  # Number of frame pairs compared for consistency.
-    objects: DetectionCounts  # Objects with names beyond COCO.
-    pixels: DetectionCounts
+    objects: DetectionCounts  # Objects whose name has no COCO class.
+    pixels: DetectionCounts  # Pixels whose name has no COCO class.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -95,11 +98,11 @@ class LabelView:
 
     Attributes:
         frame: The frame.
-        truth: Its true labels.
+        truth: True labels of the frame.
         shown: Labels of the map, [H, W] uint8.
 
     Raises:
-        DataError: The true labels have another size than the frame.
+        DataError: If the true labels have another size than the frame.
     """
 
     frame: RgbdFrame
@@ -130,7 +133,7 @@ class MapLabels:
         """Render the labels at the pose of a frame, [H, W] uint8.
 
         Raises:
-            DataError: The frame has no pose.
+            DataError: If the frame has no pose.
         """
         rows, camera, threads = self._posed.rows, self._sequence.camera, self._threads
         T_camera_map = se3.inverse(self._posed.T_map_camera(frame))
@@ -171,7 +174,7 @@ class LabelEvaluator:
         self._pairs += 1
 
     def errors(self, name: str) -> LabelErrors:
-        """Return the errors of the map over all views; the result states the map as `name`."""
+        """Return the errors over all views; `name` is the name of the map in the result."""
         lists = (
             ListErrors(labels, tuple(self._frames), tuple(confusions))
             for labels, confusions in zip(self._lists, self._confusions, strict=True)
@@ -201,7 +204,7 @@ def evaluate_labels(
         Errors of each map; empty if the run has no labels or the source no true labels.
 
     Raises:
-        DataError: A frame has no true labels or no pose.
+        DataError: If a frame has no true labels or no pose.
     """
     labels, maps = sequence.true_labels(), labelled_maps(sequence, run, threads)
     if labels is None or not maps:
@@ -242,14 +245,15 @@ class Pairs:
     def of(
         self, frame: RunFrame, image: RgbdFrame
     ) -> tuple[RunFrame | None, Correspondences | None]:
-        """Return the frame three after a frame, and the corresponding pixels of both.
+        """Find the second frame of the pair that starts with a frame.
 
         Args:
-            frame: The frame.
-            image: Its color and depth.
+            frame: The first frame.
+            image: Color and depth of the first frame.
 
         Returns:
-            The later frame and the pixels; None for both if there is no such frame.
+            The frame whose index is three higher, and the corresponding pixels of both frames. Both
+            are None if that frame does not exist or one of the two has no known pose.
         """
         other = self._by_index.get(frame.index + APART)
         T_first = _at(self._known, frame.stamp_ns)

@@ -24,11 +24,11 @@ def rendering_sheet(
 
     Args:
         errors: Errors of the frames.
-        view_of_frame: Renders the view of a frame index.
+        view_of_frame: Function that renders the view of a frame, given by its index.
         count: Number of frames.
 
     Raises:
-        ValueError: There are no frames.
+        ValueError: If there are no frames.
     """
     shown = some_of(errors.views, count)
     views = [view_of_frame(one.frame) for one in shown]
@@ -82,7 +82,7 @@ def _scale(view: RenderedView) -> str:
 
 
 def _range_m(view: RenderedView) -> tuple[float, float]:
-    """Return the depth range of the camera image, or of the rendering if no depth was measured."""
+    """Return the depth range of the frame, or of the rendering if the frame has no depth."""
     measured_m = view.frame.depth_m
     return depth_range(measured_m if measured_m.any() else view.rendering.depth_m)
 

@@ -18,9 +18,9 @@ ATE: positions after SE(3) alignment of the estimate to the truth over all pairs
 (Umeyama, PAMI 1991). RPE: (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) with truth Q and estimate P, for all
 pairs j = i + n, where n is 1 s in poses at the median rate; its translation and rotation angle.
 `evo_ape tum TRUTH ESTIMATE --align --t_max_diff 0.02` and `evo_rpe tum TRUTH ESTIMATE --delta n
---delta_unit f --all_pairs --t_max_diff 0.02 [--pose_relation angle_deg]` print the same, unless
-the clocks are half a frame apart and a pose is the nearest of two: evo then uses it twice.
-Some published systems print the mean as RMSE; both are given here."""
+--delta_unit f --all_pairs --t_max_diff 0.02 [--pose_relation angle_deg]` print the same values,
+unless a pose is the nearest of two poses, as with clocks half a frame apart: evo then uses that
+pose twice. Some published systems print the mean as RMSE; both are given here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class ErrorStatistics:
 
     @staticmethod
     def of(errors: np.ndarray) -> "ErrorStatistics":
-        """Return the statistics of some errors."""
+        """Return the statistics of errors [N]."""
         return ErrorStatistics(
             float(np.sqrt(np.mean(errors**2))),
             float(np.mean(errors)),
@@ -62,7 +62,7 @@ def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryEr
     """Compute the errors of an estimated trajectory by `PROTOCOL`.
 
     Raises:
-        DataError: Fewer than 3 poses have a partner.
+        DataError: If fewer than 3 estimated poses have a true pose within 20 ms.
     """
     pairs = associated(estimate, truth)
     T_estimate = estimate.T_world_camera[pairs[:, 0]]
@@ -82,10 +82,13 @@ def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryEr
 
 
 def associated(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
-    """Match estimated and true poses by nearest stamp within 20 ms; return index pairs [M, 2].
+    """Pair estimated and true poses by nearest stamp within 20 ms.
+
+    Returns:
+        Index of the estimated pose and of the true pose of each pair, [M, 2].
 
     Raises:
-        DataError: There are fewer than 3 pairs.
+        DataError: If there are fewer than 3 pairs.
     """
     pairs = associate(estimate.stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
     if len(pairs) < MIN_POSES:

@@ -1,4 +1,4 @@
-"""Comparison of the frames of a run with renderings of its map at their poses."""
+"""Comparison of a run's frames with renderings of the run's map at the poses of the frames."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -19,23 +19,24 @@ WINDOW_PX, SIGMA_PX = 11, 1.5  # Wang et al., 2004, section III.B.
 C1, C2 = 0.01**2, 0.03**2  # Constants of the same source, for images in 0..1.
 COVERED = 0.5  # Rendered opacity above which there is a surface to compare.
 
-TRAINING_STEP = 5  # Step of the protocol of the literature (SplaTAM, Keetha et al., 2024).
+TRAINING_STEP = 5  # Protocol B uses every fifth training frame (SplaTAM, Keetha et al., 2024).
 FIGURES = ("psnr_db", "ssim", "lpips", "depth_l1_m", "depth_share")
 
 PROTOCOL = """\
-Maps are rendered at the poses that the run ended with and compared with its rectified frames,
-colors in 0..1, renderings clipped. PSNR: pixels and channels pooled. SSIM: Wang et al. 2004, 11x11
-Gaussian of 1.5 px, windows inside the image; some published systems print MS-SSIM, often higher.
-Depth L1: mean depth of the rendering, over pixels with measured depth and rendered opacity above
-0.5; "of measured" is their fraction of the measured pixels. Cells: mean / median of frames.
-online: the map at the end of the stream, refitted after loop closures; refined: after the further
-iterations of --refine-iterations.
-A: held-out frames, tracked and never mapped. A and B leave out the rim that rectification leaves
-black; A uses every other pixel. The map has one brightness, that of the camera changes: its gain
-and bias per channel are interpolated between the keyframes before and after. Exposure fitted: to
-each evaluated frame itself, by least squares. No exposure: the map unchanged.
-B: the literature's: every 5th training frame, pixels without depth black in both images.
-LOST frames have no pose and are only counted, WEAK frames are evaluated."""
+Maps are rendered at the poses that the run ended with, and compared with the rectified frames of
+the run. Colors are in 0..1; renderings are clipped. PSNR: over all pixels and channels of a frame.
+SSIM: Wang et al. 2004, Gaussian window of 11x11 pixels and sigma 1.5 px, over windows inside the
+image; some published systems print MS-SSIM, whose values are often higher. Depth L1: mean error of
+the rendered depth, over pixels with measured depth and rendered opacity above 0.5; "of measured" is
+the fraction of measured pixels that this covers. Cells: mean / median over the frames.
+online: the map at the end of the stream, refitted after loop closures. refined: the map after the
+further iterations of --refine-iterations.
+A: held-out frames, which are tracked and never mapped, without the black rim of rectification. The
+exposure of the camera changes, that of the map does not: the rendering gets gain and bias per
+channel, interpolated between the keyframes before and after the frame. A, exposure fitted: gain and
+bias are fitted to the evaluated frame by least squares. A, no exposure: the rendering is unchanged.
+B: as in the literature, every fifth training frame; pixels without depth are black in both images.
+LOST frames have no pose and are only counted; WEAK frames are evaluated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,18 +51,21 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the peak signal-to-noise ratio in dB: 10 log10(peak^2 / mean (a - b)^2).
 
     Args:
-        a: [H, W, C] or [H, W]; uint8 (peak 255) or floating in 0..1 (peak 1).
-        b: Of the same shape and kind.
-        mask: Pixels that count, [H, W] bool; None for all.
+        a: Image [H, W, C] or [H, W]; uint8 (peak 255) or floating in 0..1 (peak 1).
+        b: Image of the same shape and kind.
+        mask: Pixels that are compared, [H, W] bool; None for all.
 
     Returns:
-        The ratio; infinity for equal images, NaN for an empty mask.
+        The ratio in dB; infinity for equal images, NaN for an empty mask.
 
     Raises:
-        ValueError: The images differ in shape or kind.
+        ValueError: If the images differ in shape, or only one of them is uint8.
     """
     if a.shape != b.shape or (a.dtype == np.uint8) != (b.dtype == np.uint8):
-        raise ValueError(f"images differ in kind: {a.dtype}{a.shape} and {b.dtype}{b.shape}")
+        raise ValueError(
+            f"PSNR of images {a.dtype}{a.shape} and {b.dtype}{b.shape}: the shapes must be equal, "
+            "and both images must be uint8 or both floating."
+        )
     peak = 255.0 if a.dtype == np.uint8 else 1.0
     squares = (a.astype(np.float64) - b) ** 2
     squares = squares if mask is None else squares[mask]
@@ -76,21 +80,25 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
 
         (2 m_a m_b + c1) (2 s_ab + c2) / ((m_a^2 + m_b^2 + c1) (s_a^2 + s_b^2 + c2))
 
-    It is computed per channel under an 11x11 Gaussian window of sigma 1.5 px. The mean is over the
-    pixels whose window lies in the image. Only one scale is used. Some papers call the multi-scale
-    MS-SSIM by the same name; its values are often higher. Wang et al., TIP 2004.
+    The similarity is computed per channel under an 11x11 Gaussian window of sigma 1.5 px. The mean
+    is over the pixels whose window lies in the image. Only one scale is used. Some papers call the
+    multi-scale MS-SSIM by the same name; its values are often higher. Wang et al., TIP 2004.
 
     Args:
-        a: [H, W, 3].
-        b: [H, W, 3].
+        a: Image [H, W, 3].
+        b: Image [H, W, 3].
         mask: Pixels that may be in a window, [H, W] bool; None for all.
 
+    Returns:
+        The mean, at most 1; NaN if the mask contains no whole window.
+
     Raises:
-        ValueError: The images differ in shape, or a side is below 11 pixels.
+        ValueError: If the images differ in shape, or a side is below 11 pixels.
     """
     if a.shape != b.shape or a.ndim != 3 or min(a.shape[:2]) < WINDOW_PX:
         raise ValueError(
-            f"SSIM of images {a.shape} and {b.shape}: their shapes must be alike, at least 11x11."
+            f"SSIM of images {a.shape} and {b.shape}: the shapes must be equal and [H, W, C], with "
+            "H and W at least 11."
         )
     a, b = a.astype(np.float64), b.astype(np.float64)
     mean_a, mean_b = _windowed(a), _windowed(b)
@@ -122,7 +130,7 @@ def depth_error(rendered_m: np.ndarray, opacity: np.ndarray, measured_m: np.ndar
 
 
 def _windowed(image: np.ndarray) -> np.ndarray:
-    """Return the Gaussian means, [H - 10, W - 10, C]."""
+    """Return the mean under the Gaussian window at each inner pixel, [H - 10, W - 10, C]."""
     kernel = cv2.getGaussianKernel(WINDOW_PX, SIGMA_PX)
     margin = WINDOW_PX // 2
     return cv2.sepFilter2D(image, -1, kernel, kernel)[margin:-margin, margin:-margin]
@@ -134,13 +142,14 @@ Distance = Callable[[np.ndarray, np.ndarray], float]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RenderedView:
-    """A frame with the rendering of the map at its pose."""
+    """A frame with the rendering of the map at the pose of the frame."""
 
     frame: RgbdFrame
     rendering: Rendering
-    # Interpolated between keyframes, not fitted to the frame.
+    # Exposure of the frame, interpolated between keyframes instead of fitted to the frame.
     exposure: Exposure = field(default_factory=Exposure)
-    valid: np.ndarray | None = None  # Pixels of the camera image, [H, W] bool; None for all.
+    # Pixels that show the camera image, not the rim of rectification, [H, W] bool; None for all.
+    valid: np.ndarray | None = None
     # Correction of the camera, to whose images the map was fitted. Renderings get its vignetting.
     correction: CameraCorrection = field(default_factory=CameraCorrection)
 
@@ -175,12 +184,12 @@ class RenderedView:
 class ViewErrors:
     """Errors of one frame, see `PROTOCOL`."""
 
-    frame: int
+    frame: int  # Index in the sequence.
     psnr_db: float
     ssim: float
-    lpips: float | None  # Missing without a network.
+    lpips: float | None  # LPIPS distance; None without a network.
     depth_l1_m: float
-    depth_share: float
+    depth_share: float  # Fraction of the pixels with measured depth that were compared.
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,26 +201,30 @@ class RenderingErrors:
     views: tuple[ViewErrors, ...]
 
     def mean(self, figure: str) -> float | None:
-        """Return the mean over frames of a metric, a field of ViewErrors; None if all are NaN."""
+        """Return the mean over frames of a metric, without NaN; None if all values are NaN.
+
+        Args:
+            figure: Metric, the name of a field of ViewErrors.
+        """
         values = self._values(figure)
         return float(np.mean(values)) if len(values) else None
 
     def median(self, figure: str) -> float | None:
-        """Return the median over frames of a metric, as `mean`."""
+        """Return the median over frames of a metric, without NaN; None if all values are NaN."""
         values = self._values(figure)
         return float(np.median(values)) if len(values) else None
 
     def _values(self, figure: str) -> np.ndarray:
-        """Return the values of a metric of all frames, except NaN."""
+        """Return the values of a metric over the frames, [M], without NaN."""
         values = np.array([getattr(view, figure) for view in self.views], float)
         return values[~np.isnan(values)]
 
 
 # --- protocols ------------------------------------------------------------------------------------
 def every_pixel(view: RenderedView) -> Images:
-    """Return camera image and rendering unmasked; the rendering has the exposure of the frame.
+    """Return camera image and rendering without a mask.
 
-    That exposure is interpolated between keyframes.
+    The rendering has the exposure of the frame, which is interpolated between keyframes.
     """
     return view.seen, view.shown
 
@@ -224,7 +237,7 @@ def exposure_fitted(view: RenderedView) -> Images:
 
 
 def map_as_it_is(view: RenderedView) -> Images:
-    """Return camera image and rendering, without any exposure correction of the rendering."""
+    """Return camera image and rendering; the rendering has the exposure of the map."""
     return view.seen, view.vignetted(view.rendering.color.clip(0, 1))
 
 
@@ -244,9 +257,9 @@ TRAINING = {"B training": measured_pixels}
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedFrames:
-    """Frames to evaluate under each protocol: held-out ones, and a selection of the mapped ones.
+    """Frames to evaluate: held-out frames for protocol A, some training frames for protocol B.
 
-    They include LOST frames, which have no pose.
+    Both include LOST frames, which have no pose.
     """
 
     held_out: tuple[RunFrame, ...]
@@ -267,7 +280,7 @@ class EvaluatedFrames:
         return [frame for frame in (*self.held_out, *self.training) if not frame.is_lost]
 
     def counts(self) -> str:
-        """Return a sentence with the numbers of frames for each protocol."""
+        """Return a text with the numbers of frames of protocols A and B."""
         if not self.held_out:
             a = "A: none, since all frames were mapped; `ldo run --hold-out-every 5` keeps some."
         else:
@@ -290,10 +303,10 @@ def view_of(
         posed: The map.
         frame: The frame of the run.
         threads: Threads of the renderer.
-        valid: Pixels of the camera image, [H, W] bool; None for all.
+        valid: Pixels that show the camera image, [H, W] bool; None for all.
 
     Raises:
-        DataError: The frame has no pose.
+        DataError: If the frame has no pose.
     """
     T_camera_map = se3.inverse(posed.T_map_camera(frame))
     rendering = render(posed.rows, image.camera, T_camera_map, threads=threads)
@@ -319,11 +332,11 @@ def evaluate_rendering(
         judged: Frames to evaluate.
         maps: The maps.
         advance: Progress function, called with the number of frames done so far.
-        distance: LPIPS of two images [H, W, 3] in 0..1; None to omit it.
+        distance: LPIPS of two images [H, W, 3] in 0..1; None to omit LPIPS.
         threads: Threads of the renderer.
 
     Raises:
-        DataError: A frame cannot be read or has no pose.
+        DataError: If a frame cannot be read or has no pose.
     """
     views: dict[tuple[str, str], list[ViewErrors]] = defaultdict(list)
     valid = valid_pixels(sequence.raw_camera)
@@ -342,12 +355,18 @@ def evaluate_rendering(
 def evaluate_view(
     view: RenderedView, is_held_out: bool, distance: Distance | None = None
 ) -> Iterator[tuple[str, ViewErrors]]:
-    """Yield each protocol that applies to a frame, with the errors of the frame under it."""
+    """Yield the name of each protocol for a frame, and the errors of the frame by that protocol.
+
+    Args:
+        view: The frame with its rendering.
+        is_held_out: True for the protocols of held-out frames, False for training frames.
+        distance: LPIPS of two images [H, W, 3] in 0..1; None to omit LPIPS.
+    """
     rendering = view.rendering
     depth = depth_error(rendering.depth_m, rendering.opacity, view.frame.depth_m)
     for protocol, images in (HELD_OUT if is_held_out else TRAINING).items():
         seen, shown = images(view)
-        if view.valid is not None:  # The rim is black in both images.
+        if view.valid is not None:  # The camera image is black outside of the valid pixels.
             shown = shown * view.valid[..., None]
         yield (
             protocol,
