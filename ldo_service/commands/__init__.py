@@ -1,1 +1,1 @@
-"""Commands of `ldo`, one module each, which parse options, call the library and print."""
+"""Commands of `ldo`, one module each; a command parses options, calls the library and prints."""

@@ -31,9 +31,9 @@ def bench(
     """Measure how long one iteration of the Gaussian optimizer takes on this machine.
 
     The times are medians over all repeats on a synthetic scene, in milliseconds of wall time. The
-    backward pass includes the step of Adam. adam_ms is the difference between the backward pass
-    with and without that step. iteration_ms is the sum of the forward pass, the loss and the
-    backward pass.
+    step of Adam runs inside the backward pass: backward_ms is the pass without the step, and
+    adam_ms is the time that the step adds. iteration_ms is the time of forward pass, loss, backward
+    pass and step together.
 
     Set the environment variable LDO_ISA to avx512, avx2 or baseline to choose the instruction set.
     """
@@ -65,7 +65,9 @@ def bench(
 def _pixels(size: str) -> tuple[int, int]:
     width, _, height = size.partition("x")
     if not (width.isdecimal() and height.isdecimal() and 1 <= int(width) <= 8192 >= int(height)):
-        raise ConfigError(f"--size {size}: must be WIDTHxHEIGHT in pixels, such as 640x480.")
+        raise ConfigError(
+            f"--size {size}: must be WIDTHxHEIGHT, each from 1 to 8192 pixels, such as 640x480."
+        )
     if int(height) < 1:
         raise ConfigError(f"--size {size}: must be at least one pixel high.")
     return int(width), int(height)

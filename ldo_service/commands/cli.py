@@ -26,7 +26,7 @@ RGB-D SLAM as a service: poses and a photo-realistic map, live, on a CPU.
 first steps:
   ldo demo                      track, map and label a built-in synthetic room
   ldo run SOURCE --out DIR      track and map a data set
-  ldo eval DIR SOURCE           evaluate its trajectory and its map
+  ldo eval DIR SOURCE           evaluate the trajectory and the map of a run
   ldo serve                     run the live service; `ldo publish SOURCE` sends frames to it
 
 verbs:
@@ -34,9 +34,9 @@ verbs:
 
 `ldo VERB --help` explains a verb. `--debug` shows the traceback of an error."""
 
-# Names of options in version 0.1, which one more version accepts.
+# Option names of version 0.1 that this version still accepts, and their new names.
 OLD_OPTIONS = {"--localise": "--localize"}
-# Names of options in version 0.1, which are refused with the new name.
+# Option names of version 0.1 that are refused; the error states the new name.
 RENAMED_OPTIONS = {
     "--elsewhere": "--gaussians-out-of-view",
     "--front-end": "--reuse-front-end",
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         datefmt="%H:%M:%S",
     )
     if not debug:
-        logging.getLogger("httpx2").setLevel(logging.WARNING)  # It logs every request.
+        logging.getLogger("httpx2").setLevel(logging.WARNING)  # INFO has a line per request.
     _end_on_interrupts()
     known = verbs()
     _raise_on_interrupts()
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run_verb(words: Sequence[str], known: dict[str, Callable[..., None]]) -> None:
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
-    if words[0] in known:  # An error then points to the help of the verb.
+    if words[0] in known:  # This `prog` makes errors point to the help of the verb.
         tyro.cli(known[words[0]], prog=f"ldo {words[0]}", args=words[1:], config=config)
     else:
         tyro.extras.subcommand_cli_from_dict(known, prog="ldo", args=words, config=config)
@@ -96,9 +96,10 @@ def _run_verb(words: Sequence[str], known: dict[str, Callable[..., None]]) -> No
 def _end_on_interrupts() -> None:
     """Let SIGINT and SIGTERM end the process at once, with exit code 130.
 
-    While the modules are imported, nothing needs an orderly end, and an exception that a signal
-    raises in the initialization of an extension becomes an ImportError. The default action would
-    not do: the kernel ignores it in process 1, which is the service in a container.
+    These handlers are used while modules are imported, when nothing needs an orderly end. An
+    exception is no alternative: raised in the initialization of an extension module, it becomes an
+    ImportError. The default action of the signals is no alternative either: the kernel ignores it
+    in process 1, and the service is process 1 in a container.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(130))
@@ -107,15 +108,19 @@ def _end_on_interrupts() -> None:
 def _raise_on_interrupts() -> None:
     """Make SIGINT and SIGTERM raise KeyboardInterrupt.
 
-    A shell without job control starts `ldo view &` with SIGINT ignored. Python keeps that setting,
-    so the handler must be installed again.
+    The handler must be installed explicitly: a shell without job control starts `ldo view &` with
+    SIGINT ignored, and Python keeps that setting.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
 
 
 def _refuse_renamed_options(words: Sequence[str]) -> None:
-    """Raise ConfigError with the new name of an option that has been renamed."""
+    """Check that no option has been renamed.
+
+    Raises:
+        ConfigError: If an option has been renamed; the message states the new name.
+    """
     for word in words:
         option = word.partition("=")[0]
         if option in RENAMED_OPTIONS:
@@ -129,7 +134,7 @@ def first_lines() -> Iterator[str]:
 
 
 def verbs() -> dict[str, Callable[..., None]]:
-    """Return the function of each verb; its docstring is the help text."""
+    """Return the function of each verb, by name; the function's docstring is the help text."""
     from ldo_service.commands import (
         bench,
         control,

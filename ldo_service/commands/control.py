@@ -43,17 +43,20 @@ def control(
     """Pause, resume, save, reset or refine a running service, or add a label to it.
 
     The command returns when every actor has executed the request. If an actor did not, the message
-    names it and the exit code is 4.
+    names the actor and the exit code is 4.
 
-    `refine` goes to the mapper alone, and the command does not wait for it. The mapper runs these
-    iterations before it takes its next keyframe.
+    `refine` goes to the mapper alone, and the command does not wait until it is done. The mapper
+    runs the iterations before it takes its next keyframe.
 
       ldo control reset
       ldo control refine --iterations 500
       ldo control add-label "fire extinguisher"
     """
     if bool(name) != (verb == "add-label"):
-        raise ConfigError("`ldo control add-label NAME` needs a name; the other verbs take none.")
+        raise ConfigError(
+            f"`ldo control {verb}` with name {name!r}: add-label needs a NAME, as in `ldo control "
+            "add-label samovar`; the other verbs take none."
+        )
     with connect(robot, endpoint, keys) as service:
         if verb == "refine":
             ask_to_refine(service, iterations)
@@ -68,7 +71,7 @@ def ask_to_refine(service: Client, iterations: int) -> None:
     """Request refinement iterations from the mapper.
 
     Raises:
-        ConfigError: The number of iterations is out of bounds.
+        ConfigError: If the number of iterations is out of bounds.
     """
     try:
         service.refine(iterations)
@@ -81,7 +84,7 @@ def run_control_verb(service: Client, verb: str) -> None:
     """Run a control command in all actors and print the result.
 
     Raises:
-        StageError: An actor did not execute the command.
+        StageError: If an actor did not execute the command.
     """
     answer = service.control(verb)
     if not answer.ok:

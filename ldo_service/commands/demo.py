@@ -26,7 +26,7 @@ from .run import with_options
 
 FRAMES = 70  # Frames of the synthetic flat that show its first room.
 HOLD_OUT = 5  # Every 5th frame is tracked but not mapped.
-PROCESSES = 4  # Processes that ray cast; each takes seconds to start and 1 s per frame.
+PROCESSES = 4  # Maximum ray-casting processes; each takes seconds to start, then 1 s per frame.
 NETWORKS = "demo"  # Name of the networks that come with the package.
 
 
@@ -36,7 +36,7 @@ def demo(
     ),
     overwrite: Overwrite = False,
 ) -> None:
-    """Track, map and label a built-in synthetic room, and evaluate the result by ground truth.
+    """Track, map and label a built-in synthetic room, and compare the result with ground truth.
 
     The command prints a table and writes three pictures. The frames are made by ray casting, with
     the blur and the depth noise of a Kinect. Every fifth frame is tracked but not mapped, and the

@@ -40,7 +40,7 @@ LIBRARIES = {  # Name on the package index: name to import.
     "tokenizers": "tokenizers",
     "zstandard": "zstandard",
 }
-EXTRAS = {
+EXTRAS = {  # Optional extra of the package: modules that it installs.
     "viewer": ("viser", "gsply"),
     "keys": ("cryptography",),
     "realsense": ("pyrealsense2",),
@@ -60,7 +60,7 @@ MARKS = {
 class Finding:
     """Result of one check, printed as one line."""
 
-    # "ok", "absent" (optional), "note" (information) or "bad" (needs action).
+    # "ok", "absent" (an optional part is missing), "note" (information) or "bad" (needs action).
     mark: str
     text: str
 
@@ -85,7 +85,7 @@ def doctor(
         bad += finding.mark == "bad"
     if bad:
         raise LdoError(
-            f"problems found: {bad}. Each line marked bad above says what to do about one."
+            f"problems found: {bad}. Each line above that is marked bad says how to fix a problem."
         )
 
 
@@ -130,8 +130,8 @@ def networks() -> Iterator[Finding]:
     if not models.names:
         yield Finding(
             "absent",
-            "registered networks: `demo` knows only the synthetic scenes; `ldo models add NAME "
-            "FILE` registers a YOLOv5, YOLOX or YOLOv8 in ONNX",
+            "registered networks: the built-in `demo` recognizes only objects of the synthetic "
+            "scenes; `ldo models add NAME FILE` registers a YOLOv5, YOLOX or YOLOv8 in ONNX",
         )
     for name in models.names:
         try:
@@ -165,10 +165,10 @@ def service(robot: str, endpoint: str, keys: Path | None) -> Iterator[Finding]:
 
 
 def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[ActorStatus]:
-    """Return the status of every actor after listening for LISTEN_S.
+    """Listen to a service for LISTEN_S and return the status of every actor.
 
     Raises:
-        ConfigError: No router answers on the endpoint.
+        ConfigError: If no router answers on the endpoint.
     """
     heard: dict[str, tuple[float, Health]] = {}
     with (

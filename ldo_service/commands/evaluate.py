@@ -59,7 +59,7 @@ def open_table(rows: list[LabelErrors], calls_per_frame: float | None) -> Table:
 
     Args:
         rows: Label errors of each map.
-        calls_per_frame: Requests to the labeller per frame; None where the run did not count them.
+        calls_per_frame: Requests to the labeller per frame; None if the run did not count them.
     """
     columns = ("map", "consistency", "beyond COCO: recall", "precision", "Labeller calls per frame")
     table = Table(*columns)
@@ -101,9 +101,9 @@ def evaluate(
 ) -> None:
     """Evaluate a run: its trajectory, loop closures, rendered map and labels.
 
-    Trajectory and loop closures are compared with the ground truth of the source. Renderings of the
-    map are compared with its frames, and labels with its labels. Without ground truth only the map
-    is evaluated.
+    Trajectory and loop closures are compared with the true poses of the source, renderings of the
+    map with the frames, and labels of the map with the true labels of the source. Without true
+    poses, only the map is evaluated.
 
     The command prints the protocol above the results, and writes trajectory.png and rendering.png
     into DIR, and labels.png if the source has ground-truth labels and a detector ran. `ldo run
@@ -129,12 +129,16 @@ def evaluate(
 
 
 def run_config(folder: Path) -> Config:
-    """Return the configuration that a run was made with."""
+    """Read the configuration that a run was made with.
+
+    Raises:
+        DataError: If the folder has no config.yaml.
+    """
     return load_config(require_file(folder, "config.yaml"))
 
 
 def labelled_by(config: Config) -> dict[str, str]:
-    """Return the detector and the labeller of a run; empty names where it had none."""
+    """Return the names of the detector and the labeller of a run; empty if the run had none."""
     labeller = config.vlm_labeller.model or config.vlm_labeller.url
     return {"detector": config.detector.model, "labeller": labeller}
 
@@ -174,7 +178,7 @@ def _print_renderings(console: Console, results: Results, lpips: Path | None) ->
 
 
 def _print_labels(console: Console, results: Results, who: dict[str, str]) -> None:
-    """Print label results; print nothing if the map or the source has no labels."""
+    """Print the label results, or the reason why labels are not evaluated."""
     if results.unlabelled:
         console.print(results.unlabelled, style="dim")
     if not results.labels:
@@ -221,7 +225,7 @@ def _share(value: float | None) -> str:
 
 
 def _spread(values: tuple[float, ...], factor: float, unit: str) -> str:
-    """Return the median and the maximum as text."""
+    """Return the median and the maximum of values, times `factor`, as text with a unit."""
     if not values:
         return "-"
     return f"{factor * np.median(values):.2f}, at most {factor * max(values):.2f} {unit}"

@@ -34,13 +34,13 @@ TRAJECTORY_COLUMNS = ("stamp_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Job of a writer: its source, its file and its options."""
+    """Map to export, output file and options, as given to the writer of a format."""
 
     source: MapFolder
     out: Path
-    voxel_m: float | None
-    up: Up
-    heights_m: tuple[float, float]
+    voxel_m: float | None  # Side of a voxel; None for the default of the format.
+    up: Up  # Axis of the map that points up.
+    heights_m: tuple[float, float]  # Height range of the floor plan above the first camera.
     console: Console
 
 
@@ -77,9 +77,9 @@ def export(
     """Write the map or the trajectory of a run for other programs.
 
     The refined map is exported if there is one. `mesh` is a PLY file with colored triangles.
-    `occupancy` is an .npz file with a grid of free, occupied and unknown voxels. With it comes a
-    floor plan (.pgm and .yaml) for map_server of ROS. The map has the axes of the first camera, so
-    `--up -y` is right if that camera was level.
+    `occupancy` is an .npz file with a grid of free, occupied and unknown voxels; a floor plan (.pgm
+    and .yaml) for map_server of ROS is written beside it. The map has the axes of the first camera,
+    so `--up -y` is right if that camera was level.
 
       ldo export runs/desk --format splat
       ldo export runs/desk --format occupancy --voxel 0.05 --heights -0.8 0.3
@@ -94,15 +94,22 @@ def export(
     try:
         facts = WRITERS[format](job)
     except OSError as error:
-        raise ConfigError(f"{out} cannot be written: {error.strerror}.") from error
+        raise ConfigError(
+            f"{out} cannot be written: {error.strerror}. Choose another --out."
+        ) from error
     Console(highlight=False).print(f"{out}: {facts}", soft_wrap=True)
 
 
 def require_writable(runs: Iterable[Path], files: list[Path], overwrite: bool) -> None:
-    """Check that the files to write neither exist nor are outputs of the runs.
+    """Check that an export replaces neither an output of a run nor an existing file.
+
+    Args:
+        runs: Folders of runs.
+        files: Files to write.
+        overwrite: True if existing files may be replaced; outputs of a run never may.
 
     Raises:
-        ConfigError: A file exists already, or is an output of a run.
+        ConfigError: If a file exists already, or is an output of a run.
     """
     exported = {name for names in EXPORTED.values() for name in names}
     kept = {(run / name).resolve() for run in runs for name in WRITTEN - exported}
@@ -138,7 +145,7 @@ def _csv(job: Job) -> str:
 
 
 def write_csv(path: Path, trajectory: Trajectory) -> None:
-    """Write a row per pose T_map_camera: stamp in seconds, meters, quaternion wxyz."""
+    """Write a CSV file of poses T_map_camera: stamp (s), position (m), quaternion wxyz."""
     with path.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(TRAJECTORY_COLUMNS)

@@ -42,9 +42,9 @@ class New:
 class AddKeys:
     """Make the keys of the program NAME, in the folder DIR/NAME.
 
-    Copy this folder to the machine of the program, which takes it as --keys. The command also
-    updates the access control list `access.yaml` in the folder of each service. Copy the new file
-    to each service, and restart the service.
+    Copy this folder to the machine of the program, and pass it to the program with --keys. The
+    command also updates the access control list `access.yaml` in the folder of each service. Copy
+    the new list to each service, and restart the service.
 
       ldo keys add DIR service mule --robot mule --host mule.local
       ldo keys add DIR camera front --robot mule
@@ -56,13 +56,15 @@ class AddKeys:
         tyro.conf.Positional,
         argument(
             metavar="service|camera|odometry|viewer|operator",
-            help="role that limits what it may do",
+            help="role that limits what the program may do",
         ),
     ]
     name: Name
     robot: Annotated[
         str,
-        argument(metavar="NAME", help="robot whose topics it may use; default: every robot"),
+        argument(
+            metavar="NAME", help="robot whose topics the program may use; default: every robot"
+        ),
     ] = EVERY_ROBOT
     host: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -85,7 +87,8 @@ class ListKeys:
 class RevokeKeys:
     """Revoke keys, and delete their folder on this machine.
 
-    Copy the new `access.yaml` to each router and restart it; only then the revocation takes effect.
+    The revocation takes effect at a router once you have copied the new `access.yaml` there and
+    restarted the router.
     """
 
     folder: Folder
@@ -115,7 +118,8 @@ Verb = (
 def keys(verb: Verb) -> None:
     """Make and revoke the keys that authenticate programs on the network.
 
-    Without keys the service listens on this machine alone:
+    A service without keys accepts programs on this machine alone. These commands make keys for a
+    service and for a viewer on another machine, and start the service:
 
       ldo keys init DIR
       ldo keys add DIR service mule --host mule.local
@@ -138,15 +142,18 @@ def keys(verb: Verb) -> None:
         case AddKeys():
             authority = CertificateAuthority(verb.folder)
             made = authority.add(verb.name, verb.role, verb.robot, verb.days, verb.host)
-            print(f"{made} has the keys of {verb.name}: copy it to that machine, for --keys.")
+            print(
+                f"{made} has the keys of {verb.name}: copy this folder to the machine of "
+                f"{verb.name}, and pass it there with --keys."
+            )
         case ListKeys():
             table = _table(CertificateAuthority(verb.folder))
             Console(highlight=False, markup=False, soft_wrap=True).print(table)
         case RevokeKeys():
             CertificateAuthority(verb.folder).remove(verb.name)
             print(
-                f"{verb.name} is revoked. Copy the new {ACCESS} to every service and restart it: "
-                "until then the keys remain valid there."
+                f"{verb.name} is revoked. Copy the new {ACCESS} to every service and restart the "
+                "service: until then the keys remain valid there."
             )
 
 

@@ -38,11 +38,14 @@ class RealSenseOptions:
         """Return the stream with these options.
 
         Raises:
-            ConfigError: The size or the rate cannot be read.
+            ConfigError: If the size or the rate is invalid.
         """
         width, _, height = self.size.partition("x")
         if not (width.isdecimal() and height.isdecimal() and self.fps > 0):
-            raise ConfigError(f"--size {self.size} --fps {self.fps}: must be like 640x480 and 30.")
+            raise ConfigError(
+                f"--size {self.size} --fps {self.fps}: must be WIDTHxHEIGHT in pixels and a "
+                "positive rate in Hz, such as 640x480 and 30."
+            )
         return RealSenseStream(self.serial, int(width), int(height), self.fps)
 
 
@@ -60,7 +63,7 @@ class RosOptions:
     ] = ""
     info: Annotated[
         str,
-        argument(metavar="TOPIC", help="CameraInfo of color; default: camera_info next to it"),
+        argument(metavar="TOPIC", help="CameraInfo of color; default: camera_info beside --color"),
     ] = ""
     bridge: Annotated[
         str,
@@ -83,7 +86,7 @@ class RosOptions:
         """Return the topics.
 
         Raises:
-            ConfigError: A topic is missing or has an invalid name.
+            ConfigError: If a topic is missing or has an invalid name.
         """
         if not (self.color and self.depth):
             raise ConfigError("`ldo publish ros2` needs --color TOPIC and --depth TOPIC.")
@@ -98,11 +101,13 @@ def frames_of_ros(
 
     Args:
         options: Topics and options.
-        service: Endpoint of the service; the bridge uses it too unless `options.bridge` is given.
-        notify: Receives notes for the user.
+        service: Endpoint of the service. Its router also forwards the topics of the bridge, unless
+            `options.bridge` gives another router.
+        notify: Callback that receives notes for the user.
 
     Raises:
-        ConfigError: The router has keys and lets no topics of a bridge through.
+        ConfigError: If the router of the service has keys, so that it forwards no topics of a
+            bridge.
     """
     if service.keys is not None and not options.bridge:
         raise ConfigError(
@@ -129,7 +134,7 @@ def require_no_sequence(source: str, **options: object) -> None:
     """Check that no option is given that applies only to recorded frames.
 
     Raises:
-        ConfigError: Such an option is given.
+        ConfigError: If such an option is given.
     """
     for name, value in options.items():
         if value:
@@ -147,8 +152,8 @@ def relay(
         service: Connection to the service.
         frames: Frames of a live camera.
         chosen: Stride and maximum number of frames.
-        restamp: Replace the stamp of each frame by the time of sending.
-        notify: Receives notes for the user.
+        restamp: True to replace the stamp of each frame by the time of sending.
+        notify: Callback that receives notes for the user.
     """
     if not service.wait_for_subscriber():
         notify("camera/rgbd has no subscriber yet: is the service of this robot running?")

@@ -26,10 +26,10 @@ Name = Annotated[
 
 @dataclass(frozen=True)
 class AddModel:
-    """Check a network in ONNX, copy and register it.
+    """Check an ONNX network, copy it into the registry and register it under NAME.
 
-    With a text encoder or with embeddings, FILE is the image encoder of a pair in the layout of
-    CLIP. Such a pair labels regions.
+    FILE is a detector. With --text or --embeddings, FILE is instead the image encoder of a pair in
+    the layout of CLIP. Such a pair labels regions.
 
       ldo models add nano yolox_nano.onnx --license Apache-2.0
       ldo models add clip visual.onnx --text text.onnx --vocabulary bpe_simple_vocab_16e6.txt.gz
@@ -40,17 +40,19 @@ class AddModel:
     file: Annotated[Path, tyro.conf.Positional, argument(metavar="FILE", help="network in ONNX")]
     layout: Annotated[
         Literal["yolov5", "yolox", "yolov8"] | None,
-        argument(help="layout of its output; default: recognized by its shape"),
+        argument(help="layout of the network's output; default: recognized by the output's shape"),
     ] = None
     names: Annotated[
         str,
         argument(
             metavar="FILE",
-            help="its classes, one per line; default: those in the network, or the 80 of COCO",
+            help="classes of the network, one per line; default: those that the network file "
+            "states, or the 80 of COCO",
         ),
     ] = ""
     license: Annotated[
-        str, argument(metavar="FILE|TEXT", help="its license, which is stored with it")
+        str,
+        argument(metavar="FILE|TEXT", help="license of the network, stored with the network"),
     ] = ""
     text: Annotated[Path | None, argument(metavar="FILE", help="text encoder in ONNX")] = None
     vocabulary: Annotated[
@@ -124,7 +126,7 @@ def add(verb: AddModel) -> None:
     """Register a detector or an encoder pair and print its facts.
 
     Raises:
-        ConfigError: A file cannot be used.
+        ConfigError: If a file cannot be used.
     """
     model = _add_pair(verb) if verb.is_pair else _add_detector(verb)
     about = model.about
@@ -153,7 +155,7 @@ def show(console: Console) -> None:
     """Print a table of the registered networks.
 
     Raises:
-        LdoError: A network is damaged.
+        LdoError: If a network is damaged.
     """
     registered, damaged = Models(), 0
     table = Table("name", "layout", "classes", "license", "sha256", "")
@@ -184,7 +186,7 @@ def show(console: Console) -> None:
 
 
 def _license(text: str) -> str:
-    """Return the text of the file with this name, or the argument itself."""
+    """Return the content of the file named `text`, or `text` itself if there is no such file."""
     path = Path(text)
     try:
         is_file = path.is_file()

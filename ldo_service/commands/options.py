@@ -17,12 +17,12 @@ from ldo_service.runs.job import Advance
 from ldo_service.synthetic import SCENES
 from ldo_service.tracking.keyframe_database import load_keyframe_database
 
-NO_DEFAULTS = ("None", "False", "", "''")  # Defaults that tell a reader nothing.
-LINES = 10  # Lines of progress where the output is no terminal.
+NO_DEFAULTS = ("None", "False", "", "''")  # Default values that the help does not print.
+LINES = 10  # Lines of progress per command if the output is no terminal.
 
 
 def argument(**properties: Any) -> Any:
-    """Describe an argument as `tyro.conf.arg` does; the help omits a default that says nothing."""
+    """Describe an argument as `tyro.conf.arg` does; the help omits the defaults in NO_DEFAULTS."""
     return tyro.conf.arg(help_behavior_hint=_default_hint, **properties)
 
 
@@ -72,8 +72,8 @@ StateFolder = Annotated[
         name="state",
         aliases=["--resume"],
         metavar="DIR",
-        help="folder of the actors' checkpoints, from which they resume; default: a temporary "
-        "folder",
+        help="folder of the actors' checkpoints, from which the actors resume; default: a "
+        "temporary folder",
     ),
 ]
 Localize = Annotated[
@@ -103,10 +103,12 @@ Json = Annotated[bool, argument(help="print one JSON document and nothing else")
 
 
 def localizing(config: Config, folder: Path | None) -> Config:
-    """Return the configuration with the map of --localize.
+    """Return the configuration for localization in the map of a run folder, the one of --localize.
+
+    The configuration is unchanged if the folder is None.
 
     Raises:
-        DataError: The folder has no map.
+        DataError: If the folder has no map.
     """
     if folder is None:
         return config
@@ -117,12 +119,12 @@ def localizing(config: Config, folder: Path | None) -> Config:
 
 
 def with_usable_networks(config: Config) -> Config:
-    """Return the same configuration after a check of its networks.
+    """Check that the configured networks can be used, and return the configuration unchanged.
 
-    A service only warns about a network that it cannot use.
+    The live service does not call this function: it only warns about a network that it cannot use.
 
     Raises:
-        ConfigError: A network in the configuration cannot be used.
+        ConfigError: If a network cannot be used.
     """
     parameters = actor_parameters(config)
     require_detector(parameters.detector)
@@ -135,7 +137,8 @@ def progress(title: str, total: int, console: Console) -> Iterator[Advance]:
     """Show progress while the context is open.
 
     Yields:
-        A function that takes the number of finished items and, if it grew, the number of all items.
+        A function that takes the number of finished items and, if the total has grown, the new
+        total.
     """
     if not console.is_terminal:
         yield _plain(title, total, console)

@@ -41,7 +41,7 @@ from .options import (
 )
 
 FIRST_REALSENSE, NO_TOPICS = RealSenseOptions(), RosOptions()
-MAX_BAD = 0.1  # Maximum fraction of unreadable frames.
+MAX_BAD = 0.1  # The command fails if more than this fraction of the frames cannot be read.
 
 
 def publish(
@@ -114,13 +114,17 @@ def publish(
         f"{camera.unreceived} without subscriber; `ldo doctor` shows how many the service rejected"
     )
     if camera.bad > MAX_BAD * len(indices):
-        raise DataError(f"{camera.bad} of {len(indices)} frames could not be read.")
+        raise DataError(
+            f"{camera.bad} of {len(indices)} frames could not be read. The reason for the first is "
+            "printed above."
+        )
 
 
 class SequencePublisher:
     """Publisher of the frames of a sequence.
 
-    It reports the first bad frame, and each time that the topic loses its subscribers.
+    The publisher notifies the user of the first unreadable frame, and each time the topic has lost
+    its last subscriber.
     """
 
     def __init__(
@@ -136,7 +140,7 @@ class SequencePublisher:
         self.sent = self.bad = self.unreceived = 0
 
     def send(self, index: int) -> None:
-        """Send one frame, or count it as bad if it cannot be read."""
+        """Send one frame; a frame that cannot be read is counted in `bad` and skipped."""
         self._notice_listeners()
         try:
             message = raw_frame_to_message(self._sequence.read(index))

@@ -46,15 +46,15 @@ def query(
         argument(
             metavar="NAME",
             help="encoder pair that compares TEXT with the labels if no label has the same "
-            "meaning; default for a run: its own labeller",
+            "meaning; default for a run: the labeller of the run",
         ),
     ] = "",
     json_: Annotated[Json, argument(name="json")] = False,
 ) -> None:
     """Find objects by name: print their boxes in the map, best match first.
 
-    Synonyms, broader and narrower terms are found too: "sofa" finds couches. Other words are
-    compared with the object names by the text encoder of an encoder pair, if there is one.
+    TEXT also finds synonyms, broader and narrower terms: "sofa" finds couches. If there is an
+    encoder pair, its text encoder compares other words with the object names.
 
       ldo query DIR "potted plant"
       ldo query live chair --json
@@ -71,21 +71,27 @@ def query(
 
 
 def _of_run(folder: Path) -> tuple[MapObjects, np.ndarray | None]:
-    """Return the objects of a run and the last position [3] of the camera, None without poses."""
+    """Return the objects of a run, and the last position [3] of the camera in the map, meters.
+
+    The position is None if the run has no poses.
+    """
     found, path = read_objects(folder), folder / "trajectory.txt"
     T_map_camera = Trajectory.load(path).T_world_camera if path.is_file() else np.zeros((0, 4, 4))
     return found, T_map_camera[-1, :3, 3] if len(T_map_camera) else None
 
 
 def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.ndarray | None]:
-    """Return the objects of a service and the position [3] of the camera, None if unknown."""
+    """Return the objects of a service, and the position [3] of the camera in the map, meters.
+
+    The position is None if it is unknown.
+    """
     with connect(robot, endpoint, keys) as service:
         found, poses = service.objects(), service.latest(POSE_TRACKED)
     eye = None
     for pose in poses:
         assert isinstance(pose, TrackedPose)
         if pose.submap:
-            continue  # The pose of this submap in the map is unknown.
+            continue  # The submap is not merged, so its pose in the map is unknown.
         eye = (pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera))[:3, 3]
     return found, eye
 
@@ -93,11 +99,11 @@ def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.
 def _texts_of(model: str, run: Path | None) -> Encode:
     """Return a function that encodes texts with an encoder pair.
 
-    The function opens the pair only when it is called, because the labeller of a run may no longer
-    exist.
+    The pair is opened at the call of that function, because the labeller of a run may no longer
+    exist and most queries do not need it.
 
     Args:
-        model: Name of the encoder pair; empty takes the labeller of the run.
+        model: Name of the encoder pair; empty for the labeller of the run.
         run: Folder of the run; None for a live service.
 
     Returns:
@@ -120,10 +126,10 @@ def _texts_of(model: str, run: Path | None) -> Encode:
 
 
 def _labeller_of(run: Path) -> VlmLabellerConfig | None:
-    """Return the settings of the run's labeller; None if it was no encoder pair.
+    """Return the settings of the run's labeller; None if the labeller was no encoder pair.
 
     Raises:
-        TextComparisonError: The configuration of the run cannot be read, or is of an earlier
+        TextComparisonError: If the configuration of the run cannot be read, or is of an earlier
             version.
     """
     try:

@@ -50,7 +50,8 @@ def run(
         int | None,
         argument(
             metavar="T",
-            help="threads of the renderer; 0: all cores, less one for the tracker with --realtime",
+            help="threads of the renderer; 0: all cores, or with --realtime all but one, which the "
+            "tracker uses",
         ),
     ] = None,
     refine_iterations: Annotated[
@@ -64,8 +65,8 @@ def run(
         Path | None,
         argument(
             metavar="FILE",
-            help="poses of the robot's base from another odometry, in the TUM format: an initial "
-            "guess for the tracker. Set the camera pose on the base by tracker.T_base_camera",
+            help="poses of the robot's base from another odometry, in the TUM format, as initial "
+            "guess for the tracker; tracker.T_base_camera is the camera pose on the base",
         ),
     ] = None,
     keep_front_end: Annotated[
@@ -89,8 +90,9 @@ def run(
 ) -> None:
     """Track and map a sequence; write trajectory, map and metrics to a folder.
 
-    The result depends only on the frames and the configuration, not on the load of the machine. No
-    ground truth is needed; `ldo eval DIR SOURCE` compares the result with it.
+    Unless --realtime is given, the result depends only on the frames and the configuration, not on
+    the load of the machine. No ground truth is needed; `ldo eval DIR SOURCE` compares the result
+    with the ground truth of SOURCE.
 
       ldo run synthetic:room --out runs/room
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --max-frames 300
@@ -137,10 +139,15 @@ def run(
 def execute(
     job: RunOptions, go: Callable[[RunOptions, Advance], RunWriter], console: Console
 ) -> RunWriter:
-    """Run the job with a progress bar.
+    """Run a job with a progress bar.
+
+    Args:
+        job: The job.
+        go: `run_offline` or `run_realtime`.
+        console: Console of the progress bar.
 
     Raises:
-        ConfigError: The folder cannot be written.
+        ConfigError: If the folder of the run cannot be written.
     """
     with progress("run", job.work, console) as advance:
         try:
@@ -158,7 +165,7 @@ def kept_front_end(
     """Open the recorded outputs of tracker and detector; return None without --reuse-front-end.
 
     Raises:
-        ConfigError: The run would replace the recording that it reads.
+        ConfigError: If the run would replace the recording that it reads.
     """
     if run is None:
         return None
@@ -171,7 +178,7 @@ def format_unmerged(gaussians: int) -> str:
     """Return a note on the Gaussians of submaps that were never merged with the map."""
     return (
         f"map.ply lacks {gaussians:,} Gaussians: tracking was lost, and the submaps after it were "
-        "never merged with the map, so the poses of these Gaussians in it are unknown."
+        "never merged with the map, so the poses of these Gaussians in the map are unknown."
     )
 
 
@@ -186,7 +193,7 @@ def format_localization(statuses: dict[str, int], folder: Path) -> str:
 
 
 def with_options(config: Config, hold_out: int | None, threads: int | None) -> Config:
-    """Return the configuration with the settings that have their own options."""
+    """Return the configuration with the settings that have options of their own; None keeps one."""
     tracker, mapper = config.tracker, config.mapper
     if hold_out is not None:
         tracker = replace(tracker, hold_out=hold_out)
@@ -200,11 +207,11 @@ def require_none_of(option: str, is_given: object, others: Mapping[str, object])
 
     Args:
         option: Name of the option.
-        is_given: Its value; a true value means that it is given.
-        others: Options that exclude it, by name.
+        is_given: Value of the option; a true value means that the option is given.
+        others: Values of the options that have no effect with `option`, by name.
 
     Raises:
-        ConfigError: Both are given.
+        ConfigError: If the option and one of the others are given.
     """
     wrong = [name for name, value in others.items() if value]
     if is_given and wrong:
@@ -215,7 +222,7 @@ def require_separate(localize: Path | None, out: Path, refine: int) -> None:
     """Check that localization does not change the map that it uses.
 
     Raises:
-        ConfigError: The run would refine or replace that map.
+        ConfigError: If the run would refine or replace that map.
     """
     if localize and refine:
         raise ConfigError("--localize does not change the map. Remove --refine-iterations.")
@@ -226,16 +233,16 @@ def require_separate(localize: Path | None, out: Path, refine: int) -> None:
 def require_held_out(stride: int, hold_out: int) -> None:
     """Check that the stride reaches the frames that are held out.
 
-    Held-out frames are counted in the whole sequence. With a common factor of both numbers, some of
-    them would never be read.
+    Every `hold_out`-th frame of the whole sequence is held out, counted before the stride. If both
+    numbers had a common factor, some held-out frames would never be read.
 
     Raises:
-        ConfigError: The stride and the interval of held-out frames have a common factor.
+        ConfigError: If both numbers have a common factor.
     """
     if hold_out and gcd(stride, hold_out) > 1:
         raise ConfigError(
             f"--stride {stride} and --hold-out-every {hold_out} have a common factor, so other "
-            "frames would be held out than requested. Choose numbers without one."
+            "frames would be held out than requested. Choose numbers without a common factor."
         )
 
 

@@ -58,7 +58,7 @@ def serve(
     """Run the service: camera frames in on camera/rgbd; poses, map and health out.
 
     Ctrl-C stops the service after each actor has finished its pending work. A second Ctrl-C stops
-    it at once.
+    the service at once.
 
       ldo serve
       ldo publish synthetic:room --rate 15      (in another terminal)
@@ -106,8 +106,9 @@ def record(
     A running service cannot start a recording, because the recording would lack the state of its
     actors. Stop the service, then run `ldo record` with the same --state folder to keep the map.
 
-    640x480 at 30 Hz takes 100 MB per second; recording.max_gb limits the size. `ldo replay DIR
-    --verify` replays the recording. Every verb that takes a SOURCE accepts DIR as a data set.
+    A recording of 640x480 pixels at 30 Hz takes 100 MB per second; recording.max_gb limits the
+    size. `ldo replay DIR --verify` replays the recording. Every verb that takes a SOURCE accepts
+    DIR as a data set.
 
       ldo record recordings/desk
       ldo publish synthetic:room --rate 15      (in another terminal)

@@ -36,7 +36,7 @@ def simulate(
     ] = None,
     json_: Annotated[Json, argument(name="json")] = False,
 ) -> None:
-    """Run every actor on a logical clock, and print a digest of the outputs of each one.
+    """Run all actors on a logical clock, and print a digest of each actor's outputs.
 
     The digests depend only on the frames, the configuration and the instruction set, not on the
     number of threads or the load of the machine. Nothing is written.

@@ -59,19 +59,24 @@ def suite(
     try:
         (work.out / TABLE).write_text(table)
     except OSError as error:
-        raise ConfigError(f"{work.out / TABLE} cannot be written: {error.strerror}.") from error
+        raise ConfigError(
+            f"{work.out / TABLE} cannot be written: {error.strerror}. Free some disk space or make "
+            f"{work.out} writable, and repeat the command: finished runs are kept."
+        ) from error
     print(table, end="")
     if any(outcome.missing == "failed" for outcome in outcomes):
         sys.exit(1)
 
 
 def _require_folder(folder: Path) -> None:
-    """Create the folder before hours of runs.
+    """Create the folder, so that a wrong path is found before hours of runs.
 
     Raises:
-        ConfigError: The folder cannot be written.
+        ConfigError: If the folder cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{folder} cannot be written: {error.strerror}.") from error
+        raise ConfigError(
+            f"{folder} cannot be written: {error.strerror}. Choose another --out."
+        ) from error

@@ -12,7 +12,7 @@ from ldo_service.schemas.topics import TOPICS
 
 from .options import Robot, argument
 
-WIDTH = 160  # Columns of a pipe or a file, so that no key is truncated.
+WIDTH = 160  # Columns of the table if the output is no terminal, so that no key is truncated.
 
 
 def topics(

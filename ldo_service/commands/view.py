@@ -38,8 +38,8 @@ def view(
     """Show a map in a browser: Gaussians, paths, keyframes, objects, loops, and a search box.
 
     For a run in progress, the window shows the files written so far and updates as more are
-    written. By default only browsers on this machine can open it; see docs/viewer.md. Ctrl-C
-    ends it.
+    written. By default only browsers on this machine can open the window; see docs/viewer.md.
+    Ctrl-C ends the command.
 
       ldo view runs/desk
       ldo view live --endpoint tls/mule.local:7447 --keys keys/desk
@@ -55,7 +55,7 @@ def require_viser() -> None:
     """Check that viser is installed.
 
     Raises:
-        ConfigError: It is not installed.
+        ConfigError: If viser is not installed.
     """
     if importlib.util.find_spec("viser") is None:
         raise ConfigError(f"the window needs viser. Install it by {install_command('viewer')}.")
@@ -67,9 +67,16 @@ def source_of(
 ) -> Iterator[Source]:
     """Open the scene of a run folder or of a running service.
 
+    Args:
+        where: Folder of a run, or "live" for the running service.
+        robot: Name of the robot.
+        endpoint: Address of the service's router.
+        keys: Folder with TLS keys; None for a service without keys.
+        config: Settings of the viewer.
+
     Raises:
-        DataError: No run wrote the folder.
-        ConfigError: No service answers.
+        DataError: If the folder was not written by a run.
+        ConfigError: If no service answers.
     """
     if where != LIVE:
         yield RunFolder(Path(where).expanduser(), config)
