@@ -1,9 +1,9 @@
 """Messages between the actors and to other programs; imports msgspec and numpy only.
 
-A message is one frozen, tagged struct. It is sent as a MessagePack map of the struct's field names,
-plus `type`, the name of the struct. Any MessagePack library can read it. New fields are added at
-the end and with a default; the meaning of a field never changes. Conventions of frames and units
-are those of `ldo_service.geometry`.
+A message is one frozen, tagged struct. It is sent as a MessagePack map from the names of the
+struct's fields to their values, plus `type`, the name of the struct. Any MessagePack library can
+read this map. New fields are added at the end and with a default; the meaning of a field never
+changes. Conventions of frames and units are those of `ldo_service.geometry`.
 """
 
 from ldo_service.schemas.array import Array

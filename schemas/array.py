@@ -40,10 +40,10 @@ class Array(msgspec.Struct, frozen=True):
     def of(cls, values: np.ndarray) -> "Array":
         """Return an array with a copy of `values`.
 
-        Because it is a copy, later changes of `values` do not affect the message.
+        Later changes of `values` therefore do not affect the message.
 
         Raises:
-            ValueError: The dtype is not one of `DTYPES`.
+            ValueError: If the dtype is not one of `DTYPES`.
         """
         dtype = values.dtype.str[1:]
         if dtype not in DTYPES:
@@ -54,14 +54,23 @@ class Array(msgspec.Struct, frozen=True):
     def numpy(self) -> np.ndarray:
         """Return the array as a read-only NumPy view, without a copy.
 
-        In a received message, its memory may be unaligned.
+        The memory of the view may be unaligned if the message was received.
         """
         view = np.frombuffer(self.data, "<" + self.dtype).reshape(self.shape)
         view.flags.writeable = False
         return view
 
     def require(self, name: str, dtype: DType, shape: tuple[int | None, ...]) -> None:
-        """Raise ValueError unless dtype and shape match; None in `shape` allows any length."""
+        """Check dtype and shape of the array.
+
+        Args:
+            name: Name of the array in the error message.
+            dtype: Required dtype.
+            shape: Required shape; None for a dimension of any length.
+
+        Raises:
+            ValueError: If dtype or shape differ.
+        """
         fits = len(shape) == len(self.shape) and all(
             want is None or want == have for want, have in zip(shape, self.shape, strict=True)
         )
@@ -75,7 +84,7 @@ class Array(msgspec.Struct, frozen=True):
             raise ValueError(f"{name} holds NaN or infinity")
 
     def require_ascending(self, name: str) -> None:
-        """Raise ValueError unless this one-dimensional array of ids is 0 <= a < b < ..."""
+        """Raise ValueError unless the array [N] holds ids of at least 0 in ascending order."""
         ids = self.numpy()
         if (ids.size and ids[0] < 0) or (ids[1:] <= ids[:-1]).any():
             raise ValueError(f"{name} must be ascending and at least 0")

@@ -13,8 +13,8 @@ TOLERANCE_PX = 1e-3  # Tolerance for rounding beyond the edge of the image.
 class Detection(msgspec.Struct, frozen=True, kw_only=True):
     """Box of an object with label and score.
 
-    Pixel centers are at integer coordinates. A box around only the pixel (3, 5) is therefore 2.5,
-    4.5, 3.5, 5.5.
+    Pixel centers are at integer coordinates. A box around the single pixel x = 3, y = 5 is
+    therefore 2.5, 4.5, 3.5, 5.5.
     """
 
     label: str  # Lower case, single spaces; synonyms of a class share one label.
@@ -38,8 +38,8 @@ class Detection(msgspec.Struct, frozen=True, kw_only=True):
 class DetectionBoxes(Message, frozen=True, kw_only=True):
     """Detections in a keyframe, published on detection/boxes once for every keyframe.
 
-    stamp_ns is that of the keyframe. If `network` is empty, no detector ran. `detections` is then
-    empty even if the keyframe shows objects.
+    stamp_ns is the stamp of the keyframe. If `network` is empty, no detector ran. `detections` is
+    then empty even if the keyframe shows objects.
     """
 
     keyframe: int  # Id of the keyframe.
@@ -51,13 +51,18 @@ class DetectionBoxes(Message, frozen=True, kw_only=True):
     def check(self) -> None:
         require_count("keyframe", self.keyframe)
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
-            raise ValueError(f"image size {self.width}x{self.height} is empty or over {MAX_PIXELS}")
+            raise ValueError(
+                f"image size is {self.width}x{self.height}, must have 1 to {MAX_PIXELS} pixels"
+            )
         if len(self.detections) > MAX_DETECTIONS:
             raise ValueError(
                 f"message has {len(self.detections)} detections, must have at most {MAX_DETECTIONS}"
             )
         if self.detections and not self.network:
-            raise ValueError("message has detections but no network that made them")
+            raise ValueError(
+                f"message has {len(self.detections)} detections and an empty network; network must "
+                "name the network that made them"
+            )
         for detection in self.detections:
             self._require_inside(detection)
 
@@ -66,5 +71,6 @@ class DetectionBoxes(Message, frozen=True, kw_only=True):
         low, right, bottom = -0.5 - TOLERANCE_PX, self.width - 0.5, self.height - 0.5
         if min(x0, y0) < low or x1 > right + TOLERANCE_PX or y1 > bottom + TOLERANCE_PX:
             raise ValueError(
-                f"box_px {detection.box_px} leaves the image of {self.width}x{self.height} pixels"
+                f"box_px {detection.box_px} leaves the image of {self.width}x{self.height} pixels: "
+                f"x must be in -0.5..{right}, y in -0.5..{bottom}"
             )

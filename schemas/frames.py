@@ -9,7 +9,8 @@ from ldo_service.schemas.array import Array
 from ldo_service.schemas.message import Message, require_count, require_finite
 from ldo_service.schemas.pose import IDENTITY, Pose
 
-# 33 megapixels. No RGB-D camera has more, and a corrupt header could demand terabytes.
+# 33 megapixels, more than any RGB-D camera has. Without a limit, a corrupt header could demand
+# terabytes of memory.
 MAX_PIXELS = 1 << 25
 
 
@@ -27,7 +28,9 @@ class CameraModel(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         require_finite("camera intrinsics", (self.fx, self.fy, self.cx, self.cy, *self.distortion))
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
-            raise ValueError(f"image size {self.width}x{self.height} is empty or over {MAX_PIXELS}")
+            raise ValueError(
+                f"image size is {self.width}x{self.height}, must have 1 to {MAX_PIXELS} pixels"
+            )
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"focal lengths are {self.fx:g}, {self.fy:g} px, must be positive")
         if len(self.distortion) not in (0, 4, 5, 8):
@@ -46,7 +49,7 @@ BYTES_PER_PIXEL: dict[str, int] = {"rgb8": 3, "bgr8": 3, "z16": 2, "f32": 4}
 class Image(msgspec.Struct, frozen=True, kw_only=True):
     """Image, raw or compressed.
 
-    The pixels of a compressed image are checked when it is decompressed.
+    The pixels of a compressed image are not checked here but at decompression.
     """
 
     encoding: ImageEncoding
@@ -56,7 +59,9 @@ class Image(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
-            raise ValueError(f"image size {self.width}x{self.height} is empty or over {MAX_PIXELS}")
+            raise ValueError(
+                f"image size is {self.width}x{self.height}, must have 1 to {MAX_PIXELS} pixels"
+            )
         raw = self.width * self.height * BYTES_PER_PIXEL.get(self.encoding, 0)
         if self.encoding in BYTES_PER_PIXEL and self.data.nbytes != raw:
             raise ValueError(
@@ -106,11 +111,11 @@ class CameraRgbd(Message, frozen=True, kw_only=True):
 class CameraColor(Message, frozen=True, kw_only=True):
     """Raw color image of a camera program, published on camera/color.
 
-    The actor frame_source pairs it with a depth image. The resulting frame has the stamp of the
-    color image.
+    The actor frame_source pairs the color image with a depth image. The resulting frame has the
+    stamp of the color image.
     """
 
-    frame: int  # Running number of the camera program, and of the paired frame.
+    frame: int  # Running number of the camera program; the resulting frame has the same number.
     camera: CameraModel
     image: Image
 
@@ -123,11 +128,11 @@ class CameraDepth(Message, frozen=True, kw_only=True):
     """Raw depth image of a camera program, published on camera/depth.
 
     stamp_ns is the time of exposure of the depth image. If `camera` equals the color camera and
-    T_color_depth is the identity, depth is registered already. Otherwise, the service registers it
-    to the color image.
+    T_color_depth is the identity, depth is registered already. Otherwise, the service registers the
+    depth image to the color image.
     """
 
-    frame: int  # Running number of the camera program; pairing uses stamps instead.
+    frame: int  # Running number of the camera program; images are paired by stamp, not by number.
     camera: CameraModel  # Intrinsics of the depth image.
     image: Image
     depth_scale: float  # Depth units per meter, as in camera/rgbd.

@@ -22,7 +22,7 @@ class GraphLandmark(msgspec.Struct, frozen=True, kw_only=True):
     object: int  # Id of the object, as in map/objects.
     centroid: Vector3  # Map frame, meters.
     distribution: Distribution  # Fused over the observations of all keyframes.
-    entropy: float  # Entropy of the distribution before it was cut to its likeliest classes, nats.
+    entropy: float  # Entropy over all classes, nats; `distribution` lists only the likeliest ones.
 
     def __post_init__(self) -> None:
         require_count("object", self.object)
@@ -35,14 +35,14 @@ class GraphCorrection(Message, frozen=True, kw_only=True):
     """Poses of all keyframes in the map, published on graph/correction.
 
     The poses are in the map frame, not relative to earlier messages. The newest message therefore
-    replaces all earlier ones. A message has 56 bytes per keyframe.
+    replaces all earlier messages. The poses take 56 bytes per keyframe.
     """
 
-    graph_version: int  # Ascending.
+    graph_version: int  # Version of the poses, ascending.
     keyframes: Array  # Keyframe ids, i8 [K], ascending.
     T_map_keyframe: Array  # Translation in meters and quaternion wxyz, f8 [K, 7].
-    last_refinement: int = 0  # Number of the last keyframe/refinement that it includes.
-    # Merged submaps, each with the older one that it is merged into.
+    last_refinement: int = 0  # Number of the last keyframe/refinement that the poses include.
+    # Each merged submap, with the older submap that it is merged into.
     merged_submaps: tuple[Pair, ...] = ()
     # Accepted loop closures as pairs of reference and keyframe.
     accepted_closures: tuple[Pair, ...] = ()
@@ -67,4 +67,7 @@ class GraphCorrection(Message, frozen=True, kw_only=True):
         with np.errstate(over="ignore"):  # Overflow gives infinity, which fails below.
             norms = np.sqrt((quaternions**2).sum(axis=1))
         if (abs(norms - 1.0) > QUATERNION_TOLERANCE).any():
-            raise ValueError("T_map_keyframe holds a quaternion without unit norm")
+            raise ValueError(
+                "T_map_keyframe holds a quaternion without unit norm; each norm must be 1 within "
+                f"{QUATERNION_TOLERANCE}"
+            )

@@ -1,4 +1,4 @@
-"""Heartbeat of an actor, published by its stage twice a second, also while the stage waits."""
+"""Heartbeat of an actor, published twice a second by the actor's stage, even while it waits."""
 
 from typing import Literal
 
@@ -18,8 +18,8 @@ class InputCount(msgspec.Struct, frozen=True, kw_only=True):
     queued: int  # Messages in the mailbox now.
     peak_queued: int  # Maximum of `queued` so far.
     dropped_paused: int = 0  # Messages dropped while the service was paused.
-    # Messages that never arrived, by gaps in the sequence; of lossless inputs, those that the
-    # producer had to drop.
+    # Messages that never arrived, counted by gaps in the sequence. For lossless inputs: messages
+    # that the producer had to drop.
     lost: int = 0
 
 
@@ -28,11 +28,11 @@ class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
 
     topic: str
     sent: int
-    backpressure_waits: int  # Times that the stage waited for the window of a consumer.
-    evicted_consumers: int  # Consumers evicted because their window stayed closed.
+    backpressure_waits: int  # Times that the stage waited because a consumer's window was full.
+    evicted_consumers: int  # Consumers evicted because their window stayed full.
     # Lossless messages sent again, after a loss or from a backlog.
     retransmitted: int = 0
-    # Unhandled messages of each consumer with a backlog, by its name.
+    # Number of messages that a consumer with a backlog has not handled yet, by consumer name.
     behind: dict[str, int] = {}
     backlog_mb: float = 0.0  # Size of the backlog on disk, MB.
     backlog_dropped: int = 0  # Messages that the maximum size of the backlog dropped.
@@ -41,27 +41,27 @@ class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
 class Health(Message, frozen=True, kw_only=True):
     """Heartbeat of an actor, published on health/<actor>.
 
-    A stage is the runtime around an actor. stamp_ns is that of the last message that the actor
+    A stage is the runtime around an actor. stamp_ns is the stamp of the last message that the actor
     handled.
     """
 
     actor: str
     state: Literal["starting", "ready", "busy", "draining"]
     pid: int
-    epoch: int  # Epoch of the stage; changes when its process restarts.
+    epoch: int  # Number that changes when the process restarts or the actor is reset.
     steps: int  # Handled messages.
     failures: int  # Exceptions in the handler.
     restarts: int  # Times that the actor was rebuilt from its last state.
     dead_lettered: int  # Messages that failed twice.
     step_age_s: float  # Time since the last step finished.
     current_step_s: float  # Age of the current step; 0 while waiting.
-    step_ms_p50: float  # Median of the last steps, without steps that only store a message.
-    step_ms_p95: float
+    step_ms_p50: float  # Median duration of recent steps, without steps that only store a message.
+    step_ms_p95: float  # 95th percentile of the same durations.
     rss_mb: float  # Resident memory of the process.
     inputs: tuple[InputCount, ...]
     outputs: tuple[OutputCount, ...]
     metrics: dict[str, float] = {}  # Metrics of the actor by name.
-    paused: bool = False  # True while the stage takes no messages, on request.
+    paused: bool = False  # True while the stage takes no messages, after the command `pause`.
 
     def check(self) -> None:
         for name in ("pid", "epoch", "steps", "failures", "restarts", "dead_lettered"):

@@ -16,11 +16,11 @@ def message_types() -> tuple[type[Message], ...]:
 
 
 def json_schema() -> dict[str, object]:
-    """Return one document with the schemas of all messages.
+    """Return one document with the JSON Schemas of all messages.
 
-    `$defs` contains each message by name. `topics` refers to the message of each topic. `answers`
-    refers to the reply for each topic that takes requests by query. JSON Schema describes binary
-    fields as base64 strings. In MessagePack, they have the type `bin`.
+    `$defs` contains the schema of each message, by name. `topics` refers to the message of each
+    topic. `answers` refers to the reply of each topic that takes requests by query. JSON Schema
+    describes binary fields as base64 strings; in MessagePack, these fields have the type `bin`.
     """
     _, definitions = msgspec.json.schema_components(message_types())
     for definition in definitions.values():

@@ -14,7 +14,7 @@ NO_MASK = Array.of(np.zeros((0, 0), np.uint8))
 class MeasuredPose(msgspec.Struct, frozen=True, kw_only=True):
     """Relative-pose measurement between two keyframes."""
 
-    reference: int  # Id of the keyframe that is the frame of the pose.
+    reference: int  # Id of the keyframe in whose frame the pose is given.
     keyframe: int  # Id of the measured keyframe.
     T_reference_keyframe: Pose
     information: Matrix6  # Information matrix for a perturbation on the right.
@@ -64,8 +64,8 @@ class Keyframe(Message, frozen=True, kw_only=True):
     T_reference_keyframe. If the receiver missed the reference, it uses T_odom_keyframe and any
     other keyframe of the submap.
 
-    The first keyframe of a submap has no reference. Tracking was lost before it, so its pose in
-    other submaps is unknown.
+    The first keyframe of a submap has no reference: tracking was lost before this keyframe, so its
+    pose in other submaps is unknown.
     """
 
     keyframe: int  # Id, ascending.
@@ -78,12 +78,12 @@ class Keyframe(Message, frozen=True, kw_only=True):
     information: Matrix6  # Information of T_reference_keyframe for a perturbation on the right.
     T_odom_keyframe: Pose
     overlap: float = 1.0  # Fraction of the reference keyframe's surface that this keyframe sees.
-    # Poses of this keyframe in keyframes of its submap other than the reference.
+    # Poses of this keyframe in other keyframes of the same submap, without the reference.
     window_measurements: tuple[MeasuredPose, ...] = ()
-    # u1 [H, W]; 1 where pixels move and are not mapped. [0, 0] if nothing moves.
+    # Mask u1 [H, W]; 1 where pixels move and are not mapped. Shape [0, 0] if nothing moves.
     dynamic_mask: Array = NO_MASK
     submap: int = 0  # Number of the submap; each loss of tracking starts a new one.
-    # Poses of this keyframe in keyframes of submaps that its submap is merged with.
+    # Poses of this keyframe in keyframes of other submaps, which merge these with its own submap.
     submap_measurements: tuple[MeasuredPose, ...] = ()
     camera_correction: CameraCorrection = CameraCorrection()  # Applied to `color` and `depth_m`.
 
@@ -100,7 +100,7 @@ class KeyframeMeasurements(Message, frozen=True, kw_only=True):
     """Pose measurements of a keyframe without its images; published on keyframe/measurements.
 
     Each field means the same as in `Keyframe`. The pose-graph optimizer reads this message instead
-    of `Keyframe`: without images, its backlog stays small.
+    of `Keyframe`, because a backlog of messages without images stays small.
     """
 
     keyframe: int
@@ -121,7 +121,7 @@ def _check_measurements(message: Keyframe | KeyframeMeasurements) -> None:
     """Check the fields that both messages have.
 
     Raises:
-        ValueError: A field is out of range, or a measurement is of another keyframe.
+        ValueError: If a field is out of range, or a measurement is of another keyframe.
     """
     keyframe = message.keyframe
     require_count("keyframe", keyframe)
@@ -133,7 +133,10 @@ def _check_measurements(message: Keyframe | KeyframeMeasurements) -> None:
             "one"
         )
     if message.reference is not None and not 0 <= message.reference < keyframe:
-        raise ValueError(f"keyframe {keyframe} has reference {message.reference}, not an older one")
+        raise ValueError(
+            f"keyframe {keyframe} has the reference {message.reference}, not an older one: the "
+            f"reference must be in 0..{keyframe - 1}"
+        )
     for pose in message.window_measurements:
         if not pose.reference < pose.keyframe == keyframe:
             raise ValueError(
@@ -146,11 +149,11 @@ def _check_measurements(message: Keyframe | KeyframeMeasurements) -> None:
 class KeyframeRefinement(Message, frozen=True, kw_only=True):
     """Refined relative poses of keyframes, published on keyframe/refinement by the mapper.
 
-    Each replaces the earlier measurement of the same pair of keyframes.
+    Each pose replaces the earlier measurement of the same pair of keyframes.
     """
 
     poses: tuple[MeasuredPose, ...]
-    number: int = 0  # Ascending from 1; 0 if not numbered.
+    number: int = 0  # Number of the message, ascending from 1; 0 if not numbered.
 
     def check(self) -> None:
         require_count("number", self.number)

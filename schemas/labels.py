@@ -14,14 +14,14 @@ Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in pixels; pixel cente
 class LabelRequest(Message, frozen=True, kw_only=True):
     """Request to the labeller for the label of an image region, published on label/request.
 
-    stamp_ns is that of the keyframe.
+    stamp_ns is the stamp of `keyframe`.
     """
 
-    region: int  # Id of the region; a newer request for it replaces a waiting one.
+    region: int  # Id of the region; a newer request for a region replaces one that still waits.
     keyframe: int  # Id of the newest keyframe that shows the region.
     box_px: Box  # Edges x0, y0, x1, y1 in that keyframe's image, pixels, as in detection/boxes.
-    crops: tuple[Image, ...]  # Color crops of the best views, the best first.
-    label: str = ""  # Label from the detector; empty: none.
+    crops: tuple[Image, ...]  # Color images of the region, cropped from its best views, best first.
+    label: str = ""  # Label from the detector; empty if there is none.
     score: float = 0.0  # Score of the detector, 0..1.
 
     def check(self) -> None:
@@ -46,9 +46,9 @@ class LabelResult(Message, frozen=True, kw_only=True):
 
     region: int
     keyframe: int
-    label: str  # Lower case, single spaces; empty: no label, or no labeller ran.
-    confidence: float  # Confidence 0..1; 0 without a label.
-    labeller: str = ""  # Identity of the labeller; empty: none ran.
+    label: str  # Lower case, single spaces; empty if there is no label or no labeller ran.
+    confidence: float  # Confidence of the label, 0..1; 0 without a label.
+    labeller: str = ""  # Identity of the labeller; empty if no labeller ran.
     # Other labels with their confidence 0..1, the likeliest first.
     alternatives: tuple[tuple[str, float], ...] = ()
 
@@ -57,7 +57,10 @@ class LabelResult(Message, frozen=True, kw_only=True):
         require_count("keyframe", self.keyframe)
         _require_opinion(self.label, self.confidence)
         if self.label and not self.labeller:
-            raise ValueError("result has a label but no labeller that gave it")
+            raise ValueError(
+                f"result has the label {self.label!r} and an empty labeller; `labeller` must name "
+                "the labeller that gave the label"
+            )
         if len(self.alternatives) > MAX_ALTERNATIVES:
             raise ValueError(
                 f"result has {len(self.alternatives)} alternatives, must have at most "
@@ -73,12 +76,12 @@ class LabelResult(Message, frozen=True, kw_only=True):
 
 
 class AddLabel(Message, frozen=True, kw_only=True):
-    """Request to add a name to those that the labeller chooses from, published on label/add.
+    """Request to add a name to the list that the labeller chooses from, published on label/add.
 
-    stamp_ns identifies the request; the reply has the same one.
+    stamp_ns identifies the request; the reply has the same stamp.
     """
 
-    name: str
+    name: str  # Name to add, 1 to 100 characters.
 
     def check(self) -> None:
         if not 0 < len(self.name.strip()) <= MAX_LABEL_LENGTH:
@@ -90,11 +93,12 @@ class AddLabel(Message, frozen=True, kw_only=True):
 class LabelNames(Message, frozen=True, kw_only=True):
     """Reply to a label/add, published on label/names.
 
-    stamp_ns is that of the request.
+    stamp_ns is the stamp of the request.
     """
 
-    names: tuple[str, ...]  # Names that the labeller chooses from; empty: any name, or no labeller.
-    error: str = ""  # Reason why the request failed; empty: it succeeded.
+    # Names that the labeller chooses from; empty if it gives any name, or if there is no labeller.
+    names: tuple[str, ...]
+    error: str = ""  # Reason why the request failed; empty if the request succeeded.
 
     def check(self) -> None:
         if len(self.names) > MAX_NAMES:

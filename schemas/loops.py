@@ -13,20 +13,20 @@ MAX_REASON_LENGTH = 100  # Characters.
 class LoopClosure(Message, frozen=True, kw_only=True):
     """Verified pose between an old and a new keyframe, published on loop/closure.
 
-    stamp_ns is that of the new keyframe. The pose-graph optimizer accepts the closure only if the
-    other factors of the pose graph agree with it.
+    stamp_ns is the stamp of the new keyframe. The pose-graph optimizer accepts the closure only if
+    the closure agrees with the other factors of the pose graph.
     """
 
-    pose: MeasuredPose  # Pose of the new keyframe in the old one, `reference`.
-    overlap: float  # Fraction of the new keyframe's surface that the old one sees, 0..1.
+    pose: MeasuredPose  # Pose of the new keyframe in the frame of the old one, `reference`.
+    overlap: float  # Fraction of the new keyframe's surface that the old keyframe sees, 0..1.
     rmse_m: float  # Root mean square distance of the two surfaces along their normals, meters.
     entropy: float = 0.0  # Mean entropy of the matched landmarks, nats.
 
     def check(self) -> None:
         if self.pose.reference > self.pose.keyframe:
             raise ValueError(
-                f"closure of keyframe {self.pose.keyframe} has the newer {self.pose.reference} as "
-                "its reference, must have an older one"
+                f"closure of keyframe {self.pose.keyframe} has the newer keyframe "
+                f"{self.pose.reference} as reference; the reference must be older"
             )
         require_fraction("overlap", self.overlap)
         require_not_negative("rmse_m", self.rmse_m)
@@ -36,8 +36,8 @@ class LoopClosure(Message, frozen=True, kw_only=True):
 class LoopCandidate(Message, frozen=True, kw_only=True):
     """Pair of similar subgraphs and the result of their verification, published on loop/candidate.
 
-    A subgraph is a group of a few consecutive keyframes. stamp_ns is that of the newest keyframe.
-    Values of verification steps that did not run are 0.
+    A subgraph is a group of three to five consecutive keyframes. stamp_ns is the stamp of
+    `keyframe`. Values of verification steps that did not run are 0.
     """
 
     keyframe: int  # Newest keyframe of the newer subgraph.
@@ -52,7 +52,7 @@ class LoopCandidate(Message, frozen=True, kw_only=True):
     entropy: float = 0.0  # Mean entropy of the matched landmarks, nats.
     overlap: float = 0.0  # Fraction 0..1, as in loop/closure.
     rmse_m: float = 0.0  # Meters, as in loop/closure.
-    rejected_reason: str = ""  # Reason of the rejection; "": it became a loop closure.
+    rejected_reason: str = ""  # Reason of the rejection; "": the candidate became a loop closure.
 
     def check(self) -> None:
         for name in ("keyframe", "reference", "inliers"):
@@ -67,7 +67,10 @@ class LoopCandidate(Message, frozen=True, kw_only=True):
                 f"{MAX_REASON_LENGTH}"
             )
         if not self.rejected_reason and not self.evidence:
-            raise ValueError("evidence and rejected_reason are empty; at least one must be given")
+            raise ValueError(
+                "evidence and rejected_reason are both empty: a candidate without a pose must have "
+                "a rejected_reason"
+            )
 
 
 def require_fraction(name: str, value: float) -> None:

@@ -1,11 +1,11 @@
 """Map of Gaussians: renderings, changes and snapshots.
 
-A map replica is a copy of the map in another process. It keeps its arrays equal to the mapper's as
-follows:
+A map replica is a copy of the map in another process. These steps keep the arrays of a replica
+equal to those of the mapper:
 
 1. Receive all parts of a snapshot of version v.
-2. Apply every delta with `base_version >= v` in order: first `motions`, then `removed`, then
-   `changed`; `added` is appended at the end. The replica then has the version of the delta.
+2. Apply every delta with `base_version >= v`, in order. Of each delta, apply first `motions`, then
+   `removed`, then `changed`; append `added` at the end. The replica then has the delta's `version`.
 3. If the `base_version` of a delta is not the version of the replica, a delta was missed. Start
    again with a snapshot.
 """
@@ -31,13 +31,13 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
     A row of `labels` holds the observed labels of a Gaussian, little-endian:
 
     bytes  0..19  five weights (f4), the largest first
-    bytes 20..23  sum of the weights of all observations, older ones decayed (f4)
-    bytes 24..25  extent in mm of the object it was last observed as part of (u2)
-    byte  26      keyframes since then that should have observed it and did not
-    bytes 27..31  labels of the five weights, indices into `label_names`
+    bytes 20..23  sum of the weights of all observations; the weights of older ones decay (f4)
+    bytes 24..25  extent in mm of the object that the Gaussian was last observed to belong to (u2)
+    byte  26      keyframes since that observation that show the Gaussian in no object (u1)
+    bytes 27..31  labels of the five weights, indices into `label_names` (u1)
 
     The weights sum to at most 1. The difference to 1 is the weight of background, label 0. The
-    likeliest label is byte 27 if the first weight is larger than that of background, else 0.
+    likeliest label is byte 27 if the first weight is larger than the weight of background, else 0.
     """
 
     ids: Array  # Ids, i8 [N], unique, ascending.
@@ -57,10 +57,10 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AnchorMotion(msgspec.Struct, frozen=True, kw_only=True):
-    """Rigid motion T_new_old of mean and rotation of all Gaussians with the anchor `keyframe`."""
+    """Rigid motion of the means and rotations of all Gaussians with the anchor `keyframe`."""
 
     keyframe: int
-    T_new_old: Pose
+    T_new_old: Pose  # Transform in the map frame: mean_new = T_new_old mean_old.
 
     def __post_init__(self) -> None:
         require_count("keyframe", self.keyframe)
@@ -76,7 +76,7 @@ class MapDelta(Message, frozen=True, kw_only=True):
     removed: Array  # Ids of removed Gaussians, i8 [R], ascending.
     changed: Gaussians
     added: Gaussians
-    # Names by label index, if there are new ones; indices never change.
+    # Names of all labels by index, if there are new ones, else empty; indices never change.
     label_names: tuple[str, ...] = ()
 
     def check(self) -> None:
@@ -98,9 +98,9 @@ NO_EXPOSURES = Array.of(np.zeros((0, 2, 3), np.float32))
 class MapSnapshot(Message, frozen=True, kw_only=True):
     """One of several messages that together contain the whole map at `version`.
 
-    They are published on map/snapshot and numbered by `part`, from 0 to parts - 1. Part 0 also has
-    the exposure of each keyframe and the names of the labels. The image of a keyframe has the
-    colors gain * color + bias per channel, for colors 0..1 of the map.
+    The messages are published on map/snapshot and numbered by `part`, from 0 to parts - 1. Part 0
+    also has the exposure of each keyframe and the names of the labels. Where the map has a color in
+    0..1, the image of a keyframe has gain * color + bias per channel.
     """
 
     version: int
@@ -110,7 +110,7 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
     gaussians: Gaussians
     keyframes: Array = NO_KEYFRAMES  # Keyframe ids, i8 [K], ascending.
     exposures: Array = NO_EXPOSURES  # Gains, then biases of the RGB channels, f4 [K, 2, 3].
-    label_names: tuple[str, ...] = ()  # Names by label index; empty without detections.
+    label_names: tuple[str, ...] = ()  # Names of all labels by index; empty without detections.
 
     def check(self) -> None:
         require_version(self.version, self.graph_version)
@@ -148,7 +148,7 @@ class MapRendering(Message, frozen=True, kw_only=True):
         self.opacity.require("opacity", "u1", size)
 
 
-MAX_ITERATIONS = 500  # Half a minute, in which no keyframe is mapped.
+MAX_ITERATIONS = 500  # They take about half a minute, in which no keyframe is mapped.
 
 
 class RefineMap(Message, frozen=True, kw_only=True):
@@ -159,7 +159,7 @@ class RefineMap(Message, frozen=True, kw_only=True):
 
     iterations: int
     initial_rate: float = 1.0  # Factor on the length of the first step, in (0, 1].
-    # Factor on the length of the last step; geometric interpolation between.
+    # Factor on the length of the last step; factors between are interpolated geometrically.
     final_rate: float = 1.0
 
     def check(self) -> None:
@@ -191,10 +191,13 @@ def require_names(names: tuple[str, ...]) -> None:
 
 
 def require_weights(labels: Array) -> None:
-    """Raise ValueError unless weights and evidence of each label row are finite and at least 0."""
+    """Raise ValueError unless the weights (bytes 0..23 of each row) are finite and at least 0."""
     numbers = np.ascontiguousarray(labels.numpy()[:, :24]).view("<f4")
     if not (np.isfinite(numbers).all() and (numbers >= 0).all()):
-        raise ValueError("labels hold negative, NaN or infinite weights")
+        raise ValueError(
+            "labels hold negative, NaN or infinite weights: the six numbers in bytes 0..23 of each "
+            "row must be finite and at least 0"
+        )
 
 
 def require_version(version: int, graph_version: int) -> None:

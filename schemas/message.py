@@ -1,9 +1,9 @@
 """Base class of every message, and the checks that msgspec does not make.
 
-msgspec checks types while it decodes. It accepts NaN, and it does not compare the size of a buffer
-with its shape. These checks run in `__post_init__`, so every message object is valid, whether it
-was built or received. A failed check raises ValueError when a message is built, and
-msgspec.ValidationError when it is decoded.
+msgspec checks types while it decodes, but it accepts NaN, and it does not compare the size of a
+buffer with its shape. The checks of this package run in `__post_init__`, so every message object is
+valid, whether it was built or received. A failed check raises ValueError when a message is built,
+and msgspec.ValidationError when a message is decoded.
 """
 
 from collections.abc import Iterable
@@ -18,8 +18,8 @@ LAST_INTEGER = 2**63 - 1  # Largest int64: most languages and array dtypes have 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
     """Base class of all messages.
 
-    stamp_ns is the time of the sensor data that the message refers to. Handlers of messages use no
-    other time, so that a replay gives the same results.
+    stamp_ns is the time of the sensor data that the message refers to. Actors use no other time in
+    their computations, so that a replay gives the same results as the recorded run.
     """
 
     stamp_ns: int  # Nanoseconds since the epoch of the camera's clock.
@@ -39,7 +39,7 @@ def decode(body: bytes | memoryview, kind: type[T]) -> T:
     """Return the message in a MessagePack body.
 
     Raises:
-        msgspec.DecodeError: The bytes are no valid message of this type.
+        msgspec.DecodeError: If the bytes are no valid message of this type.
     """
     try:
         return msgspec.msgpack.decode(body, type=kind)

@@ -15,24 +15,24 @@ ROUNDING = 1e-3  # Tolerance of a sum of probabilities.
 
 Vector3 = tuple[float, float, float]  # x, y, z.
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in pixels; pixel centers at integers.
-# Names and probabilities, the likeliest first. The rest of the sum to 1 belongs to `other`; a
-# class that is not listed may still have a probability.
+# Names and probabilities of the likeliest classes, in descending order. The difference of the sum
+# to 1 is the probability of `other`, which stands for all classes that are not listed.
 Distribution = tuple[tuple[str, float], ...]
 
 
 class ObjectObservation(Message, frozen=True, kw_only=True):
     """Observation of an object in a keyframe, or a miss, published on object/observation.
 
-    A miss is an object that should be visible in the keyframe and was not detected. stamp_ns is
-    that of the keyframe.
+    A miss is an object that should be visible in the keyframe and was not detected. stamp_ns is the
+    stamp of the keyframe.
     """
 
     keyframe: int  # Id of the keyframe.
     object: int  # Id of the object, as in map/objects.
     box_px: Box  # Detected box, or for a miss the expected box.
-    # Classes of the Gaussians in the box, or for a miss the classes known before.
+    # Classes of the Gaussians in the box; for a miss, the classes of the object before.
     distribution: Distribution
-    entropy: float  # Entropy of the distribution before it was cut to its likeliest classes, nats.
+    entropy: float  # Entropy over all classes, nats; `distribution` lists only the likeliest ones.
     is_miss: bool = False  # True if the object is in view and not occluded, but not detected.
 
     def check(self) -> None:
@@ -44,7 +44,7 @@ class ObjectObservation(Message, frozen=True, kw_only=True):
 
 
 class ObjectView(msgspec.Struct, frozen=True, kw_only=True):
-    """Keyframe that shows much of an object, and the object's box there."""
+    """Keyframe that shows much of an object, and the box of the object in its image."""
 
     keyframe: int
     box_px: Box
@@ -62,18 +62,18 @@ class MapObject(msgspec.Struct, frozen=True, kw_only=True):
 
     id: int
     name: str  # The likeliest class except background.
-    confidence: float  # Probability of that class, 0..1.
-    centroid: Vector3  # Mean of its Gaussians, meters.
-    # Covariance of the means of its Gaussians: 9 numbers, row-major, m^2.
+    confidence: float  # Probability of the class `name`, 0..1.
+    centroid: Vector3  # Mean position of the object's Gaussians, meters.
+    # Covariance of the positions of the object's Gaussians: 9 numbers, row-major, m^2.
     covariance: tuple[float, ...]
-    T_map_object: Pose  # Center and axes of its box.
-    size: Vector3  # Size of the box along these axes, meters.
+    T_map_object: Pose  # Center and axes of the object's box.
+    size: Vector3  # Size of the box along its axes, meters.
     distribution: Distribution
-    entropy: float  # Nats, as in `ObjectObservation`.
-    observation_count: int  # Keyframes that observed it.
-    miss_count: int  # Keyframes that should have observed it and did not.
-    first_keyframe: int  # First keyframe that observed it.
-    last_keyframe: int  # Last keyframe that observed it.
+    entropy: float  # Entropy in nats, as in `ObjectObservation`.
+    observation_count: int  # Number of keyframes in which the object was observed.
+    miss_count: int  # Number of keyframes that should show the object and in which it was missed.
+    first_keyframe: int  # First keyframe in which the object was observed.
+    last_keyframe: int  # Last keyframe in which the object was observed.
     views: tuple[ObjectView, ...] = ()  # Best views first.
 
     def __post_init__(self) -> None:
@@ -137,8 +137,6 @@ def require_distribution(distribution: Distribution) -> None:
 
 
 def require_entropy(entropy: float) -> None:
-    """Raise ValueError unless an entropy is within 0..100 nats."""
+    """Raise ValueError unless an entropy is at least 0 and below 100 nats."""
     if not 0 <= entropy < 100:  # Nats; rejects NaN too.
-        raise ValueError(
-            f"entropy is {entropy:g} nats, must be at least 0 and at most log of the class count"
-        )
+        raise ValueError(f"entropy is {entropy:g} nats, must be at least 0 and below 100")

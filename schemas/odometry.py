@@ -10,5 +10,5 @@ class OdometryPrior(Message, frozen=True, kw_only=True):
     stamp_ns is the time of the pose, by the same clock as the stamps of the frames.
     """
 
-    # Pose in the source's own odometry frame; only the motion between two messages is used.
+    # Pose in the frame of that odometry, `prior`; only the motion between two messages is used.
     T_prior_base: Pose

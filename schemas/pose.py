@@ -6,7 +6,7 @@ import msgspec
 
 from ldo_service.schemas.message import Message, require_count, require_finite
 
-# Tolerance of the norm: float64 rounding, with margin for float32 math in clients.
+# Tolerance of a quaternion's norm: float64 rounding, with margin for float32 math in clients.
 QUATERNION_TOLERANCE = 1e-6
 
 
@@ -60,16 +60,18 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     covariance: Matrix6 = (0.0,) * 36
     inlier_fraction: float = 0.0  # Fraction of the residuals that are inliers.
     residual_color: float = 0.0  # Robust sigma, gray levels of 0..255.
-    residual_depth: float = 0.0  # Robust sigma relative to that of the sensor model.
+    residual_depth: float = 0.0  # Robust sigma, relative to the sigma of the sensor model.
     overlap: float = 0.0  # Fraction of the reference keyframe's surface that this frame sees.
     iterations: int = 0
-    # Initial guess that gave the pose: direct, prior, features, gicp, relocalized, reused;
-    # first for the first frame; none without a pose.
+    # Initial guess that led to the pose: "direct", "prior", "features", "gicp", "relocalized" or
+    # "reused"; "first" for the first frame; "none" without a pose.
     pose_source: str = ""
     # Spread of the poses from several initial guesses, rad of image motion.
     hypothesis_spread_rad: float = 0.0
     T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera).
-    submap: int = 0  # Submap that T_map_odom leads to; 0 is the map, others are not merged yet.
+    # Submap whose frame is `map` in T_map_odom. 0 is the map itself; any other submap is not merged
+    # with the map yet.
+    submap: int = 0
 
     def check(self) -> None:
         require_count("frame", self.frame)

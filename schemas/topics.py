@@ -1,7 +1,7 @@
-"""Topics on the network; their key is `ldo/<robot>/<name>`.
+"""Topics on the network; the Zenoh key of a topic is `ldo/<robot>/<name>`.
 
-Each topic has one producer. On a state topic, the producer also answers a query with its last
-value, for subscribers that start later.
+Each topic has one producer. On a state topic, the producer also answers a query with the last value
+of the topic, for subscribers that start later.
 """
 
 from dataclasses import dataclass
@@ -25,15 +25,16 @@ ROBOT_PREFIX = "ldo"
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """Topic: its name, message type and description."""
+    """Topic with its name, message type and description."""
 
     name: str
     message: type[Message]
     description: str
     is_state: bool = False  # True if the topic also answers queries with its last value.
-    key: str | None = None  # Field that identifies a message for `Latest(per_key=True)`.
+    # Field by which an input with the policy `Latest(per_key=True)` keeps the latest message each.
+    key: str | None = None
     answer: type[Message] | None = None  # Type of the reply if `message` is the payload of a query.
-    is_per_actor: bool = False  # True if each actor publishes on its own name below this one.
+    is_per_actor: bool = False  # True if each actor publishes on its own key, `<name>/<actor>`.
 
     @property
     def subscription_key(self) -> str:
