@@ -2,8 +2,8 @@
 
     python deploy/check_language.py [FILE...]
 
-Without arguments it reads every tracked Python and C++ file. It prints a line for each violation
-and exits with status 1 if there is one:
+Without arguments, the program reads every tracked Python and C++ file. It prints a line for each
+violation, and exits with status 1 if there is a violation. Violations are:
 
 - a docstring or a comment that opens with a fragment, such as "Whether ..." or "Of the ...";
 - a word that the glossary retires, such as "twin" for a reference implementation;

@@ -25,7 +25,7 @@ with (
     zenoh.open(config) as session,
     session.declare_subscriber(
         "ldo/robot/pose/tracked",
-        zenoh.handlers.RingChannel(1),  # Keeps only the newest pose, so that none is old.
+        zenoh.handlers.RingChannel(1),  # Keeps only the newest pose.
     ) as poses,
 ):
     for number, sample in enumerate(poses, 1):

@@ -1,12 +1,13 @@
 """Publisher of an odometry prior, from wheels or an inertial unit, without the package ldo-slam.
 
 The service uses the prior as the initial guess of tracking. Each message is the pose of the robot's
-base in a fixed frame that the sender chooses; only the motion between two messages counts. Stamps
-must be of the same clock as those of the camera's frames. The setting `tracker.T_base_camera` of
-the service is the pose of the camera on the base.
+base in a fixed frame that the sender chooses; only the motion between two messages is used. Stamps
+must be of the same clock as the stamps of the camera's frames. The setting `tracker.T_base_camera`
+of the service is the pose of the camera on the base.
 
-A robot publishes the poses of its driver. This example reads them from a file instead and sends
-each at its time. The lines of the file are `stamp tx ty tz qx qy qz qw`, in seconds and meters.
+A real robot publishes the poses that its odometry measures. This example reads poses from a file
+instead and sends each pose at its time. The lines of the file are `stamp tx ty tz qx qy qz qw`, in
+seconds and meters.
 
 Run `.venv/bin/pip install eclipse-zenoh msgpack`. Start `ldo serve`, then this program, then `ldo
 publish` of the sequence that belongs to the file:
@@ -37,7 +38,7 @@ with (
     started_s = time.monotonic()
     for stamp_s, x, y, z, *xyzw in poses:
         norm = sum(q * q for q in xyzw) ** 0.5
-        # The file has few digits; the message needs a unit quaternion.
+        # The message needs a unit quaternion, but quaternions in the file are rounded.
         qx, qy, qz, qw = (q / norm for q in xyzw)
         time.sleep(max(0.0, started_s + stamp_s - poses[0][0] - time.monotonic()))
         message = {

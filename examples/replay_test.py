@@ -1,7 +1,7 @@
 """Regression test that replays a recording: every actor must publish the same messages again.
 
-Record once, and stop with Ctrl-C. `ldo record` is `ldo serve` that also records; a camera or `ldo
-publish` sends its frames:
+Record once. `ldo record` runs the service as `ldo serve` does, and records its inputs. Send frames
+from a camera or with `ldo publish`, then stop `ldo record` with Ctrl-C:
 
     ldo record recordings/desk
 

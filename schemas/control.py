@@ -11,7 +11,7 @@ class ControlRequest(Message, frozen=True, kw_only=True):
     pause    the service drops and counts all frames from now on
     resume   the service accepts frames again
     save     every actor writes a checkpoint of its whole state now
-    reset    every actor restarts with an empty state, and numbers its messages anew in a new epoch
+    reset    every actor restarts with an empty state and a new epoch, as if it had just started
     """
 
     command: str  # An unknown command is answered with the list of known commands.

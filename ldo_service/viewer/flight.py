@@ -9,8 +9,10 @@ from ldo_service.schemas import MapObject
 
 FILLS = 0.4  # Size of an object as a fraction of the height of the picture.
 NEAREST_M = 0.4  # Minimum distance to the center of an object.
-TILT = 0.05  # Cost of tilting a camera; rolling it costs 1.
-HALF_VIEW_RAD = 0.65  # Half the vertical field of view of the browser: viser has 75 degrees.
+TILT = 0.05  # Weight of a camera's tilt in `estimate_up`; its roll has the weight 1.
+HALF_VIEW_RAD = (
+    0.65  # Half the vertical field of view of the browser, which is 75 degrees in viser.
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,10 +29,10 @@ class CameraView:
 
 
 def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray) -> CameraView:
-    """Return a close view of a whole object, from a direction where nothing hides it.
+    """Return a close view of a whole object, from a direction where nothing hides the object.
 
-    This is the direction of the keyframe that shows the object best. If its pose is unknown, the
-    direction of `eye` is used.
+    The direction is that of the keyframe with a known pose that shows the object best. If there is
+    no such keyframe, the direction is that of `eye`.
 
     Args:
         one: The object.
@@ -49,7 +51,7 @@ def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray
 
 
 def overview(T_map_camera: np.ndarray, back_m: float = 0.6, ahead_m: float = 2.0) -> CameraView:
-    """Return a view from behind a camera in its direction.
+    """Return a view from behind a camera, in the viewing direction of that camera.
 
     Args:
         T_map_camera: Pose of the camera, [4, 4].
@@ -63,12 +65,13 @@ def overview(T_map_camera: np.ndarray, back_m: float = 0.6, ahead_m: float = 2.0
 def estimate_up(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
     """Return the up direction of the map for a level horizon, [3].
 
-    A handheld camera is tilted more than it is rolled. x (right) and y (down) are the axes of each
-    keyframe's camera. Up is the unit vector u that minimizes
+    A handheld camera is tilted more than it is rolled. Let x (right) and y (down) be the axes of
+    each keyframe's camera. Up is the unit vector u that minimizes
 
         mean (x . u)^2 + TILT (1 - mean (y . u)^2)
 
-    and points opposite to y on average. Without keyframes, it is -y of the first camera.
+    and points opposite to y on average. Without keyframes, up is -y of the map, which is up for the
+    first camera if that was level.
 
     Args:
         keyframes: T_map_camera of each keyframe, [4, 4], by id.
@@ -83,7 +86,7 @@ def estimate_up(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
 
 
 def interpolate_views(start: CameraView, end: CameraView, steps: int) -> Iterator[CameraView]:
-    """Yield views from start to end, slow at both ends; the last one is `end`."""
+    """Yield `steps` views of a motion from start to end, slow at both; the last view is `end`."""
     for step in range(1, steps + 1):
         t = step / steps
         share = t * t * (3 - 2 * t)

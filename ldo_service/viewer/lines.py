@@ -15,14 +15,14 @@ from ldo_service.schemas import MapObject
 
 from .scene import ObjectBox
 
-Color = tuple[int, int, int]  # RGB, 0..255
+Color = tuple[int, int, int]  # RGB, 0..255.
 
-# A longer step between two poses of a path means that the camera was lost, not that it moved.
+# Limits of a jump: so long a step between two poses means that tracking was lost in between.
 JUMP_M = 1.0  # Minimum length of a jump.
 JUMPS = 10.0  # Length of a jump as a multiple of the median step.
-FRUSTUM_M = 0.12  # Distance from a keyframe to its drawn image.
-MAX_SIGHTS = 8  # Maximum detections drawn per keyframe; more hide each other.
-# Camera that shapes a keyframe until its own is known.
+FRUSTUM_M = 0.12  # Distance from a keyframe's camera center to the drawn outline of its image.
+MAX_SIGHTS = 8  # Maximum detections drawn per keyframe; more would hide each other.
+# Intrinsics for drawing keyframes until their own intrinsics are known.
 UNKNOWN_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 
 ONLINE, FINAL = (220, 90, 0), (0, 150, 30)
@@ -43,7 +43,7 @@ class Lines:
 
     @classmethod
     def of(cls, points: np.ndarray, color: Color) -> "Lines":
-        """Return segments of one color."""
+        """Return segments of one color from their ends, [S, 2, 3] meters."""
         points = np.asarray(points, np.float32).reshape(-1, 2, 3)
         return cls(points, np.broadcast_to(np.array(color, np.uint8), points.shape))
 
@@ -134,7 +134,12 @@ def box_lines(objects: Iterable[MapObject], color: Color | None = None) -> Lines
 
 
 def loop_lines(loops: Iterable[tuple[int, int]], keyframes: Mapping[int, np.ndarray]) -> Lines:
-    """Return a line for each loop closure between known keyframes."""
+    """Return a line for each loop closure, if the poses of both keyframes are known.
+
+    Args:
+        loops: Ids of the two keyframes of each closure.
+        keyframes: T_map_camera of each keyframe, [4, 4], by id.
+    """
     ends = [
         [keyframes[a][:3, 3], keyframes[b][:3, 3]]
         for a, b in loops

@@ -42,9 +42,10 @@ from .view_config import ViewerConfig
 
 # Maximum actors in the panel. The names come from messages, so their number must be limited.
 MAX_ACTORS = 64
-# Maximum loop closures received, the newest. A correction lists all that the pose graph accepts.
+# Maximum received loop closures that are kept, the newest. A correction also lists all closures
+# that the pose graph accepts.
 MAX_LOOPS = 4096
-TEXT_INTERVAL_S = 1.0  # Interval of texts, so that they can be read.
+TEXT_INTERVAL_S = 1.0  # Interval between changes of the panel's text, so that it can be read.
 
 KEPT: dict[Topic, int] = {  # Maximum messages kept between two updates; the oldest are dropped.
     POSE_TRACKED: 256,  # 8 s at 30 Hz.
@@ -63,7 +64,8 @@ RESTARTED_TOGETHER = (
     "tracker",
     "mapper",
 )  # If both have restarted, the map is new or is published again.
-# Maximum time between their restarts in one start of a service. Otherwise each restarted alone.
+# If these actors restart within this time, the whole service was restarted or reset. If more time
+# passes between their restarts, each actor restarted alone.
 TOGETHER_S = 30.0
 
 
@@ -132,14 +134,15 @@ class LiveScene:
         if self._correction and correction.graph_version <= self._correction.graph_version:
             return
         self._correction = correction
-        # The correction lists only the newest; older ones have been removed here before.
+        # The correction lists only the newest rejected closures. Older ones have been removed at
+        # earlier corrections.
         for loop in correction.rejected_closures:
             self._loops.pop(loop, None)
         self._keyframes.correct(correction)
         self._changed |= {"keyframes", "final", "loops"}
 
     def _take_objects(self, objects: MapObjects) -> None:
-        if self.scene.objects is None:  # Detections from before this viewer subscribed.
+        if self.scene.objects is None:  # This adds detections from before this viewer subscribed.
             sights = sights_of(objects)
             newest = sorted(sights)[-self._config.max_keyframes :]
             self.scene.sights = {k: sights[k] for k in newest} | self.scene.sights
@@ -163,7 +166,7 @@ class LiveScene:
 
     def _take_map(self, message: MapDelta | MapSnapshot) -> None:
         if isinstance(message, MapDelta) and message.base_version == 0 and self._gaussians.version:
-            self.reset()  # The user has reset the map by `ldo control reset`.
+            self.reset()  # A delta from version 0 means that `ldo control reset` emptied the map.
         if self._gaussians.apply(message):
             self._changed.add("gaussians")
 
@@ -202,7 +205,7 @@ class LiveScene:
         return changed
 
     def _agreed_loops(self) -> tuple[tuple[int, int], ...]:
-        """Return all loop closures that the newest pose-graph correction does not reject."""
+        """Return the loop closures that the newest correction does not reject, as id pairs."""
         if self._correction is None:
             return tuple(self._loops)
         named = dict.fromkeys((*self._loops, *self._correction.accepted_closures))
@@ -275,8 +278,8 @@ class LiveSource:
     def _note_epoch(self, health: Health) -> None:
         """Reset the scene if the service was restarted or reset.
 
-        The versions in its messages may then restart at zero, so they cannot be compared with
-        earlier versions.
+        The versions in the service's messages may then restart at zero, so they cannot be compared
+        with earlier versions.
         """
         if health.actor not in RESTARTED_TOGETHER:
             return
@@ -301,6 +304,6 @@ class LiveSource:
 
 @contextmanager
 def live(service: Client, config: ViewerConfig) -> Iterator[LiveSource]:
-    """Open a context with a source of the scene, subscribed to all topics that it needs."""
+    """Open a context with the scene source of a service, subscribed to all topics it needs."""
     with ExitStack() as stack:
         yield LiveSource(service, config, stack)

@@ -18,17 +18,17 @@ class LiveKeyframes:
 
     def __init__(self) -> None:
         self.T_map: dict[int, np.ndarray] = {}
-        # Keyframes newer than the last correction.
+        # Reference and T_reference_keyframe of the keyframes newer than the last correction, by id.
         self._newer: dict[int, tuple[int | None, np.ndarray]] = {}
 
     def add(self, pose: TrackedPose, T_map_camera: np.ndarray) -> None:
-        """Add a frame that became a keyframe."""
+        """Add a frame that became a keyframe, with its pose [4, 4] as published."""
         assert pose.keyframe is not None
         self.T_map = {**self.T_map, pose.keyframe: T_map_camera}
         self._newer[pose.keyframe] = pose.reference, pose_from_message(pose.T_reference_camera)
 
     def correct(self, correction: GraphCorrection) -> None:
-        """Apply a correction."""
+        """Apply a correction; newer keyframes move with their reference keyframes."""
         T_map = keyframe_poses_from_correction(correction)
         newest = max(T_map, default=-1)
         self._newer = {k: link for k, link in self._newer.items() if k > newest}
@@ -43,9 +43,9 @@ class LiveKeyframes:
 class LivePath:
     """Positions of the camera, as published and after pose-graph corrections.
 
-    A corrected position moves with the reference keyframe of its frame. Each time that there are
-    more than `most` positions, every second one is dropped, and only half as many new ones are
-    stored from then on.
+    A corrected position moves with the reference keyframe of its frame. Each time there are more
+    than `most` positions, every second position is dropped. From then on, only half as many of the
+    new positions are stored as before.
     """
 
     def __init__(self, most: int) -> None:
@@ -53,8 +53,8 @@ class LivePath:
         self._every = 1
         self._heard = 0
         self._online: list[np.ndarray] = []
-        self._references: list[int] = []  # -1 without a reference.
-        # Position of the camera in its reference keyframe.
+        self._references: list[int] = []  # Reference keyframe of each frame; -1 if it has none.
+        # Position of the camera in the frame of the reference keyframe, [3], meters.
         self._p_reference: list[np.ndarray] = []
 
     def __len__(self) -> int:
@@ -84,9 +84,9 @@ class LivePath:
         return np.array(self._online).reshape(-1, 3)
 
     def final(self, T_map_keyframe: dict[int, np.ndarray]) -> np.ndarray:
-        """Return the corrected positions of all frames with a known reference, [K, 3].
+        """Return the corrected positions of all frames with a known reference keyframe, [K, 3].
 
-        Each is T_map_reference p_reference, in order of time.
+        A position is T_map_reference p_reference. The positions are in order of time.
 
         Args:
             T_map_keyframe: Pose of each keyframe, [4, 4], by id.
@@ -101,7 +101,7 @@ class LivePath:
 
 
 def T_map_camera_of(pose: TrackedPose) -> np.ndarray:
-    """Return the pose of the camera as published by the tracker, [4, 4]."""
+    """Return T_map_camera [4, 4] of a tracked pose."""
     return se3.orthonormalize(
         pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
     )

@@ -23,7 +23,7 @@ def escaped(text: str) -> str:
 
 # --- of a run -------------------------------------------------------------------------------------
 def of_summary(summary: Mapping[str, Any]) -> str:
-    """Return the available values of summary.json as text."""
+    """Return those values of summary.json that are present and valid as text."""
     counts = [
         f"{summary[name]:,} {says}"
         for name, says in (
@@ -54,7 +54,7 @@ def under_way(frames: int) -> str:
 
 
 def share_shown(shown: int, there: int) -> str:
-    """Return how many Gaussians are drawn; empty if all of them are."""
+    """Return a text with the number of drawn Gaussians; empty if all are drawn."""
     return f"{shown:,} of {there:,} Gaussians are drawn" if shown < there else ""
 
 
@@ -63,10 +63,10 @@ def share_shown(shown: int, there: int) -> str:
 class Rate:
     """Rate of a counter over the last RATE_OVER_S."""
 
-    _counts: deque[tuple[float, int]] = field(default_factory=deque)  # Times and counts.
+    _counts: deque[tuple[float, int]] = field(default_factory=deque)  # Times in s, and counts.
 
     def add(self, now_s: float, count: int) -> None:
-        """Add the current value of the counter."""
+        """Add the value of the counter at the time `now_s`."""
         if self._counts and count < self._counts[-1][1]:
             self._counts.clear()  # The counter was reset.
         self._counts.append((now_s, count))
@@ -110,7 +110,7 @@ def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:
 
 
 def of_health(heard: Iterable[HeartbeatRecord], now_s: float) -> str:
-    """Return a table of all actors."""
+    """Return a table with state, step rate, step time, drops and memory of each actor."""
     rows = [_row(one, now_s) for one in sorted(heard, key=lambda one: one.health.actor)]
     if not rows:
         return "No actor reports. Check the robot name, and run `ldo doctor`."

@@ -32,7 +32,7 @@ class RunFolder:
         """Open the folder.
 
         Raises:
-            DataError: The folder does not exist, or no run wrote it.
+            DataError: If the folder does not exist, or was not written by a run.
         """
         if not folder.is_dir():
             raise DataError(
@@ -88,7 +88,7 @@ class RunFolder:
         return True
 
     def _path(self, name: str) -> Path:
-        """Return the path of a file of the run; the refined file if there is one."""
+        """Return the path of a file of the run, in the folder of the refined map if it is there."""
         refined = self._folder / REFINED / name
         return refined if has_refined(self._folder) and refined.is_file() else self._folder / name
 
@@ -113,11 +113,11 @@ class RunFolder:
         except (OSError, ValueError) as error:
             raise DataError(f"{path} cannot be read: {error}.") from error
         if not isinstance(value, dict):
-            raise DataError(f"{path} is not what `ldo run` writes.")
+            raise DataError(f"{path} must be a JSON object, as `ldo run` writes. Repeat the run.")
         self._summary = value
 
     def read_frames(self, path: Path) -> None:
-        """Count the frames: frames.csv has a line for each, and one with the column names."""
+        """Count the lines of frames.csv: one for each frame, and one with the column names."""
         try:
             self._frames = max(0, path.read_bytes().count(b"\n") - 1)
         except OSError as error:
@@ -146,7 +146,7 @@ class RunFolder:
         self.scene.rows = rows[weightiest(rows, self._config.max_gaussians)]
 
     def read_objects(self, path: Path) -> None:
-        """Read the objects, and the detections of each object in some keyframes."""
+        """Read the objects, and the detections of each object in its best keyframes."""
         self.scene.objects = read_objects(path.parent)
         self.scene.sights = sights_of(self.scene.objects)
 

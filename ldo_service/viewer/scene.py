@@ -32,7 +32,8 @@ class ObjectBox:
 class Scene:
     """Content of the window, in the map frame and in meters.
 
-    Other threads read `keyframes` and `objects`. Therefore these are replaced, never modified.
+    Other threads read `keyframes` and `objects`. An update therefore replaces these two values and
+    never modifies them.
     """
 
     # Gaussians, [N, 16], see `gaussians.rows`; valid until the next update.
@@ -43,11 +44,12 @@ class Scene:
     final: np.ndarray = field(default_factory=NOTHING.copy)
     keyframes: dict[int, np.ndarray] = field(default_factory=dict)  # T_map_camera, [4, 4], by id.
     camera: Camera | None = None  # Rectified camera of the keyframes; None until it is known.
-    # Detections by keyframe.
+    # Detections in each keyframe, by keyframe id.
     sights: dict[int, tuple[ObjectBox, ...]] = field(default_factory=dict)
     objects: MapObjects | None = None
-    loops: tuple[tuple[int, int], ...] = ()  # Pairs of keyframes.
-    T_map_camera: np.ndarray | None = None  # Current or final pose of the camera, [4, 4].
+    loops: tuple[tuple[int, int], ...] = ()  # Ids of reference and keyframe of each loop closure.
+    # Pose of the camera, [4, 4], current or at the end of the run; None until it is known.
+    T_map_camera: np.ndarray | None = None
     facts: str = ""  # Text of the panel, Markdown.
 
 
@@ -70,7 +72,7 @@ class Source(Protocol):
 
 
 def sights_of(objects: MapObjects) -> dict[int, tuple[ObjectBox, ...]]:
-    """Return the detections of all objects, by keyframe."""
+    """Return the detections of all objects in their views, by keyframe id."""
     sights: dict[int, tuple[ObjectBox, ...]] = {}
     for one in objects.objects:
         for view in one.views:

@@ -13,18 +13,18 @@ class ViewerConfig:
 
     address: str = LOOPBACK  # The window needs no keys: anyone who reaches it can see the map.
     port: int = 8080  # If this port is in use, the next free one is used. 0 uses any free port.
-    # Maximum number of Gaussians, those of the largest weight, at 32 bytes each; a quarter
-    # more while a map grows.
+    # Maximum number of drawn Gaussians, 32 bytes each; those with the largest weight are drawn.
+    # While a map grows, up to a quarter more are drawn.
     max_gaussians: int = 300_000
-    # Maximum poses of a path, 11 minutes at 30 Hz; a longer one is drawn coarser.
+    # Maximum poses of a path, 11 minutes at 30 Hz; of a longer path, fewer poses are drawn.
     max_poses: int = 20_000
-    # Maximum keyframes; of more, every second, third, ... is drawn.
+    # Maximum drawn keyframes; if there are more, only every second, third, ... is drawn.
     max_keyframes: int = 2_000
-    # Maximum objects, those with the most observations: more labels hide each other.
+    # Maximum drawn objects, those with the most observations; more names would hide each other.
     max_objects: int = 200
-    update_s: float = 0.2  # Interval of updates; poses move at 5 Hz.
-    lines_s: float = 1.0  # Interval of paths, keyframes and boxes, which have at most 4 MB.
-    gaussians_s: float = 2.0  # Interval of the Gaussians: at most 6 MB per second.
+    update_s: float = 0.2  # Interval between updates; the camera thus moves at 5 Hz.
+    lines_s: float = 1.0  # Interval between drawings of paths, keyframes and boxes, at most 4 MB.
+    gaussians_s: float = 2.0  # Interval between drawings of the Gaussians, at most 6 MB per second.
 
     def __post_init__(self) -> None:
         counts = (self.max_gaussians, self.max_poses, self.max_keyframes, self.max_objects)

@@ -80,7 +80,8 @@ class Window:
     def _begin(self) -> None:
         """Clear the window, because the scene was replaced."""
         self._shown = self._scene
-        self._leveled_by = 0  # Keyframes that set the up direction; 0 until the first view is set.
+        # Number of keyframes that the up direction was estimated from; 0 before the first estimate.
+        self._leveled_by = 0
         self._found: int | None = None  # Object that was searched for.
 
     @property
@@ -122,9 +123,9 @@ class Window:
 
     # --- what is new ------------------------------------------------------------------------------
     def show(self, changed: set[Layer]) -> None:
-        """Draw the changed layers, each at most once per its interval.
+        """Draw the changed layers, each at most once in its minimum interval.
 
-        Without a connected browser, all drawing is postponed.
+        While no browser is connected, all drawing is postponed.
 
         Args:
             changed: Layers that have changed.
@@ -256,7 +257,8 @@ class Window:
     def _level(self) -> None:
         """Set the up direction of the browser, estimated from the keyframes so far.
 
-        It is called again with more keyframes, because the first one alone may be tilted.
+        The direction is estimated again when the number of keyframes has doubled, because the first
+        keyframe alone may be tilted.
         """
         self._leveled_by = max(1, len(self._scene.keyframes))
         self._server.scene.set_up_direction(estimate_up(self._scene.keyframes))
@@ -319,10 +321,10 @@ def _line(one: ObjectMatch) -> str:
 def _require_own(address: str) -> None:
     """Check that an address belongs to this machine.
 
-    Otherwise viser would try one port after the other without end.
+    With another address, viser would try one port after the other without end.
 
     Raises:
-        ConfigError: The machine does not have the address.
+        ConfigError: If the machine does not have the address.
     """
     try:
         ((family, *_, where), *_) = socket.getaddrinfo(address, 0, type=socket.SOCK_STREAM)
@@ -342,10 +344,10 @@ def open_window(source: Source, config: ViewerConfig, title: str) -> Iterator[Wi
     The port is the first free one from `config.port` on.
 
     Raises:
-        ConfigError: The machine does not have the address.
+        ConfigError: If the machine does not have the address.
     """
     _require_own(config.address)
-    # Otherwise it logs a line per browser.
+    # INFO would log a line per browser.
     logging.getLogger("websockets.server").setLevel(logging.WARNING)
     with redirect_stdout(io.StringIO()):  # Viser prints a banner.
         server = Server(host=config.address, port=config.port, label=title, verbose=False)
