@@ -1,4 +1,4 @@
-"""Heartbeat of an actor, published twice a second by the actor's stage, even while it waits."""
+"""Heartbeat of an actor, published twice a second by its stage, even while the stage waits."""
 
 from typing import Literal
 

@@ -83,7 +83,7 @@ class Keyframe(Message, frozen=True, kw_only=True):
     # Mask u1 [H, W]; 1 where pixels move and are not mapped. Shape [0, 0] if nothing moves.
     dynamic_mask: Array = NO_MASK
     submap: int = 0  # Number of the submap; each loss of tracking starts a new one.
-    # Poses of this keyframe in keyframes of other submaps, which merge these with its own submap.
+    # Poses of this keyframe in keyframes of other submaps; they connect its submap with these.
     submap_measurements: tuple[MeasuredPose, ...] = ()
     camera_correction: CameraCorrection = CameraCorrection()  # Applied to `color` and `depth_m`.
 

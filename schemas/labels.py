@@ -96,7 +96,7 @@ class LabelNames(Message, frozen=True, kw_only=True):
     stamp_ns is the stamp of the request.
     """
 
-    # Names that the labeller chooses from; empty if it gives any name, or if there is no labeller.
+    # Names that the labeller chooses from; empty if any name is possible, or without a labeller.
     names: tuple[str, ...]
     error: str = ""  # Reason why the request failed; empty if the request succeeded.
 

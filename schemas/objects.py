@@ -71,7 +71,7 @@ class MapObject(msgspec.Struct, frozen=True, kw_only=True):
     distribution: Distribution
     entropy: float  # Entropy in nats, as in `ObjectObservation`.
     observation_count: int  # Number of keyframes in which the object was observed.
-    miss_count: int  # Number of keyframes that should show the object and in which it was missed.
+    miss_count: int  # Number of keyframes in which the object was in view but not detected.
     first_keyframe: int  # First keyframe in which the object was observed.
     last_keyframe: int  # Last keyframe in which the object was observed.
     views: tuple[ObjectView, ...] = ()  # Best views first.

@@ -45,8 +45,8 @@ def control(
     The command returns when every actor has executed the request. If an actor did not, the message
     names the actor and the exit code is 4.
 
-    `refine` goes to the mapper alone, and the command does not wait until it is done. The mapper
-    runs the iterations before it takes its next keyframe.
+    `refine` goes to the mapper alone. The mapper runs the iterations before it takes its next
+    keyframe; the command does not wait for their end.
 
       ldo control reset
       ldo control refine --iterations 500

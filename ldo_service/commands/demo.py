@@ -42,9 +42,9 @@ def demo(
     the blur and the depth noise of a Kinect. Every fifth frame is tracked but not mapped, and the
     PSNR is measured on these held-out frames.
 
-    Small networks that come with the package label the objects. They were trained on other rooms of
-    this kind and recognize objects in such rooms only. The settings that separate objects by depth
-    were tuned on this room.
+    Small networks that come with the package label the objects. These networks were trained on
+    other synthetic rooms and recognize objects in synthetic rooms only. The settings that separate
+    objects by depth were tuned on this room.
     """
     console = Console(stderr=True)
     sequence = FlatSequence.named("flat")

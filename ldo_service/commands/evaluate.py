@@ -101,12 +101,12 @@ def evaluate(
 ) -> None:
     """Evaluate a run: its trajectory, loop closures, rendered map and labels.
 
-    Trajectory and loop closures are compared with the true poses of the source, renderings of the
-    map with the frames, and labels of the map with the true labels of the source. Without true
-    poses, only the map is evaluated.
+    Trajectory and loop closures are compared with the true poses of the source. Renderings of the
+    map are compared with the frames, and labels of the map with the true labels of the source.
+    Without true poses, only the map is evaluated.
 
-    The command prints the protocol above the results, and writes trajectory.png and rendering.png
-    into DIR, and labels.png if the source has ground-truth labels and a detector ran. `ldo run
+    The command prints the protocol above the results. It writes trajectory.png and rendering.png
+    into DIR, and labels.png if the source has true labels and a detector ran. `ldo run
     --hold-out-every 5` keeps every fifth frame out of the map, so that the map can be evaluated on
     these frames.
 

@@ -106,8 +106,8 @@ def frames_of_ros(
         notify: Callback that receives notes for the user.
 
     Raises:
-        ConfigError: If the router of the service has keys, so that it forwards no topics of a
-            bridge.
+        ConfigError: If the service has keys and `options.bridge` is empty: the router of the
+            service then does not forward topics of ROS 2.
     """
     if service.keys is not None and not options.bridge:
         raise ConfigError(

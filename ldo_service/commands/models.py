@@ -105,9 +105,9 @@ Verb = (
 def models(verb: Verb) -> None:
     """Register, list and remove detectors and encoder pairs.
 
-    `detector.model` in the configuration takes the registered name of a detector, and
-    `vlm_labeller.model` that of an encoder pair, which labels regions. Only `demo` comes with the
-    package: a detector and a pair for the synthetic scenes.
+    `detector.model` in the configuration takes the registered name of a detector.
+    `vlm_labeller.model` takes the registered name of an encoder pair, which labels regions. Only
+    `demo` comes with the package: a detector and a pair for the synthetic scenes.
 
       ldo models add nano yolox_nano.onnx
       ldo run SOURCE --out DIR --set detector.model=nano

@@ -103,9 +103,9 @@ Json = Annotated[bool, argument(help="print one JSON document and nothing else")
 
 
 def localizing(config: Config, folder: Path | None) -> Config:
-    """Return the configuration for localization in the map of a run folder, the one of --localize.
+    """Return the configuration for localization in the map of a run folder (--localize).
 
-    The configuration is unchanged if the folder is None.
+    If the folder is None, the configuration is unchanged.
 
     Raises:
         DataError: If the folder has no map.

@@ -74,8 +74,8 @@ def publish(
 
     `realsense` is a camera on USB. `ros2` reads topics of ROS 2 that a Zenoh bridge forwards.
 
-    The stamps are those of the source unless --restamp is given. Stamps must ascend: the service
-    rejects a frame that is not later than the frame before it. To send a data set again, use
+    Frames keep the stamps of the source unless --restamp is given. Stamps must ascend: the service
+    rejects a frame that is not later than the frame before. To send a data set again, use
     --restamp. The age of a pose is then the difference between a subscriber's clock and the stamp
     of the pose.
 

@@ -107,8 +107,8 @@ def _texts_of(model: str, run: Path | None) -> Encode:
         run: Folder of the run; None for a live service.
 
     Returns:
-        The function. It raises ConfigError if the named pair cannot be opened, and
-        TextComparisonError if no pair is named and the run has none that can be opened.
+        The function. The function raises ConfigError if the named pair cannot be opened, and
+        TextComparisonError if no pair is named and the run has no pair that can be opened.
     """
 
     def encode(texts: Sequence[str]) -> np.ndarray:

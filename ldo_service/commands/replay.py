@@ -23,7 +23,7 @@ def replay(
         tyro.conf.arg(metavar="NAME", help="replay only this actor; may be repeated; default: all"),
     ] = (),
 ) -> None:
-    """Replay a recording with new actors, and compare their outputs with the recorded ones.
+    """Replay a recording with new actors, and compare their outputs with the recorded outputs.
 
     The replay also repeats restarts, failures and the recorded send credit at each step. Nothing is
     published. Without --verify, differences are printed, and the exit code is still 0.

@@ -193,7 +193,10 @@ def format_localization(statuses: dict[str, int], folder: Path) -> str:
 
 
 def with_options(config: Config, hold_out: int | None, threads: int | None) -> Config:
-    """Return the configuration with the settings that have options of their own; None keeps one."""
+    """Return the configuration with the values of --hold-out-every and --threads.
+
+    An option that is None keeps the configured value.
+    """
     tracker, mapper = config.tracker, config.mapper
     if hold_out is not None:
         tracker = replace(tracker, hold_out=hold_out)

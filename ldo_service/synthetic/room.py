@@ -130,7 +130,7 @@ def _textures(seed: int) -> dict[str, Texture]:
         "shade": (textures.fabric(rng, (0.95, 0.87, 0.68), (0.99, 0.95, 0.84)), 0.5),
         "leaves": (textures.leaves(rng, (0.1, 0.22, 0.1), (0.42, 0.6, 0.25)), 0.5),
         "ball": (textures.rug(rng, (0.9, 0.85, 0.75), (0.8, 0.25, 0.15)), 0.5),
-        # Textures of the person. They come last, so that the room looks the same without a person.
+        # The textures of the person come last, so that the room looks the same without a person.
         "skin": (textures.plaster(rng, (0.8, 0.6, 0.48)), 0.5),
         "shirt": (textures.fabric(rng, (0.7, 0.2, 0.18), (0.9, 0.85, 0.8)), 0.4),
         "trousers": (textures.fabric(rng, (0.16, 0.2, 0.34), (0.3, 0.36, 0.52)), 0.5),

@@ -141,9 +141,9 @@ def _round(o: Vector, d: Vector, dimensions: int) -> tuple[np.ndarray, np.ndarra
 def _taper(o: Vector, d: Vector, m: float, k: float) -> tuple[np.ndarray, np.ndarray]:
     """Intersect rays with the infinite half cone x^2 + y^2 < (m + k z)^2 that contains the origin.
 
-    A ray meets the full double cone at two roots. A ray flatter than the cone is inside one half of
-    it between the roots. A steeper ray is inside the half with the origin either before the first
-    root or after the second.
+    A ray meets the full double cone at two roots. A ray flatter than the side of the cone is inside
+    one half of the double cone between the roots. A steeper ray is inside the half with the origin
+    either before the first root or after the second.
     """
     r, dr = m + k * o[2], k * d[2]
     a = d[0] * d[0] + d[1] * d[1] - dr * dr

@@ -31,8 +31,8 @@ class CameraView:
 def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray) -> CameraView:
     """Return a close view of a whole object, from a direction where nothing hides the object.
 
-    The direction is that of the keyframe with a known pose that shows the object best. If there is
-    no such keyframe, the direction is that of `eye`.
+    The object is viewed from the side of the keyframe that shows it best, among those with a known
+    pose. If there is no such keyframe, the object is viewed from the side of `eye`.
 
     Args:
         one: The object.

@@ -140,7 +140,7 @@ def is_shadowed(depth_m: np.ndarray, baseline_px_m: float) -> np.ndarray:
 
 
 def _ragged(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Replace each depth by that of a pixel in the same row, at most two pixels away.
+    """Replace each depth by the depth of a pixel in the same row, at most two pixels away.
 
     This models the inexact matching of the projected pattern at edges.
     """

@@ -33,9 +33,9 @@ STEREO_NEAREST_M, STEREO_FARTHEST_M = 0.3, 8.0
 class DepthBias:
     """Smooth error of inverse depth, 1 / z' = 1 / z + c20 x^2 + c11 x y + c02 y^2.
 
-    x and y are the offset of a pixel from the image center, in half image widths. The coefficients
-    have the size of those of the ASUS Xtion in the sequence `crowd` of Bonn RGB-D Dynamic. At 3 m,
-    that camera errs by 70 to 210 mm at the sides of the image.
+    x and y are the offset of a pixel from the image center, in half image widths. The sizes of the
+    coefficients are taken from the ASUS Xtion of the sequence `crowd` of Bonn RGB-D Dynamic. At
+    3 m, that camera errs by 70 to 210 mm at the sides of the image.
     """
 
     c20_per_m: float

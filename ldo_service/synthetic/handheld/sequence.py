@@ -239,8 +239,8 @@ class HandheldSequence(Sequence):
     def exact(self, index: int, T_world_camera: np.ndarray) -> ExactImages:
         """Return the images that a perfect camera would record from given row poses.
 
-        The person stands where it is at the stamp of the frame, even in rows and depth images that
-        are recorded earlier or later.
+        Moving objects are at their positions at the stamp of the frame, even in rows and depth
+        images that are recorded earlier or later.
 
         Args:
             index: Index of the frame.
@@ -274,8 +274,8 @@ class HandheldSequence(Sequence):
     def _rectified_ids(self, index: int, exact: ExactImages) -> tuple[np.ndarray, np.ndarray]:
         """Return the class ids and instance ids of the rectified image's pixels, each [H, W].
 
-        They are compared with labels that evaluation renders from the map, with a pinhole camera at
-        the true pose of the frame.
+        The ids are compared with labels that evaluation renders from the map, with a pinhole camera
+        at the true pose of the frame.
         """
         effects = self.config.effects
         if self.config.walk == "flat" and (effects.distortion or effects.rolling_shutter):
