@@ -1,13 +1,15 @@
 """Data association between the regions of a keyframe and object landmarks (paper, III.C).
 
-An object landmark has a sample of Gaussians, its members. The predicted box of a landmark encloses
-its members that the measured depth does not occlude. It is the box that a detector would draw
+An object landmark has a sample of Gaussians, the members. The predicted box of a landmark encloses
+the members that the measured depth does not occlude. It is the box that a detector would draw
 around the visible part of the object. A landmark and a region may be the same object if
 
-    IoU of their boxes >= 0.4,  they share a class,  and their depth ranges meet.
+    the IoU of their boxes is at least 0.4,
+    the common mass of their label distributions is at least 0.3,
+    and the gap between their depth ranges is at most 0.1 m.
 
-Of all such assignments, the one with the largest sum of IoU is used. Before the assignment, a
-region that shows a part of another region's object is merged into that region.
+Of all one-to-one assignments of such pairs, the one with the largest sum of IoU is used. Before the
+assignment, a region that shows only a part of another region's object is merged into that region.
 """
 
 from dataclasses import dataclass, replace
@@ -22,7 +24,8 @@ from .distributions import common_mass, mean_distributions
 from .object_landmarks import MEMBERS, NO_MEMBER, reliable_members, rows_of, shuffled, trimmed
 from .objects_config import AssociationConfig
 
-PROBES = 128  # Members that are projected. The first in shuffled order are a uniform subsample.
+# Members of a landmark that are projected: the first in shuffled order, a uniform subsample.
+PROBES = 128
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,7 +41,8 @@ class MapView:
         ids: Ids of the Gaussians, [N] int64, ascending.
         anchors: Anchor keyframes of the Gaussians, [N] int32.
         indices: Rows of the Gaussians that contribute to the image, [V] uint32, ascending.
-        regions: Region of each of them, [V] int32, see `Assignment`; negative if it has none.
+        regions: Region of each Gaussian in `indices`, [V] int32, see `Assignment`; negative if the
+            Gaussian has none.
         boxes: Boxes of the regions, [M, 4], x0 y0 x1 y1, pixels.
         classes: Labels by the detector and by the labeller, [M, 2]; -1 if missing.
         depth_m: Depth of the keyframe, [H, W] float32, meters.
@@ -88,12 +92,12 @@ class RegionStatistics:
     Attributes:
         numbers: Numbers of the regions within the keyframe, [R], ascending.
         boxes: Boxes of the regions, [R, 4], pixels.
-        members: Ids of a sample of their Gaussians, [R, 256], in the order of `shuffled`. Unused
-            entries at the end are NO_MEMBER.
+        members: Ids of a sample of the Gaussians of each region, [R, 256], in the order of
+            `shuffled`. Unused entries at the end are NO_MEMBER.
         p_map: Positions of these Gaussians in the map frame, [R, 256, 3], meters.
         distributions: Means of their label distributions, [R, C], weighted by opacity.
         near_m: Near end of the depth range of these Gaussians, [R], meters.
-        far_m: Far end of that range, [R], meters.
+        far_m: Far end of the depth range, [R], meters.
     """
 
     numbers: np.ndarray
@@ -108,7 +112,11 @@ class RegionStatistics:
 def compute_region_statistics(
     view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
 ) -> RegionStatistics:
-    """Compute the statistics of the regions of a keyframe."""
+    """Compute the statistics of the regions of a keyframe.
+
+    Regions with fewer than min_gaussians Gaussians are omitted. If more than max_regions remain,
+    those with the most Gaussians are used.
+    """
     hit = np.flatnonzero(view.regions >= 0)
     counts = np.bincount(view.regions[hit], minlength=len(view.boxes))
     numbers = np.sort(np.argsort(-counts, kind="stable")[: config.max_regions])
@@ -131,10 +139,12 @@ def compute_region_statistics(
 
 
 def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationConfig) -> MapView:
-    """Assign the Gaussians of a region that shows a part of another region's object to the latter.
+    """Merge each region that shows a part of another region's object into that region.
 
-    The containing region may have no Gaussians left, because its parts got them all. It then has
-    the depth range of its largest part.
+    The Gaussians of the part are assigned to the containing region; see `find_containing_regions`.
+
+    Returns:
+        The view with the new assignment.
     """
     near_m = np.full(len(view.boxes), np.inf)
     far_m = -near_m
@@ -152,7 +162,11 @@ def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationCon
 def whole_regions(
     view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
 ) -> tuple[MapView, RegionStatistics]:
-    """Merge regions that show parts of one object, and return the regions with their statistics."""
+    """Merge regions that show parts of one object.
+
+    Returns:
+        The view with the merged regions, and the statistics of the regions after the merge.
+    """
     regions = compute_region_statistics(view, T_camera_map, config)
     whole = merge_parts(view, regions, config)
     return whole, regions if whole is view else compute_region_statistics(
@@ -167,20 +181,23 @@ def find_containing_regions(
     far_m: np.ndarray,
     config: AssociationConfig,
 ) -> np.ndarray:
-    """Return for each of M regions the number of the region that contains it, or its own number.
+    """Find the region that contains each of M regions of a keyframe.
 
-    Region a contains region b if they share a class, their depth ranges meet, and the box of b lies
-    in the box of a. If several regions contain b, the largest is returned.
+    Region a contains region b if all of these hold: they share a class; the gap between their depth
+    ranges is at most max_depth_gap_m; the fraction part_inside of the box of b lies in the larger
+    box of a. A region without Gaussians gets the depth range of the largest region in its box,
+    because such parts may have got all of its Gaussians.
 
     Args:
-        boxes: Boxes of the regions, [M, 4], pixels.
+        boxes: Boxes of the regions, [M, 4], x0 y0 x1 y1, pixels.
         classes: Labels by the detector and by the labeller, [M, 2]; -1 if missing.
-        near_m: Near ends of their depth ranges, [M], meters; infinite where unknown.
-        far_m: Far ends of their depth ranges, [M], meters; infinite where unknown.
+        near_m: Near ends of the depth ranges, [M], meters; infinite where unknown.
+        far_m: Far ends of the depth ranges, [M], meters; minus infinity where unknown.
         config: Settings of the data association.
 
     Returns:
-        Region numbers, [M].
+        Number of the containing region, [M]: the largest if there are several, and the region's own
+        number if there is none. A part of a part gets the number of the whole.
 
     >>> plant, crown, pot = [0, 0, 9, 20], [0, 0, 9, 12], [2, 12, 7, 20]
     >>> at_m = np.full(3, 2.0)
@@ -201,7 +218,7 @@ def find_containing_regions(
             near_m[k], far_m[k] = near_m[parts[0]], far_m[parts[0]]
     is_part &= depth_gaps_m(near_m, far_m, near_m, far_m) <= config.max_depth_gap_m
     whole = np.arange(len(area))
-    for part in by_size:  # Large boxes first: a part of a part joins the whole.
+    for part in by_size:  # Large boxes first, so that a part of a part joins the whole.
         around = np.flatnonzero(is_part[part])
         if len(around):
             whole[part] = whole[around[np.argmax(area[around])]]
@@ -226,10 +243,16 @@ def share_a_class(classes: np.ndarray) -> np.ndarray:
 
 
 def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Return the rows of each region's first 256 Gaussians in shuffled order, [R, 256].
+    """Return the map rows of each region's first 256 Gaussians in shuffled order, [R, 256].
 
-    Entries are -1 for regions with fewer Gaussians. To save time, only about 512 candidates are
-    sorted in a region with more Gaussians than that.
+    Unused entries of regions with fewer Gaussians are -1. To save time, only about 512 candidates
+    are sorted in regions with more than 512 Gaussians.
+
+    Args:
+        view: The map and the regions of the keyframe.
+        hit: Positions in `view.indices` of the Gaussians that are in a region.
+        counts: Number of Gaussians of each region, [M].
+        numbers: Numbers of the R regions to sample.
     """
     ordinal = np.full(len(counts), -1)
     ordinal[numbers] = np.arange(len(numbers))
@@ -255,11 +278,12 @@ class PredictedBoxes:
     """Predicted boxes and visibility of K landmarks in a keyframe.
 
     Attributes:
-        boxes: Boxes of the visible members, [K, 4], pixels. If no member is visible, the box of the
-            members in front of measured depth; empty (x0 > x1) if all are occluded or out of view.
+        boxes: Boxes of the visible members, [K, 4], x0 y0 x1 y1, pixels. If no member is visible,
+            the box of the members that lie in front of the measured depth. If all members are
+            occluded or out of view, the box is empty (x0 > x1).
         shown: Fraction of the reliable members that are visible, [K]: the measured depth at their
-            pixel fits the landmark's depth range.
-        through: Fraction of the reliable members that no longer exist, [K]: the measured depth at
+            pixel is in the landmark's depth range.
+        through: Fraction of the reliable members whose surface is gone, [K]: the measured depth at
             their pixel is behind the landmark's depth range.
         near_m: Near end of the members' depth range, [K], meters.
         far_m: Far end of the members' depth range, [K], meters.
@@ -277,9 +301,15 @@ class PredictedBoxes:
 def predict_boxes(
     table: np.ndarray, view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
 ) -> PredictedBoxes:
-    """Predict boxes and visibility of landmarks [K] in a keyframe.
+    """Predict boxes and visibility of landmarks in a keyframe.
 
     A landmark without resident members is represented by its centroid.
+
+    Args:
+        table: Landmarks, [K] records of `LANDMARK`.
+        view: The map and the keyframe.
+        T_camera_map: Transform from the map to the camera, [4, 4].
+        config: Settings of the data association.
     """
     where = rows_of(table["members"], view.ids)
     there = ((where >= 0) & reliable_members(table))[:, :PROBES]
@@ -307,10 +337,14 @@ def predict_boxes(
 
 
 def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarray]:
-    """Project points [..., 3], and read the measured depth at their pixels.
+    """Project points and read the measured depth at their pixels.
+
+    Args:
+        p_camera: Points in the camera frame, [..., 3], meters.
+        view: The keyframe.
 
     Returns:
-        Pixels [..., 2], and measured depth [...] in meters; 0 outside the image.
+        Pixels, [..., 2], and measured depth, [...], meters; 0 outside the image.
     """
     z = np.maximum(p_camera[..., 2:], 1e-6)
     px = view.camera.project(np.concatenate([p_camera[..., :2], z], axis=-1))
@@ -323,18 +357,26 @@ def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarr
 def depth_gaps_m(
     near_m: np.ndarray, far_m: np.ndarray, others_near_m: np.ndarray, others_far_m: np.ndarray
 ) -> np.ndarray:
-    """Return the gaps [K, R] between depth ranges [K] and [R]; negative where they overlap."""
+    """Return the gaps between depth ranges, [K, R], meters; negative where ranges overlap.
+
+    Args:
+        near_m: Near ends of the first K ranges, [K], meters.
+        far_m: Far ends of the first K ranges, [K], meters.
+        others_near_m: Near ends of the other R ranges, [R], meters.
+        others_far_m: Far ends of the other R ranges, [R], meters.
+    """
     return np.maximum(near_m[:, None], others_near_m) - np.minimum(far_m[:, None], others_far_m)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AssociationCosts:
-    """Association of K landmarks with R regions.
+    """Pairwise measures for the association of K landmarks with R regions.
 
     Attributes:
         iou: IoU of predicted box and region box, [K, R].
-        allowed: Pairs that may be the same object, [K, R] bool: their boxes overlap, their depth
-            ranges meet, and they share a class.
+        allowed: Pairs that may be the same object, [K, R] bool: their boxes overlap, the gap
+            between their depth ranges is at most max_depth_gap_m, and the common mass of their
+            label distributions is at least min_shared.
     """
 
     iou: np.ndarray
@@ -347,7 +389,14 @@ def association_costs(
     regions: RegionStatistics,
     config: AssociationConfig,
 ) -> AssociationCosts:
-    """Compute the association costs of landmarks with label distributions [K, C]."""
+    """Compute the association costs of K landmarks and R regions.
+
+    Args:
+        distributions: Label distributions of the landmarks, [K, C].
+        predicted: Predicted boxes of the landmarks.
+        regions: Statistics of the regions.
+        config: Settings of the data association.
+    """
     iou = ious(predicted.boxes, regions.boxes)
     gap_m = depth_gaps_m(predicted.near_m, predicted.far_m, regions.near_m, regions.far_m)
     allowed = (iou > 0) & (gap_m <= config.max_depth_gap_m)
@@ -359,12 +408,17 @@ def association_costs(
 def associate(
     iou: np.ndarray, allowed: np.ndarray, min_iou: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match rows with columns of iou [K, R], each at most once, so that the sum of IoU is largest.
+    """Match rows with columns of iou, each at most once, so that the sum of IoU is largest.
 
-    A pair must be allowed and have an IoU of at least min_iou. The same arrays give the same pairs.
+    The result is deterministic.
+
+    Args:
+        iou: IoU of each pair, [K, R].
+        allowed: Pairs that may be matched, [K, R] bool.
+        min_iou: Minimum IoU of a pair.
 
     Returns:
-        Rows in ascending order, and their columns.
+        Matched rows, in ascending order, and the column of each.
     """
     gain = np.where(allowed & (iou >= min_iou), iou, 0)
     k, r = linear_sum_assignment(gain, maximize=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from .gaussian_labels import BACKGROUND, MAX_LABELS, OTHER, background, fields
 
-KEPT = 8  # Labels of a sparse distribution: the five of a Gaussian and those of its neighbors.
+KEPT = 8  # Labels of a sparse distribution: the five of one Gaussian, and three of its neighbors.
 FLOOR = 1e-6  # Minimum probability in a divergence, so that divergences are finite.
 
 
@@ -54,7 +54,10 @@ def normalized(p: np.ndarray) -> np.ndarray:
 
 
 def sparse(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heaviest labels [..., 8] uint8 and their weights [..., 8] float32.
+    """Convert dense distributions [..., C] to sparse ones.
+
+    Returns:
+        The eight heaviest labels, [..., 8] uint8, and their weights, [..., 8] float32.
 
     The heaviest label comes first; of labels with equal weight, the lower index comes first. If the
     weights sum to less than one, the remaining mass belongs to `other`.
@@ -64,7 +67,14 @@ def sparse(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def dense(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return dense distributions [..., C] float64 of sparse ones; missing mass goes to `other`."""
+    """Convert sparse distributions to dense ones, [..., C] float64.
+
+    If the weights of a distribution sum to less than one, `other` gets the remaining mass.
+
+    Args:
+        labels: Labels, [..., 8] uint8.
+        weights: Weights of the labels, [..., 8].
+    """
     out = np.zeros((*labels.shape[:-1], MAX_LABELS))
     np.put_along_axis(out, labels.astype(np.int64), weights.astype(float), axis=-1)
     out[..., OTHER] += np.maximum(1 - weights.sum(axis=-1, dtype=float), 0)
@@ -72,9 +82,9 @@ def dense(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def divergence(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return KL(p || q) = sum_c p_c log(p_c / q_c) in nats, [...], of dense [..., C].
+    """Return KL(p || q) = sum_c p_c log(p_c / q_c) in nats, [...].
 
-    q_c is clamped to at least 1e-6.
+    p and q are dense distributions, [..., C]. q_c is clamped to at least 1e-6.
 
     >>> couch, both = np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.1, 0.8])
     >>> round(float(divergence(couch, both)), 4)  # log(1 / 0.8)
@@ -87,15 +97,22 @@ def divergence(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def entropy(p: np.ndarray) -> np.ndarray:
-    """Return the entropy H = -sum_c p_c log p_c in nats (III.C), [...], of dense [..., C]."""
+    """Return the entropies H = -sum_c p_c log p_c of dense distributions [..., C], [...], nats.
+
+    Paper, III.C.
+    """
     return -np.sum(p * np.log(np.where(p > 0, p, 1)), axis=-1)
 
 
 def common_mass(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the common mass of pairs of distributions, ignoring background, [...], 0..1.
+    """Return the common mass of pairs of dense distributions [..., C], ignoring background.
 
-    It is sum_c min(p_c, q_c) over all labels c except background. This is divided by the sum of p_c
-    or the sum of q_c, whichever is smaller.
+        mass = sum_c min(p_c, q_c) / min(sum_c p_c, sum_c q_c)
+
+    The sums are over all labels except background.
+
+    Returns:
+        The common mass, [...], 0..1; 0 if p or q has all of its mass on background.
     """
     p, q = p.copy(), q.copy()
     p[..., BACKGROUND] = q[..., BACKGROUND] = 0
@@ -105,7 +122,7 @@ def common_mass(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def names(p: np.ndarray) -> np.ndarray:
-    """Return the heaviest label other than background, [...] uint8."""
+    """Return the heaviest label other than background of distributions [..., C], [...] uint8."""
     p = p.copy()
     p[..., BACKGROUND] = -1
     return np.argmax(p, axis=-1).astype(np.uint8)

@@ -12,14 +12,16 @@ from ldo_service.kernels import _labels
 BACKGROUND, OTHER = 0, 1  # The first two labels of every vocabulary.
 MAX_LABELS = 256  # C_max (III.B)
 SLOTS = 5  # L (III.B)
-NOT_SEEN, MISS = -2, -1  # Values in place of an observed label.
+NOT_SEEN, MISS = -2, -1  # Values in place of an observed label; see `Observations`.
+# Label row of one Gaussian, 32 bytes; all zero if the Gaussian was never observed.
 ROW = np.dtype(
     [
+        # Probabilities of the labels `ids`, the highest first; background has the rest.
         ("weights", "<f4", SLOTS),
         ("evidence", "<f4"),  # Sum of the weights of all observations, decayed with age.
-        # Size of the object that the Gaussian was last observed as a part of.
+        # Size of the object at the last observation of a label; 0 before the first.
         ("extent_mm", "<u2"),
-        ("misses", "u1"),  # Keyframes since then that expected it to be part of one.
+        ("misses", "u1"),  # Misses since that observation.
         ("ids", "u1", SLOTS),
     ]
 )
@@ -30,26 +32,30 @@ class ConsistencyConfig:
     """Settings of the label smoothing among neighbors."""
 
     sigma_m: float = 0.05  # sigma_cons (III.A).
-    radius_m: float = 0.15  # Three sigma; beyond it, weights are below 2e-4.
-    rate: float = 0.1  # Step size, 0..1: 1 - lambda (III.A), that of one observation.
+    # Maximum distance of neighbors: three sigma. Farther Gaussians would have weights below 2e-4.
+    radius_m: float = 0.15
+    rate: float = 0.1  # Step size, 0..1: 1 - lambda (III.A), as for one observation.
 
     def __post_init__(self) -> None:
         if not (self.sigma_m > 0 and self.radius_m > 0 and 0 <= self.rate <= 1):
             raise ConfigError(
                 named(self, "sigma_m", "radius_m", "rate")
-                + ": lengths must be positive, rate in [0, 1]."
+                + ": sigma_m and radius_m must be positive, rate in [0, 1]."
             )
 
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """Label disagreement before the smoothing step, summed over the Gaussians.
+    """Label disagreement of neighbors before the smoothing step, summed over the Gaussians.
 
-    With k_ij = w_ij exp(-|mu_i - mu_j|^2 / sigma^2):
+    Gaussian i has the mean mu_i, the label distribution p_i, its likeliest label s_i and the
+    neighbors N_i. The weight of its neighbor j is
+
+        k_ij = w_ij exp(-|mu_i - mu_j|^2 / sigma^2),  w_ij = 1 / |N_i|
 
     Attributes:
-        literal: sum k_ij [s_i != s_j], as the paper prints it; it has no gradient.
-        expected: sum k_ij (1 - p_i . p_j), which the step reduces.
+        literal: sum_ij k_ij [s_i != s_j], as the paper prints it; it has no gradient.
+        expected: sum_ij k_ij (1 - p_i . p_j), which the smoothing step reduces.
     """
 
     literal: float
@@ -66,15 +72,16 @@ def smooth_labels(
 ) -> Disagreement:
     """Move the label distributions of the Gaussians `indices` towards those of their neighbors.
 
-    Labels change in place. Only Gaussians in `indices` are neighbors.
+    The label rows change in place. With k_ij as in `Disagreement`, the step is
 
-        p_i <- (1 - rate K_i) p_i + rate sum_j k_ij p_j,  K_i = sum_j k_ij,  w_ij = 1 / |N_i|
+        p_i <- (1 - rate K_i) p_i + rate sum_j k_ij p_j,  K_i = sum_j k_ij
 
-    The step follows the gradient of the expected disagreement, sum_j k_ij p_j, and its result is
-    again a distribution. Voxels are two sigma wide. Candidates are the first eight Gaussians in the
-    same voxel and the first ones of the surrounding voxels, sixteen in total. The candidates within
-    radius_m are the neighbors N_i. Every Gaussian reads the labels from before the step. The result
-    is bitwise equal for any number of threads.
+    It follows the gradient of the expected disagreement, sum_j k_ij p_j, and its result is again a
+    distribution. All p on the right are those before the step.
+
+    Neighbors are Gaussians in `indices` within radius_m. They are chosen from at most sixteen
+    candidates, found in voxels two sigma wide: the first eight Gaussians in the same voxel and the
+    first ones of the surrounding voxels. The result is bitwise equal for any number of threads.
 
     Args:
         rows: Gaussians of the map, [N, 16].
@@ -89,8 +96,8 @@ def smooth_labels(
     Raises:
         ValueError: If the shapes or types of the arrays do not fit.
 
-    Example: two Gaussians are 5 cm apart, one a chair (2), one background. k = exp(-1), and each
-    moves by p = 0.1 k = 0.037.
+    Example: two Gaussians are 5 cm apart. One is a chair (label 2), the other is background.
+    k = exp(-1), and the step moves a probability of 0.1 k = 0.037.
 
     >>> from .gaussian_labels import distribution, fields, new_labels
     >>> rows, labels = np.zeros((2, 16), np.float32), new_labels(2)
@@ -115,16 +122,18 @@ class LabelConfig:
     detectors.
     """
 
-    ema: Literal["paper", "corrected"] = "corrected"
-    keep: float = 0.9  # Decay of the average per observation: lambda (III.A).
-    # Keyframes of misses in a row that make background: N_miss (III.A), for `paper`.
+    ema: Literal["paper", "corrected"] = "corrected"  # Rule of the update; see `observe`.
+    keep: float = 0.9  # Factor on earlier observations at each new one: lambda (III.A).
+    # Misses in a row after which a Gaussian becomes background, with `paper`: N_miss (III.A).
     miss_limit: int = 5
-    # A miss with `corrected` is evidence for background if the detector should have seen the
-    # object.
-    miss_weight: float = 0.3  # Weight of a miss; that of a detection is its confidence.
+    # A miss with `corrected` is evidence for background if the object would appear large enough for
+    # the detector to find it. The next three settings define this.
+    miss_weight: float = 0.3  # Weight of a miss; the weight of a detection is its confidence.
     min_px: float = 40.0  # Minimum side (pixels) of an object's box for a miss to count.
-    usual_extent_m: float = 0.5  # Assumed size of an object that was not observed yet.
-    hold_back: float = 1.0  # Damping of uncertain observations of settled Gaussians, 0..1.
+    # Assumed size of a Gaussian's object while no label of the Gaussian has been observed.
+    usual_extent_m: float = 0.5
+    # Damping, 0..1, of observations with low confidence of Gaussians with low entropy; 0: none.
+    hold_back: float = 1.0
 
     def __post_init__(self) -> None:
         if self.ema not in ("paper", "corrected"):
@@ -137,7 +146,7 @@ class LabelConfig:
         if not (1 <= self.miss_limit <= 255 and self.min_px >= 0 and self.usual_extent_m >= 0):
             raise ConfigError(
                 named(self, "miss_limit", "min_px", "usual_extent_m")
-                + ": miss_limit must be in 1..255, the lengths not negative."
+                + ": miss_limit must be in 1..255, min_px and usual_extent_m not negative."
             )
 
 
@@ -147,7 +156,8 @@ class Observations:
 
     Attributes:
         indices: Rows of the Gaussians, [V] uint32, ascending.
-        labels: Observed labels, [V] int16; MISS: visible, but in no region; or NOT_SEEN.
+        labels: Observed labels, [V] int16. MISS: the Gaussian is visible, but in no region.
+            NOT_SEEN: nothing was observed.
         confidences: Confidences of the labels, [V] float32, 0..1.
         extents_m: Size of the labelled object, [V] float32, meters. For a miss, the minimum size
             that an object must have for the miss to count.
@@ -160,7 +170,7 @@ class Observations:
 
 
 def fields(labels: np.ndarray) -> np.ndarray:
-    """Return rows [N, 32] as records [N] of `ROW`, without a copy."""
+    """Return label rows [N, 32] as records [N] of `ROW`: a view, not a copy."""
     return labels.view(ROW)[:, 0]
 
 
@@ -174,14 +184,15 @@ def observe(
     if keep = 0.9. Misses are counted, and miss_limit misses in a row turn a Gaussian into
     background.
 
-    With `corrected`, p is the weighted mean of all observations, and the weights decay with age.
-    With w = confidence, W <- keep W + w and a = w / W, so that the first observation has a = 1. A
-    miss is an observation of background with w = miss_weight. It counts only if the object would
-    appear at least min_px large. The size is that of the last observed object, or usual_extent_m.
+    With `corrected`, p is the weighted mean of all observations, and the weights decay with age. An
+    observation has the weight w = confidence. W is the sum of the decayed weights: W <- keep W + w
+    and a = w / W, so that the first observation has a = 1. A miss is an observation of background
+    with w = miss_weight. A miss counts only if the object would appear at least min_px large. The
+    size of the object is that at the last observation of a label, or else usual_extent_m.
 
-    An uncertain observation changes a Gaussian less if its distribution has a low entropy. With
-    `paper` a, and with `corrected` w, is multiplied by 1 - hold_back exp(-2 H) (1 - confidence).
-    H is the entropy of p. The factor is applied only if p has a label.
+    An observation with low confidence changes a Gaussian less if the entropy H of p (nats) is low:
+    the factor 1 - hold_back exp(-2 H) (1 - confidence) multiplies a with `paper` and w with
+    `corrected`. It is applied only if p has a label other than background.
 
     The result is bitwise equal for any number of threads. Paper, III.A; ALGORITHMS, Semantics on
     Gaussians.
@@ -203,10 +214,10 @@ def observe(
     >>> see(2, 0.6, LabelConfig(ema="paper", hold_back=0))  # 0.9 p + 0.1
     [0.225, 0.0, 0.464, 0.31]
 
-    A settled Gaussian (H = 0) holds an observation back: 0.5 counts as 0.5 (1 - (1 - 0.5)).
+    With hold_back = 1 and H = 0, a confidence of 0.5 gives w = 0.5 (1 - (1 - 0.5)) = 0.25.
 
     >>> labels = new_labels(1)
-    >>> see(2, 0.6, LabelConfig())  # No label yet, nothing is held back: W = 0.6.
+    >>> see(2, 0.6, LabelConfig())  # No label yet, so the factor is 1: W = 0.6.
     [0.0, 0.0, 1.0, 0.0]
     >>> see(3, 0.5, LabelConfig())  # w = 0.25, W = 0.54 + 0.25, a = 0.316
     [0.0, 0.0, 0.684, 0.316]
@@ -230,7 +241,8 @@ def observe(
 def clear_background(labels: np.ndarray, indices: np.ndarray) -> None:
     """Remove the weight of background from rows `indices` [V] of labels [N, 32], in place.
 
-    The evidence is reduced in proportion. The other labels keep their proportions to each other.
+    The other labels keep their proportions to each other and then sum to one. The evidence is
+    multiplied by the weight that they had before.
 
     >>> labels = new_labels(1)
     >>> row = fields(labels)
@@ -252,18 +264,28 @@ def reset_labels(labels: np.ndarray, indices: np.ndarray) -> None:
 
 
 def background(labels: np.ndarray) -> np.ndarray:
-    """Return the probability of background, [N] float32."""
+    """Return the probability of background in label rows [N, 32], [N] float32."""
     return np.maximum(1 - fields(labels)["weights"].sum(axis=1), 0)
 
 
 def top_labels(labels: np.ndarray) -> np.ndarray:
-    """Return the likeliest label, [N] uint8; if background is as likely, return background."""
+    """Return the likeliest label of each label row [N, 32], [N] uint8.
+
+    If background is as likely as the likeliest other label, it is background.
+    """
     rows = fields(labels)
     return np.where(rows["weights"][:, 0] > background(labels), rows["ids"][:, 0], BACKGROUND)
 
 
 def distribution(labels: np.ndarray, classes: int = MAX_LABELS) -> np.ndarray:
-    """Return dense distributions, [N, classes] float32; each row sums to one.
+    """Convert label rows [N, 32] to dense distributions.
+
+    Args:
+        labels: Label rows.
+        classes: Number of labels of the result.
+
+    Returns:
+        The distributions, [N, classes] float32; each row sums to one.
 
     Raises:
         ValueError: If a label is not below `classes`.
@@ -282,7 +304,7 @@ def distribution(labels: np.ndarray, classes: int = MAX_LABELS) -> np.ndarray:
 
 
 def entropy(labels: np.ndarray) -> np.ndarray:
-    """Return the entropy H = -sum p log p (III.A) in nats, [N] float32.
+    """Return the entropy H = -sum p log p (III.A) of label rows [N, 32], [N] float32, nats.
 
     >>> labels = new_labels(1)
     >>> fields(labels)["weights"][0, 0] = 0.5

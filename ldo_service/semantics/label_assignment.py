@@ -15,18 +15,20 @@ from ldo_service.geometry import Camera
 from ldo_service.kernels import _labels
 from ldo_service.regions.foreground import Foreground
 
-HIDDEN, UNMATCHED = -2, -1  # Values in place of a region.
+HIDDEN, UNMATCHED = -2, -1  # Values in place of a region's number; see `Assignment`.
 
 
 @dataclass(frozen=True, slots=True)
 class AssignmentConfig:
     """Settings of the assignment of Gaussians to regions."""
 
-    # The paper's IoU of box and splat labels almost no Gaussian: a splat is a few pixels, a box
-    # hundreds. Coverage is their intersection divided by the area of the splat.
+    # Measure of the overlap of a splat and a region. The paper's `iou` labels almost no Gaussian,
+    # because a splat is a few pixels wide and a box hundreds. `coverage` is the intersection
+    # divided by the area of the splat.
     rule: Literal["coverage", "iou"] = "coverage"
-    min_overlap: float = 0.3  # Minimum overlap by the rule: theta_IoU (III.A).
-    max_depth_gap_m: float = 0.1  # Maximum distance from the measured depth: delta_z (III.A).
+    min_overlap: float = 0.3  # Minimum overlap: theta_IoU (III.A).
+    # Maximum difference between the depth of a Gaussian and the measured depth: delta_z (III.A).
+    max_depth_gap_m: float = 0.1
 
     def __post_init__(self) -> None:
         if self.rule not in ("coverage", "iou"):
@@ -44,12 +46,11 @@ class Regions:
 
     Attributes:
         boxes: Boxes, [M, 4] float32, x0 y0 x1 y1, pixels.
-        scores: Scores, [M] float32, 0..1. Where regions overlap, the largest overlap times score
-            wins.
-        rects: Column, row, width and height of the rectangle that the table of each region covers,
-            [M, 4] int32. With width 0, the region has no table and is its whole box.
-        sums: Summed-area tables [height + 1, width + 1] of the masks, one after the other, [S]
-            int32.
+        scores: Scores, [M] float32, 0..1. A Gaussian in several regions gets the one with the
+            largest product of overlap and score.
+        rects: Rectangle of the image that the mask of each region covers: column, row, width and
+            height, [M, 4] int32, pixels. Width 0: the region has no mask and is its whole box.
+        sums: Summed-area tables [height + 1, width + 1] of the masks, concatenated, [S] int32.
     """
 
     boxes: np.ndarray
@@ -59,16 +60,21 @@ class Regions:
 
     @classmethod
     def of_boxes(cls, boxes: np.ndarray, scores: np.ndarray) -> "Regions":
-        """Return regions that are whole boxes."""
+        """Return regions that are whole boxes [M, 4], with scores [M]."""
         return cls(*_float32(boxes, scores), np.zeros((len(boxes), 4), np.int32), _NO_SUMS)
 
     @classmethod
     def of_foregrounds(
         cls, boxes: np.ndarray, scores: np.ndarray, foregrounds: Sequence[Foreground]
     ) -> "Regions":
-        """Return regions that are only the foregrounds of their boxes.
+        """Return regions that are the foreground pixels of their boxes.
 
-        A foreground without any pixel gets no Gaussian.
+        A region whose foreground has no pixel gets no Gaussian.
+
+        Args:
+            boxes: Boxes, [M, 4], x0 y0 x1 y1, pixels.
+            scores: Scores, [M], 0..1.
+            foregrounds: Foreground of each box.
         """
         shown = [f if f.mask.size else _NOWHERE for f in foregrounds]
         rects = [(f.column, f.row, f.mask.shape[1], f.mask.shape[0]) for f in shown]
@@ -79,12 +85,12 @@ class Regions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Assignment:
-    """Regions of V Gaussians.
+    """Assignment of V Gaussians to the regions of an image.
 
     Attributes:
-        regions: Number of the region, [V] int32. UNMATCHED: in no region. HIDDEN: outside of the
-            image, or not at the depth that was measured at its pixel.
-        overlaps: Overlap with that region by the rule, [V] float32; 0 without a region.
+        regions: Number of the region of each Gaussian, [V] int32. UNMATCHED: in no region. HIDDEN:
+            outside of the image, or not at the depth that was measured at its pixel.
+        overlaps: Overlap with that region by the setting `rule`, [V] float32; 0 without a region.
         depths_m: Depths of the Gaussians in the camera frame, [V] float32.
     """
 
@@ -108,18 +114,21 @@ def assign_gaussians(
 
     Each Gaussian is projected as in rendering, S = J R Sigma R' J' + 0.3 px^2 I. Its splat is the
     axis-aligned box of two standard deviations around its center, clipped to the image. A Gaussian
-    is considered if its center lies in the image, at most max_depth_gap_m from depth_m at that
-    pixel. The others are HIDDEN. It may be assigned to a region if
+    is HIDDEN if its center lies outside of the image, or max_depth_gap_m or more from the measured
+    depth at that pixel. Any other Gaussian may be assigned to a region if overlap > min_overlap:
 
-        overlap > min_overlap,  overlap = |splat * region| / |splat|, or by `iou` / |splat + region|
+        rule `coverage`:  overlap = area(splat and region) / area(splat)
+        rule `iou`:       overlap = area(splat and region) / area(splat or region)
 
-    With `coverage`, its center must lie in the region too, because depth was tested at the center.
-    If several regions qualify, it gets the one with the largest overlap times score; of equal ones,
-    the first. The result is bitwise equal for any number of threads.
+    With `coverage`, the center of the Gaussian must lie in the region too, because depth was tested
+    at the center. If a Gaussian may be assigned to several regions, it gets the one with the
+    largest product of overlap and score; of equal ones, the first. The result is bitwise equal for
+    any number of threads.
 
     Args:
         rows: Gaussians of the map, [N, 16] float32.
-        indices: Rows to assign, [V] uint32, ascending, as `Contributions.indices`.
+        indices: Rows of the V Gaussians to assign, [V] uint32, ascending; see
+            `Contributions.indices`.
         camera: Intrinsics of depth_m, without distortion.
         T_camera_map: Transform from the map to the camera, [4, 4].
         depth_m: Measured depth, [H, W] float32, meters; 0 where unknown.
@@ -127,11 +136,14 @@ def assign_gaussians(
         config: Settings of the assignment.
         threads: Number of threads.
 
+    Returns:
+        The region of each Gaussian.
+
     Raises:
         ValueError: If the shapes or types of the arrays do not fit.
 
-    Example: the splat of a Gaussian with a sigma of 1 px at (2, 5) is [0, 4] x [3, 7]. A region
-    that begins at x = 2 covers half of it. They share 8 px^2 of 16 and 64:
+    Example: the splat of a Gaussian with a sigma of 1 px at (2, 5) is [0, 4] x [3, 7], 16 px^2. A
+    region of 64 px^2 that begins at x = 2 covers half of the splat, 8 px^2:
 
     >>> camera, depth_m = Camera(20, 10, 10.0, 10.0, 2.0, 5.0), np.ones((10, 20), np.float32)
     >>> row = np.zeros((1, 16), np.float32)

@@ -1,9 +1,10 @@
-"""Table of object landmarks: a sample of Gaussians each, and the values derived from it.
+"""Table of object landmarks: for each, a sample of its Gaussians and values derived from it.
 
-A landmark stores the ids of at most 256 of its Gaussians, its members, and votes for each. The
-members are the Gaussians whose ids come first when all ids are shuffled by a fixed rule. They are
-therefore a uniform sample, independent of the order in which Gaussians were added. Position and
-label are derived from the rows and labels of the members in the map and change with them.
+A landmark stores the ids of at most 256 of its Gaussians, the members, and a number of votes for
+each member. A fixed rule shuffles all ids, and the Gaussians whose ids come first are the members.
+The members are therefore a uniform sample, independent of the order in which Gaussians were added.
+Position and label of a landmark are derived from the members' rows and labels in the map and change
+with them.
 """
 
 import numpy as np
@@ -13,32 +14,34 @@ from ldo_service.geometry import Camera
 from .distributions import KEPT, dense, entropy, mean_distributions, sparse
 from .gaussian_labels import BACKGROUND
 
-# Members per landmark: the centroid of a sample is within 1/16 of the object's spread.
+# Maximum members per landmark. The centroid of 256 samples has a standard error of 1/16 of the
+# object's spread.
 MEMBERS = 256
 VIEWS = 3  # Best views that are stored.
 NO_MEMBER = -1
-MAX_VOTES = 8  # Maximum votes: a member that is wrong is removed after as many keyframes.
+# Maximum votes of a member. A wrong member loses one per keyframe and is removed after at most 8.
+MAX_VOTES = 8
 TRIM = 0.02  # Fraction of the members at each end of an axis that counts as outliers of the box.
 _AT_A_TIME = 128  # Landmarks per batch of `derive_in_batches`, to stay in cache.
 
 LANDMARK = np.dtype(
     [
         ("id", "<i8"),  # Id of the object for other programs; -1 for a candidate.
-        ("seen", "<i4"),  # Keyframes that observed it.
-        ("missed", "<i4"),  # Keyframes that should have observed it and did not.
+        ("seen", "<i4"),  # Keyframes that observed the object.
+        ("missed", "<i4"),  # Keyframes that should have observed the object and did not.
         ("misses", "<i4"),  # Misses in a row since the last observation.
-        ("first", "<i8"),  # First and last keyframe that observed it.
+        ("first", "<i8"),  # First and last keyframe that observed the object.
         ("last", "<i8"),
-        ("anchor", "<i8"),  # Anchor keyframe of most of its members.
+        ("anchor", "<i8"),  # Anchor keyframe of most members.
         ("centroid", "<f8", 3),  # m, map frame.
         ("covariance", "<f8", (3, 3)),  # m^2
-        ("T_map_object", "<f8", (4, 4)),  # Center and axes of its box.
+        ("T_map_object", "<f8", (4, 4)),  # Center and axes of the object's box.
         ("size", "<f8", 3),  # Extents of the box along its axes, m.
-        ("weights", "<f4", KEPT),  # Sparse distribution over labels.
+        ("weights", "<f4", KEPT),  # Sparse label distribution: weights of `labels`.
         ("labels", "u1", KEPT),
         ("members", "<i8", MEMBERS),  # Ids of Gaussians in shuffled order, then NO_MEMBER.
-        ("votes", "i1", MEMBERS),
-        ("view_keyframes", "<i8", VIEWS),  # Best first; -1 for none.
+        ("votes", "i1", MEMBERS),  # Votes of the members; see `observations.update_votes`.
+        ("view_keyframes", "<i8", VIEWS),  # Keyframes of the best views, best first; -1 for none.
         ("view_scores", "<f4", VIEWS),
         ("view_boxes", "<f4", (VIEWS, 4)),  # x0 y0 x1 y1, pixels.
     ]
@@ -60,7 +63,7 @@ def distributions(table: np.ndarray) -> np.ndarray:
 
 
 def labels_of(table: np.ndarray) -> np.ndarray:
-    """Return the label of each landmark, [K] uint8: the heaviest one other than background."""
+    """Return the heaviest label other than background of each landmark, [K] uint8."""
     first = table["labels"][:, 0]
     return np.where(first == BACKGROUND, table["labels"][:, 1], first)
 
@@ -72,10 +75,11 @@ def entropies(table: np.ndarray) -> np.ndarray:
 
 # --- members --------------------------------------------------------------------------------------
 def shuffled(ids: np.ndarray) -> np.ndarray:
-    """Return a sort key for each id, [...] uint64, unique per id; NO_MEMBER has the largest key.
+    """Return a sort key for each id, [...] uint64, that shuffles the ids by a fixed rule.
 
-    Multiplication by an odd number permutes the 64-bit numbers. The golden ratio spreads
-    consecutive ids.
+    Each id has a key of its own, and NO_MEMBER has the largest key. The key is the id times an odd
+    number, which permutes the 64-bit numbers. The number is derived from the golden ratio, so that
+    the keys of consecutive ids are spread.
     """
     places = ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return np.where(ids == NO_MEMBER, np.uint64(2**64 - 1), places)
@@ -84,15 +88,20 @@ def shuffled(ids: np.ndarray) -> np.ndarray:
 def merged_members(
     members: np.ndarray, votes: np.ndarray, others: np.ndarray, other_votes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the union of two member lists for each of K landmarks: members [K, 256] and votes.
+    """Merge two lists of members for each of K landmarks.
 
-    A member of both lists keeps its votes from the first. A member with zero votes is removed.
+    A member of both lists keeps its votes of the first list. Members with zero votes are first
+    removed from the first list. If more than 256 members remain, those that come first in shuffled
+    order are kept.
 
     Args:
         members: Ids of the first list, [K, M].
         votes: Votes of the first list, [K, M].
         others: Ids of the second list, [K, L].
         other_votes: Votes of the second list, [K, L].
+
+    Returns:
+        Ids of the members, [K, 256], and their votes, [K, 256] int8.
     """
     both = np.concatenate([np.where(votes > 0, members, NO_MEMBER), others], axis=1)
     counts = np.concatenate([votes, other_votes], axis=1)
@@ -117,10 +126,15 @@ def reliable_members(table: np.ndarray) -> np.ndarray:
 
 
 def rows_of(members: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """Return the rows of members [...] in the map with ascending ids [N]; -1 if not resident."""
+    """Return the rows of members in the map, [...]; -1 if a member is not resident.
+
+    Args:
+        members: Ids of the members, [...].
+        ids: Ids of the Gaussians of the map, [N], ascending.
+    """
     if len(ids) == 0:
         return np.full(members.shape, -1)
-    # Sorted queries search neighboring entries: four times faster.
+    # The search is four times faster if queries are sorted, because it reads neighboring entries.
     order = np.argsort(members, axis=None)
     at = np.empty(members.size, np.int64)
     at[order] = np.searchsorted(ids, members.ravel()[order])
@@ -147,7 +161,7 @@ def derive(
         labels: Label rows of the Gaussians, [N, 32].
         ids: Ids of the Gaussians, [N], ascending.
         anchors: Anchor keyframes of the Gaussians, [N].
-        least: Minimum number of members.
+        least: Minimum number of reliable resident members.
     """
     where = np.where(reliable_members(table), rows_of(table["members"], ids), -1)
     known = np.flatnonzero(np.count_nonzero(where >= 0, axis=1) >= max(least, 1))
@@ -177,7 +191,7 @@ def derive_in_batches(table: np.ndarray, *gaussians: np.ndarray, least: int) -> 
     Args:
         table: Landmarks, [K] records of `LANDMARK`.
         *gaussians: Rows, labels, ids and anchors of the map, see `derive`.
-        least: Minimum number of members.
+        least: Minimum number of reliable resident members; see `derive`.
     """
     for start in range(0, len(table), _AT_A_TIME):
         derive(table[start : start + _AT_A_TIME], *gaussians, least=least)
@@ -190,12 +204,19 @@ def _opacities(rows: np.ndarray, where: np.ndarray) -> np.ndarray:
 
 
 def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return weighted means [K, 3] and covariances [K, 3, 3] of points [K, M, 3].
+    """Return weighted means and covariances of K sets of points.
 
         mu = sum_m w_m x_m / sum_m w_m,  Sigma = sum_m w_m (x_m - mu) (x_m - mu)' / sum_m w_m
 
     The points at the two ends of each axis, 2 % each, are excluded as outliers. Paper, III.C
     (landmarks).
+
+    Args:
+        p_map: Points in the map frame, [K, M, 3], meters.
+        weights: Weights of the points, [K, M]; 0 for unused points.
+
+    Returns:
+        Means, [K, 3], meters, and covariances, [K, 3, 3], m^2.
 
     Example: two points lie on the x axis; the one at 4 has three times the weight. mu = 12 / 4,
     Sigma = (9 + 3) / 4.
@@ -215,10 +236,15 @@ def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def trimmed(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest of values [K, M, D] without 2 % at each end, [K, D] each.
+    """Return the lowest and the highest of M values after removal of 2 % at each end.
 
-    Only values where `valid` [K, M] is true are used. If there are none, the lowest value is
-    infinity and the highest is minus infinity.
+    Args:
+        values: Values, [K, M, D].
+        valid: Values to use, [K, M] bool.
+
+    Returns:
+        Lowest values and highest values, [K, D] each; infinity and minus infinity if no value is
+        valid.
     """
     count = np.count_nonzero(valid, axis=1)[:, None]
     ordered = np.where(valid[:, None], np.swapaxes(values, 1, 2), np.inf)
@@ -229,16 +255,24 @@ def trimmed(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return low, np.where(count > 0, high, -np.inf)
 
 
-SAVING = 0.8  # Maximum volume ratio of an oriented box to the axis-aligned one that it replaces.
+SAVING = 0.8  # Volume ratio of oriented to axis-aligned box below which the oriented one is used.
 
 
 def boxes(
     p_map: np.ndarray, valid: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return T_map_object [K, 4, 4] and sizes [K, 3] of boxes around points [K, M, 3].
+    """Return boxes around K sets of points.
 
-    A box is parallel to the axes of the map. If a box along the principal axes of the points has at
-    most four fifths of its volume, that box is returned instead.
+    By default, a box is parallel to the axes of the map. If the box along the principal axes of the
+    points has less than four fifths of that volume, the box along the principal axes is returned.
+
+    Args:
+        p_map: Points in the map frame, [K, M, 3], meters.
+        valid: Points to use, [K, M] bool; 2 % at each end of an axis are excluded as outliers.
+        covariance: Covariances of the points, [K, 3, 3], m^2.
+
+    Returns:
+        T_map_object, [K, 4, 4], with the center and axes of the boxes, and their sizes, [K, 3], m.
     """
     _, main = np.linalg.eigh(covariance)
     main = main[..., ::-1] * np.sign(_largest(main[..., ::-1]))[:, None]  # Fix the arbitrary signs.
@@ -280,7 +314,7 @@ def _commonest(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def moved(table: np.ndarray, T_new_old: np.ndarray) -> None:
-    """Move landmarks [K] by T_new_old [K, 4, 4], in place."""
+    """Move landmarks [K] by the corrections T_new_old [K, 4, 4] of the map frame, in place."""
     R, t = T_new_old[:, :3, :3], T_new_old[:, :3, 3]
     table["centroid"] = (R @ table["centroid"][..., None])[..., 0] + t
     table["covariance"] = R @ table["covariance"] @ np.swapaxes(R, 1, 2)
@@ -289,9 +323,12 @@ def moved(table: np.ndarray, T_new_old: np.ndarray) -> None:
 
 # --- visibility -----------------------------------------------------------------------------------
 def within(table: np.ndarray, camera: Camera, T_camera_map: np.ndarray) -> np.ndarray:
-    """Return which landmarks have a bounding sphere that meets the view of a camera, [K] bool."""
+    """Return which landmarks may be in view of a camera, [K] bool.
+
+    The test is whether a bounding sphere of the landmark intersects the camera's view.
+    """
     p = table["centroid"] @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
-    # Twice the radius of the box, since members lie outside it too.
+    # Twice the radius of the box's bounding sphere, because some members lie outside of the box.
     radius = np.linalg.norm(table["size"], axis=1)
     low = (-0.5 - camera.cx) / camera.fx, (-0.5 - camera.cy) / camera.fy
     out = p[:, 2] > -radius

@@ -44,14 +44,14 @@ from .observations import (
     update_votes,
 )
 
-CANDIDATE = -1  # Value in place of an id.
+CANDIDATE = -1  # Value of `id` for a landmark that is a candidate.
 
 
 class Objects:
     """Table of all landmarks: objects and candidates.
 
     The class is not thread-safe. The same calls give bitwise equal results, also after `unpack`. An
-    id is assigned once and belongs to its object until that is merged or removed.
+    object keeps its id until it is merged into another one or removed. Ids are never reused.
     """
 
     def __init__(self, config: ObjectsConfig | None = None) -> None:
@@ -73,20 +73,23 @@ class Objects:
     ) -> ObjectUpdate:
         """Update the objects from a keyframe.
 
-        A region without an associated landmark creates a candidate. A candidate becomes an object
-        after min_keyframes observations that agree: KL(p || p_t) < max_divergence. Here, p is the
-        mean label distribution of the candidate's Gaussians before the keyframe. p_t is that of the
-        Gaussians in the region. Both means are weighted by opacity. A keyframe that exceeds the
-        divergence restarts the count. Regions are associated with objects first, and the remaining
-        regions with candidates.
+        Regions are associated with objects first, and the remaining regions with candidates. A
+        region without an associated landmark creates a candidate.
+
+        A candidate becomes an object after min_keyframes observations that agree with it:
+        KL(p || p_t) < max_divergence. Here, p is the mean label distribution of the candidate's
+        Gaussians before the keyframe, and p_t is the mean of the Gaussians in the region. Both
+        means are weighted by opacity. An observation with a larger divergence restarts the count.
 
         Args:
             view: The map and the regions of the keyframe.
             undetectable: Labels that the detector does not know, [256] bool. An object with such a
-                label is missed only if the measured depth shows that it is gone.
-            is_late: The keyframe was observed before, and the view has only regions with late
-                labels. It counts for a candidate only outside of the candidate's first to last
-                keyframe. Objects gain no observation, and nothing is missed.
+                label is missed only if the measured depth shows that it is gone. None: the detector
+                knows all labels.
+            is_late: True if the keyframe was observed before and the view has only regions whose
+                labels arrived later. Then objects gain no observation, and no landmark is missed. A
+                candidate gains an observation only if the keyframe is before the first or after the
+                last keyframe that observed the candidate.
 
         Returns:
             The changes of the objects.
@@ -122,7 +125,15 @@ class Objects:
 
     # --- association ------------------------------------------------------------------------------
     def _match(self, near: np.ndarray, pairs: AssociationCosts) -> tuple[np.ndarray, np.ndarray]:
-        """Return the matched landmarks, as numbers in `near`, and their regions."""
+        """Match landmarks with regions: objects first, then candidates with the other regions.
+
+        Args:
+            near: Rows of the table, [K], for the landmarks of `pairs`.
+            pairs: Association costs of these landmarks.
+
+        Returns:
+            Positions in `near` of the matched landmarks, and the region of each.
+        """
         is_object = (self._table["id"][near] != CANDIDATE)[:, None]
         allowed, least = pairs.allowed.copy(), self.config.association.min_iou
         k, r = associate(pairs.iou, allowed & is_object, least)
@@ -138,11 +149,14 @@ class Objects:
         regions: RegionStatistics,
         r: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Find regions that show only a piece of a landmark that no region was matched with.
+        """Find unmatched regions that show a piece of an unmatched landmark.
+
+        A region is a piece if enough of its Gaussians lie in the box of the landmark.
 
         Returns:
-            Landmarks that are matched or have such a piece, [K] bool; they are not missed. Numbers
-            of the regions that are neither matched nor such a piece.
+            Two arrays. The first has the landmarks that are matched or have a piece and thus cannot
+            be missed, [K] bool. The second has the numbers of the regions that are neither matched
+            nor a piece.
         """
         excused, is_left = np.zeros(len(near), bool), np.ones(len(regions.numbers), bool)
         excused[k], is_left[r] = True, False
@@ -186,17 +200,28 @@ class Objects:
         ]
 
     def _lacks(self, which: np.ndarray, keyframe: int) -> np.ndarray:
-        """Return which landmarks [K] are candidates whose observations do not reach a keyframe."""
+        """Return which landmarks are candidates first seen after or last seen before a keyframe.
+
+        Args:
+            which: Rows of the table, [K].
+            keyframe: Id of the keyframe.
+
+        Returns:
+            The candidates, [K] bool.
+        """
         table = self._table[which]
         is_within = (table["first"] <= keyframe) & (keyframe <= table["last"])
         return (table["id"] == CANDIDATE) & ~is_within
 
     def _derive(self, table: np.ndarray, *gaussians: np.ndarray) -> None:
-        """Derive landmarks in place; those with too few resident Gaussians stay unchanged."""
+        """Derive landmarks in place; landmarks with too few resident Gaussians stay unchanged."""
         derive_in_batches(table, *gaussians, least=self.config.association.min_gaussians)
 
     def _promote(self, which: np.ndarray) -> tuple[int, ...]:
-        """Turn candidates with enough observations into objects and return their ids."""
+        """Turn candidates with enough observations into objects, and return the new ids.
+
+        A candidate whose heaviest label is background stays a candidate.
+        """
         seen = self._table[which]
         ready = (seen["id"] == CANDIDATE) & (seen["seen"] >= self.config.min_keyframes)
         ready = which[ready & (seen["labels"][:, 0] != BACKGROUND)]
@@ -215,10 +240,11 @@ class Objects:
         excused: np.ndarray,
         undetectable: np.ndarray | None,
     ) -> np.ndarray:
-        """Return the numbers of the landmarks in `near` that are missed in the keyframe.
+        """Return the positions in `near` of the landmarks that are missed in the keyframe.
 
         A landmark is missed if it is visible and the detector did not find it. It is also missed if
-        the measured depth lies behind it, so that it is gone.
+        the measured depth lies behind most of it, which shows that it is gone. `excused` landmarks
+        are never missed.
         """
         sides = np.clip(predicted.boxes[:, 2:] - predicted.boxes[:, :2], 0, None)
         is_large = np.sqrt(np.prod(sides, axis=1)) >= self.config.min_side_px
@@ -240,7 +266,7 @@ class Objects:
         ]
 
     def _remove(self, gone: np.ndarray) -> tuple[int, ...]:
-        """Remove landmarks with too many misses and those in `gone` [K] bool.
+        """Remove landmarks with too many misses, and the landmarks in `gone` [K] bool.
 
         Returns:
             Ids of the objects that were removed after misses.
@@ -266,8 +292,8 @@ class Objects:
         """Merge landmarks that overlap; see `observations.boxes_overlap`.
 
         Returns:
-            Pairs of a removed id and the id it was merged into, and which landmarks were merged
-            into others, [K] bool.
+            Pairs of a removed id and the id that it was merged into, and the landmarks that were
+            merged into others and must be removed, [K] bool.
         """
         merged: list[tuple[int, int]] = []
         gone = np.zeros(len(self._table), bool)
@@ -284,7 +310,10 @@ class Objects:
         return tuple(merged), gone
 
     def _age(self, k: int) -> tuple[bool, int, int]:
-        """Return a sort key for landmark `k`: objects come before candidates, older ones first."""
+        """Return a sort key for landmark `k`: objects before candidates, lower ids and rows first.
+
+        Lower ids and rows belong to older landmarks.
+        """
         return self._table["id"][k] == CANDIDATE, int(self._table["id"][k]), k
 
     def _merge_pair(self, keep: int, merged_row: int, view: MapView) -> None:
@@ -295,7 +324,7 @@ class Objects:
 
     # --- candidates -------------------------------------------------------------------------------
     def _begin(self, view: MapView, regions: RegionStatistics, left: np.ndarray) -> None:
-        """Create a candidate for each region in `left`.
+        """Create a candidate for each region in `left`, the numbers of the unmatched regions.
 
         If there are more than max_candidates, the candidates observed longest ago are dropped.
         """
@@ -309,7 +338,8 @@ class Objects:
         candidates = np.flatnonzero(self._table["id"] == CANDIDATE)
         excess = len(candidates) - self.config.max_candidates
         if excess > 0:
-            # The new ones are at the end. With a late label, their keyframe may be old.
+            # New candidates are at the end of the table. They are dropped last, although a late
+            # label may give them an old keyframe.
             is_new = candidates >= len(self._table) - len(new)
             oldest = np.lexsort((self._table["last"][candidates], is_new))[:excess]
             self._table = np.delete(self._table, candidates[oldest])
@@ -318,9 +348,9 @@ class Objects:
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move the landmarks after a correction of the keyframe poses.
 
-        Each landmark moves with the anchor keyframe of most of its members. A landmark whose
-        Gaussians are offloaded thus gets the position that they will have when they are loaded.
-        `refresh` updates landmarks with resident Gaussians.
+        Each landmark moves with the anchor keyframe of most of its members. A landmark with
+        offloaded Gaussians thus gets the position that these Gaussians will have after loading.
+        Landmarks with resident Gaussians become exact with the next `refresh`.
 
         Args:
             T_new_old: Correction of each moved keyframe in the map frame, [4, 4], by id.
@@ -349,7 +379,8 @@ class Objects:
             labels: Label rows of the Gaussians, [N, 32].
             ids: Ids of the Gaussians, [N], ascending.
             anchors: Anchor keyframes of the Gaussians, [N].
-            seen_from: Camera and T_map_camera; only landmarks in this view are derived. None: all.
+            seen_from: Camera and T_map_camera [4, 4]; only landmarks in this view are derived.
+                None: all landmarks are derived.
         """
         which = np.arange(len(self._table))
         if seen_from:
@@ -361,7 +392,7 @@ class Objects:
 
     # --- state ------------------------------------------------------------------------------------
     def pack(self) -> dict[str, Any]:
-        """Return arrays and plain numbers for a file or a checkpoint."""
+        """Return the landmarks and counters as arrays, for a file or a checkpoint."""
         table = self._table.copy().view(np.uint8).reshape(len(self._table), LANDMARK.itemsize)
         counts = [self._next_id, self._merged, self._removed, self._refused]
         return {"landmarks": table, "counts": np.array(counts, np.int64)}

@@ -1,4 +1,4 @@
-"""Settings of the objects: association, and when they appear, merge and are removed (III.C)."""
+"""Settings of the objects: association, creation, merge and removal (paper, III.C)."""
 
 from dataclasses import dataclass, field
 
@@ -9,16 +9,21 @@ from ldo_service.errors import ConfigError, named
 class AssociationConfig:
     """Settings of the data association."""
 
-    min_iou: float = 0.4  # Minimum IoU of the boxes (III.C).
-    # Minimum `common_mass`: a cup lies in the box of its table, but is no table.
+    # Minimum IoU of the predicted box of an object and the box of a region (III.C).
+    min_iou: float = 0.4
+    # Minimum `common_mass` of the label distributions of an object and a region. It prevents, for
+    # example, a match of a cup with the table whose box contains the cup.
     min_shared: float = 0.3
-    # Maximum gap between depth ranges; tolerance of the occlusion test (delta_z, III.A).
+    # Maximum gap between the depth ranges of an object and a region, and tolerance of the occlusion
+    # test (delta_z, III.A).
     max_depth_gap_m: float = 0.1
-    min_gaussians: int = 8  # Minimum Gaussians of a region; with fewer, its position is unknown.
-    # Maximum regions per keyframe, those with the most Gaussians; COCO images have 7.
+    min_gaussians: int = 8  # Minimum Gaussians of a region; fewer do not fix its position.
+    # Maximum regions per keyframe; those with the most Gaussians are used. Images of COCO have 7
+    # objects on average.
     max_regions: int = 64
-    # Detectors draw separate boxes around a plant, its crown and its pot. A box is a part of a
-    # larger one of its class and depth if this fraction of it lies inside; above 1, none is.
+    # Detectors draw separate boxes around a plant, its crown and its pot. A box counts as a part of
+    # a larger box of the same class and depth if at least this fraction of its area lies inside the
+    # larger box. Above 1, no box counts as a part.
     part_inside: float = 0.9
 
     def __post_init__(self) -> None:
@@ -43,20 +48,27 @@ class ObjectsConfig:
     association: AssociationConfig = field(default_factory=AssociationConfig)
     # Keyframes that must observe a candidate before it becomes an object (III.C).
     min_keyframes: int = 3
-    # Maximum divergence (nats) of an observation from the candidate (III.C).
+    # Maximum divergence (nats) of the label distributions of a candidate and its observation, above
+    # which the count of `min_keyframes` starts again (III.C).
     max_divergence: float = 0.2
-    miss_limit: int = 10  # Misses in a row, while it is visible, that remove an object (III.C).
-    uncertain_miss_limit: int = 5  # The same for objects with a high entropy.
-    # Minimum entropy (nats) of such objects, which are removed earlier (III.C).
+    # Misses in a row after which an object is removed (III.C).
+    miss_limit: int = 10
+    # Value of miss_limit for objects with an entropy above `uncertain_entropy`.
+    uncertain_miss_limit: int = 5
+    # Entropy (nats) of the label distribution above which an object is removed earlier (III.C).
     uncertain_entropy: float = 0.5
-    # The same for candidates; a removed candidate can be created again.
+    # Value of miss_limit for candidates; a removed candidate can be created again.
     candidate_miss_limit: int = 3
-    min_visible: float = 0.5  # Minimum fraction of the members in view and not occluded for a miss.
-    # Minimum side of the predicted box for a miss; smaller objects may be overlooked.
+    # Minimum fraction of an object's members that are in view and not occluded for a miss to count.
+    min_visible: float = 0.5
+    # Minimum square root of the predicted box's area for a miss to count: a detector may overlook
+    # smaller objects.
     min_side_px: float = 20.0
-    merge_overlap: float = 0.5  # Minimum fraction of the members of one in the box of the other.
-    max_objects: int = 2000  # 6 MB, and some ms per keyframe if all are in view.
-    max_candidates: int = 256  # Maximum candidates; those observed last are kept.
+    # Minimum fraction of the members of one object in the box of another for the two to merge.
+    merge_overlap: float = 0.5
+    # Maximum objects; 2000 take 6 MB, and some ms per keyframe if all of them are in view.
+    max_objects: int = 2000
+    max_candidates: int = 256  # Maximum candidates; the most recently observed ones are kept.
 
     def __post_init__(self) -> None:
         counts = (

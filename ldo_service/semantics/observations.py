@@ -23,7 +23,8 @@ class ObservedObject:
 
     Attributes:
         object: Id of the object.
-        box: Observed box or, for a miss, the predicted one, [4], x0 y0 x1 y1, pixels.
+        box: Box of the observed region or, for a miss, the predicted box of the object, [4],
+            x0 y0 x1 y1, pixels.
         distribution: Label distribution of the Gaussians in the region or, for a miss, of the
             object, [C].
         entropy: Entropy of that distribution, nats.
@@ -49,25 +50,25 @@ class ObjectUpdate:
 
 
 def one_each(members: np.ndarray) -> np.ndarray:
-    """Return one vote for each member, [K, 256] int8; 0 beyond."""
+    """Return one vote for each of the members [K, 256], [K, 256] int8; 0 where NO_MEMBER."""
     return (members != NO_MEMBER).astype(np.int8)
 
 
 def update_votes(
     votes: np.ndarray, rows: np.ndarray, view: MapView, numbers: np.ndarray
 ) -> np.ndarray:
-    """Return the votes [K, 256] of the members of landmarks after a keyframe.
+    """Return the votes of the members of K landmarks after a keyframe, [K, 256] int8.
 
-    Members in the region of their landmark gain a vote. Members that are visible outside of it, or
-    not resident, lose one.
+    A member in the region of its landmark gains a vote, up to 8. A member that is visible outside
+    of this region, or not resident, loses a vote. A member without votes stays at 0.
 
     Args:
-        votes: Votes before, [K, 256].
+        votes: Votes before the keyframe, [K, 256].
         rows: Rows of the members in the map, [K, 256]; -1 if not resident.
         view: The map and the regions of the keyframe.
-        numbers: Region of each landmark, [K].
+        numbers: Number of the region that each landmark was associated with, [K].
     """
-    # Same dtype, else all of `indices` is converted.
+    # `searchsorted` would convert all of `indices` if the dtypes differed.
     wanted = np.maximum(rows, 0).astype(view.indices.dtype)
     at = np.minimum(np.searchsorted(view.indices, wanted), len(view.indices) - 1)
     is_shown = view.indices[at] == rows
@@ -79,9 +80,15 @@ def update_votes(
 
 
 def add_views(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.ndarray) -> None:
-    """Add a keyframe to the best views of landmarks.
+    """Add a keyframe to the best views of K landmarks, in place.
 
-    The score of a view is the visible fraction `shown` times the square root of the box's area.
+    The score of a view is the visible fraction times the square root of the box's area.
+
+    Args:
+        table: Landmarks, [K] records of `LANDMARK`.
+        keyframe: Id of the keyframe.
+        shown: Visible fraction of each landmark, [K], 0..1.
+        boxes: Box of each landmark in the keyframe, [K, 4], x0 y0 x1 y1, pixels.
     """
     scores = shown * np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1))
     add_view(table, np.full(len(table), keyframe), scores, boxes)
@@ -90,7 +97,14 @@ def add_views(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.nda
 def add_view(
     table: np.ndarray, keyframes: np.ndarray, scores: np.ndarray, boxes: np.ndarray
 ) -> None:
-    """Keep the best views of landmarks [K] after adding one to each, in place."""
+    """Add one view to each of K landmarks, and keep the three views with the highest scores.
+
+    Args:
+        table: Landmarks, [K] records of `LANDMARK`; changed in place.
+        keyframes: Keyframe of the new view of each landmark, [K].
+        scores: Scores of the new views, [K]; see `add_views`.
+        boxes: Boxes of the landmarks in the new views, [K, 4], x0 y0 x1 y1, pixels.
+    """
     all_scores = np.concatenate([table["view_scores"], scores[:, None]], axis=1).astype(np.float32)
     order = np.argsort(-all_scores, axis=1, kind="stable")[:, :VIEWS]
     for name, new in (
@@ -106,8 +120,16 @@ def add_view(
 def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[tuple[int, int]]:
     """Return pairs of landmarks that may be the same object.
 
-    One landmark of a pair is in `matched` and the other is not. They have the same label, and the
-    spheres around their boxes meet. Both are numbers of rows of `table` from `near` [K].
+    The first landmark of a pair is in `matched`, the second is not. Both have the same label, and
+    the spheres around their boxes intersect.
+
+    Args:
+        table: All landmarks.
+        near: Rows of `table` from which the pairs are formed, [K].
+        matched: Rows of `table` that a region was associated with.
+
+    Returns:
+        Pairs of rows of `table`.
     """
     here, is_matched = table[near], np.isin(near, matched)
     name, place = labels_of(here), here["T_map_object"][:, :3, 3]
@@ -118,15 +140,16 @@ def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[
 
 
 def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: float) -> bool:
-    """Return whether at least the fraction `least` of one landmark lies in the box of the other.
+    """Return whether enough members of a landmark lie in the box of another landmark.
 
-    It suffices if this holds in one of the two directions.
+    The members of `one` are compared with the box of `other`, and the members of `other` with the
+    box of `one`. The larger of the two fractions must be at least `least`.
 
     Args:
-        one: A table of one landmark.
-        other: A table of one landmark.
-        view: The map with the Gaussians of both.
-        least: Minimum fraction of the reliable members.
+        one: First landmark, as an array with one record of `LANDMARK`.
+        other: Second landmark, likewise.
+        view: The map with the Gaussians of both landmarks.
+        least: Minimum fraction of the reliable resident members, 0..1.
     """
     shares = (
         inside(other[0], resident_positions(one, view)),
@@ -136,9 +159,10 @@ def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: floa
 
 
 def merge_into(one: np.ndarray, gone: np.ndarray) -> None:
-    """Add the members, counts and views of the landmark `gone` to `one`, both tables [1], in place.
+    """Merge the landmark `gone` into the landmark `one`: its members, counts and best views.
 
-    The caller must derive pose, size and label of `one` again.
+    Both are arrays with one record of `LANDMARK`; `one` changes in place. The caller must derive
+    pose, size and label of `one` again.
     """
     one["members"], one["votes"] = merged_members(
         one["members"], one["votes"], gone["members"], gone["votes"]
@@ -153,7 +177,10 @@ def merge_into(one: np.ndarray, gone: np.ndarray) -> None:
 
 
 def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
-    """Return the fraction of points [M, 3] within the box of a landmark; 0 without points."""
+    """Return the fraction, 0..1, of points [M, 3] within the box of a landmark; 0 without points.
+
+    The points are in the map frame, in meters.
+    """
     T = landmark["T_map_object"]
     local = (p_map - T[:3, 3]) @ T[:3, :3]
     return (
@@ -162,9 +189,9 @@ def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
 
 
 def resident_positions(landmark: np.ndarray, view: MapView) -> np.ndarray:
-    """Return the positions [M, 3] of the reliable resident members of a landmark.
+    """Return the positions of the reliable resident members of a landmark, [M, 3], map frame, m.
 
-    `landmark` is an array with one row of the landmark table.
+    `landmark` is an array with one record of `LANDMARK`.
     """
     where = rows_of(landmark["members"][reliable_members(landmark)], view.ids)
     return view.rows[where[where >= 0], :3].astype(float)

@@ -65,8 +65,8 @@ class FusedLabels:
     """Fused labels of V Gaussians or regions.
 
     Attributes:
-        labels: Labels, [V] int16.
-        confidences: SemConf, [V] float32, 0..1.
+        labels: Fused labels, [V] int16.
+        confidences: Fused confidences, SemConf in the paper, [V] float32, 0..1.
         alpha: Weight of the detector, [V] float32, 0..1.
         by_detector: Contribution of the detector, alpha Conf_YOLO, [V] float32.
     """
@@ -130,7 +130,7 @@ def _alpha(r_detector: np.ndarray, r_open: np.ndarray, config: FusionConfig) -> 
 
 
 def reliable_label_mask(labels: np.ndarray, top: np.ndarray, least: float) -> np.ndarray:
-    """Return where the map has a reliable label other than background, [H, W] bool.
+    """Return the pixels where the map has a reliable label other than background, [H, W] bool.
 
     Args:
         labels: Label rows of the Gaussians, [N, 32].
@@ -151,11 +151,12 @@ def label_image(
     *,
     threads: int = 1,
 ) -> np.ndarray:
-    """Render the labels of the map: at each pixel the s with the largest sum_i w_i p_i(s).
+    """Render the labels of the map: at each pixel the label s with the largest sum_i w_i p_i(s).
 
-    w_i is the weight of Gaussian i in the pixel and p_i its label distribution. Of equal labels,
-    the lower index is used. Pixels without Gaussians are background. One rendering computes three
-    labels only, so the function is slow and meant for evaluation and pictures.
+    w_i is the weight of Gaussian i in the pixel and p_i its label distribution. Of labels with
+    equal sums, the one with the lower index is used. Pixels without Gaussians are background. The
+    function is slow and meant for evaluation and pictures: it renders the map once for every three
+    labels.
 
     Args:
         rows: Gaussians of the map, [N, 16].
@@ -208,7 +209,13 @@ class SemanticFusionConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FusionResult:
-    """Result of fusing a keyframe: assignment, observations and label disagreement."""
+    """Result of fusing the regions of a keyframe into the labels of the map.
+
+    Attributes:
+        assigned: Region of each Gaussian.
+        seen: Observations of the Gaussians.
+        disagreement: Label disagreement before the smoothing step.
+    """
 
     assigned: Assignment
     seen: Observations
@@ -240,13 +247,11 @@ def fuse_detections(
         depth_m: Measured depth, [H, W], meters.
         detections: Labels of the regions by detector and labeller.
         config: Settings of the fusion.
-        is_late: True if the keyframe was fused before, and `detections` has only the regions with
-            late
-            labels. Gaussians outside of these regions then get no miss. Where the detector's label
-            wins, it is not counted a second time.
+        is_late: True if the keyframe was fused before, and `detections` has only the regions whose
+            labels by the labeller arrived later. Gaussians outside of these regions then get no
+            miss. Gaussians whose fused label is the detector's are not observed a second time.
         undetectable: Labels that the detector does not know, [256] bool. Gaussians with such a
-            label get
-            no miss.
+            label get no miss. None: the detector knows all labels.
         threads: Number of threads.
 
     Returns:
@@ -261,7 +266,8 @@ def fuse_detections(
     # Observed labels.
     seen = observations(where, indices, camera, detections, config, is_late=is_late)
     if undetectable is not None:
-        # A label that the detector does not know is neither missed now nor was before.
+        # The detector cannot miss a label that it does not know: ignore new misses of such labels,
+        # and remove the background weight of earlier misses.
         is_undetectable = undetectable[top_labels(labels[indices])] & (seen.labels == MISS)
         seen.labels[is_undetectable] = NOT_SEEN
         is_named = undetectable[np.maximum(seen.labels, 0)] & (seen.labels >= 0)
@@ -287,7 +293,10 @@ def assign_detections(
     *,
     threads: int = 1,
 ) -> Assignment:
-    """Assign the Gaussians that contribute to a keyframe to its regions; see `fuse_detections`."""
+    """Assign the Gaussians that contribute to a keyframe to its regions.
+
+    The arguments are those of `fuse_detections`.
+    """
     regions = regions_of(detections, depth_m, camera, config)
     T_camera_map = se3.inverse(T_map_camera)
     return assign_gaussians(
@@ -298,9 +307,15 @@ def assign_detections(
 def regions_of(
     detections: RegionDetections, depth_m: np.ndarray, camera: Camera, config: SemanticFusionConfig
 ) -> Regions:
-    """Return the regions of the boxes, without the pixels of smaller regions that lie in them.
+    """Return the region of each box: its foreground or, with the setting `region: box`, all of it.
 
-    By the setting `region`, a region is the foreground of its box or the whole box.
+    A foreground does not have the pixels of smaller regions that are nested in it.
+
+    Args:
+        detections: Boxes and scores, with foregrounds where they are already known.
+        depth_m: Measured depth, [H, W], meters.
+        camera: Intrinsics of depth_m.
+        config: Settings of the fusion.
     """
     if config.region == "box" or len(detections.boxes) == 0:
         return Regions.of_boxes(np.reshape(detections.boxes, (-1, 4)), detections.scores())
@@ -329,9 +344,17 @@ def observations(
 
     The extent of an object is the side of a square with the area of its box, converted to meters at
     the depth of the Gaussian.
+
+    Args:
+        where: Region of each Gaussian.
+        indices: Rows of the Gaussians, [V] uint32, ascending.
+        camera: Intrinsics of the keyframe.
+        detections: Labels of the regions by detector and labeller.
+        config: Settings of the fusion.
+        is_late: See `fuse_detections`.
     """
-    # Tables indexed by outcome: hidden, in no region, in region 0, 1, ...
-    # intp avoids a conversion in `take`.
+    # The tables below are indexed by `outcome`: hidden, in no region, in region 0, 1, ...
+    # The dtype intp avoids a conversion in `take`.
     outcome = np.subtract(where.regions, HIDDEN, dtype=np.intp)
     region_labels = np.where(
         (detections.confidences > 0) & (not is_late), detections.labels, NOT_SEEN
@@ -341,7 +364,7 @@ def observations(
     confidences = np.array([0, 0, *detections.confidences], np.float32).take(outcome)
     corners, min_px = np.reshape(detections.boxes, (-1, 2, 2)), config.labels.min_px
     sides_px = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1))
-    # Regions that have a label of the labeller too are fused per Gaussian.
+    # Fuse the two labels per Gaussian in regions that also have a label by the labeller.
     is_fused = np.array([False, False, *(detections.open_confidences > 0)])
     if is_fused.any():
         both = np.flatnonzero(is_fused.take(outcome))

@@ -30,20 +30,20 @@ from .semantic_map_config import SemanticMapConfig
 
 @dataclass(frozen=True, slots=True)
 class KeyframeSemantics:
-    """Result of fusing a keyframe: changes of the objects, and regions to send to the labeller."""
+    """Result of fusing the detections of a keyframe."""
 
     keyframe: int
-    observed: ObjectUpdate
-    requested: tuple[Region, ...] = ()
+    observed: ObjectUpdate  # Changes of the objects.
+    requested: tuple[Region, ...] = ()  # Regions to send to the labeller.
 
 
 class SemanticMap:
-    """Labels of the Gaussians of a MapBuilder, and the objects among them.
+    """Labels of the Gaussians of a MapBuilder, and the objects that these Gaussians form.
 
     The MapBuilder stores the images and the current pose of each keyframe. The detections of a
-    keyframe are fused once. Label results of its regions are fused when they arrive. The same
-    inputs give the same results if the MapBuilder is deterministic. Without any detections and
-    labels, the map is bitwise equal to one without this class.
+    keyframe are fused once. Label results of the keyframe's regions are fused when they arrive. The
+    same inputs give the same results if the MapBuilder is deterministic. Without detections and
+    labels, this class does not change the map.
     """
 
     def __init__(
@@ -70,12 +70,14 @@ class SemanticMap:
             OpenVocabularyLabeling(self.config.naming, is_fused=is_fused) if has_labeller else None
         )
         self._map, self._threads = map_, threads
-        self._by_detector, self._by_labeller = set[int](), set[int]()  # Labels by source.
-        self._done: dict[int, None] = {}  # The newest keyframes, in order.
-        # Detections by keyframe, the oldest first.
+        # Labels that the detector ever gave, and labels that the labeller ever gave.
+        self._by_detector, self._by_labeller = set[int](), set[int]()
+        # Newest keyframes whose detections were fused, in the order of fusion.
+        self._done: dict[int, None] = {}
+        # Detections of keyframes that are not mapped yet, the oldest first.
         self._waiting: dict[int, RegionDetections | None] = {}
         self._disagreement = Disagreement(0.0, 0.0)
-        self._labelled = 0  # Keyframes.
+        self._labelled = 0  # Number of keyframes whose detections were received and fused.
         self._boxes = self._repeated = self._too_early = self._without_images = 0
         self._results_without_images = self._movable = 0
 
@@ -95,7 +97,7 @@ class SemanticMap:
     ) -> KeyframeSemantics | None:
         """Fuse the detections of a keyframe, or store them until the keyframe is mapped.
 
-        Repeated messages are dropped and counted.
+        Repeated detections of a keyframe are dropped and counted.
 
         Args:
             keyframe: Id of the keyframe.
@@ -118,7 +120,11 @@ class SemanticMap:
         return None
 
     def on_keyframe_mapped(self, keyframe: int) -> KeyframeSemantics | None:
-        """Fuse the stored detections of a keyframe that was just mapped; None if it has none."""
+        """Fuse the stored detections of a keyframe that was just mapped.
+
+        Returns:
+            The result of the fusion; None if nothing was fused.
+        """
         if keyframe not in self._waiting:
             return None
         return self._fuse_keyframe(keyframe, self._waiting.pop(keyframe))
@@ -128,8 +134,9 @@ class SemanticMap:
     ) -> KeyframeSemantics | None:
         """Fuse the detections of a mapped keyframe.
 
-        If its images are no longer stored, the Gaussians in the boxes cannot be found. The
-        detections are then counted and dropped.
+        Without the images of the keyframe, the Gaussians in the boxes cannot be found. If the
+        images are no longer stored, the keyframe is counted, its detections are dropped and None is
+        returned.
         """
         self._done[keyframe] = None
         self._labelled += 1
@@ -159,8 +166,8 @@ class SemanticMap:
     def _seen(self, keyframe: int) -> tuple[TrainingView, Contributions]:
         """Return a keyframe with completed depth, and the Gaussians that contribute to its image.
 
-        Missing depth, such as on dark surfaces, is filled with depth rendered from the map. Pixels
-        of the ignore mask have no depth.
+        Where depth is missing, such as on dark surfaces, the depth rendered from the map is used.
+        Pixels of the ignore mask have no depth.
         """
         made_by, view = self._map.visible_contributions(keyframe), self._map.views[keyframe]
         in_map_m = self._map.render_keyframe(keyframe).median_depth_m
@@ -170,7 +177,7 @@ class SemanticMap:
         return replace(view, depth_m=depth_m), made_by
 
     def _remove_dynamic(self, keyframe: int, found: RegionDetections) -> RegionDetections:
-        """Remove detections of dynamic classes, and their surface from the map."""
+        """Remove the surface of dynamic classes from the map, and return the other detections."""
         names, sure = self.config.movable.classes, self.config.movable_confidence
         kinds = [self.vocabulary.name(int(label)) for label in found.labels]
         is_movable = np.isin(kinds, names) & (found.confidences >= sure)
@@ -184,7 +191,17 @@ class SemanticMap:
     def _with_names(
         self, view: TrainingView, top: np.ndarray, detections: RegionDetections
     ) -> tuple[RegionDetections, tuple[Region, ...]]:
-        """Add known labels to the detections of a keyframe, and choose regions to label."""
+        """Add known labels by the labeller to the detections of a keyframe.
+
+        Args:
+            view: The keyframe.
+            top: Row of the Gaussian that contributes most to each pixel, [H, W]; negative without
+                one.
+            detections: Detections of the keyframe.
+
+        Returns:
+            The detections with the known labels, and the regions to send to the labeller.
+        """
         self._by_detector.update(detections.labels.astype(int).tolist())
         if self.naming is None:
             return detections, ()
@@ -202,7 +219,10 @@ class SemanticMap:
         return label in self._by_labeller and label not in self._by_detector
 
     def _undetectable_labels(self) -> np.ndarray | None:
-        """Return labels that only the labeller gave, [256] bool; a detector cannot miss them."""
+        """Return which labels only the labeller ever gave, [256] bool; None if there are none.
+
+        The detector cannot miss such labels.
+        """
         if not self._by_labeller:
             return None
         return np.array([self._is_labellers(label) for label in range(MAX_LABELS)])
@@ -215,7 +235,10 @@ class SemanticMap:
         *,
         is_late: bool = False,
     ) -> FusionResult:
-        """Fuse the labels of regions into the Gaussians, and mark those that changed."""
+        """Fuse the labels of regions into the Gaussians `indices` [V].
+
+        Gaussians whose labels changed are marked in the map. `is_late`: see `fuse_detections`.
+        """
         is_labelled = detections.open_confidences > 0
         self._by_labeller.update(detections.open_labels[is_labelled].astype(int).tolist())
         gaussians = self._map.gaussians
@@ -257,6 +280,11 @@ class SemanticMap:
         If the images of the keyframe are no longer stored, the Gaussians of the region cannot be
         found, and nothing is fused.
 
+        Args:
+            region: Id of the region.
+            keyframe: Id of the keyframe.
+            answer: The label result.
+
         Returns:
             True if the label was fused.
         """
@@ -273,7 +301,8 @@ class SemanticMap:
         self.refresh(view)
         at = self._map_view(view, made_by.indices, labelled.assigned.regions, detections)
         is_undetectable = self._is_labellers(int(detections.open_labels[0]))
-        # A region that the detector found is observed with the detections of each keyframe.
+        # A region with a box and a label of the detector needs no late observation: the detections
+        # of each keyframe observe its object.
         if self.config.uses_labeller and (is_undetectable or detections.confidences[0] == 0):
             views = [at, *self._other_views(region, keyframe, is_labelled=is_undetectable)]
             for seen in sorted(views, key=lambda seen: seen.keyframe):
@@ -283,13 +312,17 @@ class SemanticMap:
     def _other_views(
         self, region: int, labelled_keyframe: int, *, is_labelled: bool
     ) -> list[MapView]:
-        """Return the region in the other keyframes of its label request.
+        """Return map views of a region in the other keyframes that show the region.
 
         Args:
             region: Id of the region, which has a label.
             labelled_keyframe: Keyframe in which the label was fused already.
-            is_labelled: Fuse the label in the keyframes too. This is meant for labels that the
-                detector never gives; others were fused with the detections of those keyframes.
+            is_labelled: True: fuse the label in the returned keyframes too. This is meant for
+                labels that the detector never gives. Labels of the detector were already fused with
+                the detections of those keyframes.
+
+        Returns:
+            One map view for each keyframe whose images are stored and in which the region is found.
         """
         assert self.naming is not None
         views = []
@@ -311,13 +344,17 @@ class SemanticMap:
     def _assign(
         self, view: TrainingView, indices: np.ndarray, detections: RegionDetections
     ) -> np.ndarray:
-        """Return the region of each Gaussian, without a change of its label."""
+        """Return the region of each of the Gaussians `indices` [V], [V] int32; labels stay."""
         at = view.camera, view.T_map_camera, view.depth_m, detections, self.config.labelling
         rows = self._map.gaussians.rows
         return assign_detections(rows, indices, *at, threads=self._threads).regions
 
     def refresh(self, view: TrainingView | None = None) -> None:
-        """Derive the objects from their Gaussians again: all, or those in view of a keyframe."""
+        """Derive pose, size and label of objects from their Gaussians again.
+
+        Args:
+            view: Keyframe; only the objects in its view are derived. None: all objects.
+        """
         gaussians = self._map.gaussians
         known = gaussians.rows, gaussians.labels, gaussians.ids, gaussians.anchors
         seen_from = view and (view.camera, view.T_map_camera)
@@ -366,8 +403,9 @@ class SemanticMap:
             "keyframes_labelled": self._labelled,
             "boxes": self._boxes,
             "boxes_repeated": self._repeated,  # Messages repeated after a restart.
-            "detections_too_early": self._too_early,  # Dropped before their keyframe was mapped.
-            # Messages for keyframes without stored images.
+            # Keyframes whose stored detections were dropped before the keyframe was mapped.
+            "detections_too_early": self._too_early,
+            # Keyframes with detections, but without stored images.
             "boxes_without_images": self._without_images,
             # Gaussians of dynamic classes, removed again.
             "gaussians_dynamic_removed": self._movable,
@@ -377,12 +415,12 @@ class SemanticMap:
             "label_names_rejected": self.vocabulary.refused,
             **self.objects.metrics(),
             **(self.naming.metrics() if self.naming else {}),
-            # Keyframes without stored images.
+            # Label results for keyframes without stored images.
             "answers_without_images": self._results_without_images,
         }
 
 
 def _packed(detections: RegionDetections | None) -> list[np.ndarray]:
-    """Return the arrays of a keyframe's detections; none if no detector ran."""
+    """Return the arrays of a keyframe's detections; an empty list if no detector ran."""
     names = [f.name for f in fields(RegionDetections) if f.name not in ("parts", "replaces_labels")]
     return [getattr(detections, name) for name in names] if detections else []

@@ -19,16 +19,16 @@ class SemanticMapConfig:
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     naming: OpenVocabularyConfig = field(default_factory=OpenVocabularyConfig)
     movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
-    # Minimum score of a detection that removes dynamic surface. Scores below are not relied on
-    # elsewhere either, and a hole where a picture passed for a person would be worse than the
-    # person.
+    # Minimum score of a detection that removes dynamic surface from the map. Lower scores are not
+    # relied on elsewhere either. A false detection, such as a picture of a person, would cut a hole
+    # into the map, which is worse than a person left in it.
     movable_confidence: float = 0.6
-    max_names: int = MAX_LABELS  # Maximum names in the vocabulary; a later name is `other`.
-    # Maximum keyframes with detections that are not mapped yet: as many as may be on their way to
-    # the mapper.
+    max_names: int = MAX_LABELS  # Maximum names in the vocabulary; further names become `other`.
+    # Maximum keyframes whose detections are stored until the mapper has mapped the keyframe: as
+    # many keyframes as may be in transit to the mapper.
     max_waiting: int = 8
-    # Newest keyframes with detections that are remembered, to drop repeated messages. After a
-    # restart, a window of 8 is sent again.
+    # Number of the newest keyframes whose ids are remembered, to drop repeated detections. After a
+    # restart, the messages of 8 keyframes are sent again.
     max_remembered: int = 64
 
     def __post_init__(self) -> None:

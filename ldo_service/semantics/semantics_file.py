@@ -1,11 +1,13 @@
-"""File semantics.npz: the label distribution of each Gaussian of a map.ply, row by row.
+"""File semantics.npz: the label distribution of each Gaussian of the map.ply of the same run.
+
+The arrays have the Gaussians in the order of map.ply.
 
 names     [C] text           names of the labels, by index: background, other, ...
 weights   [N, 5] float32     five highest probabilities, heaviest first; the rest is background
 ids       [N, 5] uint8       labels that the weights belong to; unused where the weight is 0
 evidence  [N] float32        sum of the weights of all observations, decayed with age
-extent_mm [N] uint16         size of the object that the Gaussian was last observed as a part of
-misses    [N] uint8          keyframes since then that expected it to be part of one
+extent_mm [N] uint16         size of the object at the last observation of a label
+misses    [N] uint8          misses since that observation: visible, but in no region
 """
 
 from dataclasses import dataclass
@@ -21,19 +23,24 @@ from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
 from .gaussian_labels import MAX_LABELS, ROW, fields
 
 COLUMNS = ROW.names or ()
-MAX_BYTES = 1 << 32  # Enough for 128 million Gaussians.
+MAX_BYTES = 1 << 32  # Maximum size of the arrays, enough for 128 million Gaussians.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SavedSemantics:
-    """Label rows [N, 32], see `gaussian_labels.ROW`, and names by index."""
+    """Contents of a semantics.npz.
+
+    Attributes:
+        labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
+        names: Names of the labels, by index.
+    """
 
     labels: np.ndarray
     names: tuple[str, ...]
 
 
 def write_semantics(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> None:
-    """Write labels [N, 32] in the order of the Gaussians in the map.ply of the same run."""
+    """Write label rows [N, 32], in the order of the Gaussians in map.ply, and the label names."""
     rows = fields(labels)
     columns: dict[str, Any] = {name: rows[name] for name in COLUMNS}
     with path.open("wb") as file:
@@ -41,14 +48,16 @@ def write_semantics(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> N
 
 
 def read_semantics(path: Path, gaussians: int | None = None) -> SavedSemantics:
-    """Read a file of `write_semantics`, bit for bit.
+    """Read a file that `write_semantics` wrote; all values are restored exactly.
 
     Args:
         path: The file.
-        gaussians: Number of Gaussians in the map.ply of the same run; None: not compared.
+        gaussians: Number of Gaussians in the map.ply of the same run, which the file must have too.
+            None: the number is not checked.
 
     Raises:
-        DataError: If the file cannot be read, has another format, or belongs to another map.
+        DataError: If the file cannot be read, has another format, or has another number of
+            Gaussians.
     """
     try:
         saved = read_arrays(path, MAX_BYTES)
@@ -82,6 +91,6 @@ def _require_names(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> No
     last = int(rows["ids"][rows["weights"] > 0].max(initial=0))
     if not last < len(names) <= MAX_LABELS:
         raise DataError(
-            f"{path} uses label {last} and has {len(names)} names; it must have {last + 1} to "
-            f"{MAX_LABELS}."
+            f"{path} has {len(names)} names and labels up to {last}; it must have {last + 1} to "
+            f"{MAX_LABELS} names."
         )

@@ -8,18 +8,18 @@ import numpy as np
 from ldo_service.detection.vocabulary import answers_to, normalized
 from ldo_service.errors import did_you_mean
 
-# Function from T texts to their unit vectors [T, D], the text encoder of an open-vocabulary
-# labeller; zeros where it has no vector. Raises TextComparisonError.
+# Text encoder of an open-vocabulary labeller. It maps T texts to unit vectors, [T, D]; a text
+# without a vector gets zeros. It raises TextComparisonError if it fails.
 Encode = Callable[[Sequence[str]], np.ndarray]
 
 # Score of a hyponym or hypernym of the text; the text itself and its synonyms score 1.
 SYNONYM_SCORE = 0.9
 MIN_COSINE = 0.85  # Minimum cosine of text vectors; CLIP gives 0.7 to unrelated names.
-MIN_SCORE = 0.1
+MIN_SCORE = 0.1  # Minimum score of a hit.
 
 
 class TextComparisonError(Exception):
-    """Failed comparison of texts by meaning; the message is a sentence with the reason."""
+    """Failure of a comparison of texts by meaning; its message is a sentence with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,17 +35,20 @@ def search(
 ) -> list[SearchHit]:
     """Return the objects that match `text`, best first; equal scores keep the order of `objects`.
 
-    The score of an object with the probabilities p by name is
+    The score of an object is the maximum of p(name) nearness(name) over its names, where p(name) is
+    the probability that the object has this name. Objects with a score below 0.1 are omitted.
 
-        max over its names of  p(name) nearness(name)
-
-    nearness is 1 for `text` and its synonyms, 0.9 for its hyponyms and hypernyms. For other names
-    it is the cosine of the text vectors, from 0.85 on, if `encode` is given.
+    nearness(name) is 1 for `text` and its synonyms, and 0.9 for its hyponyms and hypernyms. For any
+    other name, it is the cosine of the vectors of `text` and the name if `encode` is given and the
+    cosine is at least 0.85, else 0.
 
     Args:
         text: Name to search for.
-        objects: Probabilities of each object by name.
+        objects: For each object, its probabilities by name, 0..1.
         encode: Text encoder; None: names are compared by the vocabulary only.
+
+    Raises:
+        TextComparisonError: If the text encoder fails or has no vector for `text`.
 
     >>> things = [{"chair": 0.8, "couch": 0.2}, {"couch": 1.0}, {"armchair": 0.5}]
     >>> [(hit.index, hit.score) for hit in search("Sofa", things)]
@@ -62,9 +65,13 @@ def search(
 def text_similarity(
     text: str, names: Sequence[str], encode: Encode | None = None
 ) -> dict[str, float]:
-    """Return the nearness of each name to `text`, as `search` defines it.
+    """Return the nearness of names to `text` by name; `search` defines the nearness.
 
-    Names that are not near to it are omitted.
+    Names with a nearness of 0 are omitted. The result also has the synonyms of `text`, its hyponyms
+    and its hypernyms, even if they are not in `names`.
+
+    Raises:
+        TextComparisonError: If the text encoder fails or has no vector for `text`.
     """
     itself, *akin = answers_to(text)
     near = dict.fromkeys(akin, SYNONYM_SCORE) | {itself: 1.0}
