@@ -18,16 +18,18 @@ from .yolo import EXPECTED, Letterbox, detect_layout, layout_named
 class NetworkConfig:
     """Settings of a detector."""
 
-    layout: str = ""  # yolov5, yolox, yolov8; empty: determined by the shape of its output.
-    # File with one class name per line; empty: those it was registered with or contains, or the
-    # 80 of COCO.
+    # Layout of the output: yolov5, yolox or yolov8; empty: determined by the shape of the output.
+    layout: str = ""
+    # File with one class name per line; empty: the names that the network was registered with, or
+    # those in its metadata, or the 80 of COCO.
     names: str = ""
-    # Width and height of the input, if the network takes any.
+    # Width and height of the input, used if the network takes any size.
     input_px: tuple[int, int] = (640, 480)
     score_min: float = 0.25  # Minimum score of a box; the default of YOLOv5 and YOLOX.
     nms_iou: float = 0.45  # Maximum IoU of two objects of one class; the default of YOLOv5.
-    max_boxes: int = 100  # Maximum boxes of an image, by score; as in COCO's own evaluation.
-    # Maximum boxes before non-maximum suppression, which bounds its time.
+    # Maximum boxes of an image, those with the highest scores; 100 as in COCO's own evaluation.
+    max_boxes: int = 100
+    # Maximum boxes before non-maximum suppression, to bound the time of the suppression.
     max_candidates: int = 1000
     # Execution providers of onnxruntime, by preference: cuda, tensorrt, ...
     providers: tuple[str, ...] = ("cpu",)
@@ -47,11 +49,12 @@ class NetworkConfig:
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """Detections in an image, highest score first in the results of `OnnxDetector`."""
+    """Detections in an image; `OnnxDetector` returns them with the highest score first."""
 
-    boxes_px: np.ndarray  # [M, 4] float64, x0, y0, x1, y1; the whole image is -0.5 .. W - 0.5.
-    scores: np.ndarray  # [M] 0..1.
-    class_ids: np.ndarray  # [M], index into the class names of the network.
+    # [M, 4] float64, x0, y0, x1, y1; the image of width W covers x from -0.5 to W - 0.5.
+    boxes_px: np.ndarray
+    scores: np.ndarray  # [M], 0..1.
+    class_ids: np.ndarray  # [M], indices into the class names of the network.
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -63,17 +66,21 @@ class Detections:
     def inside(self) -> "Detections":
         """Return the detections with a positive area.
 
-        Boxes were clipped to the image, so a box outside of it has no area left.
+        Boxes were clipped to the image, so a box outside of the image has no area.
         """
         sides_px = self.boxes_px[:, 2:] - self.boxes_px[:, :2]
         return self.chosen(np.flatnonzero(sides_px.min(axis=1) > 0))
 
     def best(self, most: int) -> "Detections":
-        """Return the detections with the highest scores, at most `most`."""
+        """Return the `most` detections with the highest scores, the highest first."""
         return self.chosen(np.argsort(-self.scores, kind="stable")[:most])
 
     def distinct(self, iou_max: float) -> "Detections":
-        """Return the detections that non-maximum suppression with `iou_max` keeps."""
+        """Return the detections that remain after non-maximum suppression per class.
+
+        Args:
+            iou_max: Maximum IoU of two boxes of one class that both remain.
+        """
         return self.chosen(
             non_maximum_suppression(self.boxes_px, self.scores, self.class_ids, iou_max)
         )
@@ -94,8 +101,8 @@ class OnnxDetector:
         Args:
             path: The ONNX file.
             config: Settings.
-            names: Class names, unless `config.names` gives others; empty: the names in the file's
-                metadata, or the 80 of COCO.
+            names: Class names, unless `config.names` gives a file of names; empty: the names in the
+                network's metadata, or the 80 of COCO.
             name: Name of the network in errors and in `identity`; empty: the name of the file.
 
         Raises:
@@ -114,18 +121,18 @@ class OnnxDetector:
             self.names = class_names(self._head.class_count, names, metadata)
         except ModelError as error:
             raise ModelError(f"{name or path} cannot be used as a detector: {error}") from error
-        self.labels = tuple(map(canonical, self.names))  # Names in a vocabulary.
-        # Identifies the network in records.
+        self.labels = tuple(map(canonical, self.names))  # Canonical names of the classes.
+        # Name and version of the network, for recordings and logs.
         self.identity = f"{name or path.stem} {sha256(path)[:12]}"
 
     @property
     def layout(self) -> str:
-        """Name of the layout."""
+        """Name of the layout of the network's output: yolov5, yolox or yolov8."""
         return self._head.layout.name
 
     @property
     def providers(self) -> list[str]:
-        """Execution providers that the network runs on, by onnxruntime's names."""
+        """Execution providers that the network runs on, by onnxruntime's names, preferred first."""
         return self._network.providers
 
     def detect(self, image: np.ndarray) -> Detections:
@@ -155,19 +162,28 @@ class OnnxDetector:
     def _output(self, planes: np.ndarray) -> np.ndarray:
         outputs = self._network.run(**{self._input: planes})
         if len(outputs) != 1:
-            raise ModelError(f"it has {len(outputs)} outputs. Expected: one, {EXPECTED}.")
+            raise ModelError(f"the network has {len(outputs)} outputs. Expected: one, {EXPECTED}.")
         return outputs[0]
 
 
 def _image_input(network: Network, free_px: tuple[int, int]) -> tuple[str, tuple[int, int]]:
-    """Return name, width and height of the input; `free_px` if the network takes any size."""
+    """Return the name of the network's only input, and its width and height.
+
+    Args:
+        network: The network.
+        free_px: Width and height that are used if the network takes any size.
+
+    Raises:
+        ModelError: If the network has other inputs than one image.
+    """
     inputs = network.inputs
     shapes = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
     name, kind, shape = inputs[0] if len(inputs) == 1 else ("", "", [])
     is_image = kind == "tensor(float)" and len(shape) == 4
     if not is_image or not (_allows(shape[0], 1) and _allows(shape[1], 3)):
         raise ModelError(
-            f"its inputs are {shapes}. Expected: one image, float32 [1, 3, height, width]."
+            f"the network's inputs are {shapes}. Expected: one image, float32 "
+            "[1, 3, height, width]."
         )
     width, height = free_px
     return name, (_side(shape[3], width), _side(shape[2], height))
@@ -187,6 +203,6 @@ def _noise(size_px: tuple[int, int]) -> np.ndarray:
 
 
 def _planes(image: np.ndarray, scale: float) -> np.ndarray:
-    """Return an image as float32 planes, [1, 3, H, W]."""
+    """Convert an image [H, W, 3] uint8 to float32 planes [1, 3, H, W], multiplied by `scale`."""
     planes = np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
     return planes if scale == 1 else planes * np.float32(scale)

@@ -11,19 +11,24 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 
-CORE = 0.5  # Middle part of a box by width and height; it mostly shows the object itself.
+# Width and height of a box's core, its middle part, as a fraction of the box. The core mostly shows
+# the object itself and not the background.
+CORE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class DynamicClassConfig:
     """Settings of the dynamic classes."""
 
-    # Classes of COCO that are alive or driven; objects that are carried move with a person.
+    # Classes of COCO that move by themselves: living beings and vehicles. Carried objects are
+    # omitted, because they move with a person.
     classes: tuple[str, ...] = (
         *("person", "bird", "cat", "dog", "horse", "sheep", "cow", "elephant", "bear", "zebra"),
         *("giraffe", "bicycle", "car", "motorcycle", "bus", "train", "truck", "boat", "airplane"),
     )
-    reach_m: float = 0.4  # Maximum depth from the median of the core: a stride, an arm.
+    # Maximum difference between the depth of a pixel and the median depth of the core. 0.4 m covers
+    # a stride or an outstretched arm.
+    reach_m: float = 0.4
 
     def __post_init__(self) -> None:
         if not self.reach_m > 0:
@@ -32,7 +37,7 @@ class DynamicClassConfig:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Detection of a class, with the pixels left <= u < right, top <= v < bottom."""
+    """Detection of a class: its box has the pixels left <= u < right, top <= v < bottom."""
 
     label: str
     left: float
@@ -51,10 +56,10 @@ def dynamic_class_mask(
 ) -> np.ndarray:
     """Return the pixels of objects that may move by themselves, [H, W] bool.
 
-    The core of a box is its middle part, half as wide and high. A pixel of the box is masked if its
-    depth is within `reach_m` of the core's median depth. It must also be connected to the core by
-    such pixels. Gaps of a few pixels without depth are masked too. A box without depth in its core
-    is masked as a whole.
+    The core of a box is its middle part, half as wide and high. A pixel of the box is masked if two
+    conditions hold: its depth is within `reach_m` of the core's median depth, and pixels with such
+    depths connect it to the core. Gaps of a few pixels are masked too. If the core has no known
+    depth, the whole box is masked.
 
     Args:
         boxes: Detections; labels that are not in `classes` are ignored.
@@ -72,7 +77,13 @@ def dynamic_class_mask(
 
 
 def _foreground(depth_m: np.ndarray, core: np.ndarray, config: DynamicClassConfig) -> np.ndarray:
-    """Return the pixels of the object in the window of a box, [h, w] bool."""
+    """Return the pixels of the object in the window of a box, [h, w] bool.
+
+    Args:
+        depth_m: Depth in the window, [h, w], meters; 0 where unknown.
+        core: Pixels of the core of the box, [h, w] bool.
+        config: Settings.
+    """
     measured = depth_m[core & (depth_m > 0)]
     if not measured.size:
         return np.ones(depth_m.shape, bool)

@@ -1,15 +1,19 @@
 """Registry of the user's networks (`ldo models`). Only `demo` comes with the package.
 
-    <folder>/<name>/model.onnx    a copy of the file: a detector, or a labeller's image encoder
+    <folder>/<name>/model.onnx    copy of the registered detector or image encoder
     <folder>/<name>/about.json    checksum, layout, classes, license
 
-A labeller is a pair of an image encoder and a text encoder, as in CLIP. Its folder also has the
-text encoder with its table of byte pairs. Computed text embeddings may replace these two files:
+A labeller is a pair of an image encoder and a text encoder, as in CLIP. The folder of a pair also
+has the text encoder and the table of byte pairs of its tokenizer:
 
-    text.onnx, bpe.txt.gz
-    embeddings.npz or embeddings.safetensors
+    <folder>/<name>/text.onnx
+    <folder>/<name>/bpe.txt.gz
 
-The folder is LDO_MODELS, or else ldo/models in XDG_DATA_HOME.
+Precomputed text embeddings may replace these two files:
+
+    <folder>/<name>/embeddings.npz or embeddings.safetensors
+
+The environment variable LDO_MODELS gives <folder>; by default, it is ldo/models in XDG_DATA_HOME.
 """
 
 import os
@@ -38,20 +42,20 @@ NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 FILE, ABOUT = "model.onnx", "about.json"
 TEXT, VOCABULARY = "text.onnx", "bpe.txt.gz"
 EMBEDDINGS = ("embeddings.npz", "embeddings.safetensors", "text_embeddings.npz")
-# Names of the image encoder in a folder that is not registered.
+# File names of the image encoder in a folder that is not registered, by preference.
 IMAGES = (FILE, "image_encoder.onnx")
-CLIP = "clip"  # Layout of a pair of encoders.
+CLIP = "clip"  # Value of `ModelInfo.layout` for a pair of encoders.
 
 
 class ModelInfo(msgspec.Struct, frozen=True, kw_only=True):
     """Description of a registered network, as stored in about.json."""
 
-    sha256: str
-    layout: str
-    classes: tuple[str, ...]
+    sha256: str  # Checksum of model.onnx, hexadecimal.
+    layout: str  # Layout of the detector, see `yolo`, or "clip" for a pair of encoders.
+    classes: tuple[str, ...]  # Names of the classes, or of the labels of a labeller.
     license: str = ""  # Text of the license; empty if not stated.
     source: str = ""  # Name of the file that was copied.
-    parts: dict[str, str] = {}  # Checksums of the other files of a pair, by name.
+    parts: dict[str, str] = {}  # Checksums of the other files of a pair, by file name.
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +68,7 @@ class Model:
 
     @property
     def file(self) -> Path:
-        """Path of the network, or of the image encoder of a pair."""
+        """Path of the detector, or of the image encoder of a pair."""
         return self.folder / FILE
 
     def verify(self) -> None:
@@ -87,7 +91,7 @@ class Model:
 
 
 class Models:
-    """Registered networks in a folder; by default, that of `default_folder`."""
+    """Registry of networks in a folder; by default, in `default_folder`."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder or default_folder()
@@ -99,7 +103,7 @@ class Models:
             name: Name of the model.
             file: ONNX file of the detector.
             config: Settings of the trial run that checks the file.
-            license: Text of its license.
+            license: Text of the detector's license; empty if unknown.
 
         Raises:
             ConfigError: If the name is invalid or taken, or the folder cannot be written.
@@ -121,9 +125,9 @@ class Models:
             name: Name of the model.
             pair: Files of the pair.
             config: Settings of the trial run that checks the files.
-            names: Labels that the labeller chooses from, stored with the pair; empty: the names of
-                its embeddings, or those of COCO.
-            license: Text of its license.
+            names: Labels that the labeller chooses from, stored with the pair; empty: the names in
+                its file of embeddings or, without such a file, the 80 of COCO.
+            license: Text of the license of the pair; empty if unknown.
 
         Raises:
             ConfigError: If the name is invalid or taken, or the folder cannot be written.
@@ -210,7 +214,11 @@ class Models:
 
 
 def default_folder() -> Path:
-    """Return the folder of the user's networks: LDO_MODELS, or the XDG base directory."""
+    """Return the folder of the user's networks.
+
+    The environment variable LDO_MODELS gives the folder; by default, it is ldo/models in the XDG
+    base directory for data.
+    """
     if folder := os.environ.get("LDO_MODELS"):
         return Path(folder).expanduser()
     data = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")
@@ -228,7 +236,7 @@ def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
 
     Raises:
         ConfigError: If there is no such model.
-        ModelError: If it cannot be used as a detector.
+        ModelError: If the model cannot be used as a detector.
     """
     if model == demo_networks.NAME:
         return _open_demo_detector(config)
@@ -259,11 +267,12 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
         model: `demo`, a registered name, or a folder with the files that the docstring of this
             module lists.
         config: Settings.
-        names: Labels that the labeller chooses from; empty: those it was registered with.
+        names: Labels that the labeller chooses from; empty: those that the pair was registered
+            with.
 
     Raises:
         ConfigError: If there is no such model.
-        ModelError: If it cannot be used as a labeller.
+        ModelError: If the model cannot be used as a labeller.
     """
     if model == demo_networks.NAME:
         return _open_demo_labeller(config, names)
@@ -289,7 +298,7 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
 
 
 def _pair_in(folder: Path) -> EncoderFiles:
-    """Return the files of a pair in a folder."""
+    """Return the files of a pair that a folder has, by their usual names."""
 
     def here(*parts: str) -> Path | None:
         return next((folder / part for part in parts if (folder / part).is_file()), None)
@@ -302,7 +311,7 @@ def _pair_in(folder: Path) -> EncoderFiles:
 def _fill_pair(
     folder: Path, pair: EncoderFiles, config: DualEncoderConfig, names: Sequence[str], license: str
 ) -> ModelInfo:
-    """Check a pair, copy it into a folder and write its description."""
+    """Check a pair, copy its files into a new folder and write its description there."""
     labeller = DualEncoder(pair, config, names)
     suffix = pair.embeddings.suffix if pair.embeddings else ""
     embeddings = next((part for part in EMBEDDINGS if part.endswith(suffix)), EMBEDDINGS[0])
@@ -326,7 +335,7 @@ def _fill_pair(
 
 
 def _fill(folder: Path, file: Path, config: NetworkConfig, license: str) -> ModelInfo:
-    """Copy a detector into a folder and write its description."""
+    """Copy a detector into a new folder, check it and write its description there."""
     folder.mkdir()
     shutil.copyfile(file, folder / FILE)
     detector = OnnxDetector(folder / FILE, config, name=str(file))
@@ -361,7 +370,7 @@ def _open_demo_labeller(config: DualEncoderConfig, names: Sequence[str] = ()) ->
     """Return the built-in labeller, which has a table of text embeddings and no text encoder.
 
     Args:
-        config: Settings. If `nothing` is empty, `demo_networks.NOTHING` is used.
+        config: Settings. If `config.nothing` is empty, `demo_networks.NOTHING` is used.
         names: Labels that the labeller chooses from; empty: all names of the table.
 
     Raises:

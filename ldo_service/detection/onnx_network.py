@@ -15,6 +15,7 @@ log = logging.getLogger(__name__)
 
 SUFFIX = "ExecutionProvider"
 CPU = "CPU" + SUFFIX
+# Prefix of onnxruntime's error messages.
 _SUGAR = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : (Load model from .*? failed: ?)?")
 
 
@@ -26,26 +27,27 @@ class Network:
 
         Args:
             path: The ONNX file.
-            providers: Execution providers by preference, as onnxruntime's names or short: cpu,
-                cuda, tensorrt, openvino. A provider that this machine lacks is ignored with a
-                warning. The CPU always comes last, even if it is not given.
+            providers: Execution providers by preference, by onnxruntime's names or short names:
+                cpu, cuda, tensorrt, openvino. A provider that this machine lacks is ignored with a
+                warning. The CPU is always added as the last one.
             threads: Threads of one inference; with 1, the CPU gives bitwise equal results in every
                 run.
 
         Raises:
-            ConfigError: If onnxruntime knows no provider of a given name.
-            ModelError: If the file does not exist or is no network.
+            ConfigError: If onnxruntime has no provider of a given name.
+            ModelError: If the file does not exist or is not an ONNX network.
         """
         wanted = available(providers)
         if not path.is_file():
-            raise ModelError("there is no such file.")
+            raise ModelError("there is no such file. Give the path of an ONNX file.")
         try:
             self._session = _session(path, wanted, threads)
         except Exception as error:  # Errors of onnxruntime have no common base class.
-            raise ModelError(f"it is no network in ONNX: {_first_line(error)}.") from error
+            raise ModelError(f"the file is no network in ONNX: {_first_line(error)}.") from error
         if self.providers[0] != wanted[0]:
             log.warning(
-                "%s: execution provider %s is unavailable for this network; running on %s.",
+                "%s: execution provider %s cannot run this network, which now runs on %s; no "
+                "action needed unless it is too slow.",
                 path,
                 wanted[0],
                 self.providers[0],
@@ -71,10 +73,13 @@ class Network:
         try:
             return dict(self._session.get_modelmeta().custom_metadata_map)
         except UnicodeDecodeError as error:
-            raise ModelError(f"its metadata is not text: {error}.") from error
+            raise ModelError(f"the network's metadata is not text: {error}.") from error
 
     def run(self, **inputs: np.ndarray) -> list[np.ndarray]:
-        """Return all outputs of an inference.
+        """Run an inference, and return all outputs in the order of the network.
+
+        Args:
+            **inputs: Value of each input, by the input's name.
 
         Raises:
             ModelError: If the inference fails or an output has NaN or infinity.
@@ -82,21 +87,35 @@ class Network:
         try:
             outputs = [np.asarray(output) for output in self._session.run(None, inputs)]
         except Exception as error:
-            raise ModelError(f"its inference fails: {_first_line(error)}.") from error
+            raise ModelError(
+                f"the inference of the network fails: {_first_line(error)}."
+            ) from error
         if not all(np.isfinite(output).all() for output in outputs):
-            raise ModelError("it yields NaN or infinity: its weights are damaged. Export it again.")
+            raise ModelError(
+                "the network yields NaN or infinity, so its weights are damaged: export it again."
+            )
         return outputs
 
 
 def sha256(path: Path) -> str:
-    """Return the checksum of a file in hexadecimal."""
+    """Return the SHA-256 checksum of a file in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def available(names: Sequence[str]) -> list[str]:
-    """Return onnxruntime's names of the providers that this machine has, the CPU last."""
-    import onnxruntime  # A local import, here and below: it would slow every start of `ldo`.
+    """Return those of the given execution providers that this machine has.
+
+    Args:
+        names: Names of providers, by preference, as onnxruntime's or short names.
+
+    Returns:
+        The names of onnxruntime, in the order of `names`, with the CPU last unless it was given.
+
+    Raises:
+        ConfigError: If onnxruntime has no provider of a given name.
+    """
+    import onnxruntime  # Imported in functions only, because the import slows the start of `ldo`.
 
     wanted = [_full_name(name) for name in names]
     here = onnxruntime.get_available_providers()
@@ -113,7 +132,7 @@ def available(names: Sequence[str]) -> list[str]:
 
 
 def _full_name(name: str) -> str:
-    """Return onnxruntime's name of a provider."""
+    """Return onnxruntime's name of a provider, such as CUDAExecutionProvider for cuda."""
     import onnxruntime
 
     known = {full.removesuffix(SUFFIX).casefold(): full for full in onnxruntime.get_all_providers()}

@@ -1,6 +1,6 @@
 """Class names of networks and of COCO, their synonyms, and their indices in a map.
 
-The table of synonyms and its rule are in `synonyms.yaml`.
+`synonyms.yaml` has the table of synonyms and explains its columns.
 """
 
 import ast
@@ -14,7 +14,7 @@ import yaml
 
 from ldo_service.errors import ConfigError, ModelError
 
-# Lin et al., ECCV 2014; the 80 classes in use, in the order of all detectors trained on them.
+# The 80 classes of COCO (Lin et al., ECCV 2014), in the order that detectors trained on COCO use.
 COCO = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
     "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog",
@@ -33,7 +33,7 @@ TABLE = "synonyms.yaml"
 
 BACKGROUND, OTHER = 0, 1
 FIRST_NAMES = ("background", "other", *COCO)
-CAP = 256  # C_max: the numbers of one byte.
+CAP = 256  # Maximum names in a vocabulary, C_max: an index is one byte.
 
 
 def normalized(name: str) -> str:
@@ -56,8 +56,12 @@ def class_names(
 
     Args:
         count: Number of classes.
-        given: Names from the user, which override those of the metadata.
+        given: Names from the user, which override those of the metadata; empty: none.
         metadata: The metadata entry `names` of the network: a dictionary or list as Python source.
+            None: the network has no such entry.
+
+    Returns:
+        The given names, else those of the metadata, else those of COCO if `count` is 80.
 
     Raises:
         ModelError: If the number of names is not `count`, or there are no names.
@@ -68,11 +72,13 @@ def class_names(
         return _fitting(_of_metadata(metadata), count, "its metadata names")
     if count == len(COCO):
         return COCO
-    raise ModelError(f"it has {count} classes without names: give a file with one name per line.")
+    raise ModelError(
+        f"the network has {count} classes without names: give a file with one name per line."
+    )
 
 
 def read_names(path: Path) -> tuple[str, ...]:
-    """Read one name per line; empty lines at the end are ignored.
+    """Read a text file with one name per line; empty lines at the end are ignored.
 
     Raises:
         ConfigError: If the file cannot be read or a line is not a valid name.
@@ -94,8 +100,8 @@ def read_names(path: Path) -> tuple[str, ...]:
 def _fitting(names: tuple[str, ...], count: int, who: str) -> tuple[str, ...]:
     if len(names) != count:
         raise ModelError(
-            f"it has {count} classes and {who} {len(names)}: give the names that it was trained "
-            "with, one per line."
+            f"the network has {count} classes and {who} {len(names)}: give the names that it was "
+            "trained with, one per line."
         )
     return names
 
@@ -109,12 +115,13 @@ def _of_metadata(text: str) -> tuple[str, ...]:
         entry = [entry[number] for number in range(len(entry))]
     if not isinstance(entry, list | tuple):
         raise ModelError(
-            f"its metadata names no classes: {text[:60]!r}. Expected: a list, or a dictionary with "
-            "the keys 0, 1, ...; or give a file with one name per line."
+            f"the network's metadata names no classes: {text[:60]!r}. Expected: a list, or a "
+            "dictionary with the keys 0, 1, ...; or give a file with one name per line."
         )
     if not all(map(is_name, entry)):
         raise ModelError(
-            f"its metadata has names that are not of 1 to {LONGEST} characters: {text[:60]!r}."
+            f"the network's metadata has names that are not of 1 to {LONGEST} characters: "
+            f"{text[:60]!r}. Give a file with one name per line."
         )
     return tuple(entry)
 
@@ -138,8 +145,11 @@ def coco_class(name: str) -> str | None:
 def answers_to(query: str) -> tuple[str, ...]:
     """Return the class names that match a text query, the nearest first.
 
-    The first is the query's canonical name. The COCO class that includes it follows, because
-    detectors may only know that class. The last are the names of its own subclasses.
+    The first is the query's canonical name. Next is the COCO class that includes the query, if any:
+    a detector may only know that class. The last are the subclasses of the query.
+
+    The answer to "chair" is "chair" and its subclasses such as "armchair"; the answer to "armchair"
+    is "armchair" and "chair".
     """
     plain = canonical(query)
     kinds = _table("kinds")
@@ -149,20 +159,18 @@ def answers_to(query: str) -> tuple[str, ...]:
 
 @cache
 def _table(column: str) -> Mapping[str, str]:
-    """Return the mapping from words to classes of a column of synonyms.yaml.
-
-    The column is `same` or `kinds`.
-    """
+    """Return the class of each word in one column of synonyms.yaml, `same` or `kinds`."""
     text = resources.files("ldo_service.detection").joinpath(TABLE).read_text("utf-8")
     rows: dict[str, dict[str, list[str]]] = yaml.safe_load(text)
     return {word: name for name, row in rows.items() for word in row.get(column, ())}
 
 
 class Vocabulary:
-    """Vocabulary of a map: `background`, `other`, the 80 names of COCO, then new names in order.
+    """Vocabulary of a map: the names of its labels, each with an index.
 
-    Synonyms have the same index, see `synonyms.yaml`. Once the vocabulary has `cap` names, each new
-    name gets the index of `other`.
+    The first names are `background`, `other` and the 80 of COCO; new names follow in the order of
+    their addition. Synonyms share one index, see `synonyms.yaml`. Once the vocabulary has `cap`
+    names, each new name gets the index of `other`.
     """
 
     def __init__(self, cap: int = CAP) -> None:
@@ -172,7 +180,7 @@ class Vocabulary:
             cap: Maximum number of names.
 
         Raises:
-            ConfigError: If the cap is below the number of names at the start.
+            ConfigError: If the cap is below the number of initial names.
         """
         if cap < len(FIRST_NAMES):
             raise ConfigError(
@@ -182,7 +190,7 @@ class Vocabulary:
         self.cap = cap
         self._names: list[str] = [*FIRST_NAMES]
         self._indices = {name: index for index, name in enumerate(FIRST_NAMES)}
-        self.refused = 0  # New names that became `other`.
+        self.refused = 0  # Number of new names that became `other`.
 
     def __len__(self) -> int:
         return len(self._names)
@@ -200,7 +208,7 @@ class Vocabulary:
         return self._names[index]
 
     def find(self, name: str) -> int | None:
-        """Return the index of a name, or None if it is not known."""
+        """Return the index of a name or its synonym; None if the vocabulary has neither."""
         return self._indices.get(canonical(name))
 
     def index(self, name: str) -> int:
@@ -219,7 +227,7 @@ class Vocabulary:
         return self._indices[plain]
 
     def pack(self) -> dict[str, Any]:
-        """Return plain values for a file or a checkpoint."""
+        """Return the vocabulary as plain values, for a file or a checkpoint."""
         return {"cap": self.cap, "names": list(self._names), "refused": self.refused}
 
     @staticmethod
@@ -235,8 +243,8 @@ class Vocabulary:
         start = len(FIRST_NAMES)
         if tuple(names[:start]) != FIRST_NAMES or not start <= len(names) <= vocabulary.cap:
             raise ValueError(
-                f"{len(names)} names must start with the {start} initial ones of every vocabulary "
-                f"and be at most {vocabulary.cap}"
+                f"the {len(names)} names of the vocabulary must start with the {start} initial "
+                f"names of every vocabulary and be at most {vocabulary.cap}"
             )
         vocabulary._names = list(names)
         vocabulary._indices = {name: index for index, name in enumerate(names)}

@@ -4,16 +4,19 @@ The networks predict boxes in the cells of grids over the input, one grid for ea
 number of boxes therefore determines the layout of the output. As a check, the predicted boxes must
 lie near their cells.
 
-            in                             out
+            input                          output
     yolov5  RGB 0..1, centered             [1, 3 cells, 5 + C] cx, cy, w, h, objectness, classes
-    yolox   BGR 0..255, upper left corner  [1, cells, 5 + C] the same, as offsets and log sizes
+    yolox   BGR 0..255, upper left corner  [1, cells, 5 + C] as yolov5, with offsets and log sizes
     yolov8  RGB 0..1, centered             [1, 4 + C, cells] cx, cy, w, h, classes
 
-YOLOX may also come with decoded boxes (`--decode_in_inference`). YOLOv7 has the layout of YOLOv5;
-YOLOv9 and YOLO11 have that of YOLOv8.
+Here, `cells` is the number of cells of all grids, and C the number of classes. In yolox, the center
+of a box is an offset from its cell, and its size is a logarithm; networks exported with
+`--decode_in_inference` have pixels like the others. YOLOv7 has the layout of YOLOv5. YOLOv9 and
+YOLO11 have that of YOLOv8.
 
-Images are scaled into the input of a network (letterbox), and boxes are scaled back. Of overlapping
-boxes of one class, non-maximum suppression keeps the one with the highest score.
+An image is scaled to fit into the input of a network (letterbox), and the boxes are scaled back to
+the image. Of overlapping boxes of one class, non-maximum suppression keeps the one with the highest
+score.
 """
 
 from dataclasses import dataclass
@@ -24,31 +27,32 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, ModelError
 
-# Strides of known exports; a network uses some that follow each other.
+# Strides of known networks; each network has some consecutive ones of them.
 STRIDES_PX = (4, 8, 16, 32, 64)
-# Maximum median distance of a box center from its cell, in cells; distances to sides reach 16.
+# Maximum median distance of box centers from their cells, in cells. The networks place the sides of
+# a box at most 16 cells from its cell.
 CELLS_APART = 8
-SCORE_TOLERANCE = 1e-3  # Tolerance of scores beyond 0..1 for rounding.
+SCORE_TOLERANCE = 1e-3  # Maximum excess of a score over 0..1, which rounding may cause.
 EXPECTED = (
     "[1, N, 5 + C] with three boxes a cell (yolov5) or one (yolox), or [1, 4 + C, N] (yolov8), "
     "over grids of strides 8, 16 and 32 pixels or the like, exported without suppression of "
     "overlapping boxes"
 )
 
-PADDING = 114  # Gray value that the YOLO family is trained with.
+PADDING = 114  # Gray value of the padding around images that YOLO networks are trained with.
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Input and output of one kind of network."""
+    """Format of the input and the output of one kind of network."""
 
     name: str
     boxes_per_cell: int
-    has_objectness: bool
-    is_channels_first: bool  # The output is [1, channels, N].
-    is_centered: bool  # The image is centered in the input.
-    is_rgb: bool  # The colors are RGB; false: BGR.
-    value_scale: float  # Factor of pixels in 0..255.
+    has_objectness: bool  # True: a score for any object precedes the scores of the classes.
+    is_channels_first: bool  # True: the output is [1, channels, N]; false: [1, N, channels].
+    is_centered: bool  # True: the image is centered in the input; false: upper left corner.
+    is_rgb: bool  # True: the colors of the input are RGB; false: BGR.
+    value_scale: float  # Factor that converts pixel values 0..255 to values of the input.
 
 
 LAYOUTS = {
@@ -85,28 +89,28 @@ class Grid:
 class Candidates:
     """Boxes before non-maximum suppression."""
 
-    boxes: np.ndarray  # [M, 4] x0, y0, x1, y1, pixels of the input from its corner.
-    scores: np.ndarray  # [M] 0..1.
-    class_ids: np.ndarray  # [M], index into the classes.
+    boxes: np.ndarray  # [M, 4], x0, y0, x1, y1, pixels from the upper left corner of the input.
+    scores: np.ndarray  # [M], 0..1.
+    class_ids: np.ndarray  # [M], indices of the classes.
 
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """Layout of the output of one network."""
+    """Output of one network: its layout, number of classes and grid."""
 
     layout: Layout
     class_count: int
-    grid: Grid | None  # Grid of the boxes; if unknown, they are not checked.
-    is_decoded: bool  # False: boxes are offsets to their cells and log sizes.
+    grid: Grid | None  # Grid of the boxes; None if unknown, and the boxes are then not checked.
+    is_decoded: bool  # True: boxes are in pixels; false: offsets from their cells and log sizes.
 
     def candidates(self, output: np.ndarray, score_min: float) -> Candidates:
         """Return the boxes of an output whose best class has at least the score `score_min`.
 
-        The score is the product of objectness and class score. In layouts without objectness, it is
-        the class score.
+        The score of a class is the product of its output and the objectness. In layouts without
+        objectness, it is the output of the class.
         """
         rows = _rows(output, self.layout)
-        scores = self._scores(rows)  # One column excludes most boxes.
+        scores = self._scores(rows)  # This cheap bound excludes most boxes.
         chosen = np.flatnonzero(scores >= score_min)
         classes = rows[chosen, self._first_class :]
         class_ids = classes.argmax(axis=1)
@@ -138,7 +142,7 @@ class Head:
             )
 
     def cells_apart(self, output: np.ndarray) -> float:
-        """Return the median distance of boxes from their cells, in cells; 0 if unknown."""
+        """Return the median distance of boxes from their cells, in cells; 0 if grid is None."""
         if self.grid is None:
             return 0.0
         rows = _rows(output, self.layout)
@@ -163,19 +167,22 @@ class Head:
 
 
 def detect_layout(output: np.ndarray, input_px: tuple[int, int], wanted: str = "") -> Head:
-    """Determine the layout of a network's output.
+    """Determine the layout of a network's output, and check the output.
 
     Args:
-        output: The only output of the network, for one image.
+        output: The only output of the network, for one image, [1, N, channels] or
+            [1, channels, N] float32.
         input_px: Width and height of the network's input.
         wanted: Name of the layout; empty: determine it from the shape of the output.
 
     Raises:
-        ModelError: If the output has no known layout, or not the wanted one.
+        ConfigError: If there is no layout of the name `wanted`.
+        ModelError: If the output has no known layout, or another one than wanted.
     """
     if output.ndim != 3 or output.shape[0] != 1 or output.dtype != np.float32:
         raise ModelError(
-            f"its output is {output.dtype} {list(output.shape)}. Expected: float32 {EXPECTED}."
+            f"the network's output is {output.dtype} {list(output.shape)}. Expected: float32 "
+            f"{EXPECTED}."
         )
     layout = layout_named(wanted) if wanted else _layout_of(output, input_px)
     boxes, channels = _rows(output, layout).shape
@@ -185,8 +192,9 @@ def detect_layout(output: np.ndarray, input_px: tuple[int, int], wanted: str = "
     is_without_cells = layout.name == "yolox" and grid is None
     if class_count < 1 or boxes_per_cell != layout.boxes_per_cell or is_without_cells:
         raise ModelError(
-            f"its output {list(output.shape)} for an input of {input_px[0]}x{input_px[1]} pixels "
-            f"is not that of {layout.name}. Expected: {EXPECTED}."
+            f"the network's output {list(output.shape)} for an input of "
+            f"{input_px[0]}x{input_px[1]} pixels is not that of {layout.name}. "
+            f"Expected: {EXPECTED}."
         )
     heads = [Head(layout, class_count, grid, is_decoded=True)]
     if layout.name == "yolox":
@@ -208,11 +216,16 @@ def layout_named(name: str) -> Layout:
 
 
 def find_grid(count: int, input_px: tuple[int, int]) -> Grid | None:
-    """Return the grid for a network that predicts `count` boxes, or None if there is none.
+    """Return the grid for a network that predicts `count` boxes, or None if no grid fits.
 
-    Grids have consecutive strides and one or three boxes per cell. Boxes are sorted by stride, the
-    finest first. With three per cell, the grid is repeated three times. No two grids of an input
-    have the same count.
+    A grid has some consecutive strides and one or three boxes per cell. No two grids for the same
+    input have the same number of boxes. The boxes are sorted by stride, the smallest first. With
+    three boxes per cell, the cells of each stride are repeated three times, one repetition after
+    the other.
+
+    Args:
+        count: Number of boxes.
+        input_px: Width and height of the network's input.
     """
     for first, end in combinations(range(len(STRIDES_PX) + 1), 2):
         strides = STRIDES_PX[first:end]
@@ -225,7 +238,7 @@ def find_grid(count: int, input_px: tuple[int, int]) -> Grid | None:
 
 
 def _grid(input_px: tuple[int, int], strides: tuple[int, ...], boxes_per_cell: int) -> Grid:
-    """Return the grid of these strides."""
+    """Return the grid with these strides for an input of this width and height."""
     corners: list[np.ndarray] = []
     for stride in strides:
         columns, rows = input_px[0] // stride, input_px[1] // stride
@@ -236,24 +249,24 @@ def _grid(input_px: tuple[int, int], strides: tuple[int, ...], boxes_per_cell: i
 
 
 def _layout_of(output: np.ndarray, input_px: tuple[int, int]) -> Layout:
-    """Return the layout whose box axis in this output has the length of a possible grid."""
+    """Return the layout in which the number of boxes of this output fits a grid."""
     for layout in LAYOUTS.values():
         grid = find_grid(len(_rows(output, layout)), input_px)
         if grid is not None and grid.boxes_per_cell == layout.boxes_per_cell:
             return layout
     raise ModelError(
-        f"its output {list(output.shape)} for an input of {input_px[0]}x{input_px[1]} pixels is "
-        f"of no known layout. Expected: {EXPECTED}."
+        f"the network's output {list(output.shape)} for an input of "
+        f"{input_px[0]}x{input_px[1]} pixels is of no known layout. Expected: {EXPECTED}."
     )
 
 
 def _rows(output: np.ndarray, layout: Layout) -> np.ndarray:
-    """Return the boxes as rows, [N, channels]."""
+    """Return the boxes of an output as rows, [N, channels]."""
     return output[0].T if layout.is_channels_first else output[0]
 
 
 def _corners(boxes: np.ndarray) -> np.ndarray:
-    """Return x0, y0, x1, y1 of cx, cy, w, h, [M, 4]."""
+    """Convert boxes [M, 4] from cx, cy, w, h to x0, y0, x1, y1."""
     halves = boxes[:, 2:] / 2
     return np.hstack((boxes[:, :2] - halves, boxes[:, :2] + halves))
 
@@ -276,7 +289,13 @@ class Letterbox:
 
     @staticmethod
     def fit(image_px: tuple[int, int], input_px: tuple[int, int], is_centered: bool) -> "Letterbox":
-        """Return the placement in the center (YOLOv5) or in the upper left corner (YOLOX)."""
+        """Return the placement of the largest scaled image that fits into the input.
+
+        Args:
+            image_px: Width and height of the image.
+            input_px: Width and height of the network's input.
+            is_centered: True: the image is centered (YOLOv5); false: upper left corner (YOLOX).
+        """
         scale = min(input_px[0] / image_px[0], input_px[1] / image_px[1])
         inner = max(1, round(image_px[0] * scale)), max(1, round(image_px[1] * scale))
         room = input_px[0] - inner[0], input_px[1] - inner[1]
@@ -293,11 +312,17 @@ class Letterbox:
         return canvas
 
     def to_image(self, boxes: np.ndarray) -> np.ndarray:
-        """Return boxes [M, 4] of the input in pixels of the image, clipped to it.
+        """Convert boxes from the input to the image, and clip them to the image.
 
-        Boxes are x0, y0, x1, y1. Networks place the origin at the corner of the first pixel; this
-        project places it at the pixel's center. So x_image = (x_input - offset) * W / w - 0.5, and
-        the image covers -0.5 to W - 0.5.
+        Networks have the origin at the corner of the first pixel, this project has it at the
+        pixel's center. So x_image = (x_input - offset) * W / w - 0.5, where W is the width of the
+        image and w that of the scaled image. The image covers -0.5 to W - 0.5.
+
+        Args:
+            boxes: Boxes in the input, [M, 4], x0 y0 x1 y1, pixels.
+
+        Returns:
+            Boxes in the image, [M, 4], x0 y0 x1 y1, pixels.
         """
         scale = np.divide(self.image_px, self.inner_px)
         corners = (boxes.reshape(-1, 2, 2) - self.offset_px) * scale

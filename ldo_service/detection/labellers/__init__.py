@@ -1,8 +1,9 @@
 """Open-vocabulary labellers of image regions (paper, III.B).
 
-Labeller      the interface that the actor uses
-DualEncoder   dual_encoder.py: an image and a text encoder with one space, as in CLIP; ONNX
-HttpLabeller  chat_completion.py: a vision-language model behind an OpenAI-compatible server
+Labeller      interface of all labellers, which the actor vlm_labeller uses
+DualEncoder   dual_encoder.py: image and text encoder with a common embedding space, as in CLIP;
+              ONNX
+HttpLabeller  chat_completion.py: vision-language model behind an OpenAI-compatible server
 """
 
 from collections import defaultdict
@@ -19,12 +20,12 @@ class Labeller(Protocol):
 
     @property
     def identity(self) -> str:
-        """Name and version of the labeller for records."""
+        """Name and version of the labeller, for recordings and logs."""
         ...
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names that it chooses from; empty: any name."""
+        """Names that the labeller chooses from; empty: it may return any name."""
         ...
 
     def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
@@ -43,10 +44,10 @@ class Labeller(Protocol):
         ...
 
     def add(self, name: str) -> None:
-        """Add a name to choose from.
+        """Add a name that the labeller may choose from now on.
 
         Raises:
-            ConfigError: If that is not possible.
+            ConfigError: If the labeller cannot add this name.
         """
         ...
 
@@ -58,8 +59,9 @@ class Labeller(Protocol):
 def fused_over_views(views: Iterable[Iterable[ScoredLabel]]) -> list[ScoredLabel]:
     """Return the mean probability of each label over the views, the most probable first.
 
-    A view without a label counts as probability 0. So two views that agree prevail over one with a
-    high probability. Equal labels keep their order.
+    A view that does not have a label counts as probability 0 for this label. Two views that agree
+    can therefore prevail over a single view with a high probability. Labels with equal means keep
+    the order of their first appearance.
 
     >>> fused_over_views([[("cup", 0.75), ("vase", 0.25)], [("vase", 1.0)]])
     [('vase', 0.625), ('cup', 0.375)]

@@ -1,6 +1,7 @@
 """Labels by a vision-language model behind an OpenAI-compatible server: vLLM, llama.cpp, Ollama.
 
-An answer must be one name; its confidence comes from the log-probabilities. All else is rejected.
+An answer of the model must be a single name; any other answer is rejected. The confidence comes
+from the log-probabilities of the answer's tokens.
 """
 
 import base64
@@ -26,9 +27,10 @@ from .http_endpoint import HttpClient, HttpClientConfig
 log = logging.getLogger(__name__)
 
 NONE = "none"  # Answer of the model if no name fits.
+# Answers that name no object.
 _NO_NAME = {NONE, "unknown", "unclear", "nothing", "object", "thing", "item", "n/a", "unsure"}
 _NAME = re.compile(r"[^\W\d_][\w' -]*")  # Words, beginning with a letter.
-_MARK = re.compile(r"<[|/]?\w+[|]?>")  # Mark of a model's own, such as an end of turn.
+_MARK = re.compile(r"<[|/]?\w+[|]?>")  # Special token of a model, such as an end of turn.
 
 OPEN_PROMPT = (
     "What is the object in the middle of this picture? Answer with its common name alone, in one "
@@ -79,10 +81,13 @@ class Answer:
 
 
 def read_answer(body: bytes) -> Answer:
-    """Return the first choice of a chat completion of OpenAI's API.
+    """Return the first choice of a chat completion, the response of OpenAI's API.
+
+    Args:
+        body: Body of the response, JSON.
 
     Raises:
-        EndpointError: If it is not a chat completion.
+        EndpointError: If the body is not a chat completion.
     """
     try:
         choice = msgspec.json.decode(body, type=_Completion).choices[0]
@@ -95,10 +100,11 @@ def read_answer(body: bytes) -> Answer:
 
 
 def confidence(logprobs: tuple[float, ...], how: Sureness) -> float:
-    """Return the probability of an answer: the product over its tokens or their geometric mean.
+    """Return the confidence of an answer: product or geometric mean of its tokens' probabilities.
 
-    `product` is the probability of exactly this answer, which is lower for names of many tokens.
-    `mean` is independent of length, and too high for names that the first token determines.
+    `product` is the probability of exactly this answer. It is lower for names of many tokens.
+    `mean` does not depend on the number of tokens. It is too high for a name whose later tokens
+    follow from the first one.
 
     >>> round(confidence((-0.1, -0.3), "product"), 3), round(confidence((-0.1, -0.3), "mean"), 3)
     (0.67, 0.819)
@@ -108,11 +114,11 @@ def confidence(logprobs: tuple[float, ...], how: Sureness) -> float:
 
 
 def name_of(text: str, allowed: Collection[str], max_words: int) -> str | None:
-    """Return the name in an answer as in a vocabulary; None if missing or not allowed.
+    """Return the canonical name in an answer; None if there is no single name or it is not allowed.
 
     Args:
         text: Answer of the model.
-        allowed: Allowed names as in a vocabulary; empty: any.
+        allowed: Allowed canonical names; empty: any name.
         max_words: Maximum words of a name.
 
     >>> name_of("A Sofa.", (), 4), name_of("sofa", ("chair",), 4), name_of("I am not sure", (), 3)
@@ -129,9 +135,9 @@ def name_of(text: str, allowed: Collection[str], max_words: int) -> str | None:
 
 
 def _logprobs(raw: msgspec.Raw) -> tuple[float, ...]:
-    """Return the log-probabilities of tokens other than white space and marks.
+    """Return the log-probabilities of the answer's tokens, without white space and special tokens.
 
-    Empty unless all of them are numbers.
+    The result is empty if the entry is missing or a value is not a valid log-probability.
     """
     try:
         response = msgspec.json.decode(raw, type=_Logprobs | None)
@@ -147,15 +153,15 @@ def _logprobs(raw: msgspec.Raw) -> tuple[float, ...]:
 class HttpConfig:
     """Settings of the requests to a vision-language model."""
 
-    model: str = ""  # Name of the model on the server; empty: its only one.
-    views: int = 2  # Maximum views of a region, one request each.
+    model: str = ""  # Name of the model on the server; empty: the server's only model.
+    views: int = 2  # Maximum views of a region that are sent, in one request each.
     # Maximum side of a crop; a larger one is scaled down. 336 px is the input of CLIP-L, the image
     # encoder of LLaVA.
     side_px: int = 336
-    # Product of the probabilities of an answer's tokens, or their mean.
+    # Confidence of an answer: the product of its tokens' probabilities, or their geometric mean.
     confidence: Sureness = "product"
     confidence_untold: float = 0.3  # Confidence if the server returns no log-probabilities.
-    max_words: int = 4  # Maximum words of an answer without a list of names; more is a sentence.
+    max_words: int = 4  # Maximum words of a name; an answer with more is a sentence.
     max_tokens: int = 16  # Maximum tokens of an answer.
     endpoint: HttpClientConfig = field(default_factory=HttpClientConfig)
 
@@ -171,9 +177,10 @@ class HttpConfig:
 
 
 class HttpLabeller:
-    """Labeller by a vision-language model on a server, with one request per view.
+    """Labeller by a vision-language model on a server, with one request per view of a region.
 
-    The labels of the views are fused; invalid answers are dropped.
+    The labels of the views are fused by `fused_over_views`. A view with an invalid answer has no
+    label.
     """
 
     def __init__(
@@ -189,7 +196,7 @@ class HttpLabeller:
         Args:
             url: Address of the API, such as http://127.0.0.1:8000/v1.
             config: Settings.
-            names: Names to choose from; empty: any name.
+            names: Names that the model must choose from; empty: it may answer any name.
             clock: See `HttpClient`.
             sleep: See `HttpClient`.
 
@@ -204,11 +211,11 @@ class HttpLabeller:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names to choose from; empty: any name."""
+        """Canonical names that the model must choose from; empty: it may answer any name."""
         return tuple(self._names)
 
     def add(self, name: str) -> None:
-        """Add a name to choose from.
+        """Add a name that the model may choose from now on.
 
         Raises:
             ConfigError: If it is not a valid name, or the labeller has no list of names.
@@ -226,9 +233,10 @@ class HttpLabeller:
     def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
         """Return the labels of a region; see `Labeller`.
 
-        A view with a rejected answer has no label. If the server fails after some views, those are
-        used. All views together may take `patience_s`. A view that would exceed this limit, if it
-        took as long as the slowest one before, is omitted.
+        A view with a rejected answer has no label. If the server fails after some views have
+        labels, these labels are used. All views together may take `patience_s`. If a view would
+        exceed this limit by taking as long as the slowest earlier view, it and later ones are
+        omitted.
         """
         views: list[list[ScoredLabel]] = []
         until_s, slowest_s = self._clock() + self.config.endpoint.patience_s, 0.0
@@ -248,8 +256,9 @@ class HttpLabeller:
     def metrics(self) -> dict[str, float]:
         """Return the counters of the labeller.
 
-        `answers_refused`: no name, or none of the list. `answers_none`: the model cannot recognize
-        the object. `answers_without_logprobs`: answers with the configured confidence.
+        `answers_refused` counts answers that are no name or not in the list of names.
+        `answers_none` counts answers that the model cannot recognize the object.
+        `answers_without_logprobs` counts answers with the confidence `http.confidence_untold`.
         """
         return {
             "names": len(self._names),
@@ -261,7 +270,7 @@ class HttpLabeller:
         }
 
     def _label_crop(self, crop: np.ndarray, until_s: float) -> list[ScoredLabel]:
-        """Request the label of one view."""
+        """Request the label of one view; the result is empty if the answer is rejected."""
         self._questions += 1
         body = self._endpoint.post("/chat/completions", self._question(crop), until_s)
         answer = read_answer(body)
@@ -286,7 +295,7 @@ class HttpLabeller:
         return self.config.confidence_untold
 
     def _question(self, crop: np.ndarray) -> bytes:
-        """Return a request of OpenAI's API: text, then the picture as a data URL."""
+        """Return the JSON of a request of OpenAI's API: the prompt, then the crop as a data URL."""
         picture = base64.b64encode(codecs.encode_jpeg(shrunk(crop, self.config.side_px))).decode()
         text = CLOSED_PROMPT.format(names=", ".join(self._names)) if self._names else OPEN_PROMPT
         content = [

@@ -1,4 +1,7 @@
-"""Labels by an image encoder and a text encoder with one space (Radford et al., ICML 2021)."""
+"""Labels by an image encoder and a text encoder with a common embedding space, as in CLIP.
+
+Radford et al., ICML 2021.
+"""
 
 import json
 from collections.abc import Sequence
@@ -22,30 +25,31 @@ from .text_embeddings import (
     unit,
 )
 
-# Normalization of RGB in 0..1; Radford et al., their code.
+# Normalization of RGB in 0..1, from the code of Radford et al.
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
-CLIP_SCALE = 100.0  # The maximum of CLIP's logit scale in training, and its final value.
-CLIP_PX = 224  # Side of the input if an encoder takes any size.
-MAX_LABELS = 5  # Maximum labels of a region; the others are noise.
+CLIP_SCALE = 100.0  # CLIP's logit scale after training, which is also the maximum in training.
+CLIP_PX = 224  # Side of the input if an image encoder takes any size.
+MAX_LABELS = 5  # Maximum labels of a region; less probable ones are noise.
 
 
 @dataclass(frozen=True, slots=True)
 class DualEncoderConfig:
     """Settings of a pair of encoders."""
 
-    # Texts for a name; the mean of their embeddings is used.
+    # Texts for a name, with {} in place of the name; the mean of their embeddings is used.
     prompts: tuple[str, ...] = (
         "a photo of a {}.",
         "a cropped photo of a {}.",
         "a {} in a room.",
     )
-    # Normalization of RGB in 0..1; empty: from the metadata of the image encoder, or CLIP's.
+    # Mean and standard deviation of RGB in 0..1, to normalize images; empty: from the metadata of
+    # the image encoder, or CLIP's.
     mean: tuple[float, ...] = ()
     std: tuple[float, ...] = ()
-    # Sharpness of the softmax; 0: from the files of the pair, or CLIP's 100.
+    # Factor on the cosines before the softmax; 0: from the files of the pair, or CLIP's 100.
     logit_scale: float = 0.0
-    # Names that compete but are never returned, such as wall and floor.
+    # Names that have a probability like all others but are never returned, such as wall and floor.
     nothing: tuple[str, ...] = ()
     # Execution providers of onnxruntime, by preference: cuda, tensorrt, ...
     providers: tuple[str, ...] = ("cpu",)
@@ -72,12 +76,12 @@ class DualEncoderConfig:
 
 @dataclass(frozen=True, slots=True)
 class EncoderFiles:
-    """Files of a pair: an image encoder, and a text encoder with its byte pairs or embeddings."""
+    """Files of a pair of encoders: either text and vocabulary, or embeddings, or all must exist."""
 
-    image: Path
-    text: Path | None = None
-    vocabulary: Path | None = None
-    embeddings: Path | None = None
+    image: Path  # Image encoder, ONNX.
+    text: Path | None = None  # Text encoder, ONNX.
+    vocabulary: Path | None = None  # Byte pairs of the text encoder's tokenizer.
+    embeddings: Path | None = None  # Precomputed text embeddings of names.
 
     def __post_init__(self) -> None:
         if (self.text is None) != (self.vocabulary is None):
@@ -93,7 +97,7 @@ class EncoderFiles:
 
 
 class DualEncoder:
-    """Labeller by a pair of encoders that fit each other."""
+    """Labeller by an image encoder and a text encoder with a common embedding space."""
 
     def __init__(
         self,
@@ -107,12 +111,14 @@ class DualEncoder:
         Args:
             pair: Files of the pair.
             config: Settings.
-            names: Names to choose from; empty: those of the embeddings, or the 80 of COCO.
-            name: Name in errors and `identity`; empty: that of the image encoder's file.
+            names: Names to choose from; empty: the names in the file of embeddings or, without such
+                a file, the 80 of COCO.
+            name: Name of the pair in errors and `identity`; empty: that of the image encoder's
+                file.
 
         Raises:
             ConfigError: If a setting is invalid.
-            ModelError: If the files are no such networks.
+            ModelError: If the files are not a pair of encoders.
         """
         self.config = config or DualEncoderConfig()
         what = name or str(pair.image)
@@ -131,8 +137,10 @@ class DualEncoder:
                 )
         self.logit_scale = self._logit_scale()
         self.identity = f"{name or pair.image.stem} {sha256(pair.image)[:12]}"
-        self._rows: dict[str, np.ndarray] = {}  # Embeddings by name as in a vocabulary.
-        self._listed: dict[str, str] = {}  # The word that each such name was first given as.
+        self._rows: dict[str, np.ndarray] = {}  # Text embeddings by canonical name.
+        # Names to choose from and those of `nothing`, by canonical name. The value is the spelling
+        # that was given first, which the text encoder gets.
+        self._listed: dict[str, str] = {}
         for entry in (*(names or self._own_names()), *self.config.nothing):
             self._listed.setdefault(canonical(entry), entry)
         if self.texts.encoder is None:
@@ -140,21 +148,31 @@ class DualEncoder:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names to choose from, without those of `nothing`."""
+        """Canonical names to choose from, without those of `nothing`."""
         nothing = set(map(canonical, self.config.nothing))
         return tuple(name for name in self._listed if name not in nothing)
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Names as they were given, which is the form that the text encoder gets."""
+        """Names to choose from and those of `nothing`, in the spelling that was given.
+
+        The text encoder gets this spelling.
+        """
         return tuple(self._listed.values())
 
     def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
-        """Return P(name) = softmax(logit_scale cos(image, name)), averaged over the crops.
+        """Return at most five labels of a region with their probabilities, the most probable first.
 
-        With two names, cosines of 0.3 and 0.28 and a scale of 100, it is
-        exp(30) / (exp(30) + exp(28)) = 0.881. The result is empty if a name of `nothing` is the
-        most probable.
+            P(name) = softmax(logit_scale cos(image, name)), averaged over the crops
+
+        With two names, cosines of 0.3 and 0.28 and a scale of 100, the first has
+        P = exp(30) / (exp(30) + exp(28)) = 0.881.
+
+        Args:
+            crops: Views of the region, each [h, w, 3] uint8 RGB.
+
+        Returns:
+            The labels; empty if the most probable name is one of `nothing`.
         """
         self._place_listed()
         rows, known_names = np.stack([self._rows[name] for name in self._listed]), set(self.names)
@@ -164,10 +182,10 @@ class DualEncoder:
         return [scored for scored in best if scored[0] in known_names][:MAX_LABELS]
 
     def add(self, name: str) -> None:
-        """Add a name to choose from.
+        """Add a name that the labeller may choose from now on.
 
         Raises:
-            ConfigError: The name is invalid, or it has no stored embedding and there is no text
+            ConfigError: If the name is invalid, or has no stored embedding and there is no text
                 encoder to compute one.
         """
         if not is_name(name):
@@ -180,18 +198,26 @@ class DualEncoder:
         return {"names": len(self.names)}
 
     def _view(self, crop: np.ndarray, rows: np.ndarray) -> list[ScoredLabel]:
-        """Return the probability of each name for one crop."""
+        """Return the probability of each name for one crop, given the embeddings of all names."""
         probabilities = softmax(self.logit_scale * (rows @ self._image.embed(crop)))
         return list(zip(self._listed, probabilities.tolist(), strict=True))
 
     def _place_listed(self) -> None:
-        """Compute embeddings when they are first needed: it takes seconds for eighty names."""
+        """Compute the missing text embeddings of the names.
+
+        With a text encoder, this is called at the first label request and not at the start, because
+        eighty names take seconds.
+        """
         for name, word in self._listed.items():
             if name not in self._rows:
                 self._rows[name] = self._place(word)
 
     def _place(self, name: str) -> np.ndarray:
-        """Return the embedding of a name, [D] float32 of length 1, from the file if it is there."""
+        """Return the text embedding of a name, [D] float32 of length 1.
+
+        Raises:
+            ConfigError: If the name has no stored embedding and there is no text encoder.
+        """
         row = self.texts.find(name)
         if row is not None:
             return row
@@ -204,7 +230,7 @@ class DualEncoder:
         return self.texts.cached.names if self.texts.cached else COCO
 
     def _logit_scale(self) -> float:
-        """Return the logit scale of the settings, the embeddings, the image encoder, or CLIP."""
+        """Return the first known logit scale: of settings, embeddings, image encoder, or CLIP."""
         stored_scale = self._image.metadata_numbers("logit_scale", 1)
         cached = self.texts.cached.logit_scale if self.texts.cached else None
         return (
@@ -237,12 +263,12 @@ class ImageEncoder:
         )
 
     def metadata_numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """Return numbers from the metadata; empty if missing.
+        """Return `count` numbers from an entry of the network's metadata; empty if it is missing.
 
-        The exporter wrote them as "0.5, 0.5, 0.5" or "[0.5, 0.5, 0.5]".
+        The text of the entry is like "0.5, 0.5, 0.5" or "[0.5, 0.5, 0.5]".
 
         Raises:
-            ModelError: If it has another number of them, or invalid ones.
+            ModelError: If the entry does not have `count` valid numbers.
         """
         text = self._network.metadata.get(key)
         if text is None:
@@ -254,7 +280,10 @@ class ImageEncoder:
             values = ()
         is_usable = len(values) == count and np.isfinite(values).all()
         if not is_usable or (key != "mean" and min(values) <= 0):
-            raise ModelError(f"its metadata has {key}={text[:60]!r}: {count} numbers are expected.")
+            raise ModelError(
+                f"the network's metadata has {key}={text[:60]!r}. Expected: {count} finite "
+                "numbers, positive unless they are the mean."
+            )
         return values
 
 
@@ -266,7 +295,7 @@ def _text_encoder(pair: EncoderFiles, config: DualEncoderConfig) -> TextEncoder 
 
 
 def _square_input(network: Network) -> tuple[str, int]:
-    """Return name and side of the image input.
+    """Return the name of the network's only input, and the side of its square images in pixels.
 
     Raises:
         ModelError: If the network has other inputs.
@@ -278,7 +307,7 @@ def _square_input(network: Network) -> tuple[str, int]:
     if kind != "tensor(float)" or not fits or len(sides) > 1:
         found_inputs = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
         raise ModelError(
-            f"its inputs are {found_inputs}. Expected: one image, float32 [N, 3, S, S]."
+            f"the network's inputs are {found_inputs}. Expected: one image, float32 [N, 3, S, S]."
         )
     return name, next(iter(sides), CLIP_PX)
 
@@ -288,7 +317,13 @@ def _allows(side: int | str | None, length: int) -> bool:
 
 
 def _square(crop: np.ndarray, side_px: int, around: np.ndarray) -> np.ndarray:
-    """Return a crop centered in a square, uncut, so that it contains the region's edges."""
+    """Scale a crop to fit into a square, centered on a background of the color `around`.
+
+    The crop is not cut, so that the square contains the edges of the region.
+
+    Returns:
+        The square, [side_px, side_px, 3] uint8.
+    """
     height, width = crop.shape[:2]
     longest = max(height, width)
     canvas = np.empty((longest, longest, 3), np.uint8)
@@ -300,7 +335,7 @@ def _square(crop: np.ndarray, side_px: int, around: np.ndarray) -> np.ndarray:
 
 
 def softmax(logits: np.ndarray) -> np.ndarray:
-    """Return the softmax of logits.
+    """Return the softmax of logits [C], [C] float64.
 
     >>> softmax(100 * np.array([0.3, 0.28])).round(3).tolist()
     [0.881, 0.119]

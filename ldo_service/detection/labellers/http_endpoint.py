@@ -12,7 +12,7 @@ import httpx2
 from ldo_service.errors import ConfigError, EndpointError, named
 
 MAX_BYTES = 1 << 20  # Maximum size of a response.
-# Status codes that may differ on a later attempt.
+# HTTP status codes of temporary failures, after which another attempt may succeed.
 RETRY_STATUS_CODES = (408, 425, 429, 500, 502, 503, 504)
 
 
@@ -21,14 +21,16 @@ class HttpClientConfig:
     """Timeouts, retries and rate limit of the client."""
 
     timeout_s: float = 10.0  # Maximum time of one attempt.
-    attempts: int = 3
+    attempts: int = 3  # Maximum attempts of one request.
     backoff_s: float = 0.5  # Pause before the second attempt; doubled before each further one.
     # Maximum time for a region with all its views, attempts and pauses. It must be below
     # supervision.backend_step_timeout_s, after which an actor is stopped.
     patience_s: float = 40.0
     per_minute: float = 60.0  # Maximum attempts per minute, evenly spaced.
-    pause_s: float = 10.0  # Pause after a failed request; doubled with each further one.
-    max_pause_s: float = 300.0  # Maximum pause after failed requests.
+    # Time after a failed request in which further requests fail at once, without an attempt. It is
+    # doubled with each further failure in a row.
+    pause_s: float = 10.0
+    max_pause_s: float = 300.0  # Maximum of that time.
     key_variable: str = ""  # Environment variable with the API key; empty: none.
 
     def __post_init__(self) -> None:
@@ -57,9 +59,9 @@ class HttpClientConfig:
 
 
 class DeadlineExceeded(EndpointError):
-    """Deadline that passed before the server had its full `timeout_s` to answer.
+    """Expiry of the deadline before the server had its full `timeout_s` to respond.
 
-    It does not count as a failure of the server.
+    This error does not count as a failure of the server.
     """
 
 
@@ -79,7 +81,7 @@ class HttpClient:
             url: Address of the server, http or https.
             config: Settings.
             clock: Monotonic clock, seconds.
-            sleep: Function that waits by this clock.
+            sleep: Function that waits for a number of seconds of this clock.
 
         Raises:
             ConfigError: If the address or the key is invalid.
@@ -88,7 +90,8 @@ class HttpClient:
         self._address = str(_address(url))
         self._headers = {
             "Content-Type": "application/json",
-            "Accept-Encoding": "identity",  # The response is read as received, not decompressed.
+            # The response must not be compressed, because `_exchange` reads the raw bytes.
+            "Accept-Encoding": "identity",
             **_key(config.key_variable),
         }
         self._tls = ssl.create_default_context()
@@ -98,18 +101,21 @@ class HttpClient:
         self.attempts = 0
 
     def post(self, path: str, body: bytes, until_s: float) -> bytes:
-        """Return the response to a request.
+        """Send a POST request, with retries, and return the body of the response.
 
-        A request with less than `timeout_s` left until the deadline does not count as a failure of
-        the server.
+        After a failed request, further requests fail at once for a while (circuit breaker, see
+        `pause_s`). A request whose deadline passes before the server had `timeout_s` to respond
+        does not count as failed.
 
         Args:
             path: Path of the request below the address.
             body: Content of the request, JSON.
-            until_s: Deadline by the clock.
+            until_s: Deadline by the clock, seconds.
 
         Raises:
-            EndpointError: If there is no response before the deadline.
+            DeadlineExceeded: If the deadline passes before the server had `timeout_s`.
+            EndpointError: If the circuit breaker is open, all attempts fail or the server rejects
+                the request.
         """
         if self._clock() < self._paused_until_s:
             raise EndpointError(
@@ -129,7 +135,7 @@ class HttpClient:
         return answer
 
     def _post_with_retries(self, path: str, body: bytes, until_s: float) -> bytes:
-        """Send a request until it succeeds, fails for good, or no attempt is left."""
+        """Send a request until an attempt succeeds, the server rejects it or no attempt is left."""
         failure = DeadlineExceeded(f"{self.url} may not be asked again within patience_s.")
         for attempt in range(self._config.attempts):
             pause_s = self._config.backoff_s * 2 ** (attempt - 1) if attempt else 0.0
@@ -139,7 +145,7 @@ class HttpClient:
                 return self._attempt(path, body, within_s)
             except _TransientError as passing:
                 if within_s < self._config.timeout_s and self._clock() >= until_s:
-                    raise failure from passing  # The response is unknown.
+                    raise failure from passing  # The server did not have its full timeout_s.
                 failure = EndpointError(
                     f"{self.url} {passing} ({attempt + 1} attempts): is the server up, and the "
                     "address right?"
@@ -147,7 +153,13 @@ class HttpClient:
         raise failure
 
     def _wait(self, pause_s: float, until_s: float, failure: EndpointError) -> None:
-        """Wait until the next attempt is allowed; raise `failure` if that is past the deadline."""
+        """Wait until the next attempt is allowed.
+
+        Args:
+            pause_s: Minimum time to wait.
+            until_s: Deadline by the clock, seconds.
+            failure: Error that is raised if the next attempt is not allowed before the deadline.
+        """
         now_s = self._clock()
         start_s = max(now_s + pause_s, self._free_at_s)
         if start_s >= until_s:
@@ -157,7 +169,7 @@ class HttpClient:
         self._free_at_s = start_s + 60 / self._config.per_minute
 
     def _attempt(self, path: str, body: bytes, within_s: float) -> bytes:
-        """Return the response to one attempt.
+        """Make one attempt of a request, and return the body of the response.
 
         Raises:
             _TransientError: If another attempt may succeed.
@@ -176,10 +188,10 @@ class HttpClient:
     async def _exchange(self, path: str, body: bytes, within_s: float) -> bytes:
         """Send a request and read its response in one connection.
 
-        The timeouts of the library apply to each read alone, and a server that sends single bytes
-        would never exceed them. So one timeout covers everything, connecting included. Proxies of
-        the environment are not used, and redirects are not followed: the key would go to another
-        host.
+        One timeout covers the whole exchange, including the connection. The timeouts of the library
+        apply to each read alone, and a server that sends single bytes would never exceed them.
+        Proxies of the environment are not used and redirects are not followed, because the API key
+        would go to another host.
         """
         async with (
             asyncio.timeout(within_s),
@@ -207,14 +219,14 @@ class HttpClient:
 
 
 class _TransientError(Exception):
-    """Failure that another attempt may not meet."""
+    """Temporary failure of an attempt; another attempt may succeed."""
 
 
 def _address(url: str) -> httpx2.URL:
-    """Return the address of a server.
+    """Parse the address of a server.
 
     Raises:
-        ConfigError: If it is not a usable address, or contains a password.
+        ConfigError: If the address is not usable, or contains a user name or password.
     """
     try:
         address = httpx2.URL(url.rstrip("/"))
@@ -243,7 +255,13 @@ def _without_user(url: str) -> str:
 
 
 def _key(variable: str) -> dict[str, str]:
-    """Return the header with the API key, which is sent to the server only."""
+    """Return the HTTP header with the API key from an environment variable.
+
+    The result is empty if `variable` is empty.
+
+    Raises:
+        ConfigError: If the environment variable has no usable key.
+    """
     if not variable:
         return {}
     key = os.environ.get(variable, "").strip()

@@ -17,20 +17,25 @@ from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
 
 WORD_END = "</w>"
 START, END = "<|startoftext|>", "<|endoftext|>"
-# CLIP's vocabulary of 49,408 without the 512 bytes and the two marks; its file has more.
+# Maximum merges that are read. CLIP's vocabulary has 49,408 tokens: 512 for bytes, two for start
+# and end of a text, the others for merges. Its file has more merges.
 MAX_MERGES = 49_408 - 512 - 2
-MAX_VOCABULARY_BYTES = 1 << 26  # Maximum size unpacked; CLIP's has 3 MB.
+MAX_VOCABULARY_BYTES = 1 << 26  # Maximum size of the unpacked file; CLIP's has 3 MB.
 _WORDS = r"'(?:s|t|re|ve|m|ll|d)|\p{L}+|\p{N}|[^\s\p{L}\p{N}]+"  # Words as in CLIP.
 
-MAX_BYTES = 1 << 30  # Enough for 260,000 names in 1024 dimensions.
-CONTEXT = 77  # CLIP's number of tokens, if a network takes any.
+MAX_BYTES = 1 << 30  # Maximum size of embeddings: enough for 260,000 names in 1024 dimensions.
+CONTEXT = 77  # Number of tokens, as in CLIP, if a network takes any number.
 
 
 def read_tokenizer(path: Path) -> Tokenizer:
-    """Return CLIP's tokenizer with the byte pairs of a file.
+    """Return a tokenizer like CLIP's with the byte pairs of a file.
 
-    Tokens are numbered as in CLIP: the bytes, printable ones first; the same as ends of words; the
-    merges in order of their rank; the marks of start and end of a text.
+    Tokens are numbered in the order of CLIP:
+
+    1. the 256 bytes, printable ones first;
+    2. the 256 bytes again, as ends of words;
+    3. the merged byte pairs, in the order of the file;
+    4. the tokens for start and end of a text.
 
     Args:
         path: A file such as CLIP's bpe_simple_vocab_16e6.txt.gz: a comment line, then one pair per
@@ -69,7 +74,7 @@ def _text(path: Path) -> str:
     """Return the text of a file, which may be compressed by gzip.
 
     Raises:
-        ModelError: If it cannot be read or is too large.
+        ModelError: If the file cannot be read or is too large.
     """
     try:
         body = path.read_bytes()
@@ -84,22 +89,25 @@ def _text(path: Path) -> str:
 
 
 class TextEncoder:
-    """Text encoder of names: the mean of the embeddings of its prompts, of length 1."""
+    """Text encoder of names.
+
+    The embedding of a name is the mean of the embeddings of its prompts, scaled to length 1.
+    """
 
     def __init__(self, network: Network, tokenizer: Tokenizer, prompts: Sequence[str]) -> None:
-        """Run a network once.
+        """Create an encoder of names, and run its network once as a check.
 
         Args:
-            network: The text encoder.
+            network: The network that computes the embedding of tokens.
             tokenizer: Tokenizer of the network.
-            prompts: Texts with {} for the name.
+            prompts: Texts with {} in place of the name.
 
         Raises:
             ModelError: If the network is not a text encoder.
         """
         self._network, self._tokenizer, self._prompts = network, tokenizer, tuple(prompts)
         self._inputs, context = _text_inputs(network)
-        tokenizer.enable_truncation(context)  # The end of a text that is too long is cut.
+        tokenizer.enable_truncation(context)  # Longer texts are cut at the end.
         tokenizer.enable_padding(length=context)
         self.dimensions = len(self._of_text("a"))
 
@@ -120,15 +128,21 @@ class TextEncoder:
 class CachedEmbeddings:
     """Embeddings of names from a file.
 
-    The file is .npz or .safetensors, with `embeddings` [C, D], `names` [C], and optionally
-    `logit_scale`. In .safetensors, the names are the metadata entry `names`, one per line.
+    The file is .npz or .safetensors, with `embeddings` [C, D], `names` [C] and, optionally, the
+    number `logit_scale`. A .safetensors file has the names in its metadata entry `names`, one per
+    line.
+
+    Attributes:
+        names: The names.
+        dimensions: Number of dimensions D.
+        logit_scale: Factor on the cosines before the softmax; None if the file has none.
     """
 
     def __init__(self, path: Path) -> None:
         """Read a file.
 
         Raises:
-            ModelError: If it cannot be read or its embeddings are invalid.
+            ModelError: If the file cannot be read or its embeddings are invalid.
         """
         try:
             names, arrays = _safetensors(path) if path.suffix == ".safetensors" else _npz(path)
@@ -156,21 +170,24 @@ class CachedEmbeddings:
         self._rows |= {normalized(name): row for name, row in rows}
 
     def find(self, name: str) -> np.ndarray | None:
-        """Return the embedding of a name or a synonym, [D] float32 of length 1, or None."""
+        """Return the embedding of a name or one of its synonyms, [D] float32 of length 1.
+
+        None if the file has neither the name nor a synonym.
+        """
         row = self._rows.get(normalized(name), self._rows.get(canonical(name)))
         return None if row is None else unit(row)
 
 
 class TextEmbeddings:
-    """Text embeddings of a pair: from the file where possible, else computed."""
+    """Text embeddings of a pair of encoders: from the file if it has the name, else computed."""
 
     def __init__(self, cached: CachedEmbeddings | None, encoder: TextEncoder | None) -> None:
         self.cached, self.encoder = cached, encoder
 
     def find(self, text: str) -> np.ndarray | None:
-        """Return an embedding, [D] float32 of length 1.
+        """Return the embedding of a text, [D] float32 of length 1.
 
-        None if it is not in the file and there is no encoder.
+        None if the file does not have the text and there is no text encoder.
         """
         row = self.cached.find(text) if self.cached else None
         if row is None and self.encoder is not None:
@@ -178,7 +195,11 @@ class TextEmbeddings:
         return row
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """Return embeddings [T, D]; zeros, which resemble nothing, for texts without one."""
+        """Return the embeddings of T texts, [T, D] float32.
+
+        The row of a text without an embedding is zero, so that it has a cosine of 0 with all
+        others.
+        """
         rows = [self.find(text) for text in texts]
         (dimensions,) = {space.dimensions for space in (self.cached, self.encoder) if space}
         nowhere = np.zeros(dimensions, np.float32)
@@ -186,32 +207,40 @@ class TextEmbeddings:
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """Return a vector scaled to length 1.
+    """Return a vector [D] scaled to length 1, [D] float32.
 
     Raises:
-        ModelError: If its length is 0.
+        ModelError: If the vector has the length 0.
     """
     length = np.linalg.norm(vector)
     if not length > 0:
-        raise ModelError("it yields an embedding of zeros: its weights are damaged.")
+        raise ModelError(
+            "the network yields an embedding of zeros, so its weights are damaged: export it again."
+        )
     return (vector / length).astype(np.float32)
 
 
 def only_embedding(outputs: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the one output that is [1, D], as [D]; exporters add hidden states.
+    """Return the only output of shape [1, D], as [D] float32.
+
+    Outputs of other shapes are ignored, because exporters may add hidden states.
 
     Raises:
-        ModelError: If there is not exactly one.
+        ModelError: If there is not exactly one such output.
     """
     found = [output for output in outputs if output.ndim == 2 and len(output) == 1]
     if len(found) != 1 or found[0].shape[1] < 2:
         shapes = ", ".join(str(list(output.shape)) for output in outputs)
-        raise ModelError(f"its outputs are {shapes}. Expected: one embedding, [N, D].")
+        raise ModelError(f"the network's outputs are {shapes}. Expected: one embedding, [N, D].")
     return found[0][0].astype(np.float32)
 
 
 def _text_inputs(network: Network) -> tuple[dict[str, type[np.integer]], int]:
-    """Return the type of each input by name, and their number of tokens."""
+    """Return the type of each input by name, and the number of tokens that the inputs take.
+
+    Raises:
+        ModelError: If the network has other inputs than tokens and an attention mask.
+    """
     kinds: dict[str, type[np.integer]] = {"tensor(int64)": np.int64, "tensor(int32)": np.int32}
     inputs, shapes = network.inputs, [shape for _, _, shape in network.inputs]
     tokens = [name for name, _, _ in inputs if "mask" not in name]
@@ -220,7 +249,8 @@ def _text_inputs(network: Network) -> tuple[dict[str, type[np.integer]], int]:
     if not fits or len(tokens) != 1 or len(lengths) > 1 or min(lengths, default=CONTEXT) < 3:
         found_inputs = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
         raise ModelError(
-            f"its inputs are {found_inputs}. Expected: tokens, int64 or int32 [N, length]."
+            f"the network's inputs are {found_inputs}. Expected: tokens, int64 or int32 "
+            "[N, length]."
         )
     return {name: kinds[kind] for name, kind, _ in inputs}, int(min(lengths, default=CONTEXT))
 

@@ -169,9 +169,9 @@ def test_mismatched_embedding_dimensions_raise(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("pair", "message"),
     [
-        (replace(PAIR, channels=1), r"its inputs are pixels .* Expected: one image"),
-        (replace(PAIR, image_metadata=(("mean", "gray"),)), "3 numbers are expected"),
-        (replace(PAIR, image_metadata=(("std", "0,1,1"),)), "3 numbers are expected"),
+        (replace(PAIR, channels=1), r"inputs are pixels .* Expected: one image"),
+        (replace(PAIR, image_metadata=(("mean", "gray"),)), "Expected: 3 finite numbers"),
+        (replace(PAIR, image_metadata=(("std", "0,1,1"),)), "Expected: 3 finite numbers"),
     ],
 )
 def test_invalid_image_encoder_raises(tmp_path: Path, pair: ColorPair, message: str) -> None:
@@ -190,7 +190,7 @@ def test_invalid_and_swapped_files_raise(tmp_path: Path, full_files: EncoderFile
     with pytest.raises(ModelError, match="Expected: tokens"):
         DualEncoder(replace(full_files, text=full_files.image))
     vocabulary(tmp_path / "large.gz", tuple(f"x {chr(ord('!') + n)}" for n in range(40)))
-    with pytest.raises(ModelError, match="inference fails"):
+    with pytest.raises(ModelError, match="inference of the network fails"):
         DualEncoder(replace(full_files, vocabulary=tmp_path / "large.gz"))
 
 
