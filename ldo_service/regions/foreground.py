@@ -1,4 +1,4 @@
-"""Foreground masks: the pixels of a detected box that show the object, and nested masks."""
+"""Foreground masks: the pixels of a detected box that show its object."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _foreground
 
-MAX_RATIO = 1e6  # Maximum of a ratio.
+MAX_RATIO = 1e6  # Maximum value of a relative setting.
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,12 +22,15 @@ class ForegroundConfig:
 
     max_step: float = 0.05  # Maximum relative depth step within 3x3 pixels of one surface.
     min_cosine: float = 0.9  # Minimum cosine of normals 4 px apart on one surface.
-    # Minimum fraction of a surface inside the box; floors and walls extend outside.
+    # Minimum fraction of a surface inside the box. It excludes floors and walls, which extend
+    # outside of the box.
     min_inside: float = 0.5
     max_gap: float = 0.15  # Maximum relative depth step within 3x3 pixels of one object.
-    depth_bin: float = 0.05  # Relative bin width of the depth histogram that gives the mode.
-    near_mode: float = 0.1  # Relative distance to the mode within which the object starts to grow.
-    grow_px: int = 2  # Growth over the noisy edges of the object.
+    # Bin width, relative to the depth, of the histogram whose mode is the object's depth.
+    depth_bin: float = 0.05
+    # Maximum difference, relative to the mode, of depths that count as the object's depth.
+    near_mode: float = 0.1
+    grow_px: int = 2  # Growth of the mask over the noisy edges of the object.
 
     def __post_init__(self) -> None:
         shares = (self.max_step, self.min_cosine, self.min_inside, self.max_gap, self.near_mode)
@@ -50,11 +53,12 @@ class ForegroundConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SmoothSurfaces:
-    """Smooth surfaces of a depth image, as `surfaces` finds them.
+    """Smooth surfaces of a depth image, found by `surfaces`.
 
     Attributes:
-        labels: Surface of each pixel, [H, W] int32; 0 on edges and where depth is unknown.
-        sizes: Size of each surface, [S] int64, pixels.
+        labels: Number of the surface of each pixel, [H, W] int32; 0 on edges and where depth is
+            unknown.
+        sizes: Number of pixels with each label, [S] int64.
     """
 
     labels: np.ndarray
@@ -63,12 +67,12 @@ class SmoothSurfaces:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Foreground:
-    """Mask of an object within a window of an image.
+    """Mask of an object, stored for a window of the image.
 
     Attributes:
-        row: Row in the image of the first row of the mask.
-        column: Column in the image of the first column of the mask.
-        mask: Pixels of the object, [h, w] bool.
+        row: First row of the window in the image.
+        column: First column of the window in the image.
+        mask: Pixels of the object in the window, [h, w] bool.
     """
 
     row: int
@@ -76,7 +80,7 @@ class Foreground:
     mask: np.ndarray
 
     def image(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the mask in an image of this shape, [H, W] bool."""
+        """Return the mask in the whole image, which has this shape, [H, W] bool."""
         out = np.zeros(shape, bool)
         height, width = self.mask.shape
         out[self.row : self.row + height, self.column : self.column + width] = self.mask
@@ -84,7 +88,7 @@ class Foreground:
 
     @property
     def box_px(self) -> np.ndarray:
-        """Box around the whole mask, [4], x0 y0 x1 y1, with pixel centers at integers.
+        """Box around the window of the mask, [4], x0 y0 x1 y1, with pixel centers at integers.
 
         >>> Foreground(2, 1, np.ones((3, 4), bool)).box_px.tolist()
         [0.5, 1.5, 4.5, 4.5]
@@ -94,7 +98,7 @@ class Foreground:
         return np.array(corners) - 0.5
 
     def pack(self) -> tuple[tuple[int, ...], np.ndarray]:
-        """Return row, column and shape, and the mask as bits, for a checkpoint."""
+        """Return (row, column, h, w) and the mask as packed bits, for a checkpoint."""
         return (self.row, self.column, *self.mask.shape), np.packbits(self.mask)
 
     @staticmethod
@@ -108,15 +112,18 @@ class Foreground:
 def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> SmoothSurfaces:
     """Find the smooth surfaces of a depth image, which end at depth steps and creases.
 
-    One call per keyframe serves all boxes; it takes 0.8 ms for 640x480 pixels. A pixel belongs to a
-    surface under two conditions. All depths within its 3x3 pixels are known, and no two of them
-    differ by more than max_step. The normals two pixels to its left and right have a cosine above
-    min_cosine, and so do the normals two pixels above and below. Normals are those of the blurred
-    depth.
+    One call per keyframe is enough for all boxes; it takes 0.8 ms for 640x480 pixels. A pixel
+    belongs to a surface if two conditions hold:
 
-    Pixels that share a side belong to one surface. Surfaces are numbered from 1 in the order of
-    their first pixels, row by row. If a cosine is at its threshold, the result may differ between
-    instruction sets.
+    - All depths within its 3x3 pixels are known, and no two of them differ by more than max_step,
+      relatively.
+    - The cosine between the normals two pixels to the left and to the right is above min_cosine,
+      and so is the cosine between the normals two pixels above and below. The normals are computed
+      from blurred depth.
+
+    Such pixels that share a side belong to the same surface. Surfaces are numbered from 1 in the
+    order of their first pixels, row by row. If a cosine is at its threshold, the result may differ
+    between instruction sets.
 
     Args:
         depth_m: Depth, [H, W], meters; NaN or not above 0 where unknown.
@@ -149,22 +156,27 @@ def foreground(
     camera: Camera,
     config: ForegroundConfig,
 ) -> Foreground:
-    """Return the object that fills the middle of a box of a depth image.
+    """Return the mask of the object in the middle of a box.
 
-    The depth of the object is the mode of the depths around the center of the box. A surface may
-    belong to the object if it lies mostly inside the box, and no further from that depth than the
-    box is wide. The object consists of those pixels of such surfaces and their edges that are
-    connected to pixels of that depth in the middle half of the box.
+    The depth of the object is the mode of the depths in the middle half of the box. A pixel may
+    belong to the object if two conditions hold:
+
+    - The pixel lies on an edge, or on a surface that lies mostly inside the box.
+    - Its depth differs from the object's depth by less than the size of the box in meters.
+
+    The object consists of such pixels that are connected, without depth steps above max_gap, to
+    pixels at the object's depth in the middle half of the box.
 
     Args:
-        box: The box, x0 y0 x1 y1, pixels.
-        depth_m: Depth, [H, W], meters.
+        box: The box, [4], x0 y0 x1 y1, pixels.
+        depth_m: Depth, [H, W], meters; not above 0 where unknown.
         found: Surfaces of the depth image.
         camera: Intrinsics of the depth.
         config: Settings.
 
     Returns:
-        The object. Its mask is empty if the depth is unknown or the box shows only a wall.
+        The mask of the object, without any pixel if the depth is unknown or the box shows only a
+        wall.
 
     Raises:
         ValueError: If the surfaces belong to another image.
@@ -190,7 +202,7 @@ def foreground(
 
 
 def pixels_of(box: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Return rows and columns of the pixels with centers in a box, within the image."""
+    """Return the rows and columns of an image of this shape whose pixel centers lie in a box."""
 
     def within(low: float, high: float, size: int) -> slice:
         start = min(max(0, int(np.ceil(low))), size)
@@ -204,13 +216,15 @@ def pixels_of(box: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
 class NestingConfig:
     """Settings of nested regions: an object in front of a larger one, such as a cup on a table.
 
-    Both regions may be correct. The smaller one gets the shared pixels. If the scores decided, a
-    table with a score of 0.9 would get the pixels of a cup with a score of 0.5.
+    The smaller region gets the pixels that both regions have. If the scores decided, a table with a
+    score of 0.9 would get the pixels of a cup with a score of 0.5.
     """
 
-    inside: float = 0.8  # Minimum fraction of the smaller region that must lie in the larger one.
-    times: float = 2.0  # Minimum ratio of their sizes; below it, both show one object.
-    min_score: float = 0.5  # Minimum score of the smaller region; many boxes below are wrong.
+    inside: float = 0.8  # Minimum fraction of the smaller region that lies in the larger region.
+    # Minimum ratio of the sizes of both regions; below it, both regions show the same object.
+    times: float = 2.0
+    # Minimum score of the smaller region; many boxes with lower scores are wrong.
+    min_score: float = 0.5
 
     def __post_init__(self) -> None:
         if not (0 < self.inside <= 1 and self.times > 1 and self.min_score >= 0):
@@ -223,9 +237,16 @@ class NestingConfig:
 def without_nested(
     parts: Sequence[Foreground], scores: np.ndarray, config: NestingConfig
 ) -> list[Foreground]:
-    """Remove from each of M masks the pixels of the smaller masks that lie in it.
+    """Remove from each of M masks the pixels of smaller masks that are nested in it.
 
-    Masks with a score below `min_score` remove nothing; scores are [M].
+    Args:
+        parts: The masks, M.
+        scores: Scores of the masks, [M]. A mask with a score below `min_score` is not removed from
+            larger masks.
+        config: Settings.
+
+    Returns:
+        The masks without the pixels of nested masks, M.
 
     >>> table = Foreground(0, 0, np.ones((4, 8), bool))
     >>> cup = Foreground(1, 2, np.ones((2, 2), bool))
@@ -250,7 +271,10 @@ Window = tuple[slice, slice]
 
 
 def _shared(a: Foreground, b: Foreground) -> tuple[Window, Window] | None:
-    """Return the common window of two masks, as slices of each; None if they do not meet."""
+    """Return the common window of two masks, as rows and columns of mask a and of mask b.
+
+    None if the windows of the masks do not intersect.
+    """
     top, left = max(a.row, b.row), max(a.column, b.column)
     bottom = min(a.row + a.mask.shape[0], b.row + b.mask.shape[0])
     right = min(a.column + a.mask.shape[1], b.column + b.mask.shape[1])
@@ -265,18 +289,18 @@ def _shared(a: Foreground, b: Foreground) -> tuple[Window, Window] | None:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionDetections:
-    """Labels of M boxes of a keyframe.
+    """Boxes of a keyframe with labels by the detector and by the labeller.
 
     Attributes:
         boxes: Boxes, [M, 4], x0 y0 x1 y1, pixels, with pixel centers at integers.
-        labels: Labels of the detector, [M].
-        confidences: Confidences of the detector, [M]; 0 without a detection.
-        open_labels: Labels of the open-vocabulary labeller, [M].
-        open_confidences: Confidences of the labeller, [M]; 0 if it was not invoked.
-        parts: Mask of the object in each box. If it is None or the tuple is empty, the foreground
-            of the box is computed.
-        replaces_labels: True if the earlier labels of the Gaussians in the boxes are deleted,
-            because they describe another object.
+        labels: Labels by the detector, [M]; unused where its confidence is 0.
+        confidences: Confidences of the detector, [M], 0..1; 0 without a detection.
+        open_labels: Labels by the open-vocabulary labeller, [M]; unused where its confidence is 0.
+        open_confidences: Confidences of the labeller, [M], 0..1; 0 without a label by the labeller.
+        parts: Mask of the object in each box. For a box with None, or for all boxes if the tuple is
+            empty, the foreground is computed later.
+        replaces_labels: True if the earlier labels of the Gaussians in the regions must be deleted,
+            because those labels describe another object.
     """
 
     boxes: np.ndarray
@@ -291,7 +315,7 @@ class RegionDetections:
     def of_detector(
         cls, boxes: np.ndarray, labels: np.ndarray, confidences: np.ndarray
     ) -> "RegionDetections":
-        """Return detections that have labels of the detector only."""
+        """Return detections with labels by the detector only; the arrays are as in the class."""
         return cls(boxes, labels, confidences, labels, np.zeros(len(boxes), np.float32))
 
     @classmethod
@@ -313,10 +337,13 @@ class RegionDetections:
         )
 
     def scores(self) -> np.ndarray:
-        """Return the scores that decide which of overlapping regions gets a Gaussian, [M]."""
+        """Return the score of each box, [M]: the larger of the two confidences.
+
+        Scores decide which of several overlapping regions a Gaussian is assigned to.
+        """
         return np.maximum(self.confidences, self.open_confidences)
 
     def classes(self) -> np.ndarray:
-        """Return the labels of detector and labeller, [M, 2]; -1 if missing."""
+        """Return the labels by the detector and by the labeller, [M, 2] int; -1 if missing."""
         sources = (self.labels, self.confidences), (self.open_labels, self.open_confidences)
         return np.stack([np.where(sure > 0, one.astype(int), -1) for one, sure in sources], axis=1)

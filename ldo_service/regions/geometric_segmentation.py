@@ -2,11 +2,11 @@
 
 A segment has one of five kinds:
 
-    apart      connected without depth steps, and not on a structural plane (see `planes`)
-    standing   within a segment `apart`: stands on a flat surface, such as a cup on a table
-    convex     within a segment `apart`: bounded by concave creases, such as a cabinet by an oven
-    flat       on a structural plane, with another color: a picture, a window, a rug
-    room       a structural plane: it is no object, but it may appear in an object's box
+    apart      a connected surface without depth steps that is not on a structural plane (`planes`)
+    standing   a part of a segment `apart` that stands on a flat surface: a cup on a table
+    convex     a part of a segment `apart` between concave creases: a cabinet next to an oven
+    flat       a part of a structural plane with another color: a picture, a window, a rug
+    room       a structural plane, which is no object but may appear in an object's box
 
 Convex segments follow Stein et al., CVPR 2014: objects are convex, and creases between them are
 concave. Segments overlap: a couch with its cushions is one segment `apart`, and each cushion on it
@@ -41,15 +41,21 @@ _3X3 = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True, slots=True)
 class GeometricSegmentationConfig:
-    """Settings of the segmentation, in pixels of the small image; chosen like `PlaneConfig`."""
+    """Settings of the segmentation.
+
+    Lengths are in pixels of the small image, see `PlaneConfig`. The values were chosen on the same
+    data as those of `PlaneConfig`.
+    """
 
     planes: PlaneConfig = field(default_factory=PlaneConfig)
-    min_px: int = 60  # Minimum size of a segment.
+    min_px: int = 60  # Minimum number of pixels of a segment.
     max_gap: float = 0.06  # Maximum relative depth step within 3x3 pixels of one object.
     crease_px: int = 3  # Distance to either side of a crease at which normals are compared.
-    crease: float = 0.35  # Minimum angle (rad) of a concave crease that divides.
+    # Minimum difference of the normals (rad) at a concave crease that divides a segment.
+    crease: float = 0.35
     color_step: float = 1.5  # Minimum gradient (Lab per pixel) of a color edge.
-    # Minimum color difference (Lab, lightness weighted by half) from a wall to be a flat segment.
+    # Minimum color difference between a flat segment and the main color of its structural plane
+    # (Lab, lightness weighted by half).
     color_gap: float = 4.5
 
     def __post_init__(self) -> None:
@@ -66,25 +72,25 @@ class GeometricSegmentationConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Segment:
-    """Segment of a keyframe: its kind and its mask."""
+    """Segment of a keyframe."""
 
     kind: Kind
-    part: Foreground
+    part: Foreground  # Mask of the segment.
 
 
 def segment_geometry(
     color: np.ndarray, depth_m: np.ndarray, camera: Camera, config: GeometricSegmentationConfig
 ) -> list[Segment]:
-    """Segment a keyframe; the same images give the same segments.
+    """Segment a keyframe by geometry and color; the result is deterministic.
 
     Args:
         color: Color image, [H, W, 3] uint8 RGB.
         depth_m: Depth, [H, W], meters; 0 where unknown.
-        camera: Intrinsics of both.
+        camera: Intrinsics of both images.
         config: Settings.
 
     Returns:
-        The segments at the size of the image.
+        The segments, in pixels of the full image; the structural planes (`room`) come last.
     """
     # Features of the small depth image.
     seen = compute_depth_features(depth_m, camera, config.planes)
@@ -125,21 +131,28 @@ def components(mask: np.ndarray, min_px: int = 1) -> Iterator[Foreground]:
 
 
 def _joined(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndarray:
-    """Return where depth is known and has no step to a neighbor, [h, w] bool."""
+    """Return the pixels with known depth and without a depth step to a neighbor, [h, w] bool."""
     low = cv2.erode(seen.inverse, _3X3)
     return (low > 0) & (cv2.dilate(seen.inverse, _3X3) < (1 + config.max_gap) * low)
 
 
 def _on_planes(found: Planes, apart: np.ndarray) -> np.ndarray:
-    """Return the planes that are not structural, with their edges, [h, w] bool."""
+    """Return the pixels on planes in `apart` and next to such planes, [h, w] bool.
+
+    Args:
+        found: All planes of the keyframe.
+        apart: Pixels that are not on structural planes, [h, w] bool.
+    """
     return cv2.dilate(((found.number > 0) & apart).astype(np.uint8), _3X3) > 0
 
 
 def _concave(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndarray:
     """Return the pixels on concave creases, [h, w] bool.
 
-    A crease between points a and b is concave if (p_b - p_a) . (n_b - n_a) < 0, with normals n
-    towards the camera. The normals must differ by at least the angle `config.crease`.
+    A pixel is selected if (p_b - p_a) . (n_b - n_a) < 0 and |n_b - n_a| > `config.crease`. Here, a
+    and b are the pixels `config.crease_px` to its left and right, or above and below, p are their
+    points, and n their unit normals. Stein et al. define concave creases by this inequality for
+    normals towards the camera; `DepthFeatures.normals` point away from the camera.
     """
     points = seen.rays / np.maximum(seen.smooth, np.float32(1e-3))[..., None]
     r, concave = config.crease_px, np.zeros(seen.inverse.shape, bool)
@@ -155,9 +168,9 @@ def _divided(
 ) -> Iterator[np.ndarray]:
     """Yield the convex pieces of each component of `apart`, [h, w] bool.
 
-    Concave creases divide a component into pieces. Each piece is grown over the creases around it.
-    A piece with at least half of the component's pixels is not yielded, because it shows the same
-    object as the component.
+    The pixels on concave creases, `concave` [h, w] bool, divide a component into pieces. Each piece
+    is grown over the creases around it. A piece with at least half of the component's pixels is not
+    yielded, because it shows the same object as the component.
     """
     of_thing = np.asarray(cv2.connectedComponents(apart.astype(np.uint8), connectivity=4)[1])
     sizes = np.bincount(of_thing.ravel())
@@ -170,7 +183,10 @@ def _divided(
 
 
 def _across(values: np.ndarray, r: int, axis: int) -> np.ndarray:
-    """Return the difference of the values `r` pixels after and before each pixel along an axis."""
+    """Return the value `r` pixels after minus that `r` pixels before each pixel, along an axis.
+
+    The result is shorter than `values` by 2 r along the axis.
+    """
     swapped = np.swapaxes(values, 0, axis)
     return np.swapaxes(swapped[2 * r :] - swapped[: -2 * r], 0, axis)
 
@@ -178,7 +194,17 @@ def _across(values: np.ndarray, r: int, axis: int) -> np.ndarray:
 def _colored(
     color: np.ndarray, of_room: np.ndarray, config: GeometricSegmentationConfig, camera: Camera
 ) -> Iterator[np.ndarray]:
-    """Yield for each structural plane its pixels that differ from its main color, [h, w] bool."""
+    """Yield, for each structural plane, its pixels with another color than its main color.
+
+    Args:
+        color: Color image, [H, W, 3] uint8 RGB.
+        of_room: Number of the structural plane of each pixel, [h, w] int32; 0 without one.
+        config: Settings.
+        camera: Intrinsics of the color image.
+
+    Yields:
+        The pixels, [h, w] bool.
+    """
     k, (height, width) = shrink_factor(camera.width, config.planes), of_room.shape
     small = cv2.resize(
         color[: height * k, : width * k], (width, height), interpolation=cv2.INTER_AREA
@@ -192,7 +218,7 @@ def _colored(
 
 
 def _steps(lab: np.ndarray) -> np.ndarray:
-    """Return the color gradient in Lab per pixel, [h, w]."""
+    """Return the magnitude of the color gradient of an image [h, w, 3] in Lab, [h, w]."""
     smooth = cv2.GaussianBlur(lab, (0, 0), 1.0)
     across = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     down = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
@@ -200,9 +226,15 @@ def _steps(lab: np.ndarray) -> np.ndarray:
 
 
 def _of_plane(even: np.ndarray, lab: np.ndarray, config: GeometricSegmentationConfig) -> np.ndarray:
-    """Return the pixels of a plane with its main color, [h, w] bool, grown over their edges.
+    """Return the pixels that have the main color of a plane, [h, w] bool.
 
-    The components of `even` have no color edges inside. The largest one gives the main color.
+    The main color is the median color of the largest component of `even`. The result has all
+    components with a similar color, grown by two pixels over the color edges around them.
+
+    Args:
+        even: Pixels of the plane that are not on color edges, [h, w] bool.
+        lab: Colors, [h, w, 3] float32, Lab.
+        config: Settings.
     """
     count, parts = cv2.connectedComponents(even.astype(np.uint8), connectivity=4)
     parts = np.asarray(parts, np.int32)
@@ -220,9 +252,9 @@ def _of_plane(even: np.ndarray, lab: np.ndarray, config: GeometricSegmentationCo
 
 
 def _filled(part: Foreground) -> Foreground:
-    """Return a mask with filled holes, grown by one pixel.
+    """Return a mask with its holes filled, and grown by one pixel within its window.
 
-    Growing restores the color edge around the segment, which belongs to it.
+    The growth adds the color edge around the segment, which is a part of the segment.
     """
     outline, _ = cv2.findContours(
         part.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
@@ -232,6 +264,6 @@ def _filled(part: Foreground) -> Foreground:
 
 
 def _enlarged(part: Foreground, k: int) -> Foreground:
-    """Return a mask of the small image enlarged by k, to the size of the full image."""
+    """Return a mask of the small image, enlarged by the factor k for the full image."""
     mask = np.repeat(np.repeat(part.mask, k, axis=0), k, axis=1)
     return Foreground(k * part.row, k * part.column, mask)

@@ -1,9 +1,9 @@
-"""Label requests to an open-vocabulary labeller and the use of its results (paper, III.B).
+"""Label requests to an open-vocabulary labeller, and the use of its label results (paper, III.B).
 
-A label result arrives later than its keyframe. It describes the pixels of a region in that
-keyframe, so these are stored until it arrives. The result is also stored as a vote of the region,
-next to the votes of the detector's boxes. A later keyframe that observes the region gets its label
-too.
+A label result arrives later than its keyframe. It labels the pixels of a region in that keyframe,
+so box and mask of the region are stored until the result arrives. The result is also stored as a
+vote of the region, next to the votes of the detector's boxes. Later keyframes that observe the
+region get the label too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,12 +38,13 @@ class OpenVocabularyConfig:
     trigger: RegionProposalConfig = field(default_factory=RegionProposalConfig)
     regions: RegionTrackerConfig = field(default_factory=RegionTrackerConfig)
     reliable: float = 0.6  # Minimum probability of a label that needs no label request (III.B).
-    # Minimum confidence of a label result: with 0.5, the flat's recall is 7 points less.
-    # Labellers that recognize regions without an object return few results below.
+    # Minimum confidence of a label result. With 0.5, the recall on the synthetic flat is 7
+    # percentage points lower. Labellers that recognize regions without an object return few results
+    # with a confidence below 0.3.
     min_sure: float = 0.3
-    # Labels that are no objects, whatever their source; such regions stay background.
+    # Labels that are no objects; a region with such a label result stays background.
     structure: tuple[str, ...] = ("background", "wall", "floor", "ceiling")
-    # Maximum pending label requests, some 10 kB each: the labeller queues 32 regions, and each may
+    # Maximum pending label requests, some 10 kB each. The labeller queues 32 regions, and each may
     # be requested three times.
     max_open: int = 96
 
@@ -57,14 +58,14 @@ class OpenVocabularyConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PendingRequest:
-    """Label request without a result so far.
+    """Region of a label request whose label result has not arrived.
 
     Attributes:
-        box_px: Box of the region in the keyframe, [4], x0 y0 x1 y1, pixels.
-        part: Mask of the region in the keyframe.
-        label: Label of the detector; empty without one.
-        score: Score of the detector.
-        kind: Kind of the region, see `geometric_segmentation`.
+        box_px: Box of the region in the requested keyframe, [4], x0 y0 x1 y1, pixels.
+        part: Mask of the region in the requested keyframe.
+        label: Label of the detector's box; empty without a box.
+        score: Score of the detector's box, 0..1; 0 without a box.
+        kind: Kind of the region, see `geometric_segmentation`; empty for the foreground of a box.
     """
 
     box_px: np.ndarray
@@ -87,12 +88,12 @@ class OpenVocabularyLabeling:
 
         Args:
             config: Settings.
-            is_fused: True if labels of regions are added to the detections. If false, they are only
-                stored as votes of the regions.
+            is_fused: True: labels of regions are added to the detections of a keyframe. False: they
+                are only stored as votes of the regions.
         """
         self.config, self._is_fused = config or OpenVocabularyConfig(), is_fused
         self._regions = RegionTracker(self.config.regions)
-        # Requests by region and keyframe, the oldest first.
+        # Pending requests by the ids of region and keyframe, the oldest first.
         self._open: dict[tuple[int, int], PendingRequest] = {}
         self._requests = self._named = self._unnamed = self._unknown = self._overdue = 0
         self._overruled = 0
@@ -159,7 +160,7 @@ class OpenVocabularyLabeling:
     def apply_label_result(
         self, region: int, keyframe: int, answer: RegionLabelResult, vocabulary: Vocabulary
     ) -> RegionDetections | None:
-        """Return the labels of a region by the labeller and the detector in the requested keyframe.
+        """Apply a label result, and return the region's labels in the requested keyframe.
 
         Args:
             region: Id of the region.
@@ -168,8 +169,8 @@ class OpenVocabularyLabeling:
             vocabulary: Vocabulary of the map.
 
         Returns:
-            The labels. None if the result has no label or no pending request, or if the votes of
-            the region give another label.
+            One box with the labels by the detector and by the labeller. None if the result has no
+            label or no pending request, or if the votes of the region give another label.
         """
         pending = self._open.pop((region, keyframe), None)
         if pending is None:
@@ -195,7 +196,7 @@ class OpenVocabularyLabeling:
             np.array([label_ids]),
             np.array([confidence], np.float32),
             (pending.part,),
-            # Earlier labels of its Gaussians are those of the surface below it.
+            # The Gaussians of a standing object have the label of the surface below it until now.
             replaces_labels=pending.kind == "standing"
             and confidence >= self.config.regions.settled
             and before is not None
@@ -204,7 +205,7 @@ class OpenVocabularyLabeling:
         )
 
     def shown_in(self, region: int) -> tuple[int, ...]:
-        """Return the keyframes whose images are in the label request of a region."""
+        """Return the keyframes whose crops are in the label request of a region."""
         return self._regions.shown_in(region)
 
     def propagated(
@@ -223,7 +224,8 @@ class OpenVocabularyLabeling:
             T_map_keyframe: Current poses of all keyframes, [4, 4], by id.
 
         Returns:
-            Detections with the label; None if the region has no label or is not visible there.
+            One box with the label; None if the region has no label or is not visible in the
+            keyframe.
         """
         place = view.keyframe, view.depth_m, view.camera, T_map_keyframe
         region_label = self._regions.propagated(region, *place)
@@ -234,10 +236,10 @@ class OpenVocabularyLabeling:
     def _filter_answer(
         self, answer: RegionLabelResult, pending: PendingRequest
     ) -> RegionLabelResult:
-        """Return a label result without the labels in `config.structure`.
+        """Return a label result without labels of structure, see `config.structure`.
 
-        A label with a confidence below min_sure is also removed, unless the region is a box of the
-        detector.
+        The result has no label if its label is one of structure. It also has no label if its
+        confidence is below min_sure, unless the region has a box of the detector.
         """
         others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))
         if not self._is_object(answer.label):
@@ -254,7 +256,7 @@ class OpenVocabularyLabeling:
 
     # --- state ------------------------------------------------------------------------------------
     def pack(self) -> dict[str, Any]:
-        """Return plain values and arrays for a checkpoint."""
+        """Return regions and pending requests as plain values and arrays, for a checkpoint."""
         return {
             "regions": self._regions.pack(),
             "open": [[*key, *_packed(pending)] for key, pending in self._open.items()],
@@ -285,9 +287,9 @@ class OpenVocabularyLabeling:
             "answers_named": self._named,
             # Results without a label: no object, or no labeller available.
             "answers_unnamed": self._unnamed,
-            # The votes of the region give another label.
+            # Results with another label than the votes of the region give.
             "label_results_overruled": self._overruled,
-            # Results without a pending request: it was dropped, or the result repeated.
+            # Results without a pending request: the request was dropped, or the result is repeated.
             "answers_unknown": self._unknown,
         }
 
@@ -295,11 +297,18 @@ class OpenVocabularyLabeling:
 def match_boxes_to_regions(
     boxes: int, found: Sequence[RegionProposal]
 ) -> tuple[Foreground | None, ...]:
-    """Return for each of the detector's boxes the mask of its region, or None if it has none.
+    """Return the mask of the region that belongs to each of the detector's boxes.
 
     The mask is that of a segment by depth and creases, or else the foreground of the box without
     structural planes. Segments by color ("flat") are not used, because they include the edge of the
     surface behind the object.
+
+    Args:
+        boxes: Number of boxes.
+        found: Regions of the keyframe.
+
+    Returns:
+        For each box, its mask; None if the box has no region.
     """
     parts: list[Foreground | None] = [None] * boxes
     for one in found:
@@ -316,9 +325,10 @@ def add_region_labels(
 ) -> RegionDetections:
     """Add the labels of regions to the detections of a keyframe.
 
-    A region without a box is added as a new box. For a region with a box, its label is added as the
-    labeller's label of that box. If `boxes_vote`, it also replaces the detector's label, whose vote
-    it contains already.
+    The label of a region with a box becomes the labeller's label of that box. If `boxes_vote`, the
+    detector's label of the box is dropped, because its vote is already a part of the region's
+    label. A region without a box is added as a new box, unless it is a part of a larger region with
+    the same label.
 
     Args:
         detections: Detections of the keyframe.
@@ -338,7 +348,7 @@ def add_region_labels(
                 region_label.sure,
             )
             if boxes_vote:
-                by_detector[number] = 0  # The label of the region contains its vote.
+                by_detector[number] = 0  # The region's label contains the vote of the box.
     alone = [
         region_label
         for region_label in region_labels
@@ -357,7 +367,7 @@ def add_region_labels(
 
 
 def _is_part_of_one(region_label: RegionLabel, region_labels: Sequence[RegionLabel]) -> bool:
-    """Return whether most of the label's box lies in the box of a larger region of that label."""
+    """Return whether over 70 % of a region's box lies in a larger box with the same label."""
     larger = [
         other.of.box_px
         for other in region_labels

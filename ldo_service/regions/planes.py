@@ -1,4 +1,4 @@
-"""Planes of a keyframe, and the structural ones among them: walls, floors and ceilings.
+"""Planes of a keyframe, and its structural planes: walls, floors and ceilings.
 
 On a plane, inverse depth is linear in the image coordinates: n . (ray z) = d gives 1 / z =
 n . ray / d. Planes are therefore fitted to inverse depth by least squares. The noise of inverse
@@ -25,23 +25,27 @@ _EPSILON = np.float32(1e-6)
 class PlaneConfig:
     """Settings of the planes.
 
-    The values were chosen on the sequence `synthetic:flat`, where regions covered the objects best,
-    and were not varied on other data. Lengths in pixels refer to the image after its reduction to
-    `width_px`.
+    The values are those with which regions covered the objects of the sequence `synthetic:flat`
+    best; no other data were tried. Lengths in pixels refer to the small image, which is the depth
+    image scaled down to a width of about `width_px`.
     """
 
-    width_px: int = 320  # Width of that image; normals over a few of its pixels are stable enough.
+    # Width of the small image; at this width, normals over a few pixels are stable enough.
+    width_px: int = 320
     blur_px: float = 2.0  # Blur of the inverse depth for normals.
     min_cosine: float = 0.94  # Minimum cosine of normals 4 px apart on one surface.
     max_step: float = 0.04  # Maximum relative depth step within 3x3 pixels of one surface.
-    step_floor: float = 0.004  # 1 / m, added to that step, since far away noise alone is a step.
+    # Inverse depth, 1 / m, by which a step may exceed max_step. At large distances, the noise alone
+    # exceeds max_step.
+    step_floor: float = 0.004
     min_share: float = 0.01  # Minimum plane size as a fraction of the image.
-    most: int = 24  # Maximum number of planes, the largest.
-    tolerance: float = 0.006  # 1 / m, maximum distance of a plane's pixels from it.
-    # Maximum fraction of a structural plane's outline with a farther surface behind it. Where the
-    # image cuts the outline, the surface is unknown and counts as none behind.
+    most: int = 24  # Maximum number of surfaces to which planes are fitted, the largest.
+    # Maximum difference, 1 / m, between the inverse depth of a plane and of its pixels.
+    tolerance: float = 0.006
+    # Maximum fraction of a structural plane's outline past which a farther surface is visible.
+    # Where the border of the image cuts the plane, no farther surface is counted.
     behind: float = 0.3
-    # Range of distances outside the outline where surfaces behind are counted.
+    # Range of the distances outside of the outline at which farther surfaces are counted.
     gap_px: tuple[int, int] = (3, 8)
 
     def __post_init__(self) -> None:
@@ -64,16 +68,16 @@ class PlaneConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DepthFeatures:
-    """Features of a depth image that was scaled down, [h, w] each.
+    """Features of the small image, a depth image that was scaled down, [h, w] each.
 
     Attributes:
         inverse: Measured inverse depth, float32, 1 / m; 0 where unknown.
-        smooth: Blurred inverse depth, float32, 1 / m.
-        normals: Normals towards the camera, [h, w, 3] float32.
-        rays: Viewing rays with z = 1, [h, w, 3] float32.
+        smooth: Blurred inverse depth, float32, 1 / m; 0 where unknown.
+        normals: Unit normals in the camera frame, pointing away from the camera, [h, w, 3] float32.
+        rays: Viewing rays in the camera frame with z = 1, [h, w, 3] float32.
         is_step: True where depth has a step or is unknown, bool.
-        surfaces: Smooth surfaces, int32; 0 on edges.
-        sizes: Size of each surface, [S], pixels.
+        surfaces: Number of the smooth surface of each pixel, int32; 0 on edges.
+        sizes: Size of each surface, by number, [S], pixels; 0 for the edges.
     """
 
     inverse: np.ndarray
@@ -87,12 +91,12 @@ class DepthFeatures:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Planes:
-    """Planes of a keyframe.
+    """Planes of a keyframe, in the small image.
 
     Attributes:
-        number: Plane of each pixel, [h, w] int32; 0 without one.
-        inverses: Inverse depth that each of P planes would have at every pixel of the image, P
-            arrays [h, w] float32, 1 / m. Plane 1 comes first.
+        number: Number of the plane of each pixel, [h, w] int32, from 1; 0 without a plane.
+        inverses: For each plane, its inverse depth if it filled the whole image, [h, w] float32,
+            1 / m. Plane 1 comes first.
     """
 
     number: np.ndarray
@@ -107,7 +111,13 @@ def shrink_factor(width: int, config: PlaneConfig) -> int:
 def compute_depth_features(
     depth_m: np.ndarray, camera: Camera, config: PlaneConfig
 ) -> DepthFeatures:
-    """Compute the features of depth [H, W] in meters, 0 where unknown."""
+    """Scale a depth image down to the small image, and compute its features.
+
+    Args:
+        depth_m: Depth, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of the depth.
+        config: Settings.
+    """
     k = shrink_factor(camera.width, config)
     inverse = _shrunk_inverse(depth_m, k)
     height, width = inverse.shape
@@ -127,9 +137,10 @@ def compute_depth_features(
 
 
 def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
-    """Fit planes to the largest surfaces; surfaces on one plane get the same number.
+    """Fit planes to the largest surfaces.
 
-    A wall that an object in front divides into two surfaces is therefore one plane.
+    Surfaces on the same plane get the same number. For example, an object in front of a wall may
+    divide the wall into two surfaces, but the wall is one plane.
     """
     number, inverses = np.zeros(seen.inverse.shape, np.int32), []
     for piece in np.argsort(-seen.sizes, kind="stable")[: config.most]:
@@ -138,7 +149,7 @@ def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
             break
         part = (seen.surfaces == piece) & (number == 0)
         if np.count_nonzero(part) < 0.5 * size:
-            continue  # Most of it belongs to a plane already.
+            continue  # Most of the surface belongs to an earlier plane.
         plane = _fitted(seen, part, config)
         if plane is None:
             continue
@@ -153,8 +164,8 @@ def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
 def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -> np.ndarray:
     """Return the number of the structural plane of each pixel, [h, w] int32; 0 without one.
 
-    A plane gets the pixels that `found` gives it, and pixels near them whose distance from the
-    plane is within the depth noise.
+    A structural plane has its pixels in `found` that are within the depth noise of the plane, and
+    such pixels up to 15 px around them.
     """
     out = np.zeros(found.number.shape, np.int32)
     for number, inverse in enumerate(found.inverses, 1):
@@ -163,7 +174,7 @@ def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -
             continue
         part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, disc(3))
         if _share_behind(seen, part, inverse, config) < config.behind:
-            # Unblurred depth: blurred over a step, it would add a ring around each object.
+            # Use unblurred depth: the blur over depth steps would add a ring around each object.
             is_near = np.abs(seen.inverse - inverse) < np.maximum(config.tolerance, 0.02 * inverse)
             reached = (cv2.dilate(part, disc(15)) > 0) & (seen.inverse > 0)
             out[reached & is_near & (out == 0)] = number
@@ -176,7 +187,10 @@ def disc(radius_px: int) -> np.ndarray:
 
 
 def _shrunk_inverse(depth_m: np.ndarray, k: int) -> np.ndarray:
-    """Return the mean inverse depth of the measured pixels in each block of k x k pixels."""
+    """Return the mean inverse depth of the measured pixels in each block of k x k pixels, [h, w].
+
+    A block without measured pixels has 0.
+    """
     height, width = (side // k * k for side in depth_m.shape)
     depth_m = depth_m[:height, :width]
     measured = (depth_m > 0).astype(np.float32)
@@ -187,7 +201,7 @@ def _shrunk_inverse(depth_m: np.ndarray, k: int) -> np.ndarray:
 
 
 def _blurred(inverse: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Return the inverse depth blurred over measured pixels only."""
+    """Blur inverse depth [h, w], with the values of measured pixels only; others stay 0."""
     measured = (inverse > 0).astype(np.float32)
     total, count = (cv2.GaussianBlur(a, (0, 0), sigma_px) for a in (inverse, measured))
     return measured * total / np.maximum(count, np.float32(1e-3))
@@ -196,7 +210,17 @@ def _blurred(inverse: np.ndarray, sigma_px: float) -> np.ndarray:
 def _pieces(
     smooth: np.ndarray, normals: np.ndarray, config: PlaneConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return connected surfaces with similar normals, [h, w], and their sizes; 0 for edges."""
+    """Find connected surfaces with similar normals.
+
+    Args:
+        smooth: Pixels without a depth step, [h, w] bool.
+        normals: Unit normals, [h, w, 3].
+        config: Settings.
+
+    Returns:
+        Number of the surface of each pixel, [h, w] int32, 0 on edges; and the size of each surface
+        in pixels, by number, [S], with 0 for the edges.
+    """
     smooth = smooth.copy()
     smooth[:, 2:-2] &= (normals[:, 4:] * normals[:, :-4]).sum(axis=-1) > config.min_cosine
     smooth[2:-2] &= (normals[4:] * normals[:-4]).sum(axis=-1) > config.min_cosine
@@ -207,12 +231,17 @@ def _pieces(
 
 
 def _fitted(seen: DepthFeatures, part: np.ndarray, config: PlaneConfig) -> np.ndarray | None:
-    """Fit a plane 1 / z = a x + b y + c to a surface.
+    """Fit a plane 1 / z = a x + b y + c to a surface, where (x, y, 1) is the ray of a pixel.
 
     The fit is repeated twice without outliers.
 
+    Args:
+        seen: Features of the small image.
+        part: Pixels of the surface, [h, w] bool.
+        config: Settings.
+
     Returns:
-        a, b, c; None if the surface is not planar.
+        The array (a, b, c), 1 / m; None if the surface is not planar.
     """
     v, u = np.nonzero(part)
     v, u = v[::4], u[::4]
@@ -230,10 +259,18 @@ def _fitted(seen: DepthFeatures, part: np.ndarray, config: PlaneConfig) -> np.nd
 def _share_behind(
     seen: DepthFeatures, part: np.ndarray, inverse: np.ndarray, config: PlaneConfig
 ) -> float:
-    """Return the fraction of a plane's outline with a surface behind it.
+    """Return the fraction of a plane's outline past which a farther surface is visible, 0..1.
 
-    The depth just outside the outline is compared with the plane, extended to there. A surface is
-    behind if it is farther than the extended plane. Objects in front of the plane are not counted.
+    Pixels just outside of the outline are compared with the extended plane. The result is the
+    number of pixels that are farther than the plane, divided by the number of pixels that are
+    farther, nearer or cut off by the border of the image. Pixels on the extended plane do not
+    count.
+
+    Args:
+        seen: Features of the small image.
+        part: Pixels of the plane, [h, w] uint8.
+        inverse: Inverse depth of the extended plane, [h, w], 1 / m.
+        config: Settings.
     """
     near, far = config.gap_px
     ring = (cv2.dilate(part, disc(far)) > 0) & (cv2.dilate(part, disc(near)) == 0) & ~seen.is_step

@@ -12,17 +12,19 @@ from .foreground import Foreground
 from .region_proposals import RegionProposal
 from .region_views import RegionView
 
-MAX_POINTS = 96  # Points per observation, 12 bytes each.
+MAX_POINTS = 96  # Maximum points per observation, 12 bytes each.
 
 
-Votes = tuple[tuple[str, float, float], ...]  # Label, sum of its votes, highest confidence.
+# Votes of a region, one entry per label: label, sum of its votes, highest confidence of a vote.
+Votes = tuple[tuple[str, float, float], ...]
 
 
 def with_vote(votes: Votes, name: str, sure: float, weight: float = 1.0) -> Votes:
-    """Add a vote for a label; the value of a vote is the square of its confidence.
+    """Add a vote for the label `name`; with an empty name, nothing is added.
 
-    The square is used because in the demo a third of the boxes with a score of 0.3 are right, and
-    nearly all with a score of 0.6.
+    The value of the vote is `weight` times the square of the confidence `sure`, 0..1. The square is
+    used because, in the demo, a third of the boxes with a score of 0.3 are right, and nearly all of
+    those with a score of 0.6.
 
     >>> votes = with_vote((("tv", 0.25, 0.5),), "tv", 0.6)
     >>> with_vote(votes, "oven", 0.5, weight=4)
@@ -32,9 +34,15 @@ def with_vote(votes: Votes, name: str, sure: float, weight: float = 1.0) -> Vote
 
 
 def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
-    """Add the vote of a detector's box, but let the sum for its label not exceed `most`.
+    """Add the vote of a detector's box for a label, up to a sum of `most` votes for this label.
 
     The sum is limited because the detector finds the same box again in each keyframe.
+
+    Args:
+        votes: Votes before.
+        name: Label of the box; if empty, nothing is added.
+        sure: Score of the box, 0..1.
+        most: Maximum sum of the votes for the label; if 0, nothing is added.
 
     >>> with_box(with_box((), "tv", 0.6, 0.4), "tv", 0.5, 0.4)
     (('tv', 0.4, 0.6),)
@@ -46,7 +54,7 @@ def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
 
 
 def with_votes_of(votes: Votes, others: Votes, share: float) -> Votes:
-    """Add the votes of another region, multiplied by the weight `share`, 0..1.
+    """Add the votes of another region; their sums and confidences are multiplied by `share`, 0..1.
 
     >>> with_votes_of((("clock", 1.0, 0.5),), (("radiator", 2.0, 0.8), ("clock", 0.5, 0.4)), 0.5)
     (('clock', 1.25, 0.5), ('radiator', 1.0, 0.4))
@@ -55,9 +63,10 @@ def with_votes_of(votes: Votes, others: Votes, share: float) -> Votes:
 
 
 def winning_label(votes: Votes, least: float) -> tuple[str, float]:
-    """Return the label with the most votes and its confidence; ("", 0) below `least`.
+    """Return the label with the most votes, and its confidence.
 
-    The confidence is the highest one for this label, times its fraction of all votes.
+    The confidence is the highest confidence of a vote for this label, times the label's fraction of
+    all votes. The result is ("", 0) if the label has fewer than `least` votes.
 
     >>> winning_label((("tv", 0.6, 0.5), ("oven", 0.4, 0.6)), 0.35)
     ('tv', 0.3)
@@ -69,7 +78,7 @@ def winning_label(votes: Votes, least: float) -> tuple[str, float]:
 
 
 def _added(votes: Votes, more: Votes) -> Votes:
-    """Return the sum of two sets of votes."""
+    """Return the sums of two sets of votes by label, with the higher confidence of each label."""
     sums = {name: (total, most) for name, total, most in votes}
     for name, total, most in more:
         before, surest = sums.get(name, (0.0, 0.0))
@@ -85,9 +94,9 @@ class RegionLabelResult:
     """Label result of a labeller for a region.
 
     Attributes:
-        label: Label; empty if the region is no object or the labeller does not know it.
+        label: Label; empty if the region shows no object or the labeller has no label for it.
         confidence: Confidence of the label, 0..1.
-        others: Alternative labels and their confidences.
+        others: Alternative labels and their confidences, 0..1.
     """
 
     label: str
@@ -101,8 +110,9 @@ class RegionObservation:
 
     Attributes:
         keyframe: Id of the keyframe.
-        candidate: Box, mask and label of the region.
-        p_camera: Points of its surface in the camera frame, [P, 3] float32, meters.
+        candidate: Box, mask and label of the region in the keyframe.
+        p_camera: Points on the surface of the region, in the keyframe's camera frame, [P, 3]
+            float32, meters.
     """
 
     keyframe: int
@@ -121,7 +131,7 @@ class RegionObservation:
         return int(np.count_nonzero(self.candidate.part.mask))
 
     def surface_m2(self, camera: Camera) -> float:
-        """Return the visible surface of the region, as if it faced the camera, square meters."""
+        """Return the visible area of the region in m^2, as if its surface faced the camera."""
         if not len(self.p_camera):
             return 0.0
         depth_m = float(np.median(self.p_camera[:, 2]))
@@ -136,19 +146,19 @@ class Region:
         id: Id of the region.
         keyframe: Keyframe of the newest observation.
         box_px: Box of the newest observation, x0 y0 x1 y1, pixels.
-        shape: Observation that later observations are compared with. It is the one in the label
-            request or, before any request, the largest.
+        shape: Observation that later observations are compared with: the observation in the first
+            label request or, before any request, the largest observation.
         seen: Number of keyframes that observed the region.
-        best: Observation with the best view.
+        best: Observation with the best view; None without a view.
         views: Best views, the best first.
-        label: Label of the detector's box with the highest score.
-        score: Score of that box, 0..1.
+        label: Label of the detector's box with the highest score; empty without a box.
+        score: Score of the box with the highest score, 0..1; 0 without a box.
         votes: Votes for each label.
         questions: Number of label requests so far.
-        quality: Summed quality of the views at the last label request.
-        answer: Label result with the highest confidence, without alternatives.
-        is_supported: True if the region stood on another object in a keyframe. It is then a
-            separate object, not part of the other one.
+        quality: Summed quality of the views at the last label request; 0 before any request.
+        answer: Label result with the highest confidence, without alternatives; None without one.
+        is_supported: True if the region stood on another object in any keyframe. The region is then
+            a separate object and not a part of the other object.
     """
 
     id: int
@@ -167,7 +177,10 @@ class Region:
     is_supported: bool = False
 
     def surface_m2(self, camera: Camera) -> float:
-        """Return the surface that its best view shows, as if it faced the camera, square meters."""
+        """Return the area in the best view in m^2, as if the surface faced the camera.
+
+        The area is 0 without a view.
+        """
         return self.best.surface_m2(camera) if self.best else 0.0
 
     def view_quality_gain(self) -> float:
@@ -185,31 +198,34 @@ class RegionRequest:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionLabel:
-    """Label of a region in a keyframe: box and mask `of`, label, and confidence `sure`, 0..1."""
+    """Label of a region in a keyframe."""
 
-    of: RegionProposal
+    of: RegionProposal  # Box and mask of the region in the keyframe.
     label: str
-    sure: float
+    sure: float  # Confidence of the label, 0..1.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionUpdate:
-    """Result of tracking a keyframe: new label requests, and labels of the keyframe's regions."""
+    """Result of tracking the regions of a keyframe."""
 
-    questions: list[RegionRequest]
-    region_labels: list[RegionLabel]
+    questions: list[RegionRequest]  # New label requests.
+    region_labels: list[RegionLabel]  # Labels of the keyframe's regions.
 
 
 def observe_region(
     keyframe: int, candidate: RegionProposal, depth_m: np.ndarray, camera: Camera
 ) -> RegionObservation | None:
-    """Return the observation of a region with points of its surface; None if it has no depth.
+    """Create the observation of a region in a keyframe, with points on the region's surface.
 
     Args:
         keyframe: Id of the keyframe.
         candidate: Region in the keyframe.
         depth_m: Depth, [H, W], meters; 0 where unknown.
         camera: Intrinsics of the depth.
+
+    Returns:
+        The observation; None if no pixel of the region has depth.
     """
     part = candidate.part
     rows, columns = np.nonzero(part.mask)
@@ -225,11 +241,17 @@ def observe_region(
 
 
 def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Select at most MAX_POINTS of N pixels that spread evenly over a region.
+    """Select at most MAX_POINTS of a region's pixels, spread evenly over the region.
 
-    The selected pixels lie on a grid. If the region is too thin for a grid, every n-th pixel is
-    selected. This would not do for all regions: every n-th pixel of a rectangle may lie on a few
-    lines.
+    The selected pixels lie on a square grid. Only if the region is too thin for a grid, every n-th
+    pixel is selected; in a rectangle, every n-th pixel may lie on a few lines.
+
+    Args:
+        rows: Rows of the region's pixels, [N].
+        columns: Columns of the pixels, [N].
+
+    Returns:
+        Indices of the selected pixels.
     """
     step = max(1, int(np.sqrt(len(rows) / MAX_POINTS)))
     while True:
@@ -244,12 +266,13 @@ def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def merge_observation(region: Region, seen: RegionObservation, max_boxes: float) -> Region:
-    """Add an observation to a region.
+    """Return a region with an observation added, but without a new view.
 
     Args:
         region: The region.
         seen: The observation.
-        max_boxes: Maximum sum of the votes of boxes for a label.
+        max_boxes: Maximum sum of the votes for a label to which the vote of the detector's box may
+            be added.
     """
     proposal = seen.candidate
     surer = max(region, proposal, key=lambda one: one.score)
@@ -295,7 +318,10 @@ def unpack(row: Mapping[str, Any]) -> Region:
 
 
 def _packed_observation(seen: RegionObservation) -> list[Any]:
-    """Return an observation as a list, without the number of its box, which is not needed."""
+    """Return an observation as a list, for a checkpoint.
+
+    The number of the detector's box is omitted, because only its own keyframe uses it.
+    """
     of = seen.candidate
     label_fields = of.label, of.score, of.kind
     return [seen.keyframe, seen.p_camera, of.box_px, *label_fields, *of.part.pack()]

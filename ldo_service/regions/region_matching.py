@@ -11,10 +11,14 @@ from ldo_service.geometry import Camera, se3
 from .foreground import Foreground
 from .region import Region, RegionObservation
 
-STRIDE_PX = 4  # Distance of the sampled pixels and side of the square that each represents.
-MARGIN_PX = 24  # Margin around the visible points, which are few and end within their region.
+# Distance between sampled pixels, and side of the square of the mask that each of them stands for.
+STRIDE_PX = 4
+# Margin around a region's visible points in which pixels are sampled. The points are few and do not
+# reach the edges of the region.
+MARGIN_PX = 24
 MIN_PIXELS = 12  # Minimum sampled pixels of a propagated mask.
-# Maximum distance to the nearest point as a multiple of the points' spacing; farther is behind.
+# Maximum distance of a pixel's point from the nearest point of the region, as a multiple of the
+# spacing of the region's points. A point farther away lies on a surface behind the region.
 SPACING = 1.5
 
 
@@ -23,9 +27,9 @@ class ProjectedPoints:
     """Points of R regions that are visible in a keyframe.
 
     Attributes:
-        rows: Rows of the points in the image, [P].
-        columns: Columns of the points in the image, [P].
-        of: Region of each point, [P], 0..R-1.
+        rows: Rows of the points in the image, [P] int64.
+        columns: Columns of the points in the image, [P] int64.
+        of: Index of the region of each point, [P], 0..R-1.
         counts: Number of visible points of each region, [R].
     """
 
@@ -35,9 +39,10 @@ class ProjectedPoints:
     counts: np.ndarray
 
     def only(self, regions: Sequence[int]) -> "ProjectedPoints":
-        """Return the points of the given regions only, and number the regions in this order.
+        """Return the points of some regions only.
 
-        Each region must be given only once.
+        Args:
+            regions: Indices of the regions, each once; their order gives the new indices.
         """
         places = np.full(len(self.counts), -1)
         places[regions] = np.arange(len(regions))
@@ -47,7 +52,7 @@ class ProjectedPoints:
         return ProjectedPoints(*points, self.counts[regions])
 
     def shares_in(self, part: Foreground) -> np.ndarray:
-        """Return the fraction of each region's visible points that lie in a mask, [R]."""
+        """Return the fraction of each region's visible points that lie in a mask, [R], 0..1."""
         inside = is_in(part, self.rows, self.columns)
         hits = np.bincount(self.of[inside], minlength=len(self.counts))
         return hits / np.maximum(self.counts, 1)
@@ -61,7 +66,7 @@ def projected(
     T_map_keyframe: Mapping[int, np.ndarray],
     max_gap_m: float,
 ) -> ProjectedPoints:
-    """Project the points of regions into a keyframe, and return those that are visible there.
+    """Project the points of regions into a keyframe, and return the points that are visible there.
 
     Args:
         regions: Regions with points.
@@ -69,7 +74,7 @@ def projected(
         camera: Intrinsics of all keyframes.
         T_camera_map: Transform from the map to the keyframe, [4, 4].
         T_map_keyframe: Current poses of the regions' keyframes, [4, 4], by id.
-        max_gap_m: Maximum distance from the measured depth of a visible point.
+        max_gap_m: Maximum difference between the depth of a visible point and the measured depth.
     """
     points, of = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for i, region in enumerate(regions):
@@ -92,16 +97,16 @@ def reverse_overlap(
     T_map_keyframe: Mapping[int, np.ndarray],
     least: int,
 ) -> float:
-    """Return the fraction of an observation's points that lie in the mask of a region.
+    """Return the fraction of an observation's points that lie in the mask of a known region.
 
-    The points are projected into the keyframe of the stored observation, `region.shape`. Points
-    outside its image are not counted. Points that were occluded there count as outside of the mask
-    and lower the fraction. An object that was mostly occluded there and is fully visible now
-    therefore becomes a new region.
+    The points are projected into the keyframe of the region's stored observation, `region.shape`.
+    Points outside of that image are not counted. Points that were occluded in that keyframe count
+    as outside of the mask and lower the fraction. An object that was mostly occluded in the stored
+    observation and is fully visible now therefore becomes a new region.
 
     Args:
-        seen: The observation.
-        region: The region.
+        seen: The new observation.
+        region: The known region.
         shape: Height and width of the images.
         camera: Intrinsics of all keyframes.
         T_map_keyframe: Current poses of both keyframes, [4, 4], by id.
@@ -118,7 +123,12 @@ def reverse_overlap(
 def pixels(
     p_camera: np.ndarray, camera: Camera, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows and columns [P] of points [P, 3] and which lie in the image, [P] bool."""
+    """Project points [P, 3] in the camera frame, meters, to pixels of an image of this shape.
+
+    Returns:
+        Rows, [P] int64, columns, [P] int64, and which points lie in the image, [P] bool. Rows and
+        columns are 0 for points outside of the image.
+    """
     z = p_camera[:, 2]
     far = np.maximum(z, 1e-6)
     u = np.rint(camera.fx * p_camera[:, 0] / far + camera.cx)
@@ -129,7 +139,7 @@ def pixels(
 
 
 def is_in(part: Foreground, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return which pixels lie in a mask, [P] bool."""
+    """Return which of the pixels with these rows [P] and columns [P] lie in a mask, [P] bool."""
     height, width = part.mask.shape
     r, c = rows - part.row, columns - part.column
     inside = (r >= 0) & (c >= 0) & (r < height) & (c < width)
@@ -148,19 +158,20 @@ def propagate_mask(
 ) -> Foreground | None:
     """Project a region's mask from an earlier keyframe into the current one.
 
-    Every fourth pixel of every fourth row is sampled. Its 3D point is projected into the earlier
-    keyframe. The pixel belongs to the region if the point lies in the mask and on the surface of
-    the earlier observation.
+    In the current keyframe, every fourth pixel of every fourth row around the region is sampled.
+    The 3D point of such a pixel is projected into the earlier keyframe. The pixel belongs to the
+    region if the point lies in the mask and on the surface of the earlier observation.
 
     Args:
         seen: The earlier observation of the region.
-        rows: Rows of the region's points in the current keyframe, [P].
-        columns: Columns of these points, [P].
+        rows: Rows of the region's visible points in the current keyframe, [P].
+        columns: Columns of the visible points, [P].
         depth_m: Depth of the current keyframe, [H, W], meters; 0 where unknown.
         camera: Intrinsics of both keyframes.
         T_seen_now: Transform from the current camera to the earlier one, [4, 4].
-        max_gap_m: Maximum distance of a point from the observed surface. A larger distance is
-            allowed if the points of the observation are farther apart than that.
+        max_gap_m: Maximum distance of a pixel's point from the nearest point of the earlier
+            observation. If 1.5 times the spacing of the observation's points is larger, it is used
+            instead.
 
     Returns:
         The mask in the current keyframe, or None if fewer than 12 sampled pixels belong to the
@@ -180,11 +191,11 @@ def propagate_mask(
 def _points(
     rows: np.ndarray, columns: np.ndarray, depth_m: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a grid of pixels around the visible points, and their 3D points.
+    """Sample a grid of pixels around a region's visible points.
 
     Returns:
-        Rows [N], columns [N] and points [N, 3] in the camera frame, meters; z is 0 where depth is
-        unknown.
+        Rows, [N], and columns, [N], of the pixels, and their 3D points in the camera frame, [N, 3],
+        meters; z is 0 where depth is unknown.
     """
     grid = np.meshgrid(
         *(
@@ -208,7 +219,13 @@ def _spacing_m(seen: RegionObservation, camera: Camera) -> float:
 
 
 def _enlarged(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> Foreground:
-    """Return a mask of squares of STRIDE_PX at these pixels."""
+    """Return a mask with a square of side STRIDE_PX at each of these sampled pixels.
+
+    Args:
+        rows: Rows of the upper left corners of the squares, [N].
+        columns: Columns of the corners, [N].
+        shape: Height and width of the image.
+    """
     top, left = int(rows.min()), int(columns.min())
     small = np.zeros(
         ((int(rows.max()) - top) // STRIDE_PX + 1, (int(columns.max()) - left) // STRIDE_PX + 1),
@@ -240,8 +257,10 @@ class RegionMatcher:
             keyframe: Id of the keyframe.
             depth_m: Depth of the keyframe, [H, W], meters; 0 where unknown.
             camera: Intrinsics of all keyframes.
-            T_map_keyframe: Current poses of all keyframes and this one, [4, 4], by id.
-            max_gap_m: Maximum distance from the measured depth of a visible point.
+            T_map_keyframe: Current poses of this keyframe and of the regions' keyframes, [4, 4], by
+                id.
+            max_gap_m: Maximum difference between the depth of a visible point and the measured
+                depth.
             min_points: Minimum visible points of a region; with fewer, it is not matched.
         """
         self._regions = [r for r in regions if r.shape.keyframe in T_map_keyframe]
@@ -276,19 +295,23 @@ class RegionMatcher:
         return best
 
     def seen(self) -> Iterator[int]:
-        """Yield the ids of the regions that are visible in the keyframe."""
+        """Yield the ids of the regions with at least `min_points` visible points."""
         for i, region in enumerate(self._regions):
             if self._is_seen(i):
                 yield region.id
 
     def overlaps(self, shown: Sequence[tuple[int, Foreground]]) -> np.ndarray:
-        """Return the intersection over union of the regions' masks in the keyframe, [M, M].
+        """Estimate the IoU of each pair of M regions' masks in the keyframe.
 
-        It is estimated from two fractions: that of the points of region a in the mask of region b,
-        and the reverse. The diagonal is 1. A region with too few visible points has 0 with others.
+        The IoU of regions a and b is estimated from two fractions: that of a's points in the mask
+        of b, and that of b's points in the mask of a.
 
         Args:
             shown: Ids of M regions, each once, and their masks in the keyframe.
+
+        Returns:
+            The IoU, [M, M], with 1 on the diagonal. A region with too few visible points has 0 with
+            all other regions.
         """
         places = {region.id: i for i, region in enumerate(self._regions)}
         inside = np.zeros((len(shown), len(shown)))
@@ -302,7 +325,7 @@ class RegionMatcher:
         return iou
 
     def propagated(self, region: int) -> Foreground | None:
-        """Propagate the mask of a region into the keyframe; see `propagate_mask`."""
+        """Propagate the mask of the region of this id into the keyframe; see `propagate_mask`."""
         i = next(i for i, one in enumerate(self._regions) if one.id == region)
         shape, is_its = self._regions[i].shape, self._seen.of == i
         T_map_now, T_map_seen = (self._T_map_keyframe[k] for k in (self._keyframe, shape.keyframe))

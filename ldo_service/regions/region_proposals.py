@@ -1,12 +1,12 @@
 """Region proposals of a keyframe for an open-vocabulary labeller (paper, III.B).
 
-The paper requests a label for a region if its best detection has a score below 0.6 or gives no
-reliable label. A proposal is therefore one of the following:
+In the paper, a label is requested for a region if the region's best detection has a score below 0.6
+or gives no reliable label. Two kinds of regions are therefore proposed:
 
-- A box with a low score that does not show the object of a box with a high score.
-- A segment by depth, creases or color (see `geometric_segmentation`) that no box matches and whose
-  pixels mostly have no reliable label in the map. A segment that stands on a labelled object is a
-  proposal too, because that label describes the object below.
+- Boxes with a low score that do not show the object of a box with a high score.
+- Segments by depth, creases or color (see `geometric_segmentation`) that match no box and whose
+  pixels mostly have no reliable label in the map. A segment that stands on a labelled object is
+  also proposed, because the label describes the object below the segment.
 
 `region_tracker` follows proposals over keyframes by their positions.
 """
@@ -23,7 +23,7 @@ from ldo_service.geometry.boxes import ious, non_maximum_suppression
 from .foreground import Foreground, ForegroundConfig, foreground, pixels_of, surfaces
 from .geometric_segmentation import GeometricSegmentationConfig, Segment
 
-_ORDER = ("flat", "apart", "standing", "convex")  # Preference among similar regions.
+_ORDER = ("flat", "apart", "standing", "convex")  # Kinds by preference, if regions are similar.
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,16 +31,20 @@ class RegionProposalConfig:
     """Settings of the region proposals."""
 
     sure: float = 0.6  # Minimum score of a detection that needs no label request (III.B).
-    # Minimum IoU of two boxes of one object; that with the lower score is dropped.
+    # Minimum IoU of two boxes that show the same object; the box with the lower score is dropped.
     same_iou: float = 0.5
-    # Minimum IoU of a box and the box of a region that shows the same object.
+    # Minimum IoU of a detector's box and the box of a region that show the same object.
     fits_iou: float = 0.6
-    similar_iou: float = 0.7  # Minimum IoU of the boxes of two similar regions; one is enough.
-    explained: float = 0.5  # Minimum fraction of labelled pixels for a region to be explained.
-    min_side_px: int = 24  # Minimum side of a region; smaller ones show a labeller nothing.
-    # Maximum size as a fraction of the image; larger ones are rooms, not objects.
+    # Minimum IoU of the boxes of two similar regions; only one of them is proposed.
+    similar_iou: float = 0.7
+    # Minimum fraction of a region's pixels with a reliable label for it to need no label.
+    explained: float = 0.5
+    min_side_px: int = (
+        24  # Minimum side of a region's box; in smaller ones, a labeller sees nothing.
+    )
+    # Maximum size of a region as a fraction of the image; larger ones are rooms, not objects.
     max_share: float = 0.5
-    # Minimum fraction of its box; a region that fills less is a frame around something.
+    # Minimum fraction of its box that a region fills; with less, it is a frame around something.
     min_fill: float = 0.25
     most: int = 32  # Maximum proposals of a keyframe, the largest.
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
@@ -69,15 +73,16 @@ class RegionProposalConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionProposal:
-    """Region proposal: a region that has no reliable label, or that a box with a high score shows.
+    """Region that has no reliable label, or that a box with a high score shows.
 
     Attributes:
         box_px: Box of the region, [4], x0 y0 x1 y1, pixels.
         part: Mask of the region.
-        label: Label of the detector's box; empty without one.
-        score: Score of the detector's box.
-        number: Number of the detector's box; None without one.
-        kind: Kind of the segment, see `geometric_segmentation`; empty without one.
+        label: Label of the detector's box; empty without a box.
+        score: Score of the detector's box, 0..1; 0 without a box.
+        number: Number of the detector's box in the keyframe; None without a box.
+        kind: Kind of the segment, see `geometric_segmentation`; empty if the region is the
+            foreground of a box.
     """
 
     box_px: np.ndarray
@@ -101,19 +106,21 @@ def propose_regions(
 ) -> list[RegionProposal]:
     """Return the regions of a keyframe that need a label, and those of boxes with a high score.
 
-    The region tracker follows both. The largest region comes first. The same arguments give the
-    same proposals.
+    The region tracker follows both kinds. The result is deterministic.
 
     Args:
-        boxes_px: Boxes of the detector, [M, 4], pixels.
-        labels: Labels of the detector, M.
-        scores: Scores of the detector, [M].
+        boxes_px: Boxes of the detector, [M, 4], x0 y0 x1 y1, pixels.
+        labels: Labels of the boxes, M.
+        scores: Scores of the boxes, [M], 0..1.
         depth_m: Depth, [H, W], meters; 0 where unknown.
         camera: Intrinsics of the depth.
         is_labelled: Pixels for which the map has a reliable label, [H, W] bool.
         found: Regions of the keyframe from `regions_of_image`.
         room: Structural planes, see `geometric_segmentation`.
         config: Settings.
+
+    Returns:
+        At most `config.most` regions, the largest first.
     """
     proposals, is_taken = _boxed(boxes_px, labels, scores, depth_m, camera, found, room, config)
     is_sure = np.asarray(scores) >= config.sure
@@ -130,7 +137,7 @@ def propose_regions(
         if one.score >= config.sure or _is_plausible(one, depth_m.shape, config)
     ]
     size = {id(one): np.count_nonzero(one.part.mask) for one in worth}
-    # Boxes with a high score need no label request, and are dropped first.
+    # Boxes with a high score need no label request, so they are dropped first.
     kept = sorted(worth, key=lambda c: (c.score >= config.sure, -size[id(c)]))[: config.most]
     return sorted(kept, key=lambda c: -size[id(c)])
 
@@ -145,10 +152,11 @@ def _boxed(
     room: Sequence[Foreground],
     config: RegionProposalConfig,
 ) -> tuple[list[RegionProposal], list[bool]]:
-    """Return a proposal for each distinct box, and which of the regions `found` these use.
+    """Return a proposal for each distinct box, and which of the regions `found` were used for them.
 
-    A box gets the region that fits it best. If none fits, it gets its own foreground. Structural
-    planes are removed from the foreground if the remainder is large enough.
+    The arguments are those of `propose_regions`. The mask of a box is that of the region that fits
+    the box best or, if no region fits, the foreground of the box. Structural planes are removed
+    from the foreground if the remainder is large enough.
     """
     proposals, is_taken, pieces = [], [False] * len(found), None
     regions_px = _boxes(found)
@@ -169,16 +177,16 @@ def _boxed(
 
 
 def remove_structure(part: Foreground, room: Sequence[Foreground], inside: float) -> Foreground:
-    """Remove from the mask of an object the structural planes that lie mostly outside its box.
+    """Remove structural planes that lie mostly outside of an object's box from the object's mask.
 
-    Examples are the wall between the leaves of a plant and the floor between the legs of a table.
-    If this would remove most of the mask, the mask stays unchanged. An example is a clock, whose
-    mask lies on the plane of its wall.
+    Examples are the wall between the leaves of a plant, and the floor between the legs of a table.
+    The mask stays unchanged if most of it would be removed. An example is a clock, whose mask lies
+    on the plane of the wall.
 
     Args:
         part: The mask of the object.
         room: Structural planes.
-        inside: Minimum fraction of a plane inside the box; such a plane is not removed.
+        inside: Fraction of a plane inside the box, from which the plane is not removed.
 
     >>> plant, wall = np.ones((2, 4), bool), np.zeros((6, 8), bool)
     >>> wall[:, 3:] = True
@@ -201,12 +209,12 @@ def labeled_regions(
     found: Sequence[RegionProposal],
     config: RegionProposalConfig,
 ) -> list[RegionProposal]:
-    """Return the regions `found` that have a reliable label in the map and match no box.
+    """Return the regions in `found` that have a reliable label in the map and match no box.
 
     Regions that stand on an object are excluded, because they are proposals already.
 
     Args:
-        boxes_px: Boxes of the detector, [M, 4], pixels.
+        boxes_px: Boxes of the detector, [M, 4], x0 y0 x1 y1, pixels.
         is_labelled: Pixels for which the map has a reliable label, [H, W] bool.
         found: Regions of the keyframe from `regions_of_image`.
         config: Settings.
@@ -223,9 +231,14 @@ def labeled_regions(
 def regions_of_image(
     found: Sequence[Segment], shape: tuple[int, ...], config: RegionProposalConfig
 ) -> list[RegionProposal]:
-    """Return the segments of an image [H, W] that a labeller could recognize, without duplicates.
+    """Return the segments of an image that a labeller could recognize, without similar ones.
 
-    The pixels of objects that stand on a region are removed from its mask.
+    The pixels of segments `standing` are removed from the masks of segments `apart`.
+
+    Args:
+        found: Segments of the image.
+        shape: Height and width of the image.
+        config: Settings.
     """
     out: list[RegionProposal] = []
     for kind in _ORDER:
@@ -249,9 +262,10 @@ def _without(one: RegionProposal, others: np.ndarray) -> RegionProposal:
 def distinct_boxes(
     boxes_px: np.ndarray, scores: np.ndarray, config: RegionProposalConfig
 ) -> list[int]:
-    """Return for each object the number of the box with the highest score.
+    """Return the numbers of the boxes that show different objects.
 
-    Boxes with an IoU of at least `same_iou` show one object.
+    Of several boxes that show the same object, that with the highest score is returned. A box shows
+    the object of a box with a higher score if their IoU exceeds `same_iou`.
 
     >>> boxes = np.array([[0, 0, 10, 10], [1, 0, 10, 10], [20, 0, 30, 10.0]])
     >>> distinct_boxes(boxes, np.array([0.9, 0.4, 0.5]), RegionProposalConfig())
@@ -264,7 +278,7 @@ def distinct_boxes(
 def _is_plausible(
     candidate: RegionProposal, shape: tuple[int, ...], config: RegionProposalConfig
 ) -> bool:
-    """Return whether a region is worth a label request, by its size and how it fills its box."""
+    """Return whether the size of a region and its fraction of its box are those of an object."""
     width, height = candidate.box_px[2:] - candidate.box_px[:2]
     size_px = np.count_nonzero(candidate.part.mask)
     is_object = size_px <= config.max_share * shape[0] * shape[1]
@@ -280,7 +294,7 @@ def _share(explained: np.ndarray, part: Foreground) -> float:
 
 
 def _painted(boxes_px: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an image with filled boxes, [H, W] bool."""
+    """Return the pixels of an image [H, W] that lie in any of the boxes [M, 4], [H, W] bool."""
     image = np.zeros(shape, bool)
     for x0, y0, x1, y1 in np.round(boxes_px).astype(int).clip(0):
         image[y0 : y1 + 1, x0 : x1 + 1] = True

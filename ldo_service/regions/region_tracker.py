@@ -1,18 +1,18 @@
 """Region tracks: regions over keyframes, with label requests and votes for their labels.
 
-Two observations are of one region if most of the visible points of each lie in the mask of the
-other (see `region_matching`). A view is the crop of an image around the region. A region stores its
-best views and its votes, from the detector's boxes and from label results. Its label is the one
-with the most votes.
+Two observations show the same region if most of the visible points of each observation lie in the
+mask of the other observation (see `region_matching`). A view is the crop of an image around the
+region. A region stores its best views and its votes for labels, which come from the detector's
+boxes and from label results. The label of the region is the label with the most votes.
 
-An object may be segmented differently in each keyframe, so several regions may show it. The label
-of a region is therefore decided by its own votes plus those of overlapping labelled regions,
-weighted by their overlap. A region that stands on an object does not get the votes of that object,
-nor the reverse.
+An object may be segmented differently in each keyframe, so several regions may show the same
+object. To decide the label of a region, the votes of overlapping labelled regions are therefore
+added, weighted by the overlap. A region that stands on another object and the region of that object
+do not add their votes to each other.
 
-The tracker requests a label for a region when it has found no better view for a while. The request
-contains the best views. Most regions show only parts or shadows of objects. The number of requests
-is therefore limited, and regions with the best views come first.
+The tracker requests a label for a region when no better view was found for some keyframes. The
+request contains the best views. Most regions show only parts or shadows of objects. The number of
+requests is therefore limited, and regions with the best views come first.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -53,9 +53,9 @@ class RegionTracker:
 
     def __init__(self, config: RegionTrackerConfig | None = None) -> None:
         self.config = config or RegionTrackerConfig()
-        self._regions: dict[int, Region] = {}  # The last observed comes last.
+        self._regions: dict[int, Region] = {}  # By id; the most recently observed region is last.
         self._next_id = 0
-        self._allowed = 0.0  # Label requests allowed now.
+        self._allowed = 0.0  # Number of label requests that are allowed now.
 
     def __len__(self) -> int:
         return len(self._regions)
@@ -74,17 +74,21 @@ class RegionTracker:
         T_map_keyframe: Mapping[int, np.ndarray],
         named: Sequence[RegionProposal] = (),
     ) -> RegionUpdate:
-        """Track the proposals of a keyframe; return new label requests and labels of its regions.
+        """Track the region proposals of a keyframe.
 
         Args:
             keyframe: Id of the keyframe.
             found: Region proposals of the keyframe.
             color: Color image, [H, W, 3] uint8 RGB.
             depth_m: Depth, [H, W], meters; 0 where unknown.
-            camera: Intrinsics of both.
-            T_map_keyframe: Current poses of this keyframe and those of earlier observations,
-                [4, 4], by id.
-            named: Regions that have a reliable label in the map; they get no label request.
+            camera: Intrinsics of both images.
+            T_map_keyframe: Current poses of this keyframe and of the keyframes with earlier
+                observations, [4, 4], by id.
+            named: Regions that have a reliable label in the map. They are observations of known
+                labelled regions and create no region or label request.
+
+        Returns:
+            New label requests, and the labels of the keyframe's regions.
         """
         config, observed, taken = self.config, list[tuple[int, RegionProposal]](), set[int]()
         regions, place = [*self._regions.values()], (keyframe, depth_m, camera, T_map_keyframe)
@@ -124,7 +128,15 @@ class RegionTracker:
     def _propagated(
         self, known: RegionMatcher, taken: Collection[int]
     ) -> list[tuple[int, RegionProposal]]:
-        """Propagate the masks of labelled regions that are visible but matched no observation."""
+        """Propagate the masks of visible labelled regions that matched no observation.
+
+        Args:
+            known: Matcher with the points of the known regions in the keyframe.
+            taken: Ids of the regions that matched an observation.
+
+        Returns:
+            Ids of the regions, each with its mask in the keyframe.
+        """
         found: list[tuple[int, RegionProposal]] = []
         for number in known.seen():
             region = self._regions[number]
@@ -144,8 +156,12 @@ class RegionTracker:
     ) -> list[RegionLabel]:
         """Return the labels of the keyframe's regions that have a label result.
 
-        Overlapping regions add their votes. Regions without a label result are omitted, so that
-        their boxes keep the labels of the detector.
+        The votes of overlapping regions are added to each region's own votes. Regions without a
+        label result are omitted, so that their boxes keep the labels of the detector.
+
+        Args:
+            shown: Ids of the regions in the keyframe, each with its box and mask there.
+            known: Matcher with the points of the known regions in the keyframe.
         """
         regions = [(self._regions[number], of) for number, of in shown]
         named = [(region, of) for region, of in regions if self._label_of(region)[0]]
@@ -161,7 +177,10 @@ class RegionTracker:
         return region_labels
 
     def shown_in(self, region: int) -> tuple[int, ...]:
-        """Return the keyframes of the best views of a region, which its label request contains."""
+        """Return the keyframes of the views that a label request for a region contains.
+
+        The result is empty if the region was dropped.
+        """
         known = self._regions.get(region)
         return tuple(view.keyframe for view in known.views) if known else ()
 
@@ -175,8 +194,16 @@ class RegionTracker:
     ) -> RegionLabel | None:
         """Propagate the mask and the label of a region into an earlier keyframe.
 
-        The arguments have the meaning of those of `observe_keyframe`. The result is None if the
-        region has no label or is not visible in the keyframe.
+        Args:
+            region: Id of the region.
+            keyframe: Id of the earlier keyframe.
+            depth_m: Its depth, [H, W], meters; 0 where unknown.
+            camera: Intrinsics of all keyframes.
+            T_map_keyframe: Current poses of all keyframes, [4, 4], by id.
+
+        Returns:
+            The mask and the label in the keyframe. None if the region has no label or is not
+            visible there.
         """
         known, config = self._regions.get(region), self.config
         label, sure = self._label_of(known) if known else ("", 0.0)
@@ -190,10 +217,14 @@ class RegionTracker:
     def _label_requests(
         self, now: int, T_map_keyframe: Mapping[int, np.ndarray]
     ) -> list[RegionRequest]:
-        """Return label requests for the regions that need one now, up to the allowed number.
+        """Return label requests for the regions that need a label now, up to the allowed number.
 
-        The regions whose views improved most since their last request come first, weighted by size
-        and kind.
+        Regions come first whose view quality increased most since their last request; the increase
+        is weighted by the region's size and kind (see `_priority`).
+
+        Args:
+            now: Id of the current keyframe.
+            T_map_keyframe: Current poses of the keyframes, [4, 4], by id.
         """
         config = self.config
         self._allowed = min(self._allowed + config.per_keyframe, float(config.at_once))
@@ -204,7 +235,11 @@ class RegionTracker:
         return requests
 
     def _request(self, region: Region) -> RegionRequest:
-        """Create a label request with the best observation of a region, and count the request."""
+        """Create a label request with the best observation of a region.
+
+        The region counts the request. At its first request, the observation in the request becomes
+        `Region.shape`, with which later observations are compared.
+        """
         quality = sum(view.quality for view in region.views)
         shape = region.best if region.best and region.questions == 0 else region.shape
         region = replace(region, questions=region.questions + 1, quality=quality, shape=shape)
@@ -221,17 +256,21 @@ class RegionTracker:
         self._regions[region.id] = region
 
     def _label_of(self, region: Region) -> tuple[str, float]:
-        """Return the label and confidence of a region with a label result, or ("", 0)."""
+        """Return label and confidence of a region; ("", 0) if the region has no label result."""
         return self.name(region) if region.answer and region.answer.label else ("", 0.0)
 
     def name(self, region: Region) -> tuple[str, float]:
-        """Return the label of a region by its own votes, and its confidence; ("", 0) if none."""
+        """Return the label that a region's own votes give, and its confidence, 0..1.
+
+        The result is ("", 0) if there are too few votes.
+        """
         return winning_label(region.votes, self.config.min_votes)
 
     def answered(self, region: int, answer: RegionLabelResult) -> str:
-        """Add a label result to the votes of a region, and return the label that then wins.
+        """Add a label result to the votes of a region, and return the label with the most votes.
 
-        A result with a high confidence prevents further label requests.
+        A result with a confidence of at least `settled` prevents further label requests. If the
+        region was dropped, the label of the result is returned.
         """
         known = self._regions.get(region)
         if known is None:
@@ -253,7 +292,7 @@ class RegionTracker:
     def _with_view(
         self, region: Region, observation: RegionObservation, view: RegionView
     ) -> Region:
-        """Return a region with a view added, if the view is good enough."""
+        """Return the region with a view added; unchanged if the view is below min_quality."""
         if view.quality < self.config.min_quality:
             return region
         views = sorted((*region.views, view), key=lambda view: -view.quality)
@@ -281,12 +320,12 @@ class RegionTracker:
         )
 
     def _forget(self) -> None:
-        """Drop the regions observed longest ago until at most `config.most` remain."""
+        """Drop the regions observed longest ago, so that at most `config.most` remain."""
         while len(self._regions) > self.config.most:
             del self._regions[next(iter(self._regions))]
 
     def pack(self) -> dict[str, Any]:
-        """Return plain values, bytes and lists for a checkpoint."""
+        """Return the tracks as plain values and arrays, for a checkpoint."""
         regions = [pack(region) for region in self._regions.values()]
         return {"next_id": self._next_id, "allowed": self._allowed, "regions": regions}
 
@@ -300,9 +339,10 @@ class RegionTracker:
 
 
 def _priority(region: Region) -> float:
-    """Return the weight of a region's label request, by its size and kind.
+    """Return the priority of a region's label request, by the region's size and kind.
 
-    Large regions have a higher weight, because they are rarely shadows or parts of objects.
+    Large regions have a higher priority, because they are rarely shadows or parts of objects.
+    Convex regions have a lower one.
     """
     assert region.best is not None
     of = region.best.candidate

@@ -13,36 +13,46 @@ MAX_VIEWS = 8  # Maximum views in a label request.
 class RegionTrackerConfig:
     """Settings of the region tracks."""
 
-    views: int = 5  # Number of best views in a label request.
-    views_first: int = 2  # Minimum views before a request; a single one may show a flaw of depth.
-    patience: int = 3  # Keyframes without a better view before a request; one may yet come.
+    views: int = 5  # Maximum views in a label request, the best ones.
+    # Minimum views before a label request. A region with a single view may be an error of depth.
+    views_first: int = 2
+    # Keyframes without a better view after which a label is requested.
+    patience: int = 3
     max_requests: int = 3  # Maximum label requests for a region.
-    # Label requests per keyframe; pending regions with the best views go first. Half of them
-    # show no object. The paper requests on 10-25 % of the frames (IV.B.8); the flat, 1.0 per
-    # keyframe.
+    # Maximum label requests per keyframe, on average; regions with the best views come first. Half
+    # of the regions show no object. The paper makes requests on 10-25 % of the frames (IV.B.8). On
+    # the synthetic flat, 1.0 requests per keyframe are made.
     per_keyframe: float = 2.5
-    at_once: int = 4  # Maximum requests saved up over keyframes without any.
-    gain: float = 1.3  # Minimum ratio of the views' summed quality for another request.
-    settled: float = 0.6  # Minimum confidence of a label result that needs no second one.
-    # Weight of a label result, which is based on several views, relative to a box. All boxes of
-    # one label together have the votes of one result with confidence 1.
+    # Maximum label requests at one keyframe, if earlier keyframes made fewer than per_keyframe.
+    at_once: int = 4
+    # Minimum ratio of the views' summed quality to that at the last request for another request.
+    gain: float = 1.3
+    # Minimum confidence of a label result or score of a box after which no label is requested.
+    settled: float = 0.6
+    # Weight of the vote of a label result relative to that of a box, because a result is based on
+    # several views. All boxes with the same label together have at most as many votes as one label
+    # result with confidence 1.
     answer_weight: float = 4.0
-    # True: boxes vote for the label of a region. False: they are fused per Gaussian (III.B), and
-    # a region has the labeller's label only. Regions of a checkpoint keep their votes.
+    # True: boxes vote for the label of a region. False: labels of boxes are fused per Gaussian
+    # (III.B), and the label of a region comes from the labeller only. A change does not affect the
+    # votes of regions that are restored from a checkpoint.
     boxes_vote: bool = True
     # Minimum votes for a label: one box with a score of 0.6, or four with 0.3.
     min_votes: float = 0.35
     # Minimum confidence of a label that is applied by mask propagation.
     min_propagation_confidence: float = 0.5
-    # Maximum labels of a keyframe by mask propagation: as many as it has proposals.
+    # Maximum labels by mask propagation per keyframe; equal to the maximum number of proposals.
     max_propagated: int = 32
-    overlap: float = 0.6  # Minimum mutual overlap of two observations of one region.
-    # Maximum depth difference between a point and the surface measured there (delta_z, III.A).
+    # Minimum fraction of each of two observations' points in the other's mask to show one region.
+    overlap: float = 0.6
+    # Maximum difference between the depth of a projected point and the measured depth at its pixel
+    # for the point to be visible (delta_z, III.A).
     max_gap_m: float = 0.1
-    min_points: int = 12  # Minimum points of one observation that are visible in the other.
-    min_quality: float = 0.02  # Minimum quality of a view; worse ones show a labeller nothing.
-    # Maximum regions, some 50 kB each: five views of 5 kB, two masks of 12. The region not seen for
-    # longest is dropped.
+    # Minimum points of a region that must be visible in a keyframe to match the region there.
+    min_points: int = 12
+    min_quality: float = 0.02  # Minimum quality of a view; in worse views, a labeller sees nothing.
+    # Maximum regions; the region observed longest ago is dropped. A region takes about 50 kB: five
+    # views of 5 kB and two masks of 12 kB.
     most: int = 1024
     view: ViewConfig = field(default_factory=ViewConfig)
 

@@ -18,10 +18,12 @@ class ViewConfig:
 
     context: float = 0.15  # Margin around the box as a fraction of its sides.
     side_px: int = 336  # Maximum side of the crop; a larger one is scaled down.
-    good_side_px: float = 128.0  # Side of a region that more pixels would not show better.
-    # Variance of the Laplacian (gray levels squared) with a sharpness factor of 0.5.
+    # Side of a region (square root of the box area) from which the size factor is 1.
+    good_side_px: float = 128.0
+    # Variance of the Laplacian (gray levels squared) at which the sharpness factor is 0.5.
     sharp: float = 100.0
-    min_factor: float = 0.25  # Factor of a view that is cut off or seen edge on.
+    # Quality factor of a region that touches the border of the image or is seen edge on.
+    min_factor: float = 0.25
 
     def __post_init__(self) -> None:
         if not (self.context >= 0 and min(self.good_side_px, self.sharp) > 0 and self.side_px > 0):
@@ -35,7 +37,7 @@ class ViewConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionView:
-    """View of a region: a crop of the color image of a keyframe around its box.
+    """View of a region: a crop of the color image of a keyframe around the region's box.
 
     Attributes:
         keyframe: Keyframe of the view.
@@ -63,13 +65,15 @@ def region_view(
     part: Foreground,
     config: ViewConfig,
 ) -> RegionView:
-    """Cut out the view of a region in a keyframe, and rate its quality.
+    """Crop the view of a region from a keyframe, and rate the quality of the view.
+
+    The quality is the product of the size, border, sharpness and facing factors.
 
     Args:
         keyframe: Id of the keyframe.
         color: Color image, [H, W, 3] uint8 RGB.
         depth_m: Depth, [H, W], meters; 0 where unknown.
-        camera: Intrinsics of both.
+        camera: Intrinsics of both images.
         box_px: Box of the region, [4], x0 y0 x1 y1, pixels.
         part: Mask of the region.
         config: Settings.
@@ -90,9 +94,9 @@ def region_view(
 
 
 def size_factor(box_px: np.ndarray, config: ViewConfig) -> float:
-    """Return a quality factor, 0..1, for the size of a box.
+    """Return the quality factor for the size of a box [4], x0 y0 x1 y1.
 
-    It is the side of a square with the area of the box, divided by `good_side_px`, at most 1.
+    The factor is the square root of the box area, divided by `good_side_px`, and at most 1.
 
     >>> size_factor(np.array([0, 0, 64, 64]), ViewConfig())
     0.5
@@ -102,10 +106,15 @@ def size_factor(box_px: np.ndarray, config: ViewConfig) -> float:
 
 
 def border_factor(box_px: np.ndarray, shape: tuple[int, ...], config: ViewConfig) -> float:
-    """Return a quality factor for the distance of the box from the border of the image.
+    """Return the quality factor for the distance of a box from the border of the image.
 
-    It is `min_factor` at the border and 1 if the distance is at least a tenth of the box's longer
-    side.
+    The factor is `min_factor` at the border and rises linearly to 1 at a distance of a tenth of the
+    box's longer side.
+
+    Args:
+        box_px: Box, [4], x0 y0 x1 y1, pixels.
+        shape: Height and width of the image.
+        config: Settings.
     """
     height, width = shape[:2]
     gaps = *(box_px[:2] + 0.5), width - 0.5 - box_px[2], height - 0.5 - box_px[3]
@@ -115,9 +124,10 @@ def border_factor(box_px: np.ndarray, shape: tuple[int, ...], config: ViewConfig
 
 
 def sharpness_factor(crop: np.ndarray, config: ViewConfig) -> float:
-    """Return a quality factor for sharpness: v / (v + sharp), with v the Laplacian's variance.
+    """Return the quality factor for the sharpness of a crop [h, w, 3] uint8 RGB.
 
-    Pech-Pacheco et al., ICPR 2000.
+    The factor is v / (v + sharp), where v is the variance of the Laplacian of the gray image
+    (Pech-Pacheco et al., ICPR 2000).
     """
     gray = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
     variance = float(cv2.Laplacian(gray, cv2.CV_64F).var())
@@ -127,11 +137,16 @@ def sharpness_factor(crop: np.ndarray, config: ViewConfig) -> float:
 def facing_factor(
     depth_m: np.ndarray, camera: Camera, part: Foreground, config: ViewConfig
 ) -> float:
-    """Return a quality factor for how directly the camera faces the surface of a region.
+    """Return the quality factor for how directly the camera faces the surface of a region.
 
-    It is `min_factor + (1 - min_factor) c`, with the mean cosine c between normals and viewing
-    rays; `min_factor`
-    if no normal is known.
+    The factor is `min_factor + (1 - min_factor) c`, where c is the mean cosine between the normals
+    of the region and the viewing rays. It is `min_factor` if no normal is known.
+
+    Args:
+        depth_m: Depth, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of the depth.
+        part: Mask of the region.
+        config: Settings.
     """
     height, width = part.mask.shape
     if min(height, width) < 3 or not part.mask.any():
