@@ -19,7 +19,12 @@ LARGE_SHARE = 0.01  # Minimum size of crops that are counted separately, as a fr
 
 
 def naming_report(naming: Naming, is_large: np.ndarray) -> dict:
-    """Return the accuracies of one set of crops; the mask `is_large` [N] selects the large ones."""
+    """Return the accuracies of the names of N crops, by the keys that `_totals` lists.
+
+    Args:
+        naming: Predicted names of the crops.
+        is_large: Crops whose accuracies are also counted separately, [N] bool.
+    """
     large = Naming(naming.truth[is_large], naming.told[is_large], naming.confidence[is_large])
     coco = [name for name in encoder.NAMES if name in CLASS_NAMES[:COCO_COUNT]]
     per_name = {name: naming.accuracy([name]) for name in encoder.NAMES}
@@ -41,9 +46,9 @@ def naming_report(naming: Naming, is_large: np.ndarray) -> dict:
 
 
 def regions_report(naming: Naming) -> dict:
-    """Return the accuracies on regions.
+    """Return the accuracies of the names of regions, by the keys that `_of_regions` lists.
 
-    For a region without an object, every name without an object is correct.
+    For a region without an object, each name that means "no object" (NO_THINGS) is correct.
     """
     no_things = [k for k, name in enumerate((*encoder.NAMES, NO_NAME)) if name in NO_THINGS]
     is_thing, is_named = naming.truth < len(encoder.NAMES), ~np.isin(naming.told, no_things)
@@ -60,11 +65,11 @@ def regions_report(naming: Naming) -> dict:
 
 
 def written(report: dict, folder: Path) -> str:
-    """Return the card in Markdown.
+    """Return the model card in Markdown.
 
     Args:
-        report: The scores.
-        folder: Folder of the networks' files.
+        report: The scores, as in scores.json.
+        folder: Folder of the networks' files, whose sizes the card lists.
     """
     sizes = {
         file.name: file.stat().st_size

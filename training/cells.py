@@ -15,14 +15,15 @@ THINGS = tuple(name for name in CLASS_NAMES if name in CATALOG)
 NAMES = tuple(name for name in CLASS_NAMES[:COCO_COUNT] if name in CATALOG)  # The first of THINGS.
 NOTHING = len(THINGS)  # Index of the background.
 
-SIDES_PX = ((0, 56), (40, 130), (96, 1000))  # Range of sqrt(box area) by grid.
+# Range of sqrt(box area) of the objects whose boxes a grid predicts, for each grid.
+SIDES_PX = ((0, 56), (40, 130), (96, 1000))
 BOXES_CELLS = 1.5  # Initial distance from the center of a cell to each side of its box, in cells.
 # A cell can predict an object if the object covers the fraction COVERED of the cell, or if the
 # fraction OF_OBJECT of the object's pixels lies in the cell.
 COVERED, OF_OBJECT = 0.4, 0.25
 # A cell without an object has weight 0 if objects cover more than this fraction of it.
 UNCLEAR = 0.3
-NOTHING_WEIGHT = 0.1  # Weight of a background cell of the finest grid.
+NOTHING_WEIGHT = 0.1  # Weight of a background cell of the finest grid in the loss.
 MIN_PX = 20  # Minimum visible pixels of an object in the targets.
 ID_COUNT = 256  # Number of instance ids in a frame.
 
@@ -53,7 +54,7 @@ def visible(plane: np.ndarray, names: np.ndarray) -> Visible:
 
     Args:
         plane: Instance ids [H, W].
-        names: Index into THINGS of each instance id, [256]; -1 for none.
+        names: Index into THINGS of each instance id, [256]; -1 for an id without an object.
     """
     pixels = np.bincount(plane.ravel(), minlength=ID_COUNT)
     ids = np.flatnonzero((pixels >= MIN_PX) & (names >= 0))
@@ -68,16 +69,16 @@ def visible(plane: np.ndarray, names: np.ndarray) -> Visible:
 def make_targets(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
     """Return the training targets of all N cells.
 
-    A cell predicts the smallest object that covers the fraction COVERED of the cell, or of which
-    the fraction OF_OBJECT lies in the cell.
+    The target of a cell is the smallest object that covers the fraction COVERED of the cell, or of
+    which the fraction OF_OBJECT lies in the cell.
 
     Args:
         plane: Instance ids [H, W].
         objects: The visible objects of the frame.
 
     Returns:
-        Names [N], weights [N], boxes [N, 4] in pixels, and a mask [N] of the cells that predict
-        a box.
+        Names [N] (indices into THINGS, or NOTHING), weights [N] in the loss, boxes [N, 4]
+        (x0 y0 x1 y1, pixels), and a mask [N] of the cells that predict a box.
     """
     order = np.argsort(objects.pixels, kind="stable")
     place = np.full(ID_COUNT, len(order))
@@ -95,10 +96,10 @@ def make_targets(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
 
 
 def _counts(plane: np.ndarray, kinds: int) -> list[np.ndarray]:
-    """Return how many pixels each object has in each cell, one array [cells, kinds] per grid.
+    """Return the number of pixels of each object in each cell, one array [cells, kinds] per grid.
 
     Args:
-        plane: Object of each pixel, [H, W], 0..kinds-1; the last is the background.
+        plane: Object of each pixel, [H, W], 0..kinds-1; kinds-1 is the background.
         kinds: Number of objects, plus one for the background.
     """
     stride = STRIDES_PX[0]
@@ -116,15 +117,23 @@ def _counts(plane: np.ndarray, kinds: int) -> list[np.ndarray]:
 def _of_grid(
     counts: np.ndarray, stride_px: int, pixels: np.ndarray, is_for: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Return the owner, the weight and the use of the box of each cell of one grid.
+    """Return the targets of the cells of one grid.
 
-    The owner is the index of the object that the cell predicts, or M for none. The third result
-    is True if the cell predicts a box.
+    Args:
+        counts: Number of pixels of each object in each cell, [cells, M + 1]; the background comes
+            last, the smallest object first.
+        stride_px: Side of a cell.
+        pixels: Number of visible pixels of each object, [M].
+        is_for: Objects whose boxes this grid predicts, [M] bool.
+
+    Returns:
+        For each cell: the index of the object that it predicts, or M for the background; its weight
+        in the loss; and whether it predicts a box.
     """
     things = counts[:, :-1]
     is_owned = (things >= COVERED * stride_px**2) | (things >= OF_OBJECT * pixels)
     is_owned = np.column_stack((is_owned, np.ones(len(counts), bool)))
-    owners = is_owned.argmax(axis=1)  # The smallest object comes first.
+    owners = is_owned.argmax(axis=1)  # The first one is the smallest object.
     sizes = np.bincount(owners, minlength=counts.shape[1])
     weights = 1 / np.sqrt(np.maximum(sizes, 1))
     weights[-1] = NOTHING_WEIGHT * stride_px / STRIDES_PX[0]

@@ -10,12 +10,21 @@ MARGIN = 0.1  # Margin of a crop around a box, as a fraction of the box's sides.
 
 
 def crop(image: np.ndarray, box_px: np.ndarray, side_px: int = INPUT_PX) -> np.ndarray:
-    """Return a box of an image [H, W, 3], centered in a square of CLIP's mean color."""
+    """Crop a box of an image, scaled to fit into a square of CLIP's mean color.
+
+    Args:
+        image: Image [H, W, 3] uint8.
+        box_px: Box [4], x0, y0, x1, y1.
+        side_px: Side of the square.
+
+    Returns:
+        The square [side_px, side_px, 3] uint8, with the crop in its center.
+    """
     return framed(resized(cut(image, box_px), side_px), side_px)
 
 
 def cut(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
-    """Return the part [h, w, ...] of an image [H, W, ...] inside a box."""
+    """Return the part [h, w, ...] of an image [H, W, ...] inside a box; at least one pixel."""
     last_px = np.array(image.shape[1::-1]) - 1
     x0, y0 = np.floor(np.clip(box_px[:2], 0, last_px)).astype(int)
     x1, y1 = np.ceil(np.minimum(box_px[2:], image.shape[1::-1])).astype(int)
@@ -23,7 +32,10 @@ def cut(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
 
 
 def resized(part: np.ndarray, side_px: int, is_ids: bool = False) -> np.ndarray:
-    """Resize an image in proportion to `side_px` on its longer side; ids are not interpolated."""
+    """Resize an image so that its longer side has `side_px` pixels, with its aspect ratio.
+
+    With `is_ids`, the values are ids and are not interpolated.
+    """
     scale = side_px / max(part.shape[:2])
     width, height = (max(1, round(side * scale)) for side in part.shape[1::-1])
     mixed = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -31,7 +43,7 @@ def resized(part: np.ndarray, side_px: int, is_ids: bool = False) -> np.ndarray:
 
 
 def framed(part: np.ndarray, side_px: int) -> np.ndarray:
-    """Return the image centered in a square of CLIP's mean color."""
+    """Return an image [h, w, 3] centered in a square of CLIP's mean color, with this side."""
     canvas = np.full((side_px, side_px, 3), np.round(MEAN * 255), np.uint8)
     height, width = part.shape[:2]
     left, top = (side_px - width) // 2, (side_px - height) // 2
@@ -40,7 +52,7 @@ def framed(part: np.ndarray, side_px: int) -> np.ndarray:
 
 
 def enlarged(box_px: np.ndarray, margin: float) -> np.ndarray:
-    """Return the box with a margin on each side, as a fraction of its sides."""
+    """Return a box [4] grown on each side by the fraction `margin` of its width or height."""
     sides = box_px[2:] - box_px[:2]
     return box_px + np.concatenate((-margin * sides, margin * sides))
 

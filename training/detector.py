@@ -1,9 +1,9 @@
 """Proposal network of the detector: every cell of three grids predicts the object that covers it.
 
-Each cell predicts the name of its object, as each pixel does in semantic segmentation. It also
-predicts the box of the object and the fit, which is the IoU of this box with the true one. Every
-cell has a training target in every frame, so that few frames are enough. The network learns all
-names of the catalog, not only those of COCO.
+Each cell predicts the name of its object, as in semantic segmentation. Each cell also predicts the
+box of the object and the fit, which is the IoU of the predicted box with the true one. Every cell
+has a training target in every frame, so that few frames are enough. The network learns all names of
+the catalog, not only those of COCO.
 """
 
 from collections.abc import Sequence
@@ -19,17 +19,23 @@ from views import Views
 import training
 from examples import SMALL, batches
 
-WIDE, TOLD_BY = 48, 64  # Channels of the neck and of the heads.
+WIDE, TOLD_BY = 48, 64  # Number of channels of the neck and of each head.
 RATE = 1e-2
 BOX_WEIGHT, FIT_WEIGHT = 1.5, 1.0  # Weights relative to the cross entropy of the names.
 TOLD = (4, 1, len(THINGS) + 1)  # Output channels: sides of the box, fit, names and background.
 
 
 def network(net: JaxNetwork | Graph, image) -> list:
-    """Return the raw outputs of each grid.
+    """Compute the raw outputs of each grid, the finest first.
 
-    The channels are four distances in cells from the cell's center, the logit of the fit, and the
-    logits of names and background.
+    Args:
+        net: Backend of the network, see `layers`.
+        image: Images [B, H, W, 3] in 0..1.
+
+    Returns:
+        For each grid, an array [B, rows, columns, 5 + T + 1]. The channels are the distances from
+        the center of the cell to the left, top, right and bottom side of the box (in cells, minus
+        BOXES_CELLS), the logit of the fit, and the logits of the T names and the background.
     """
     fine, middle, coarse = _trunk(net, image)
     return [
@@ -53,7 +59,10 @@ def _trunk(net: JaxNetwork | Graph, image) -> tuple:
 
 
 def _neck(net: JaxNetwork | Graph, fine, middle, coarse) -> list:
-    """Combine features of all grids: pool the coarsest, then add coarse ones to finer ones."""
+    """Combine the features of all grids: pool the coarsest, then add coarse ones to finer ones.
+
+    The results are in the order of `_trunk`, with WIDE channels each.
+    """
     x = net.conv(coarse, "pool.in", WIDE, size=1)
     wide = net.widest(x)
     c = net.conv(net.join([x, wide, net.widest(wide)]), "pool.out", WIDE, size=1)
@@ -69,15 +78,15 @@ def _head(net: JaxNetwork | Graph, x, stride_px: int):
 
 
 def predicted(net: JaxNetwork, images):
-    """Run the network.
+    """Run the network on images, and join the outputs of all N cells.
 
     Args:
-        net: Reader of the network.
+        net: Backend of the network.
         images: Images [B, H, W, 3] in 0..1.
 
     Returns:
-        Corners [B, N, 4] in pixels, logits of the fit [B, N], and logits of the names and the
-        background [B, N, T + 1].
+        Boxes [B, N, 4] as x0, y0, x1, y1 in pixels, logits of the fit [B, N], and logits of the T
+        names and the background [B, N, T + 1].
     """
     levels = network(net, images)
     flat = [level.reshape(level.shape[0], -1, level.shape[-1]) for level in levels]
@@ -89,7 +98,7 @@ def predicted(net: JaxNetwork, images):
 
 
 def loss(weights: Weights, batch: tuple):
-    """Return the sum of the cross entropies of names and fits and the GIoU loss of boxes.
+    """Return the weighted sum of cross entropies of names and fits and the GIoU loss of boxes.
 
     Args:
         weights: Weights of the network.
@@ -109,7 +118,10 @@ def loss(weights: Weights, batch: tuple):
 
 
 def overlaps(a, b):
-    """Return IoU and GIoU of corners [..., 4] (Rezatofighi et al., CVPR 2019)."""
+    """Return the IoU and GIoU, [...] each, of boxes a and b [..., 4], x0, y0, x1, y1.
+
+    Rezatofighi et al., CVPR 2019.
+    """
     low, high = jnp.maximum(a[..., :2], b[..., :2]), jnp.minimum(a[..., 2:], b[..., 2:])
     common = jnp.maximum(high - low, 0).prod(-1)
     union = jnp.maximum(_area(a) + _area(b) - common, 1e-6)
@@ -130,7 +142,7 @@ class FirstStage:
     statistics: Statistics  # Means and variances of the normalized layers.
 
     def look(self, images: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return corners, fits and logits, as `predicted`, for images [B, H, W, 3] uint8."""
+        """Return the results of `predicted` for images [B, H, W, 3] uint8."""
         live = JaxNetwork(self.weights, self.statistics)
         told = predicted(live, jnp.asarray(images, jnp.float32) / 255)
         return tuple(map(np.asarray, told))
@@ -155,11 +167,11 @@ def train(material: Views, steps: Sequence[int], seed: int) -> FirstStage:
 
 
 def looked(graph: Graph) -> tuple[str, str, str]:
-    """Add the network to an ONNX graph.
+    """Add the proposal network to an ONNX graph whose input is `images`.
 
     Returns:
-        Names of the tensors: corners [1, N, 4], logits of the fit [1, 1, N], and logits of the
-        names and the background [1, T + 1, N].
+        Names of three tensors: boxes [1, N, 4] as x0, y0, x1, y1 in pixels, logits of the fit
+        [1, 1, N], and logits of the T names and the background [1, T + 1, N].
     """
     rows = [
         graph.node("Reshape", level, graph.integers(1, sum(TOLD), -1))

@@ -1,4 +1,4 @@
-"""Small dual encoder in the layout of CLIP, which embeds crops and names in one space.
+"""Small dual encoder in the layout of CLIP, which embeds crops and names in a common space.
 
 Input:
     pixel_values: RGB [N, 3, 64, 64] with CLIP's mean and deviation; the crop is centered in a
@@ -7,8 +7,8 @@ Input:
 Output:
     image_embeds: Unit vectors [N, 96].
 
-There is no text encoder. The names' vectors are a table that is trained with the image encoder, in
-`pair`.
+There is no text encoder. The vectors of the names are a table, which `pair` trains together with
+the image encoder.
 """
 
 from collections.abc import Iterator, Sequence
@@ -54,7 +54,15 @@ ABOUT_THINGS = Framing((0.0, 0.25), 0.08, 0.3)
 
 
 def network(net: JaxNetwork | Graph, image) -> list:
-    """Return vectors [N, 1, 1, D] before normalization to unit length."""
+    """Compute the vectors of images, before normalization to unit length.
+
+    Args:
+        net: Backend of the network, see `layers`.
+        image: Normalized crops [N, H, W, 3].
+
+    Returns:
+        Vectors [N, 1, 1, D].
+    """
     x = residual(net, merged(net, image, "stem", 64, side=4), "stage4", 64)
     x = net.conv(x, "down8", 128, stride=2)
     for k in range(2):
@@ -77,7 +85,8 @@ class Pair:
     def images(self, crops: np.ndarray, with_mirror: bool = True) -> np.ndarray:
         """Return unit vectors [N, D] of crops [N, 64, 64, 3] uint8.
 
-        With `with_mirror`, a vector is the normalized sum for the crop and its mirror image.
+        With `with_mirror`, the vectors of the crop and of its mirror image are added and scaled to
+        unit length.
         """
         live = JaxNetwork(self.weights, self.statistics)
         sides = (crops, crops[:, :, ::-1])[: 1 + with_mirror]
@@ -90,7 +99,7 @@ def unit(x):
 
 
 def normalized(crops):
-    """Return uint8 crops with CLIP's mean and deviation."""
+    """Normalize crops [N, H, W, 3] uint8 with CLIP's mean and deviation."""
     return (jnp.asarray(crops, jnp.float32) / 255 - MEAN) / DEVIATION
 
 
@@ -110,7 +119,10 @@ def loss(weights: Weights, batch: tuple):
 
 
 def learnable(seen: VisibleBoxes) -> tuple[VisibleBoxes, np.ndarray]:
-    """Return the boxes that show enough of their object, and their indices into NAMES."""
+    """Return the boxes that show enough of their object, and the indices of their names in NAMES.
+
+    A box must have sides of at least SIDE_MIN_PX, and its object must fill the fraction FILLED_MIN.
+    """
     sides = seen.boxes_px[:, 2:] - seen.boxes_px[:, :2]
     chosen = seen.chosen(
         (sides.min(axis=1) >= SIDE_MIN_PX) & (seen.pixels >= FILLED_MIN * sides.prod(axis=1))
@@ -156,11 +168,11 @@ def batches(
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """Crop of a frame around one object."""
+    """Crop of a frame around one object, or around a region."""
 
     color: np.ndarray  # RGB [h, w, 3].
     plane: np.ndarray  # Instance ids [h, w].
-    instance: int  # Instance id of the object.
+    instance: int  # Instance id of the object; 0 without an object.
 
 
 def shown_in(
@@ -208,7 +220,7 @@ def example(
 
 
 def _cover(color: np.ndarray, by: Shown, rng: np.random.Generator) -> None:
-    """Paste another object over a part of the crop."""
+    """Paste the object of the crop `by` at a random position of an image [h, w, 3], in place."""
     place = rng.integers(0, np.array(color.shape[:2])) - np.array(by.plane.shape) // 2
     low = np.maximum(place, 0)
     high = np.minimum(place + by.plane.shape, color.shape[:2])
@@ -219,20 +231,29 @@ def _cover(color: np.ndarray, by: Shown, rng: np.random.Generator) -> None:
 
 
 def crops_of(seen: VisibleBoxes, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return crops of the visible objects of frames, and the indices of their names."""
+    """Return crops of the visible objects of frames, and the indices of their names.
+
+    Args:
+        seen: Visible objects of the frames.
+        colors: Frames [H, W, 3] uint8 RGB.
+
+    Returns:
+        Crops [N, 64, 64, 3] uint8 of the objects that are `learnable`, and the indices [N] of their
+        names in NAMES.
+    """
     seen, names = learnable(seen)
     rows = zip(seen.frames, seen.boxes_px, strict=True)
     return np.array([crop(colors[f], enlarged(box, MARGIN)) for f, box in rows]), names
 
 
 def fitted_scale(images: np.ndarray, texts: np.ndarray, is_right: np.ndarray) -> float:
-    """Return the scale of the cosines that minimizes the negative log-likelihood.
+    """Return the scale of the cosines that minimizes the negative log-likelihood of the names.
 
     This is temperature scaling (Guo et al., ICML 2017).
 
     Args:
-        images: Vectors [N, D] of images.
-        texts: Vectors [T, D] of names.
+        images: Unit vectors [N, D] of images.
+        texts: Unit vectors [T, D] of names.
         is_right: Mask [N, T] of the correct names; an image may have several.
     """
     scales = np.geomspace(2, 200, 200)
@@ -250,9 +271,15 @@ def fitted_scale(images: np.ndarray, texts: np.ndarray, is_right: np.ndarray) ->
 def embedded(graph: Graph, crops: str, output: str = "", with_mirror: bool = True) -> str:
     """Add the image encoder to an ONNX graph.
 
+    Args:
+        graph: Backend with the weights of the image encoder.
+        crops: Name of the tensor of normalized crops [N, 3, H, W].
+        output: Name of the result; empty: an automatic name.
+        with_mirror: True: the vectors of a crop and of its mirror image are added and scaled to
+            unit length. False: the mirror image is not used.
+
     Returns:
-        Name of the tensor of unit vectors [N, D]. With `with_mirror`, a vector is the normalized
-        sum for the crop and its mirror image.
+        Name of the tensor of unit vectors [N, D].
     """
     both = graph.node("Concat", crops, graph.mirrored(crops), axis=0) if with_mirror else crops
     raw = graph.node("Flatten", network(graph, both), axis=1)
@@ -262,7 +289,13 @@ def embedded(graph: Graph, crops: str, output: str = "", with_mirror: bool = Tru
 
 
 def export(pair: Pair, scale: float, folder: Path) -> None:
-    """Write image_encoder.onnx and text_embeddings.npz into a folder."""
+    """Write image_encoder.onnx and text_embeddings.npz into a folder.
+
+    Args:
+        pair: Trained dual encoder.
+        scale: Calibrated scale of the cosines (logit scale).
+        folder: Folder for the files.
+    """
     graph = Graph(pair.weights, pair.statistics)
     embedded(graph, "pixel_values", "image_embeds")
     about = {"logit_scale": repr(scale), "license": "Apache-2.0"}

@@ -18,21 +18,26 @@ PADDING = 114  # Gray level outside the frame.
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """Size of an example's image, and range of the frame's zoom on it."""
+    """Size of an example's image, and range of the factor by which the frame in it is scaled."""
 
     size_px: tuple[int, int] = INPUT_PX  # Width and height, multiples of the widest cell.
     zoom: tuple[float, float] = (0.8, 1.5)  # Minimum and maximum.
 
 
-# Canvas of the first round, with three eighths of the pixels. Objects have their final size or are
-# smaller.
+# Canvas of the first round, with three eighths of the pixels of the second. The objects in it are
+# at most about as large as in the second round.
 SMALL = Canvas((192, 160), (0.5, 1.2))
 
 
 def batches(
     material: Views, rng: np.random.Generator, canvas: Canvas = Canvas()
 ) -> Iterator[tuple]:
-    """Yield batches of frames in random order, without end, with the targets of their cells."""
+    """Yield batches of augmented frames in random order, without end.
+
+    Yields:
+        Images [BATCH, H, W, 3] uint8, and the targets of their cells as in `cells.make_targets`,
+        each with a first dimension BATCH.
+    """
     names = _names_of_ids(material)
     order = _shuffled(len(material.colors), rng)
     while True:
@@ -44,13 +49,13 @@ def batches(
 
 
 def _shuffled(count: int, rng: np.random.Generator) -> Iterator[int]:
-    """Yield every index once, then again in another order, without end."""
+    """Yield the indices 0..count-1 in random order, then in another random order, without end."""
     while True:
         yield from rng.permutation(count)
 
 
 def _names_of_ids(material: Views) -> np.ndarray:
-    """Return the names [F, 256] of the instance ids of each frame; -1 for none."""
+    """Return the index into THINGS of each instance id in each frame, [F, 256]; -1 for none."""
     seen: VisibleBoxes = material.seen
     names = np.full((len(material.colors), ID_COUNT), -1)
     own = {CLASS_NAMES.index(name): k for k, name in enumerate(THINGS)}
@@ -66,7 +71,15 @@ def _example(
     canvas: Canvas,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, ...]:
-    """Return an image of the canvas' size, and the targets of its cells."""
+    """Return an augmented image of the size of the canvas, and the targets of its cells.
+
+    Args:
+        color: Frame [H, W, 3] uint8 RGB.
+        plane: Instance ids [H, W].
+        names: Index into THINGS of each instance id, [256]; -1 for none.
+        canvas: Size of the result and range of the zoom.
+        rng: Source of the augmentation.
+    """
     zoom = rng.uniform(*canvas.zoom)
     place_px = (np.array(canvas.size_px) - zoom * np.array(color.shape[1::-1])) * rng.random(2)
     seen, shown = _windows(color.shape[1::-1], place_px, zoom, canvas.size_px)
@@ -92,7 +105,7 @@ def _windows(
 
     Args:
         size_px: Width and height of the frame.
-        place_px: Position of the frame's corner on the canvas.
+        place_px: Position [2] of the frame's upper left corner on the canvas.
         zoom: Zoom of the frame.
         canvas_px: Width and height of the canvas.
 

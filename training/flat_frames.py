@@ -8,7 +8,10 @@ from ldo_service.synthetic.flat import FlatSequence
 
 
 def flat_frames(stride: int) -> tuple[list[np.ndarray], VisibleBoxes]:
-    """Return every `stride`-th frame as recorded, and its visible objects."""
+    """Return every `stride`-th frame of the flat, and the visible objects of these frames.
+
+    The frames are [H, W, 3] uint8 RGB, with the errors of the simulated camera.
+    """
     sequence = FlatSequence.named("flat")
     indices = range(0, len(sequence), stride)
     planes = [sequence.labels(index) for index in indices]

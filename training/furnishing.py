@@ -1,4 +1,4 @@
-"""Objects at random positions where they do not collide."""
+"""Furnishing of a room: objects at random positions without collisions."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -28,21 +28,21 @@ from ldo_service.synthetic.flat.scene_object import Heading, Placement, SceneObj
 
 Point = tuple[float, float, float]
 
-GAP_M = 0.015  # Maximum overlap of two objects, so that objects may stand on rugs.
+GAP_M = 0.015  # Maximum overlap of the boxes of two objects; it lets objects stand on rugs.
 TRIES = 12  # Number of positions to try before an object is omitted.
 HEADROOM_M = 0.6  # Free height above tables and seats.
-# Maximum number of chairs at a table, and range of the distance that they stand under it.
+# Maximum number of chairs at a table, and range of the length of a chair that is under the table.
 CHAIRS_MOST, PUSHED_M = 4, (-0.15, 0.3)
 
-# Headings by the direction that the front faces. In this order, they suit objects at the back wall,
-# the front wall, and the walls at +x and -x.
+# Headings (direction of an object's x axis), named by the direction that the object's front faces.
+# Objects at the back wall, the front wall, and the walls at +x and -x have these four, in order.
 TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT = (1.0, 0.0), (-1.0, 0.0), (0.0, -1.0), (0.0, 1.0)
-ASKEW = ((1.0, 0.0), (0.96, 0.28), (0.8, 0.6), (0.8, -0.6), (0.96, -0.28))
+ASKEW = ((1.0, 0.0), (0.96, 0.28), (0.8, 0.6), (0.8, -0.6), (0.96, -0.28))  # Small rotations.
 
 
 @dataclass
 class Builder:
-    """Builder of one furnished room."""
+    """Builder of one furnished room, in the world frame of `layout`."""
 
     rng: np.random.Generator
     paint: Materials
@@ -56,8 +56,8 @@ class Builder:
 
         Args:
             label: Class of the object.
-            heading: Direction of its x axis.
-            shapes: Shapes to choose from; all if empty.
+            heading: Direction of the object's x axis.
+            shapes: Shapes to choose from; empty: all shapes of the class.
         """
         shape = int(self.rng.choice(shapes or range(SHAPES.get(label, 1))))
         solids = CATALOG[label](self.paint, shape)
@@ -67,12 +67,12 @@ class Builder:
     def put(
         self, thing: SceneObject, places: Iterable[Point], carrier: SceneObject | None = None
     ) -> SceneObject | None:
-        """Place an object at the first position where it is free of collisions.
+        """Place an object at the first position without a collision.
 
         Args:
             thing: The object at the origin.
-            places: Positions to try, in order.
-            carrier: Object that it may touch.
+            places: Positions to try, in order, meters.
+            carrier: Object that the new one may collide with, because it carries the new one.
 
         Returns:
             The placed object, or None if no position is free.
@@ -103,16 +103,16 @@ class Builder:
 
 @dataclass(frozen=True, slots=True)
 class _Space:
-    """Free space on a table, seat or board."""
+    """Free space on a table, a seat or a board of a shelf."""
 
-    labels: tuple[str, ...]  # Classes that may lie there.
+    labels: tuple[str, ...]  # Classes that may be placed in the space.
     most: int  # Maximum number of objects.
-    low: np.ndarray  # Low corner [3].
-    high: np.ndarray  # High corner [3].
+    low: np.ndarray  # Low corner [3], meters.
+    high: np.ndarray  # High corner [3], meters.
 
 
 def furnish(builder: Builder) -> None:
-    """Place objects along the walls, on the walls and on the floor of a room."""
+    """Place random objects along the walls, on the walls and on the floor of a room."""
     rng = builder.rng
     for label in _some(rng, AT_WALLS, 15, 23):
         thing = builder.build(label, TO_FRONT, STANDING.get(label, ()))
@@ -126,7 +126,10 @@ def furnish(builder: Builder) -> None:
 
 
 def _place(builder: Builder, thing: SceneObject, places: Iterable[Point]) -> None:
-    """Place an object, with chairs at a dining table and objects on tables, seats and shelves."""
+    """Place an object and what belongs to it.
+
+    A dining table gets chairs; tables, seats and shelves get objects on them.
+    """
     placed = builder.put(thing, places)
     if placed is not None:
         if placed.label == "dining table":
@@ -150,7 +153,10 @@ def _seat(builder: Builder, table: SceneObject) -> None:
 
 
 def _some(rng: np.random.Generator, labels: tuple[str, ...], least: int, most: int) -> list[str]:
-    """Return a random selection in the listed order, in which large objects come first."""
+    """Return a random selection of `least` to `most` labels, in the order of `labels`.
+
+    Large objects come first in that order, so they are placed first.
+    """
     count = int(rng.integers(least, most + 1))
     chosen = np.sort(rng.permutation(len(labels))[:count])
     return [labels[k] for k in chosen]
@@ -161,7 +167,7 @@ def _turned(
     thing: SceneObject,
     ways: Sequence[Heading] = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT),
 ) -> SceneObject:
-    """Turn an object to a random one of these headings, plus at most 37 degrees."""
+    """Turn an object to a random heading of `ways`, and by at most 37 degrees more."""
     quarter = ways[int(builder.rng.integers(len(ways)))]
     askew = ASKEW[int(builder.rng.integers(len(ASKEW)))]
     turns = (Placement((0.0, 0.0, 0.0), quarter), Placement((0.0, 0.0, 0.0), askew))
@@ -171,7 +177,13 @@ def _turned(
 def _along_walls(
     builder: Builder, thing: SceneObject, on_floor: bool
 ) -> tuple[SceneObject, list[Point]]:
-    """Return the object facing away from a random wall, and positions along that wall."""
+    """Choose a random wall, and return the object facing away from it and positions along it.
+
+    Args:
+        builder: The room.
+        thing: The object at the origin, facing TO_FRONT.
+        on_floor: True: the object stands on the floor; false: it hangs at a height from HUNG.
+    """
     wall = int(builder.rng.integers(4))
     heading = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT)[wall]
     if thing.label == "door":  # The leaf of a door is parallel to the wall.
@@ -210,7 +222,14 @@ def _load(builder: Builder, carrier: SceneObject) -> None:
 def _places_in(
     builder: Builder, space: _Space, low: np.ndarray, high: np.ndarray
 ) -> Iterator[Point]:
-    """Yield positions for an object of this extent at the bottom of a space."""
+    """Yield random positions for an object at the bottom of a space.
+
+    Args:
+        builder: The room.
+        space: The space.
+        low: Low corner [3] of the object at the origin, meters.
+        high: High corner [3] of the object at the origin, meters.
+    """
     to_middle = (space.low + space.high) / 2 - (low + high) / 2
     x, y = np.maximum((space.high - space.low - (high - low)) / 2, 0.0)[:2]
     for _ in range(TRIES // 2):
@@ -241,6 +260,6 @@ def _at_height(corner: np.ndarray, z_m: float) -> np.ndarray:
 
 
 def extent(thing: SceneObject) -> tuple[np.ndarray, np.ndarray]:
-    """Return the low and high corner [3] of an object's bounding box along the axes."""
+    """Return the low and the high corner [3] of an object's axis-aligned bounding box, meters."""
     center, size = thing.bounds_m
     return center - size / 2, center + size / 2

@@ -1,4 +1,8 @@
-"""Classes of objects by location in a room; large ones come first, as they are placed first."""
+"""Classes of objects by location in a room.
+
+In each list, large objects come first, because they are placed first. A class that is listed twice
+may occur twice.
+"""
 
 SHAPES = {  # Number of shapes of each class; one for classes that are not listed.
     "chair": 3, "couch": 2, "dining table": 3, "shelf": 2, "cabinet": 2, "cushion": 2, "rug": 2,
@@ -30,14 +34,14 @@ ON_TABLES = (
 )  # fmt: skip
 ON_SEATS = ("cushion", "cushion", "teddy bear", "remote", "book", "cell phone", "handbag", "laptop")
 IN_SHELVES = ("book", "book", "book", "speaker", "vase", "globe", "handbag", "clock", "bowl", "cup")
-FLAT_SHAPES = {"tv": 1}  # Shapes for the wall.
-LYING = {  # Shapes on tables.
+FLAT_SHAPES = {"tv": 1}  # Shape number of objects on walls.
+LYING = {  # Shape numbers of objects on tables, seats and shelves.
     "lamp": (1, 2),
     "speaker": (1,),
     "tv": (0,),
     "cabinet": (0, 1),
 }
-STANDING = {"lamp": (0,), "speaker": (0,)}  # Shapes on the floor.
+STANDING = {"lamp": (0,), "speaker": (0,)}  # Shape numbers of objects on the floor.
 ON_SHELVES = ("vase", "globe", "printer", "clock", "book")
 TABLES = ("dining table", "cabinet")
 SEATS_M = {"couch": 0.48, "bed": 0.51, "bench": 0.45}  # Heights of the seats.

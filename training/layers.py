@@ -1,8 +1,8 @@
 """Layers of convolutional networks, for training in JAX and for export to ONNX.
 
-A network is one function of a reader and its input. The two readers have the same methods:
-`JaxNetwork` computes arrays [N, H, W, C], and `Graph` adds ONNX nodes and returns the names of
-tensors [1, C, H, W].
+A network is a function of a backend `net` and an image, which calls a method of the backend for
+each layer. Two backends have the same methods: `JaxNetwork` computes arrays [N, H, W, C] for
+training, and `Graph` adds ONNX nodes and returns the names of tensors [N, C, H, W].
 """
 
 from collections.abc import Mapping
@@ -24,13 +24,11 @@ OPSET, IR_VERSION = 17, 8  # Versions that onnxruntime 1.18 supports.
 
 
 class JaxNetwork:
-    """Reader that computes JAX arrays; a network calls its methods for each layer.
-
-    With a random generator, it initializes weights that are missing.
+    """Backend of a network that computes JAX arrays.
 
     Attributes:
-        weights: Weights by name.
-        observed: Mean and variance of the batch in each normalized layer.
+        weights: Weights by name, including those that were initialized.
+        observed: Mean and variance of the batch in each normalized layer, by name.
     """
 
     def __init__(
@@ -39,12 +37,14 @@ class JaxNetwork:
         statistics: Mapping | None = None,
         rng: np.random.Generator | None = None,
     ) -> None:
-        """Create a reader.
+        """Create a backend.
 
         Args:
             weights: Weights by name.
-            statistics: Mean and variance of each normalized layer; None for those of the batch.
-            rng: Source of missing weights; None if there may be none missing.
+            statistics: Mean and variance for the normalization of each layer, by name. None: those
+                of the batch are used.
+            rng: Random generator that initializes missing weights. None: a missing weight raises
+                KeyError.
         """
         self.weights = dict(weights)
         self.observed: dict = {}
@@ -52,7 +52,7 @@ class JaxNetwork:
         self._rng = rng
 
     def conv(self, x, name: str, channels: int, stride: int = 1, size: int = 3):
-        """Apply a convolution, batch normalization and ReLU."""
+        """Apply a convolution of `size` x `size` pixels, batch normalization and ReLU."""
         y = self._convolved(x, name, channels, stride, size)
         mean, variance = self._moments(y, name)
         gain = self._weight(f"{name}.gain", np.ones(channels))
@@ -71,7 +71,10 @@ class JaxNetwork:
         return jnp.concatenate(parts, axis=-1)
 
     def folded(self, x, side: int):
-        """Return squares of `side` pixels as the channels of one pixel (space to depth)."""
+        """Merge each square of `side` x `side` pixels into the channels of one pixel.
+
+        This is the operation space to depth.
+        """
         n, height, width, channels = x.shape
         x = x.reshape(n, height // side, side, width // side, side, channels)
         x = x.transpose(0, 1, 3, 2, 4, 5)
@@ -82,7 +85,7 @@ class JaxNetwork:
         return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)
 
     def widest(self, x):
-        """Return the maximum over 5x5 pixels around each pixel."""
+        """Return the maximum of the 5x5 pixels around each pixel, per channel."""
         window = (1, 5, 5, 1)
         return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, window, (1, 1, 1, 1), "SAME")
 
@@ -121,7 +124,10 @@ class JaxNetwork:
 
 
 class Graph:
-    """Reader that builds ONNX nodes, with normalization folded into the convolutions."""
+    """Backend of a network that builds an ONNX graph, with normalization in the convolutions.
+
+    The methods of layers are those of `JaxNetwork`; they take and return names of tensors.
+    """
 
     def __init__(self, weights: Weights, statistics: Statistics) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -130,7 +136,7 @@ class Graph:
         self._statistics = statistics
 
     def beside(self, weights: Weights, statistics: Statistics) -> "Graph":
-        """Return a reader that adds the nodes of another network to the same graph."""
+        """Return a backend that adds the nodes of another network to the graph of this one."""
         other = Graph(weights, statistics)
         other.nodes, other.constants = self.nodes, self.constants
         return other
@@ -198,7 +204,7 @@ class Graph:
         return self.constant(np.array(value, np.float32))
 
     def halved(self, values: np.ndarray) -> str:
-        """Add a constant in half precision, which halves the file; it is cast to float once."""
+        """Add a constant in half precision with a cast to float, which halves the file's size."""
         return self.node("Cast", self.constant(values.astype(np.float16)), to=TensorProto.FLOAT)
 
     def constant(self, values: np.ndarray) -> str:
@@ -217,8 +223,8 @@ class Graph:
 
         Args:
             path: File to write.
-            inputs: Name and shape of the input.
-            outputs: Name and shape of the output.
+            inputs: Name and shape of the only input.
+            outputs: Name and shape of the only output.
             about: Metadata of the model.
         """
         ends = [
@@ -242,12 +248,15 @@ class Graph:
 
 
 def pads(size: int) -> list[tuple[int, int]]:
-    """Return the padding of rows and columns; it is symmetric, as in ONNX."""
+    """Return the padding of rows and columns for a kernel of this side.
+
+    The padding is symmetric, as in the ONNX nodes of `Graph`.
+    """
     return [(size // 2, size // 2)] * 2
 
 
 def unfolded(x, size: int, stride: int):
-    """Return the inputs of each output pixel of a convolution (im2col).
+    """Gather the input values of each output pixel of a convolution (im2col).
 
     Args:
         x: Image [N, H, W, C].
@@ -268,7 +277,7 @@ def unfolded(x, size: int, stride: int):
 
 
 def merged(net: JaxNetwork | Graph, x, name: str, channels: int, side: int = 2):
-    """Apply a patchify convolution: each square of `side` pixels becomes one pixel.
+    """Apply a patchify convolution: each square of `side` x `side` pixels becomes one pixel.
 
     See Liu et al., ConvNeXt, CVPR 2022. Training takes a quarter of the time of a 3x3 convolution
     with stride 2.
@@ -277,6 +286,9 @@ def merged(net: JaxNetwork | Graph, x, name: str, channels: int, side: int = 2):
 
 
 def residual(net: JaxNetwork | Graph, x, name: str, channels: int):
-    """Apply a bottleneck with a residual connection."""
+    """Apply a bottleneck with a residual connection.
+
+    A 1x1 convolution halves the channels, a 3x3 convolution restores them, and the input is added.
+    """
     inner = net.conv(x, f"{name}.in", channels // 2, size=1)
     return net.add(x, net.conv(inner, f"{name}.out", channels))

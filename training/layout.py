@@ -1,7 +1,7 @@
 """Rooms for training, with the flat's catalog but other sizes, layouts and paints.
 
-World frame: z up, origin on the floor at the center of the room, below the lamp that the flat's
-renderer has there.
+World frame: z up, origin on the floor at the center of the room. The renderer of the flat has a
+lamp above the origin.
 """
 
 from collections.abc import Iterator
@@ -15,10 +15,10 @@ from ldo_service.synthetic.flat.scene import Flat
 from ldo_service.synthetic.flat.scene_object import CEILING, FLOOR, WALL
 from ldo_service.synthetic.solids import Solid
 
-VERSION = 3  # Increase it with every change that alters a room.
+VERSION = 3  # Version of the cached rooms; increase it with every change that alters a room.
 LAMP = 2  # Index of the renderer's lamp above the origin.
 HALLWAY_M = 1.4  # Depth of the hallway behind the doorway.
-WIDTH_M, DEPTH_M = (3.6, 5.4), (3.2, 4.8)  # Minimum and maximum.
+WIDTH_M, DEPTH_M = (3.6, 5.4), (3.2, 4.8)  # Minimum and maximum of a room's width and depth.
 FIRST_SEED = 1000  # Offset of the seeds of paints; the flat and its variants use small seeds.
 
 
@@ -37,7 +37,7 @@ def room(seed: int) -> Flat:
 
 
 def inside_m(flat: Flat) -> tuple[float, float]:
-    """Return the width and depth of a room."""
+    """Return the inner width and depth of a room, meters."""
     back, side = flat.panels[0].solid, flat.panels[1].solid
     return back.size_m[0], side.size_m[1] - HALLWAY_M - WALL_M
 

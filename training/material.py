@@ -1,4 +1,4 @@
-"""Training frames of many rooms, rendered once by several processes."""
+"""Training frames of many rooms, which several processes render once and store."""
 
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -15,11 +15,14 @@ from views import Views, VisibleBoxes
 class Rooms:
     """Set of rooms."""
 
-    seeds: range
+    seeds: range  # Seed of each room.
     frames: int  # Number of frames per room.
 
     def load(self, folder: Path) -> Views:
-        """Return the frames of all rooms, in the order of the seeds."""
+        """Return the frames of all rooms, in the order of the seeds.
+
+        Frames that are missing in the folder are rendered and stored first.
+        """
         parts = [views.cached(folder, seed, self.frames) for seed in self.seeds]
         return Views(
             np.concatenate([part.colors for part in parts]),

@@ -23,10 +23,12 @@ from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES
 
 NO_NAME = "background"  # Name of a region that shows no object.
 NO_THINGS = (*BUILDING.split(), NO_NAME)
-# Sides of crops in pixels, and fractions of a round's steps. Small crops come first, because a
-# minute has several times as many steps with them (Tan and Le, EfficientNetV2, ICML 2021).
+# Sides of crops in pixels with their fraction of a round's steps, for each round. Small crops come
+# first, because a step with small crops takes a fraction of the time (Tan and Le, EfficientNetV2,
+# ICML 2021).
 SIDES = ((32, 0.3), (48, 0.7)), ((48, 0.5), (INPUT_PX, 0.5))
-ABOUT_REGIONS = Framing((0.1, 0.2), 0.04, 0.0)  # Many regions are cut off already, hence no cuts.
+# Variation of the crops of regions. Nothing is cut off, because many regions are already cut off.
+ABOUT_REGIONS = Framing((0.1, 0.2), 0.04, 0.0)
 # Fraction of regions in a batch, and fraction of these that show no object.
 REGIONS_SHARE, NO_THING_SHARE = 0.5, 0.35
 MARGIN = ViewConfig().context  # Margin of a labeller's crop, as a fraction of the region's sides.
@@ -73,7 +75,7 @@ def growing(
     """Yield batches whose crops become larger during the round.
 
     Args:
-        source: Function that returns batches of crops with a side in pixels.
+        source: Function that returns endless batches of crops with a given side in pixels.
         sides: Sides of crops and fractions of the steps, as in SIDES.
         steps: Steps of the round.
     """
@@ -83,7 +85,7 @@ def growing(
 
 
 def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) -> Iterator[tuple]:
-    """Yield batches like `encoder.batches`, in which half of the crops show regions."""
+    """Yield batches like `encoder.batches`, but with regions in half of the crops."""
     regions, names = named(material.regions)
     odds, count = _odds(names), round(REGIONS_SHARE * BATCH)
     for crops, told in encoder.batches(material, rng, side_px, BATCH - count):
@@ -96,23 +98,34 @@ def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) 
 
 
 def named(regions: VisibleBoxes) -> tuple[VisibleBoxes, np.ndarray]:
-    """Return the regions that have a name, and its index in (*NAMES, NO_NAME)."""
+    """Return the regions that have a name, and the index of each name in (*NAMES, NO_NAME)."""
     own = {CLASS_NAMES.index(name): k for k, name in enumerate(NAMES)} | {NO_THING: len(NAMES)}
     chosen = regions.chosen(np.array([k in own for k in regions.class_ids.tolist()], bool))
     return chosen, np.array([own[k] for k in chosen.class_ids.tolist()], np.int64)
 
 
 def crops_of(regions: VisibleBoxes, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return crops of regions as a labeller receives them, and the indices of their names."""
+    """Return crops of regions as a labeller receives them, and the indices of their names.
+
+    Args:
+        regions: Regions of the frames.
+        colors: Frames [H, W, 3] uint8 RGB.
+
+    Returns:
+        Crops [N, 64, 64, 3] uint8, and the indices [N] of their names in (*NAMES, NO_NAME).
+    """
     regions, names = named(regions)
     rows = zip(regions.frames, regions.boxes_px, strict=True)
     return np.array([crop(colors[f], enlarged(box, MARGIN)) for f, box in rows]), names
 
 
 def is_right(names: np.ndarray) -> np.ndarray:
-    """Return a mask [N, T + 1] of the correct names of regions with these names [N].
+    """Return the names that are correct for regions, [N, T + 1] bool.
 
-    For a region without an object, all of NO_THINGS are correct.
+    For a region without an object, all names in NO_THINGS are correct.
+
+    Args:
+        names: True name of each region, [N], as an index in (*NAMES, NO_NAME).
     """
     among = (*NAMES, NO_NAME)
     right = np.arange(len(among)) == names[:, None]

@@ -1,7 +1,7 @@
 """Region proposals of a frame, as the service computes them, with their ground-truth objects.
 
 Many of the regions that a labeller receives show a piece of a wall or parts of two objects. A
-network that was trained only on whole objects takes these for an object.
+network that was trained only on whole objects would give such regions the name of an object.
 """
 
 from collections.abc import Iterator
@@ -17,24 +17,29 @@ from ldo_service.synthetic.flat.sensor import measured_depth_m
 
 # Settings for frames that are half as wide as the default settings expect.
 TRIGGER = RegionProposalConfig(min_side_px=12)
-BLUR_PX = 4.0
+BLUR_PX = 4.0  # Maximum motion blur of the color images.
 NO_THING = -1  # Class of a region that shows no object.
-OWN = 0.7  # Minimum fraction of a region that one object covers.
-# Minimum fraction of the visible object that lies in the region; a smaller piece is omitted.
+OWN = 0.7  # Minimum fraction of a region's pixels that one object covers, to show this object.
+# Minimum fraction of an object's visible pixels in a region; regions with less are omitted.
 SHOWN = 0.1
 
 
 def regions(frame: FlatRendering, lens: Camera, rng: np.random.Generator) -> Iterator[tuple]:
-    """Yield class, instance, box and pixels of each region proposal of a frame.
+    """Yield the region proposals of a frame, with the object that each of them shows.
 
-    Color and depth have the errors of a camera. Where the camera measures no depth, it is exact,
-    because the service fills it from the map. A region without an object has the class NO_THING;
-    a region with too small a piece of an object is omitted.
+    The proposals are computed from color and depth with the errors of a camera. Where the camera
+    measures no depth, the exact depth is used, because the service uses the depth of the map there.
 
     Args:
         frame: The exact frame.
         lens: Intrinsics.
         rng: Source of the errors.
+
+    Yields:
+        Class id, instance id, x0, y0, x1, y1 of the box in pixels from the corner of the first
+        pixel, and number of the region's pixels on the object. A region without an object has the
+        class NO_THING, the instance 0, and the number of all of its pixels. A region with too small
+        a piece of an object is omitted.
     """
     sharp = np.floor(np.clip(frame.light, 0, 1) * 255 + 0.5).astype(np.uint8)
     measured_m = measured_depth_m(frame.depth_m, frame.light, lens.fx, rng)

@@ -1,4 +1,7 @@
-"""Scores of the exported files, which are read with onnxruntime only, as by any other program."""
+"""Scores of the exported files.
+
+The networks run in onnxruntime, without any code of the training, as in any other program.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -18,8 +21,8 @@ from ldo_service.synthetic.flat.scene_object import CLASS_NAMES
 # Minimum score of the evaluated boxes, and maximum IoU between two of them.
 SCORE_MIN, NMS_IOU = 0.01, 0.45
 HIT_IOU = 0.5  # Minimum IoU of a correct box.
-SHARE_MIN = 1e-3  # Minimum size of an object to be detected, as a fraction of the image.
-FRAME_PX = (320, 240)
+SHARE_MIN = 1e-3  # Minimum size of an object that the scores count, as a fraction of the image.
+FRAME_PX = (320, 240)  # Width and height.
 TOP_PX = (cells.INPUT_PX[1] - FRAME_PX[1]) // 2  # First row of the frame in the input.
 
 
@@ -27,9 +30,9 @@ TOP_PX = (cells.INPUT_PX[1] - FRAME_PX[1]) // 2  # First row of the frame in the
 class Found:
     """Detections in one frame of FRAME_PX."""
 
-    boxes_px: np.ndarray  # Corners [M, 4].
+    boxes_px: np.ndarray  # Boxes [M, 4], x0, y0, x1, y1.
     scores: np.ndarray  # Scores [M].
-    class_ids: np.ndarray  # Class ids [M].
+    class_ids: np.ndarray  # Indices [M] into `cells.NAMES`.
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +60,12 @@ def canvas(color: np.ndarray) -> np.ndarray:
 
 
 def output(network: onnxruntime.InferenceSession, image: np.ndarray) -> np.ndarray:
-    """Return the detector's output of each cell, [N, 4 + C]."""
+    """Run the detector on its input [256, 320, 3] uint8.
+
+    Returns:
+        For each cell, cx, cy, w, h of its box in pixels and the scores of the C classes,
+        [N, 4 + C].
+    """
     values = image.transpose(2, 0, 1)[None].astype(np.float32) / 255
     return np.asarray(network.run(None, {"images": values})[0])[0].T
 
@@ -82,9 +90,9 @@ def find(network: onnxruntime.InferenceSession, color: np.ndarray) -> Found:
 def detection(
     found: Iterable[Found], seen: VisibleBoxes, at: float = 0.25
 ) -> dict[str, ClassScore]:
-    """Return the scores of each class.
+    """Return the scores of each class that occurs, by name.
 
-    Small objects count neither as objects nor as false detections.
+    Objects below SHARE_MIN count neither as objects nor as false detections.
 
     Args:
         found: Detections of each frame.
@@ -117,9 +125,10 @@ def _counts(truth: VisibleBoxes) -> np.ndarray:
 
 
 def _class_score(frames: list[Found], truth: VisibleBoxes, class_id: int, at: float) -> ClassScore:
-    """Match the boxes of one class in order of descending score.
+    """Return the scores of one class.
 
-    Each box takes the unmatched object that it overlaps most.
+    Boxes are matched with objects in order of descending score. Each box is matched with the
+    unmatched object that it overlaps most, if their IoU is at least HIT_IOU.
     """
     counts = _counts(truth)
     rows = []  # Pairs of score and 1 for a correct box, 0 otherwise.
@@ -178,12 +187,18 @@ class Naming:
 
 
 def embedded(network: onnxruntime.InferenceSession, crops: np.ndarray) -> np.ndarray:
-    """Return the vectors [N, D] of crops [N, 64, 64, 3] uint8."""
+    """Run the image encoder on crops [N, 64, 64, 3] uint8, and return their vectors [N, D]."""
     return np.asarray(network.run(None, {"pixel_values": planes(crops)})[0])
 
 
 def naming(folder: Path, crops: np.ndarray, truth: np.ndarray) -> Naming:
-    """Predict the names of crops [N, 64, 64, 3] with the files in a folder."""
+    """Predict the names of crops with the image encoder and the text embeddings in a folder.
+
+    Args:
+        folder: Folder with image_encoder.onnx and text_embeddings.npz.
+        crops: Crops [N, 64, 64, 3] uint8.
+        truth: Ground-truth indices [N] into the encoder's names.
+    """
     with np.load(folder / "text_embeddings.npz") as texts:
         vectors, scale = texts["embeddings"], float(texts["logit_scale"])
     cosines = embedded(session(folder / "image_encoder.onnx"), crops) @ vectors.T

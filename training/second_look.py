@@ -8,10 +8,10 @@ Output:
         of COCO.
 
 The proposal network (`detector`) predicts boxes. The image encoder of the dual encoder classifies
-the LOOKS most likely boxes again. The score of a box is the class probability from both networks
-times the predicted IoU of the box. Boxes that are not rescored have score 0.
+the LOOKS most likely boxes again. The score of such a box is the class probability from both
+networks times the predicted IoU of the box. All other boxes have score 0.
 
-This follows two-step detectors (Ren et al., NeurIPS 2015). Here, however, the second step is a
+Two-step detectors (Ren et al., NeurIPS 2015) work in this way. Here, however, the second step is a
 separate network that was trained on crops, which takes far fewer training steps.
 """
 
@@ -30,13 +30,13 @@ from onnx import TensorProto
 
 LOOKS = 64  # Maximum number of rescored boxes.
 DISTINCT_IOU = 0.7  # Maximum IoU of two rescored boxes.
-# Weights of both networks' logits. They are below 1 because both see the same pixels, and they are
-# the best values on the calibration rooms.
+# Weights of the logits of the proposal network and of the image encoder. They are below 1 because
+# both networks see the same pixels. These values are the best on the calibration rooms.
 FIRST_WEIGHT, SECOND_WEIGHT = 0.5, 0.6
 
 
 def export(first: FirstStage, pair: Pair, scale: float, path: Path) -> None:
-    """Write the detector.
+    """Write the detector as an ONNX file.
 
     Args:
         first: The proposal network.
@@ -75,7 +75,8 @@ def output(
         is_chosen: Mask [N] of the cells to rescore.
 
     Returns:
-        An array [N, 4 + C] of cx, cy, w, h and the scores.
+        For each cell, cx, cy, w, h of its box in pixels and the scores of the C classes,
+        [N, 4 + C].
     """
     corners, fit, logits = (part[0] for part in first.look(image[None]))
     cells = np.flatnonzero(is_chosen)
@@ -91,7 +92,11 @@ def output(
 
 
 def _best(graph: Graph, corners: str, fit: str, logits: str) -> str:
-    """Return the cells [K] with the most likely objects after non-maximum suppression."""
+    """Add the choice of the cells with the most likely objects, after non-maximum suppression.
+
+    Returns:
+        Name of the tensor with the indices [K] of the cells, K <= LOOKS.
+    """
     _, nothing = graph.split(graph.node("Softmax", logits, axis=1), (len(THINGS), 1))
     likely = graph.node("Mul", fit, graph.node("Sub", graph.number(1), nothing))
     most, iou = graph.integers(LOOKS), graph.constant(np.array([DISTINCT_IOU], np.float32))
@@ -100,13 +105,13 @@ def _best(graph: Graph, corners: str, fit: str, logits: str) -> str:
 
 
 def _rows(graph: Graph, x: str, cells: str) -> str:
-    """Return the rows [K, C] of `cells` of a tensor [1, C, N]."""
+    """Return the name of the rows [K, C] for `cells` [K] of a tensor x [1, C, N]."""
     rows = graph.node("Transpose", graph.node("Squeeze", x, graph.integers(0)), perm=[1, 0])
     return graph.node("Gather", rows, cells, axis=0)
 
 
 def _second_logits(graph: Graph, boxes: str, pair: Pair, scale: float) -> str:
-    """Return the pair's logits [K, T + 1] of names and background."""
+    """Return the name of the dual encoder's logits of names and background, [K, T + 1]."""
     # Mirror images would double the work for the many crops.
     images = embedded(graph, _crops(graph, boxes), with_mirror=False)
     cosines = graph.node("MatMul", images, graph.constant(SECOND_WEIGHT * scale * pair.texts.T))
@@ -120,7 +125,10 @@ def _joined(graph: Graph, first: str, second: str) -> str:
 
 
 def _crops(graph: Graph, boxes: str) -> str:
-    """Return the crops [K, 3, 64, 64] of boxes, as `crops.crop` and `crops.planes` do."""
+    """Return the name of the normalized crops [K, 3, 64, 64] of boxes [K, 4].
+
+    The crops are those of `crops.crop` and `crops.planes`, apart from the interpolation.
+    """
     low, high = graph.split(boxes, (2, 2))
     margin = graph.node("Mul", graph.node("Sub", high, low), graph.number(MARGIN))
     low = graph.node("Max", graph.node("Sub", low, margin), graph.number(0))
@@ -141,7 +149,7 @@ def _crops(graph: Graph, boxes: str) -> str:
 
 
 def _zeros(graph: Graph, like: str) -> str:
-    """Return the image index 0 for each row of a tensor [K, 1]."""
+    """Return the name of a tensor [K] of zeros: the index of the only image for each of K crops."""
     flat = graph.node("Squeeze", graph.node("Mul", like, graph.number(0)), graph.integers(1))
     return graph.node("Cast", flat, to=TensorProto.INT64)
 
@@ -152,7 +160,7 @@ def _masked(graph: Graph, crops: str, extents: str) -> str:
     Args:
         graph: The graph.
         crops: Crops [K, 3, 64, 64] of squares.
-        extents: Sides [K, 2] of the boxes, in halves of the square's side.
+        extents: Width and height [K, 2] of the boxes; 2 is the side of the square.
     """
     places = np.abs((np.arange(CROP_PX) + 0.5) * 2 / CROP_PX - 1).astype(np.float32)
     shapes = (1, 1, 1, CROP_PX), (1, 1, CROP_PX, 1)

@@ -45,14 +45,15 @@ from material import Rooms, render_all
 from views import Views, VisibleBoxes
 from wear import degrade
 
+# Rooms for training, calibration of the confidences, and scores: seeds, and frames per room.
 TRAINING = Rooms(range(200, 488), 8)
 CALIBRATION = Rooms(range(160, 172), 12)
 HELD_OUT = Rooms(range(172, 190), 12)
 SEED = 0
-# Maximum difference of the scores of detector.onnx from `second_look.output`. Both resize crops in
-# different ways, so the scores are not equal.
+# Maximum difference between the scores of detector.onnx and those of `second_look.output`. The two
+# resize crops in different ways, so the scores are not equal.
 APART = 0.2
-STEPS = {"detector": (1900, 1400), "encoder": (5500, 6500)}  # Steps of two rounds each.
+STEPS = {"detector": (1900, 1400), "encoder": (5500, 6500)}  # Steps of each of the two rounds.
 FLAT_STRIDE = 8  # Every 8th frame of the flat is scored.
 SHIPPED = Path(__file__).parents[1] / "ldo_service" / "demo_networks"
 
@@ -60,7 +61,7 @@ log = logging.getLogger(__name__)
 
 
 def main() -> None:
-    """Run the program."""
+    """Render the rooms, train and export the networks, and write their scores and the card."""
     given = _arguments()
     given.out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
@@ -93,7 +94,7 @@ def main() -> None:
 
 
 def _children_s() -> float:
-    """Return the CPU time of the child processes that have ended."""
+    """Return the CPU time of the child processes that have ended, seconds."""
     return sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
 
 
@@ -118,13 +119,13 @@ def start_logging() -> None:
 
 
 def train_detector(work: Path, steps: Sequence[int]) -> FirstStage:
-    """Train the detector's proposal network in a process of its own."""
+    """Train the detector's proposal network; this runs in a process of its own."""
     start_logging()
     return detector.train(TRAINING.load(work), steps, SEED)
 
 
 def train_encoder(work: Path, steps: Sequence[int]) -> Pair:
-    """Train the dual encoder in a process of its own."""
+    """Train the dual encoder; this runs in a process of its own."""
     start_logging()
     return pair.train(TRAINING.load(work), steps, SEED)
 
@@ -132,13 +133,21 @@ def train_encoder(work: Path, steps: Sequence[int]) -> Pair:
 def export(first: FirstStage, both: Pair, work: Path, out: Path) -> None:
     """Calibrate and write the networks, and compare the files with the trained networks.
 
+    Args:
+        first: Trained proposal network.
+        both: Trained dual encoder.
+        work: Folder of the rendered rooms.
+        out: Folder for the files.
+
     Raises:
-        SystemExit: If the outputs differ by more than the tolerance.
+        SystemExit: If the outputs of a file and of the trained network differ by more than the
+            tolerance.
     """
     views = CALIBRATION.load(work)
     colors = _as_recorded(views)
     _export_labeller(both, views, colors, out)
-    # The detector classifies boxes of objects, so NO_NAME is omitted and objects calibrate it.
+    # The detector only classifies boxes of objects. Its copy of the dual encoder therefore has no
+    # NO_NAME, and crops of objects calibrate it.
     things = replace(both, texts=both.texts[: len(encoder.NAMES)], names=encoder.NAMES)
     crops, names = encoder.crops_of(views.seen, colors)
     is_right = names[:, None] == np.arange(len(things.names))
@@ -185,7 +194,7 @@ def score(work: Path, out: Path) -> dict:
 
 
 def _as_recorded(views: Views) -> list[np.ndarray]:
-    """Return frames with the errors of a camera; each frame always has the same ones."""
+    """Return the frames with the errors of a camera, which are the same in each call."""
     return [
         degrade(color, np.random.default_rng([SEED, 3, k])) for k, color in enumerate(views.colors)
     ]

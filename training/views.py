@@ -17,15 +17,17 @@ from ldo_service.synthetic.path import look_at
 
 VERSION = 2  # Version of the cached rooms; increase it when `regions` or the segmentation change.
 WIDTH_PX, HEIGHT_PX = 320, 240
-EYE_M = (1.2, 1.6)  # Height of the camera above the floor, as in a hand.
-GAZE_SLOPE = (-0.45, 0.05)  # Vertical component of the gaze.
+EYE_M = (1.2, 1.6)  # Range of the camera's height above the floor, as if held in a hand.
+# Range of the vertical component of the viewing direction, whose horizontal part has length 1.
+GAZE_SLOPE = (-0.45, 0.05)
 CLEARANCE_M = 0.3  # Minimum distance of the camera to objects.
 WALL_AHEAD_M = 1.3  # Minimum distance to the wall in front of the camera.
 # Candidate poses per frame, and the depth up to which the objects in view are counted. The pose
 # with the most objects is used.
 GLANCES, NEAR_M = 2, 3.0
 SHARE_MIN = 3.9e-4  # Minimum size of an object, as a fraction of the image: 30 pixels.
-WINDOWS = 6  # Random windows per frame that may show the building.
+# Random windows per frame. A window on a bare wall, floor or ceiling becomes a training example.
+WINDOWS = 6
 PURITY = 0.8  # Minimum fraction of such a window that one surface covers.
 
 
@@ -37,8 +39,8 @@ class VisibleBoxes:
     class_ids: np.ndarray  # Index [B] into CLASS_NAMES; -1 for a region without an object.
     instances: np.ndarray  # Instance id [B]; 0 for the building and for no object.
     boxes_px: np.ndarray  # Boxes [B, 4], x0, y0, x1, y1, from the corner of the first pixel.
-    # Visible pixels [B] of the object, in a region those inside it; without an object, all pixels
-    # of the region.
+    # Number [B] of visible pixels of the object. For a region, number of its pixels on the object
+    # or, without an object, of all of its pixels.
     pixels: np.ndarray
 
     def __len__(self) -> int:
@@ -82,7 +84,7 @@ def camera() -> Camera:
 
 
 def render(seed: int, count: int) -> Views:
-    """Render `count` frames of the room of a seed."""
+    """Render `count` frames of the room that `seed` determines."""
     flat = layout.room(seed)
     renderer, lens = FlatRenderer(flat), camera()
     rng = np.random.default_rng([seed, 8])
@@ -100,7 +102,10 @@ def render(seed: int, count: int) -> Views:
 
 
 def cached(folder: Path, seed: int, count: int) -> Views:
-    """Return the frames of `render` from a folder; render and store them if they are missing."""
+    """Return the result of `render` from a file in a folder.
+
+    If the file is missing, the frames are rendered and stored first.
+    """
     file = folder / f"{VERSION}-{layout.VERSION}-{seed}-{count}.npz"
     if not file.exists():
         views = render(seed, count)
@@ -120,9 +125,12 @@ def cached(folder: Path, seed: int, count: int) -> Views:
 def seen_in(
     planes: list[tuple[np.ndarray, np.ndarray]], rng: np.random.Generator | None = None
 ) -> VisibleBoxes:
-    """Return the visible objects in frames of class and instance ids [H, W].
+    """Return the boxes of the visible objects in frames.
 
-    With `rng`, random windows on bare walls, floors and ceilings are added.
+    Args:
+        planes: Class ids [H, W] and instance ids [H, W] of each frame.
+        rng: Source of random windows on bare walls, floors and ceilings, which are added. None: no
+            windows are added.
     """
     rows = [
         (frame, *row)
@@ -140,7 +148,7 @@ def _seen(rows: Sequence[tuple]) -> VisibleBoxes:
 
 
 def _objects(class_ids: np.ndarray, instance_ids: np.ndarray) -> Iterator[tuple]:
-    """Yield class, instance, box and pixels of each object."""
+    """Yield class id, instance id, x0, y0, x1, y1 and number of pixels of each visible object."""
     for instance in np.unique(instance_ids):
         v, u = np.nonzero(instance_ids == instance)
         if instance and len(v) >= SHARE_MIN * instance_ids.size:
@@ -149,7 +157,7 @@ def _objects(class_ids: np.ndarray, instance_ids: np.ndarray) -> Iterator[tuple]
 
 
 def _building(class_ids: np.ndarray, rng: np.random.Generator) -> Iterator[tuple]:
-    """Yield random windows on a bare wall, floor or ceiling."""
+    """Yield random windows on a bare wall, floor or ceiling, as rows like those of `_objects`."""
     height, width = class_ids.shape
     for _ in range(WINDOWS):
         w, h = rng.integers(12, 100, 2)
@@ -164,7 +172,7 @@ def _building(class_ids: np.ndarray, rng: np.random.Generator) -> Iterator[tuple
 def _poses(flat: Flat, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return random camera poses T_world_camera [count, 4, 4] in free space.
 
-    Each is the one of GLANCES candidates with the most objects in view.
+    Each pose is the best of GLANCES candidates: the one with the most objects in view.
     """
     boxes = [thing.bounds_m for thing in flat.things]
     centers_m = np.array([center for center, _ in boxes])
@@ -190,7 +198,12 @@ def _glance(
 
 
 def _things_before(T_world_camera: np.ndarray, centers_m: np.ndarray) -> int:
-    """Return the number of objects whose center is in the image and nearer than NEAR_M."""
+    """Return the number of objects whose center is in the image and at a depth below NEAR_M.
+
+    Args:
+        T_world_camera: Pose of the camera, [4, 4].
+        centers_m: Centers of the objects in the world frame, [M, 3].
+    """
     x, y, z = ((centers_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]).T
     half_x, half_y = 0.5 / FOCAL_PER_WIDTH, 0.5 * HEIGHT_PX / WIDTH_PX / FOCAL_PER_WIDTH
     is_near = (z > 0) & (z < NEAR_M)
