@@ -169,30 +169,34 @@ License: Apache-2.0, like the rest of the package. `python training/train_demo.p
 and this card.
 
 ## What they are
-- `detector.onnx`: the layout of YOLOv8. Input `images` [1, 3, 256, 320], RGB 0..1, the image
-  centered on gray 114; output `output0` [1, 4 + C, 1680]. A proposal network predicts boxes from
-  the whole image. A copy of the image encoder rescores the best 64; all others have score 0. The
-  classes are those of COCO in the catalog of the synthetic scenes, named in the file's metadata:
+- `detector.onnx`: the layout of YOLOv8. Input `images` [1, 3, 256, 320], RGB 0..1: the image in the
+  center, padded with gray 114. Output `output0` [1, 4 + C, 1680]. A proposal network predicts boxes
+  from the whole image. A copy of the image encoder rescores the best 64 boxes; all others have
+  score 0. The classes are those classes of COCO that the synthetic scenes contain; the file's
+  metadata has their names:
   {coco}.
-- `image_encoder.onnx`: the layout of CLIP. Input `pixel_values` [N, 3, 64, 64], RGB with CLIP's
-  mean and deviation: a region's box with a margin of 0.15 of its sides, in proportion, centered in
-  a square of CLIP's mean. Output `image_embeds` [N, D], unit vectors of the crop together with its
-  mirror image. The encoder is trained on regions as the service proposes them: a third of them
-  show no object, and a third show a part of one.
+- `image_encoder.onnx`: the layout of CLIP. Input `pixel_values` [N, 3, 64, 64], RGB normalized with
+  CLIP's mean and deviation: the box of a region with a margin of 0.15 of its sides, scaled with its
+  aspect ratio and centered in a square of CLIP's mean. Output `image_embeds` [N, D]: unit vectors,
+  each the normalized sum of the vectors of the crop and of its mirror image. The encoder is trained
+  on regions as the service proposes them: a third of them show no object, and a third show a part
+  of one.
 - `text_embeddings.npz`: `names` [T], unit vectors `embeddings` [T, D] and `logit_scale` (also in
   the encoder's metadata). Confidences are softmax(logit_scale * image . text) over all T names,
   calibrated for the regions that a labeller receives. The names are those of the detector;
   {others};
   and {building} and background, which mean that there is no object.
 
-There is no text encoder. A name of the table, or one of its synonyms, can be added to a shorter
-list while the service runs (`ldo control add-label`); any other name is rejected.
+There is no text encoder, so the labeller can choose only from the names of the file above and their
+synonyms. If the service runs with a shorter list of names, `ldo control add-label` adds such a name
+to the list; any other name is rejected.
 
 ## Training data
 Renders at 320x240 of random furnished rooms, with random exposure, tint, motion blur and noise. The
-rooms have the flat's catalog, pools of paints and lens, but other sizes, layouts and seeds. The
-flat is used only for the scores below. Because its catalog is the same, these scores are for known
-shapes in new arrangements and paints, not for new shapes.
+rooms have the catalog of objects, the paints and the lens of the sequence `synthetic:flat` (the
+flat), but other sizes, layouts and seeds. The flat is used only for the scores below. Because it
+has the same catalog as the rooms, these scores are for known shapes in new arrangements and paints,
+not for new shapes.
 
 Rendering took {rendering} minutes of CPU time. Training took {training} minutes of CPU time for
 {detector} steps of the detector's proposal network and {encoder} steps of the encoder. The second
@@ -229,14 +233,14 @@ Fraction of crops with the correct name, by true name, among all names:
 
 ## Limits
 - Large objects in partial view (the corner of a bed, a couch's side, a table under other objects)
-  often get a wrong box or name. So do cabinets, suitcases, and shelves from the side. The table
-  counts every view; in good views of an object, names are far better.
-- Apples, oranges, sports balls and mice are all balls of any color here. Only size and
-  surroundings distinguish them, and a crop does not show size. A door is a bare board, which can be
-  mistaken for a wall.
+  often get a wrong box or name. So do cabinets, suitcases, and shelves from the side. The scores
+  above count every view; in good views of an object, names are far better.
+- In the synthetic scenes, apples, oranges, sports balls and mice are all balls of any color. Only
+  size and surroundings distinguish them, and a crop does not show size. A door is a bare board,
+  which can be mistaken for a wall.
 - Objects of a few pixels (mouse, remote, cell phone, fruit) are mostly missed.
 - Scores of the detector are not probabilities: more than 60 % of the boxes with a score of 0.6 or
   more are correct. Confidences of the names are calibrated for regions of similar rooms and for the
-  whole table. They mean nothing for other images.
+  whole table of names. They are not meaningful for other images.
 - Training is deliberately short: with more steps both networks still improve.
 """

@@ -77,7 +77,7 @@ class Views:
 
 
 def camera() -> Camera:
-    """Return intrinsics with the flat's field of view."""
+    """Return the intrinsics of all frames, which have the flat's field of view."""
     focal_px = FOCAL_PER_WIDTH * WIDTH_PX
     center_px = (WIDTH_PX - 1) / 2, (HEIGHT_PX - 1) / 2
     return Camera(WIDTH_PX, HEIGHT_PX, focal_px, focal_px, *center_px)

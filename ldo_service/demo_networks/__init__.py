@@ -12,7 +12,7 @@ LICENSE = "Apache-2.0"
 DETECTOR = Path(__file__).with_name("detector.onnx")
 IMAGE_ENCODER = Path(__file__).with_name("image_encoder.onnx")
 TEXT_EMBEDDINGS = Path(__file__).with_name("text_embeddings.npz")
-NOTHING = ("wall", "floor", "ceiling", "background")  # names of the table that are no objects
+NOTHING = ("wall", "floor", "ceiling", "background")  # Names in the table that are no objects.
 
 __all__ = [
     "DETECTOR",
