@@ -20,7 +20,7 @@ _SUGAR = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : (Load model from .*? f
 
 
 class Network:
-    """Session of onnxruntime."""
+    """Network of an ONNX file, opened in a session of onnxruntime."""
 
     def __init__(self, path: Path, providers: Sequence[str] = ("cpu",), threads: int = 1) -> None:
         """Open a network.

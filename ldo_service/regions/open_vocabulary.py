@@ -76,7 +76,7 @@ class PendingRequest:
 
 
 class OpenVocabularyLabeling:
-    """Choice of label requests, and the use of label results.
+    """Label requests for the regions of a map, and the use of the label results.
 
     Memory is bounded. The same calls give bitwise equal results, also after `unpack`.
     """
@@ -152,7 +152,7 @@ class OpenVocabularyLabeling:
             self._overdue += 1
 
     def withdraw(self, region: int, keyframe: int) -> None:
-        """Drop a label request that was not sent, and count it."""
+        """Drop a label request that was not sent, and count it as expired."""
         if self._open.pop((region, keyframe), None) is not None:
             self._overdue += 1
 

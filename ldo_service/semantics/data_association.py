@@ -64,7 +64,10 @@ class MapView:
     def __post_init__(self) -> None:
         n, v, size = len(self.rows), len(self.indices), (self.camera.height, self.camera.width)
         if not len(self.labels) == len(self.ids) == len(self.anchors) == n:
-            raise ValueError(f"labels, ids and anchors must have the {n} rows of the map.")
+            raise ValueError(
+                f"labels, ids and anchors have {len(self.labels)}, {len(self.ids)} and "
+                f"{len(self.anchors)} rows; each must have {n}, the number of rows of the map."
+            )
         if len(self.regions) != v or (v and not self.indices[-1] < n):
             raise ValueError(
                 f"regions has {len(self.regions)} entries for {v} Gaussians: it must have one for "

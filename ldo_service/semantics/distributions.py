@@ -8,7 +8,8 @@ import numpy as np
 
 from .gaussian_labels import BACKGROUND, MAX_LABELS, OTHER, background, fields
 
-KEPT = 8  # Labels of a sparse distribution: the five of one Gaussian, and three of its neighbors.
+# Labels of a sparse distribution. A Gaussian has five; the mean of several Gaussians has more.
+KEPT = 8
 FLOOR = 1e-6  # Minimum probability in a divergence, so that divergences are finite.
 
 

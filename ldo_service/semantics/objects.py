@@ -408,7 +408,7 @@ class Objects:
         if table.dtype != np.uint8 or table.ndim != 2 or table.shape[1] != LANDMARK.itemsize:
             raise ValueError(
                 f"landmarks are {table.dtype}{table.shape}, must be uint8[K, {LANDMARK.itemsize}]: "
-                "another version of the service wrote them."
+                "another version of the service wrote them; restore them with that version."
             )
         out = Objects(config)
         out._table = table.copy().view(LANDMARK)[:, 0]

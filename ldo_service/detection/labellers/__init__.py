@@ -16,7 +16,7 @@ ScoredLabel = tuple[str, float]  # Label as in a vocabulary, and its probability
 
 
 class Labeller(Protocol):
-    """Labeller of image regions."""
+    """Interface of labellers, which give names to image regions."""
 
     @property
     def identity(self) -> str:

@@ -224,8 +224,8 @@ class HttpLabeller:
             raise ConfigError(f"{name[:40]!r} is not a name: write 1 to {LONGEST} characters.")
         if not self._names:
             raise ConfigError(
-                f"{self.identity} may answer any name, {name!r} too: set "
-                "vlm_labeller.class_names to choose from a list."
+                f"the labeller {self.identity} has no list of names and may answer {name!r} "
+                "already: set vlm_labeller.class_names to let it choose from a list."
             )
         if canonical(name) not in self._names:
             self._names.append(canonical(name))

@@ -76,7 +76,10 @@ class DualEncoderConfig:
 
 @dataclass(frozen=True, slots=True)
 class EncoderFiles:
-    """Files of a pair of encoders: either text and vocabulary, or embeddings, or all must exist."""
+    """Files of a pair of encoders.
+
+    The text encoder and its vocabulary are given together. Without them, embeddings are required.
+    """
 
     image: Path  # Image encoder, ONNX.
     text: Path | None = None  # Text encoder, ONNX.

@@ -66,7 +66,7 @@ class DeadlineExceeded(EndpointError):
 
 
 class HttpClient:
-    """HTTP client for one thread."""
+    """HTTP client with retries, a rate limit and a circuit breaker, for use by a single thread."""
 
     def __init__(
         self,
@@ -136,7 +136,7 @@ class HttpClient:
 
     def _post_with_retries(self, path: str, body: bytes, until_s: float) -> bytes:
         """Send a request until an attempt succeeds, the server rejects it or no attempt is left."""
-        failure = DeadlineExceeded(f"{self.url} may not be asked again within patience_s.")
+        failure = DeadlineExceeded(f"{self.url}: no time within patience_s for another attempt.")
         for attempt in range(self._config.attempts):
             pause_s = self._config.backoff_s * 2 ** (attempt - 1) if attempt else 0.0
             self._wait(pause_s, until_s, failure)
@@ -205,7 +205,7 @@ class HttpClient:
                 answer += piece
                 if len(answer) > MAX_BYTES:
                     raise EndpointError(
-                        f"{self.url} sends more than {MAX_BYTES} bytes: check the address."
+                        f"the response of {self.url} exceeds {MAX_BYTES} bytes: check the address."
                     )
         status = f"answers {response.status_code} {response.reason_phrase[:40]}"
         if response.status_code in RETRY_STATUS_CODES:
@@ -236,7 +236,7 @@ def _address(url: str) -> httpx2.URL:
     is_usable = address.scheme in ("http", "https") and address.host and 0 < port < 65536
     if not is_usable or "?" in url or "#" in url:
         raise ConfigError(
-            f"{_without_user(url)!r} is not the address of a server: write it as "
+            f"{_without_user(url)!r} is not the address of a server: write an address such as "
             "http://127.0.0.1:8000/v1."
         )
     if address.userinfo:
