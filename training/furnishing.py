@@ -177,12 +177,16 @@ def _turned(
 def _along_walls(
     builder: Builder, thing: SceneObject, on_floor: bool
 ) -> tuple[SceneObject, list[Point]]:
-    """Choose a random wall, and return the object facing away from it and positions along it.
+    """Turn an object away from a random wall, and choose positions along this wall.
 
     Args:
         builder: The room.
         thing: The object at the origin, facing TO_FRONT.
-        on_floor: True: the object stands on the floor; false: it hangs at a height from HUNG.
+        on_floor: True: the object stands on the floor; false: it is on the wall, at a random height
+            from HUNG.
+
+    Returns:
+        The turned object at the origin, and TRIES positions, meters.
     """
     wall = int(builder.rng.integers(4))
     heading = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT)[wall]

@@ -149,10 +149,11 @@ def _on_planes(found: Planes, apart: np.ndarray) -> np.ndarray:
 def _concave(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndarray:
     """Return the pixels on concave creases, [h, w] bool.
 
-    A pixel is selected if (p_b - p_a) . (n_b - n_a) < 0 and |n_b - n_a| > `config.crease`. Here, a
-    and b are the pixels `config.crease_px` to its left and right, or above and below, p are their
-    points, and n their unit normals. Stein et al. define concave creases by this inequality for
-    normals towards the camera; `DepthFeatures.normals` point away from the camera.
+    Let a and b be the pixels at the distance `config.crease_px` to the left and to the right of a
+    pixel, or above and below. With their points p and unit normals n, the pixel is on a crease if
+    (p_b - p_a) . (n_b - n_a) < 0 and |n_b - n_a| > `config.crease`. The first inequality defines a
+    concave crease for normals towards the camera (Stein et al.); `DepthFeatures.normals` point away
+    from the camera.
     """
     points = seen.rays / np.maximum(seen.smooth, np.float32(1e-3))[..., None]
     r, concave = config.crease_px, np.zeros(seen.inverse.shape, bool)

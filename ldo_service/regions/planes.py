@@ -164,8 +164,8 @@ def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
 def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -> np.ndarray:
     """Return the number of the structural plane of each pixel, [h, w] int32; 0 without one.
 
-    A structural plane has its pixels in `found` that are within the depth noise of the plane, and
-    such pixels up to 15 px around them.
+    A structural plane consists of its pixels in `found` and of pixels up to 15 px around them, as
+    far as their distance from the plane is within the depth noise.
     """
     out = np.zeros(found.number.shape, np.int32)
     for number, inverse in enumerate(found.inverses, 1):

@@ -37,7 +37,7 @@ class RegionProposalConfig:
     fits_iou: float = 0.6
     # Minimum IoU of the boxes of two similar regions; only one of them is proposed.
     similar_iou: float = 0.7
-    # Minimum fraction of a region's pixels with a reliable label for it to need no label.
+    # Minimum fraction of pixels with a reliable label in a region that needs no label request.
     explained: float = 0.5
     min_side_px: int = (
         24  # Minimum side of a region's box; in smaller ones, a labeller sees nothing.

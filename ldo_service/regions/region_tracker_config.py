@@ -43,7 +43,8 @@ class RegionTrackerConfig:
     min_propagation_confidence: float = 0.5
     # Maximum labels by mask propagation per keyframe; equal to the maximum number of proposals.
     max_propagated: int = 32
-    # Minimum fraction of each of two observations' points in the other's mask to show one region.
+    # Two observations show the same region if at least this fraction of the points of each lies in
+    # the mask of the other.
     overlap: float = 0.6
     # Maximum difference between the depth of a projected point and the measured depth at its pixel
     # for the point to be visible (delta_z, III.A).

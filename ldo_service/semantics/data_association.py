@@ -188,8 +188,8 @@ def find_containing_regions(
 
     Region a contains region b if all of these hold: they share a class; the gap between their depth
     ranges is at most max_depth_gap_m; the fraction part_inside of the box of b lies in the larger
-    box of a. A region without Gaussians gets the depth range of the largest region in its box,
-    because such parts may have got all of its Gaussians.
+    box of a. A region without Gaussians gets the depth range of the largest region in its box:
+    regions of parts are smaller, and all Gaussians may have been assigned to them.
 
     Args:
         boxes: Boxes of the regions, [M, 4], x0 y0 x1 y1, pixels.

@@ -48,8 +48,8 @@ class ConsistencyConfig:
 class Disagreement:
     """Label disagreement of neighbors before the smoothing step, summed over the Gaussians.
 
-    Gaussian i has the mean mu_i, the label distribution p_i, its likeliest label s_i and the
-    neighbors N_i. The weight of its neighbor j is
+    Gaussian i has the mean mu_i, the label distribution p_i, the likeliest label s_i and the
+    neighbors N_i. The weight of a neighbor j of i is
 
         k_ij = w_ij exp(-|mu_i - mu_j|^2 / sigma^2),  w_ij = 1 / |N_i|
 
@@ -241,8 +241,8 @@ def observe(
 def clear_background(labels: np.ndarray, indices: np.ndarray) -> None:
     """Remove the weight of background from rows `indices` [V] of labels [N, 32], in place.
 
-    The other labels keep their proportions to each other and then sum to one. The evidence is
-    multiplied by the weight that they had before.
+    The weights of the other labels are scaled to a sum of one. The evidence is multiplied by the
+    sum that they had before.
 
     >>> labels = new_labels(1)
     >>> row = fields(labels)

@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-ScoredLabel = tuple[str, float]  # Label as in a vocabulary, and its probability, 0..1.
+ScoredLabel = tuple[str, float]  # Canonical name, see `vocabulary`, and its probability, 0..1.
 
 
 class Labeller(Protocol):

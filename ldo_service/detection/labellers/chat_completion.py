@@ -234,9 +234,8 @@ class HttpLabeller:
         """Return the labels of a region; see `Labeller`.
 
         A view with a rejected answer has no label. If the server fails after some views have
-        labels, these labels are used. All views together may take `patience_s`. If a view would
-        exceed this limit by taking as long as the slowest earlier view, it and later ones are
-        omitted.
+        labels, these labels are used. All views together may take `patience_s`. Once the remaining
+        time is shorter than the slowest view took, the remaining views are omitted.
         """
         views: list[list[ScoredLabel]] = []
         until_s, slowest_s = self._clock() + self.config.endpoint.patience_s, 0.0
