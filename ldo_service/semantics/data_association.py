@@ -24,8 +24,7 @@ from .distributions import common_mass, mean_distributions
 from .object_landmarks import MEMBERS, NO_MEMBER, reliable_members, rows_of, shuffled, trimmed
 from .objects_config import AssociationConfig
 
-# Members of a landmark that are projected: the first in shuffled order, a uniform subsample.
-PROBES = 128
+PROBES = 128  # Members of a landmark that are projected: the first in shuffled order.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -64,10 +63,7 @@ class MapView:
     def __post_init__(self) -> None:
         n, v, size = len(self.rows), len(self.indices), (self.camera.height, self.camera.width)
         if not len(self.labels) == len(self.ids) == len(self.anchors) == n:
-            raise ValueError(
-                f"labels, ids and anchors have {len(self.labels)}, {len(self.ids)} and "
-                f"{len(self.anchors)} rows; each must have {n}, the number of rows of the map."
-            )
+            raise ValueError(f"labels, ids and anchors must each have {n} rows, as the map has.")
         if len(self.regions) != v or (v and not self.indices[-1] < n):
             raise ValueError(
                 f"regions has {len(self.regions)} entries for {v} Gaussians: it must have one for "
@@ -117,8 +113,7 @@ def compute_region_statistics(
 ) -> RegionStatistics:
     """Compute the statistics of the regions of a keyframe.
 
-    Regions with fewer than min_gaussians Gaussians are omitted. If more than max_regions remain,
-    those with the most Gaussians are used.
+    Only the max_regions regions with the most Gaussians are used, min_gaussians or more each.
     """
     hit = np.flatnonzero(view.regions >= 0)
     counts = np.bincount(view.regions[hit], minlength=len(view.boxes))
@@ -142,12 +137,9 @@ def compute_region_statistics(
 
 
 def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationConfig) -> MapView:
-    """Merge each region that shows a part of another region's object into that region.
+    """Return the view with the Gaussians of each region assigned to the region that contains it.
 
-    The Gaussians of the part are assigned to the containing region; see `find_containing_regions`.
-
-    Returns:
-        The view with the new assignment.
+    `find_containing_regions` defines which region contains another one.
     """
     near_m = np.full(len(view.boxes), np.inf)
     far_m = -near_m
@@ -165,11 +157,7 @@ def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationCon
 def whole_regions(
     view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
 ) -> tuple[MapView, RegionStatistics]:
-    """Merge regions that show parts of one object.
-
-    Returns:
-        The view with the merged regions, and the statistics of the regions after the merge.
-    """
+    """Merge regions that show parts of one object; return the new view and its statistics."""
     regions = compute_region_statistics(view, T_camera_map, config)
     whole = merge_parts(view, regions, config)
     return whole, regions if whole is view else compute_region_statistics(
@@ -249,13 +237,8 @@ def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.nda
     """Return the map rows of each region's first 256 Gaussians in shuffled order, [R, 256].
 
     Unused entries of regions with fewer Gaussians are -1. To save time, only about 512 candidates
-    are sorted in regions with more than 512 Gaussians.
-
-    Args:
-        view: The map and the regions of the keyframe.
-        hit: Positions in `view.indices` of the Gaussians that are in a region.
-        counts: Number of Gaussians of each region, [M].
-        numbers: Numbers of the R regions to sample.
+    are sorted in regions with more than 512 Gaussians. `hit` has the positions in `view.indices` of
+    the Gaussians in regions, `counts` [M] their number per region, `numbers` the R regions.
     """
     ordinal = np.full(len(counts), -1)
     ordinal[numbers] = np.arange(len(numbers))
@@ -306,13 +289,8 @@ def predict_boxes(
 ) -> PredictedBoxes:
     """Predict boxes and visibility of landmarks in a keyframe.
 
-    A landmark without resident members is represented by its centroid.
-
-    Args:
-        table: Landmarks, [K] records of `LANDMARK`.
-        view: The map and the keyframe.
-        T_camera_map: Transform from the map to the camera, [4, 4].
-        config: Settings of the data association.
+    `table` has K records of `LANDMARK`. A landmark without resident members is represented by its
+    centroid.
     """
     where = rows_of(table["members"], view.ids)
     there = ((where >= 0) & reliable_members(table))[:, :PROBES]
@@ -340,11 +318,7 @@ def predict_boxes(
 
 
 def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarray]:
-    """Project points and read the measured depth at their pixels.
-
-    Args:
-        p_camera: Points in the camera frame, [..., 3], meters.
-        view: The keyframe.
+    """Project points in the camera frame, [..., 3], meters, and read the depth at their pixels.
 
     Returns:
         Pixels, [..., 2], and measured depth, [...], meters; 0 outside the image.
@@ -360,14 +334,7 @@ def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarr
 def depth_gaps_m(
     near_m: np.ndarray, far_m: np.ndarray, others_near_m: np.ndarray, others_far_m: np.ndarray
 ) -> np.ndarray:
-    """Return the gaps between depth ranges, [K, R], meters; negative where ranges overlap.
-
-    Args:
-        near_m: Near ends of the first K ranges, [K], meters.
-        far_m: Far ends of the first K ranges, [K], meters.
-        others_near_m: Near ends of the other R ranges, [R], meters.
-        others_far_m: Far ends of the other R ranges, [R], meters.
-    """
+    """Return the gaps between K depth ranges and R other ones, [K, R]; negative at an overlap."""
     return np.maximum(near_m[:, None], others_near_m) - np.minimum(far_m[:, None], others_far_m)
 
 
@@ -392,14 +359,7 @@ def association_costs(
     regions: RegionStatistics,
     config: AssociationConfig,
 ) -> AssociationCosts:
-    """Compute the association costs of K landmarks and R regions.
-
-    Args:
-        distributions: Label distributions of the landmarks, [K, C].
-        predicted: Predicted boxes of the landmarks.
-        regions: Statistics of the regions.
-        config: Settings of the data association.
-    """
+    """Compute the association costs of K landmarks, with distributions [K, C], and R regions."""
     iou = ious(predicted.boxes, regions.boxes)
     gap_m = depth_gaps_m(predicted.near_m, predicted.far_m, regions.near_m, regions.far_m)
     allowed = (iou > 0) & (gap_m <= config.max_depth_gap_m)

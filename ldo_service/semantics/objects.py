@@ -78,8 +78,8 @@ class Objects:
 
         A candidate becomes an object after min_keyframes observations that agree with it:
         KL(p || p_t) < max_divergence. Here, p is the mean label distribution of the candidate's
-        Gaussians before the keyframe, and p_t is the mean of the Gaussians in the region. Both
-        means are weighted by opacity. An observation with a larger divergence restarts the count.
+        Gaussians before the keyframe, and p_t that of the Gaussians in the region. Both means are
+        weighted by opacity. An observation with a larger divergence restarts the count.
 
         Args:
             view: The map and the regions of the keyframe.
@@ -87,9 +87,8 @@ class Objects:
                 label is missed only if the measured depth shows that it is gone. None: the detector
                 knows all labels.
             is_late: True if the keyframe was observed before and the view has only regions whose
-                labels arrived later. Then objects gain no observation, and no landmark is missed. A
-                candidate gains an observation only if the keyframe is before the first or after the
-                last keyframe that observed the candidate.
+                labels arrived later. Objects then gain no observation, and nothing is missed. A
+                candidate gains one only if the keyframe is outside of its first to last keyframe.
 
         Returns:
             The changes of the objects.
@@ -125,11 +124,7 @@ class Objects:
 
     # --- association ------------------------------------------------------------------------------
     def _match(self, near: np.ndarray, pairs: AssociationCosts) -> tuple[np.ndarray, np.ndarray]:
-        """Match landmarks with regions: objects first, then candidates with the other regions.
-
-        Args:
-            near: Rows of the table, [K], for the landmarks of `pairs`.
-            pairs: Association costs of these landmarks.
+        """Match objects with regions, then candidates with the regions that are left.
 
         Returns:
             Positions in `near` of the matched landmarks, and the region of each.
@@ -154,9 +149,8 @@ class Objects:
         A region is a piece if enough of its Gaussians lie in the box of the landmark.
 
         Returns:
-            Two arrays. The first has the landmarks that are matched or have a piece and thus cannot
-            be missed, [K] bool. The second has the numbers of the regions that are neither matched
-            nor a piece.
+            Landmarks that are matched or have a piece, [K] bool; they are not missed. Numbers of
+            the regions that are neither matched nor a piece.
         """
         excused, is_left = np.zeros(len(near), bool), np.ones(len(regions.numbers), bool)
         excused[k], is_left[r] = True, False
@@ -200,15 +194,7 @@ class Objects:
         ]
 
     def _lacks(self, which: np.ndarray, keyframe: int) -> np.ndarray:
-        """Return which landmarks are candidates first seen after or last seen before a keyframe.
-
-        Args:
-            which: Rows of the table, [K].
-            keyframe: Id of the keyframe.
-
-        Returns:
-            The candidates, [K] bool.
-        """
+        """Return which rows [K] are candidates first seen after or last seen before a keyframe."""
         table = self._table[which]
         is_within = (table["first"] <= keyframe) & (keyframe <= table["last"])
         return (table["id"] == CANDIDATE) & ~is_within
@@ -218,10 +204,7 @@ class Objects:
         derive_in_batches(table, *gaussians, least=self.config.association.min_gaussians)
 
     def _promote(self, which: np.ndarray) -> tuple[int, ...]:
-        """Turn candidates with enough observations into objects, and return the new ids.
-
-        A candidate whose heaviest label is background stays a candidate.
-        """
+        """Turn candidates with enough observations and a label into objects; return the ids."""
         seen = self._table[which]
         ready = (seen["id"] == CANDIDATE) & (seen["seen"] >= self.config.min_keyframes)
         ready = which[ready & (seen["labels"][:, 0] != BACKGROUND)]
@@ -243,8 +226,7 @@ class Objects:
         """Return the positions in `near` of the landmarks that are missed in the keyframe.
 
         A landmark is missed if it is visible and the detector did not find it. It is also missed if
-        the measured depth lies behind most of it, which shows that it is gone. `excused` landmarks
-        are never missed.
+        the measured depth behind it shows that it is gone. `excused` landmarks are never missed.
         """
         sides = np.clip(predicted.boxes[:, 2:] - predicted.boxes[:, :2], 0, None)
         is_large = np.sqrt(np.prod(sides, axis=1)) >= self.config.min_side_px
@@ -310,10 +292,7 @@ class Objects:
         return tuple(merged), gone
 
     def _age(self, k: int) -> tuple[bool, int, int]:
-        """Return a sort key for landmark `k`: objects before candidates, lower ids and rows first.
-
-        Lower ids and rows belong to older landmarks.
-        """
+        """Return a sort key for landmark `k`: objects before candidates, older landmarks first."""
         return self._table["id"][k] == CANDIDATE, int(self._table["id"][k]), k
 
     def _merge_pair(self, keep: int, merged_row: int, view: MapView) -> None:
@@ -324,10 +303,7 @@ class Objects:
 
     # --- candidates -------------------------------------------------------------------------------
     def _begin(self, view: MapView, regions: RegionStatistics, left: np.ndarray) -> None:
-        """Create a candidate for each region in `left`, the numbers of the unmatched regions.
-
-        If there are more than max_candidates, the candidates observed longest ago are dropped.
-        """
+        """Create candidates for the regions `left`; drop those seen longest ago if too many."""
         new = new_landmarks(len(left), view.keyframe)
         new["members"], new["seen"] = regions.members[left], 1
         new["votes"] = one_each(new["members"])
@@ -338,8 +314,7 @@ class Objects:
         candidates = np.flatnonzero(self._table["id"] == CANDIDATE)
         excess = len(candidates) - self.config.max_candidates
         if excess > 0:
-            # New candidates are at the end of the table. They are dropped last, although a late
-            # label may give them an old keyframe.
+            # New candidates, at the end, are dropped last: a late label may have an old keyframe.
             is_new = candidates >= len(self._table) - len(new)
             oldest = np.lexsort((self._table["last"][candidates], is_new))[:excess]
             self._table = np.delete(self._table, candidates[oldest])
@@ -348,9 +323,8 @@ class Objects:
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move the landmarks after a correction of the keyframe poses.
 
-        Each landmark moves with the anchor keyframe of most of its members. A landmark with
-        offloaded Gaussians thus gets the position that these Gaussians will have after loading.
-        Landmarks with resident Gaussians become exact with the next `refresh`.
+        Each landmark moves with the anchor keyframe of most of its members, as its offloaded
+        Gaussians do. Landmarks with resident Gaussians become exact with the next `refresh`.
 
         Args:
             T_new_old: Correction of each moved keyframe in the map frame, [4, 4], by id.
@@ -379,8 +353,7 @@ class Objects:
             labels: Label rows of the Gaussians, [N, 32].
             ids: Ids of the Gaussians, [N], ascending.
             anchors: Anchor keyframes of the Gaussians, [N].
-            seen_from: Camera and T_map_camera [4, 4]; only landmarks in this view are derived.
-                None: all landmarks are derived.
+            seen_from: Camera and T_map_camera [4, 4] that select the landmarks in view; None: all.
         """
         which = np.arange(len(self._table))
         if seen_from:

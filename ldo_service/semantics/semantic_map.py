@@ -70,10 +70,8 @@ class SemanticMap:
             OpenVocabularyLabeling(self.config.naming, is_fused=is_fused) if has_labeller else None
         )
         self._map, self._threads = map_, threads
-        # Labels that the detector ever gave, and labels that the labeller ever gave.
-        self._by_detector, self._by_labeller = set[int](), set[int]()
-        # Newest keyframes whose detections were fused, in the order of fusion.
-        self._done: dict[int, None] = {}
+        self._by_detector, self._by_labeller = set[int](), set[int]()  # Labels given by each.
+        self._done: dict[int, None] = {}  # Newest fused keyframes, in the order of fusion.
         # Detections of keyframes that are not mapped yet, the oldest first.
         self._waiting: dict[int, RegionDetections | None] = {}
         self._disagreement = Disagreement(0.0, 0.0)
@@ -120,11 +118,7 @@ class SemanticMap:
         return None
 
     def on_keyframe_mapped(self, keyframe: int) -> KeyframeSemantics | None:
-        """Fuse the stored detections of a keyframe that was just mapped.
-
-        Returns:
-            The result of the fusion; None if nothing was fused.
-        """
+        """Fuse the stored detections of a just mapped keyframe; return None if nothing is fused."""
         if keyframe not in self._waiting:
             return None
         return self._fuse_keyframe(keyframe, self._waiting.pop(keyframe))
@@ -134,9 +128,8 @@ class SemanticMap:
     ) -> KeyframeSemantics | None:
         """Fuse the detections of a mapped keyframe.
 
-        Without the images of the keyframe, the Gaussians in the boxes cannot be found. If the
-        images are no longer stored, the keyframe is counted, its detections are dropped and None is
-        returned.
+        If the images of the keyframe are no longer stored, the Gaussians in the boxes cannot be
+        found. The keyframe is then counted, its detections are dropped, and None is returned.
         """
         self._done[keyframe] = None
         self._labelled += 1
@@ -193,11 +186,7 @@ class SemanticMap:
     ) -> tuple[RegionDetections, tuple[Region, ...]]:
         """Add known labels by the labeller to the detections of a keyframe.
 
-        Args:
-            view: The keyframe.
-            top: Row of the Gaussian that contributes most to each pixel, [H, W]; negative without
-                one.
-            detections: Detections of the keyframe.
+        For `top`, see `reliable_label_mask`.
 
         Returns:
             The detections with the known labels, and the regions to send to the labeller.
@@ -219,9 +208,9 @@ class SemanticMap:
         return label in self._by_labeller and label not in self._by_detector
 
     def _undetectable_labels(self) -> np.ndarray | None:
-        """Return which labels only the labeller ever gave, [256] bool; None if there are none.
+        """Return the labels that the detector cannot miss, [256] bool: only the labeller gave them.
 
-        The detector cannot miss such labels.
+        None if the labeller gave no label.
         """
         if not self._by_labeller:
             return None
@@ -235,10 +224,7 @@ class SemanticMap:
         *,
         is_late: bool = False,
     ) -> FusionResult:
-        """Fuse the labels of regions into the Gaussians `indices` [V].
-
-        Gaussians whose labels changed are marked in the map. `is_late`: see `fuse_detections`.
-        """
+        """Fuse labels of regions into the Gaussians `indices` [V], and mark those that changed."""
         is_labelled = detections.open_confidences > 0
         self._by_labeller.update(detections.open_labels[is_labelled].astype(int).tolist())
         gaussians = self._map.gaussians
@@ -280,11 +266,6 @@ class SemanticMap:
         If the images of the keyframe are no longer stored, the Gaussians of the region cannot be
         found, and nothing is fused.
 
-        Args:
-            region: Id of the region.
-            keyframe: Id of the keyframe.
-            answer: The label result.
-
         Returns:
             True if the label was fused.
         """
@@ -301,8 +282,7 @@ class SemanticMap:
         self.refresh(view)
         at = self._map_view(view, made_by.indices, labelled.assigned.regions, detections)
         is_undetectable = self._is_labellers(int(detections.open_labels[0]))
-        # A region with a box and a label of the detector needs no late observation: the detections
-        # of each keyframe observe its object.
+        # If the detector found the region, the detections of each keyframe observe its object.
         if self.config.uses_labeller and (is_undetectable or detections.confidences[0] == 0):
             views = [at, *self._other_views(region, keyframe, is_labelled=is_undetectable)]
             for seen in sorted(views, key=lambda seen: seen.keyframe):
@@ -317,12 +297,8 @@ class SemanticMap:
         Args:
             region: Id of the region, which has a label.
             labelled_keyframe: Keyframe in which the label was fused already.
-            is_labelled: True: fuse the label in the returned keyframes too. This is meant for
-                labels that the detector never gives. Labels of the detector were already fused with
-                the detections of those keyframes.
-
-        Returns:
-            One map view for each keyframe whose images are stored and in which the region is found.
+            is_labelled: True: fuse the label in these keyframes too. This is meant for labels that
+                the detector never gives; others were fused with the keyframes' detections.
         """
         assert self.naming is not None
         views = []
@@ -350,11 +326,7 @@ class SemanticMap:
         return assign_detections(rows, indices, *at, threads=self._threads).regions
 
     def refresh(self, view: TrainingView | None = None) -> None:
-        """Derive pose, size and label of objects from their Gaussians again.
-
-        Args:
-            view: Keyframe; only the objects in its view are derived. None: all objects.
-        """
+        """Derive the objects in view of a keyframe, or all if None, from their Gaussians again."""
         gaussians = self._map.gaussians
         known = gaussians.rows, gaussians.labels, gaussians.ids, gaussians.anchors
         seen_from = view and (view.camera, view.T_map_camera)
@@ -403,8 +375,7 @@ class SemanticMap:
             "keyframes_labelled": self._labelled,
             "boxes": self._boxes,
             "boxes_repeated": self._repeated,  # Messages repeated after a restart.
-            # Keyframes whose stored detections were dropped before the keyframe was mapped.
-            "detections_too_early": self._too_early,
+            "detections_too_early": self._too_early,  # Dropped before their keyframe was mapped.
             # Keyframes with detections, but without stored images.
             "boxes_without_images": self._without_images,
             # Gaussians of dynamic classes, removed again.
