@@ -19,9 +19,9 @@ from .rows import aligned_rows
 class AdamConfig:
     """Learning rates of Adam for each parameter of a Gaussian.
 
-    They are 5 to 10 times those of 3DGS, because a keyframe gets tens of iterations instead of
-    thousands. The map reaches the same quality in 0.35 s as with the rates of 3DGS in 4.5 s
-    (ALGORITHMS).
+    A rate is about the change of its parameter in one step. The rates are 5 to 10 times those of
+    3DGS, because a keyframe gets tens of iterations instead of thousands. On a CPU, the map reaches
+    in 0.35 s the quality that the rates of 3DGS reach in 4.5 s.
     """
 
     mean_m: float = 5e-4
@@ -63,9 +63,9 @@ class Adam:
         self.config = config or AdamConfig()
         self._rates = self.config.rates()
         self._ids = np.zeros(0, np.int64)
-        self._moments = [aligned_rows(0), aligned_rows(0)]  # May have spare capacity.
+        self._moments = [aligned_rows(0), aligned_rows(0)]  # First, second; may have spare rows.
         self._steps = np.zeros(0, np.int32)
-        # The map and its `membership` that `_ids` matches.
+        # The map that `_ids` was last matched to, with its `membership` counter at that time.
         self._followed: tuple[ref[GaussianMap], int] | None = None
 
     def step(
@@ -81,8 +81,8 @@ class Adam:
             m <- b1 m + (1 - b1) g,  v <- b2 v + (1 - b2) g^2
             row <- row - rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + epsilon)
 
-        Gaussians without any gradient (hidden, or not in `indices`) stay as they are. The result is
-        bitwise equal for any number of threads. Source: Kingma and Ba, 2015, algorithm 1.
+        Gaussians that are hidden, or that are not in `gradients.indices`, stay as they are. The
+        result is bitwise equal for any number of threads. Source: Kingma and Ba, 2015, algorithm 1.
 
         Args:
             gaussians: The map; its rows change.
@@ -117,18 +117,20 @@ class Adam:
         needle_ratio: float = 1.0,
         max_sigma_px: float = inf,
     ) -> VisibleGaussians:
-        """Compute the gradients at the last rendering and take the step of Adam in one pass.
+        """Compute the gradients of the last rendering and take a step of Adam, in one pass.
 
-        The result equals that of `step`. It is faster, since no gradients are written to memory.
+        The result equals that of `Rasterizer.gradients` and `step`. One pass is faster, since no
+        gradients are written to memory.
 
         Args:
             gaussians: The map; its rows change.
             rasterizer: The rasterizer that last rendered this map.
-            by_planes: dL/dplanes, see `Rasterizer.descend`.
+            by_planes: Derivatives of the loss by the rendered planes, [5, H, W].
             rate: Factor on the configured learning rates.
-            needle_weight: See `Rasterizer.gradients`.
-            needle_ratio: See `Rasterizer.gradients`.
-            max_sigma_px: See `Rasterizer.descend`.
+            needle_weight: Weight of the penalty on needle-shaped Gaussians; see
+                `Rasterizer.gradients`.
+            needle_ratio: Ratio of the longest to the middle axis above which the penalty applies.
+            max_sigma_px: Limit on the standard deviations after the step, in pixels of the image.
 
         Returns:
             The Gaussians that may touch the rendered image.
@@ -152,7 +154,7 @@ class Adam:
         return AdamStep(gaussians.rows, mean, square, self._steps, rates, *betas, config.epsilon)
 
     def steps(self, gaussians: GaussianMap) -> np.ndarray:
-        """Return the number of steps of each Gaussian, [N] int32, without a copy."""
+        """Return the number of Adam steps of each Gaussian, [N] int32, without a copy."""
         self._follow(gaussians)
         return self._steps
 
@@ -177,8 +179,8 @@ class Adam:
     def _follow(self, gaussians: GaussianMap) -> None:
         """Match the moments and step counts to the rows of the map.
 
-        Those of removed Gaussians are dropped. New Gaussians, and those loaded from disk, start at
-        zero.
+        Moments and counts of removed Gaussians are dropped. New Gaussians, and Gaussians loaded
+        from disk, start with zeros.
         """
         followed = ref(gaussians), gaussians.membership
         if followed == self._followed:
@@ -198,7 +200,7 @@ class Adam:
         self._ids = ids.copy()
 
     def _sort_out(self, ids: np.ndarray) -> None:
-        """Move the moments of the remaining Gaussians to their new rows; other rows get zeros."""
+        """Move moments and step counts of remaining Gaussians to their new rows; the rest is 0."""
         n = len(self._ids)
         old_places = np.searchsorted(self._ids, ids)
         stays = np.append(self._ids, -1)[old_places] == ids

@@ -66,18 +66,24 @@ def quadtree(
 ) -> QuadtreeCells:
     """Divide an image into square cells: cells that are not uniform are split into four.
 
-    A cell is uniform if three conditions hold. Within the cell and a rim of one pixel, the contrast
-    is at most `max_contrast` in every channel. The depth varies by at most the fraction
-    `max_depth_step`. All pixels of the cell are in `wanted`.
+    A cell is uniform if three conditions hold:
+
+    - Within the cell and a rim of one pixel, the values of each channel differ by at most
+      `max_contrast`.
+    - The depths in the cell differ by at most `max_depth_step` times the largest of them.
+    - All pixels of the cell are in `wanted`.
 
     Args:
         color: [H, W, 3] uint8.
         depth_m: [H, W] float32, meters.
-        wanted: Pixels to cover, [H, W] bool. Each pixel where it is true is in exactly one cell.
-            The other pixels are in no cell.
+        wanted: Pixels to cover, [H, W] bool. Each of them is in exactly one cell; all other pixels
+            are in none.
         coarsest_px: Edge of the largest cells, a power of 2.
         max_contrast: Largest contrast of a uniform cell, 0..1.
         max_depth_step: Largest depth difference in a uniform cell, as a fraction of its depth.
+
+    Returns:
+        The cells, from the largest size to single pixels.
     """
     color, depth_m = _padded(color, coarsest_px), _padded(depth_m, coarsest_px)
     wanted = _padded(wanted.astype(np.uint8), coarsest_px)

@@ -13,12 +13,13 @@ from .model import GaussianMap
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Changes:
-    """Changes of the map since the last `ChangeLog.drain`.
+    """Changes of the map that `ChangeLog.drain` returns for publication.
 
     Attributes:
         removed: Ids of removed Gaussians, [R] int64, ascending.
-        changed: Indices of rows whose parameters differ from the published ones, [C].
-        added: Indices of rows that were never published, [A].
+        changed: Rows of published Gaussians whose parameters or labels have changed, [C] int64.
+            Empty if `drain` was called without changed rows.
+        added: Rows of Gaussians that were never published, [A] int64.
     """
 
     removed: np.ndarray
@@ -31,7 +32,7 @@ class ChangeLog:
 
     New Gaussians are published at once. Changed parameters of published Gaussians are published
     at intervals, because the Gaussian optimizer changes most visible Gaussians at every keyframe.
-    Replicas move Gaussians with their anchor keyframes themselves, so motions are not recorded.
+    Motions of anchor keyframes are not recorded: each map replica applies them to its own copy.
     """
 
     def __init__(self) -> None:
@@ -40,7 +41,7 @@ class ChangeLog:
         self._removed: list[np.ndarray] = []
 
     def mark_added(self, gaussians: GaussianMap) -> None:
-        """Record that rows were appended."""
+        """Record that new Gaussians were appended to the map."""
         new = len(gaussians) - len(self._is_changed)
         self._is_changed = np.concatenate([self._is_changed, np.zeros(new, bool)])
 
@@ -59,7 +60,12 @@ class ChangeLog:
         self._removed.append(ids[ids < self._next_untold])
 
     def mark_loaded(self, gaussians: GaussianMap, ids: np.ndarray) -> None:
-        """Record that offloaded Gaussians were loaded, with the same parameters as published."""
+        """Record that offloaded Gaussians were loaded; they count as unchanged.
+
+        Args:
+            gaussians: The map, with the loaded Gaussians.
+            ids: Ids of the loaded Gaussians, [M].
+        """
         is_changed = np.zeros(len(gaussians), bool)
         is_changed[~np.isin(gaussians.ids, ids, assume_unique=True)] = self._is_changed
         self._is_changed = is_changed
@@ -76,7 +82,7 @@ class ChangeLog:
         if with_changed:
             changed = np.flatnonzero(self._is_changed[:first_new])
             self._is_changed[:] = False
-        self._is_changed[first_new:] = False  # Added rows carry their current values.
+        self._is_changed[first_new:] = False  # Added rows are published with their current values.
         removed = np.sort(np.concatenate([np.zeros(0, np.int64), *self._removed]))
         self._removed.clear()
         if len(gaussians) > first_new:
@@ -84,7 +90,7 @@ class ChangeLog:
         return Changes(removed, changed, np.arange(first_new, len(gaussians)))
 
     def mark_all_published(self, gaussians: GaussianMap) -> None:
-        """Record that replicas have received the whole map, which may have been replaced."""
+        """Drop all records: the whole map, which may be a restored one, counts as published."""
         newest = int(gaussians.ids[-1]) if len(gaussians) else -1
         self._next_untold = max(self._next_untold, newest + 1)
         self._is_changed = np.zeros(len(gaussians), bool)
@@ -95,8 +101,9 @@ class PublishedPoses:
     """Last published poses T_map_keyframe of the keyframes whose images are stored.
 
     Args:
-        min_m: A pose is published again if it has moved by at least this distance, meters.
-        min_rad: A pose is also published again after a rotation by at least this angle, radians.
+        min_m: A pose is published again if it has moved by more than this distance since its last
+            publication, meters.
+        min_rad: A pose is also published again after a rotation by more than this angle, radians.
     """
 
     def __init__(self, min_m: float, min_rad: float) -> None:
@@ -126,13 +133,17 @@ class PublishedPoses:
         return moved
 
     def move(self, T_map: Mapping[int, np.ndarray]) -> None:
-        """Replace poses after a correction of the pose graph; `drain` omits these motions."""
+        """Record the poses of a correction as published, so that `drain` omits its motions.
+
+        Args:
+            T_map: Corrected poses T_map_keyframe [4, 4] by id of the keyframe.
+        """
         self._poses.update({k: T for k, T in T_map.items() if k in self._poses})
 
     def snapshot(self) -> np.ndarray:
-        """Return the poses [K, 4, 4] in the order of their ids."""
+        """Return the last published poses [K, 4, 4] in the order of their ids."""
         return self._poses.of(self._poses)
 
     def restore(self, keyframes: Collection[int], T_map: np.ndarray) -> None:
-        """Replace all poses by those of a snapshot."""
+        """Replace all poses by the T_map_keyframe [K, 4, 4] of a snapshot."""
         self._poses.become(keyframes, T_map)

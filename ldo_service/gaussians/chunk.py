@@ -58,8 +58,9 @@ class Chunk:
 def pack(chunk: Chunk) -> bytes:
     """Compress a chunk to bytes.
 
-    Ids are stored as differences. For rows and labels, the first bytes of all values are stored
-    first, then all second bytes, and so on. The same byte is often equal in neighboring Gaussians.
+    Ids are stored as differences. Rows and labels are stored byte by byte: the first byte of every
+    Gaussian, then the second byte of every Gaussian, and so on. This compresses better, because
+    neighboring Gaussians often agree in a byte.
     """
     steps = np.diff(chunk.ids, prepend=0).astype("<i8")
     planes = np.ascontiguousarray(chunk.rows, "<f4").view(np.uint8).T
@@ -80,10 +81,12 @@ def unpack(data: bytes | memoryview) -> Chunk:
         steps = np.frombuffer(body, "<i8", count, _HEADER.size)
         planes = np.frombuffer(body, np.uint8, offset=_HEADER.size + steps.nbytes)
         if planes.size == 4 * ROW * count > 0:
-            raise DataError(f"{count} Gaussians without labels, as earlier versions wrote them")
+            raise DataError(
+                f"the file holds {count} Gaussians without labels, as earlier versions wrote them"
+            )
         planes = planes.reshape(4 * ROW + LABEL_BYTES, count).T
         rows = np.ascontiguousarray(planes[:, : 4 * ROW]).view("<f4")
         labels = np.ascontiguousarray(planes[:, 4 * ROW :])
     except (zstandard.ZstdError, struct.error, ValueError, MemoryError) as error:
-        raise DataError(f"{len(data)} bytes hold no Gaussians: {error}") from error
+        raise DataError(f"the {len(data)} bytes are not a chunk of Gaussians: {error}") from error
     return Chunk(anchor, np.cumsum(steps), rows, labels)

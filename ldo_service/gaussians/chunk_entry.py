@@ -1,4 +1,4 @@
-"""Table entries of offloaded chunks and of lost ones, without their Gaussians."""
+"""Records that stay in memory for chunks of Gaussians that are on disk or lost."""
 
 from dataclasses import dataclass, replace
 
@@ -12,16 +12,16 @@ class ChunkEntry:
     """Table entry of one offloaded chunk.
 
     The entry stays in memory while the Gaussians are in a file. The chunk has `count` Gaussians,
-    whose ids lie between `first_id` and `last_id`.
+    whose ids go from `first_id` to `last_id`, with gaps if `count` is smaller than this range.
     """
 
     anchor: int
     first_id: int
     last_id: int
     count: int
-    center_map: np.ndarray  # [3], current center of its bounding sphere in the map frame.
-    radius_m: float
-    # Motions T_new_old [4, 4] of the anchor since the file was written.
+    center_map: np.ndarray  # [3], current center of the bounding sphere in the map frame, meters.
+    radius_m: float  # Radius of the bounding sphere.
+    # Motions T_new_old [4, 4] of the anchor since the file was written; loading applies them.
     motions: tuple[np.ndarray, ...] = ()
 
     def moved(self, T_new_old: np.ndarray) -> "ChunkEntry":
@@ -32,9 +32,9 @@ class ChunkEntry:
 
 @dataclass(frozen=True, slots=True)
 class LostIdRange:
-    """Range of ids, both ends included, in which the Gaussians of a damaged chunk lie.
+    """Range of the ids of a damaged chunk, both ends included.
 
-    Ids of this range that are neither in memory nor in another chunk are lost.
+    Ids in this range that are neither in memory nor in another chunk are lost.
     """
 
     first_id: int

@@ -1,4 +1,4 @@
-"""Confirmation of Gaussians: each must be visible in the images of some keyframes."""
+"""Confirmation of Gaussians: each must be visible in the image of at least one keyframe."""
 
 import numpy as np
 
@@ -10,12 +10,12 @@ from .pruning import PruningConfig
 
 
 class Confirmation:
-    """Search for hidden Gaussians, among those of two keyframes per call.
+    """Search for Gaussians that others hide, among the Gaussians of two keyframes per call.
 
     Args:
         store: Store of the keyframe images.
         renderer: Renderer of the map at these keyframes.
-        config: Criteria.
+        config: Criteria; `confirm_keyframes` and `min_weight_px` are used.
         seed: Seed of the random choice of keyframes.
     """
 
@@ -26,16 +26,19 @@ class Confirmation:
         self._config, self._seed = config, seed
 
     def hidden_mask(self, gaussians: GaussianMap, newest: int) -> np.ndarray:
-        """Return the mask [N] bool of the hidden Gaussians that are anchored to two keyframes.
+        """Return the mask of the hidden Gaussians that are anchored to either of two keyframes.
 
         The first keyframe is the newest one that has `confirm_keyframes` later keyframes. The
-        second is a random older keyframe, since the map around old keyframes also changes. A
-        Gaussian is hidden if its weight is below `min_weight_px` in three images: those of these
-        two keyframes and of the newest one.
+        second is drawn at random from it and all earlier ones, since the map around old keyframes
+        also changes. The map is rendered at both and at the newest keyframe. A Gaussian is hidden
+        if, in each of these images, its blending weights sum to less than `min_weight_px`.
 
         Args:
             gaussians: The map.
             newest: Id of the newest keyframe.
+
+        Returns:
+            Mask [N] bool. All False while there are too few keyframes, or if `min_weight_px` is 0.
         """
         age, min_px = self._config.confirm_keyframes, self._config.min_weight_px
         older = [k for k in self._store.keyframes() if k < newest][: 1 - age or None]

@@ -18,9 +18,9 @@ from .model import GaussianMap
 from .renderer import Rendering, render
 from .rows import ROW
 
-# Densification subtracts this much of the 0.3 px^2 that the renderer adds to every splat. A
-# larger value gives sharper images. Subtracting all of it leaves cracks between Gaussians of one
-# pixel when the camera comes nearer.
+# The renderer adds 0.3 px^2 to the variance of every splat. Densification subtracts this much of
+# it from the variance of a new Gaussian. A larger value gives sharper images, but the full 0.3
+# leaves cracks between Gaussians of one pixel when the camera comes nearer.
 LOW_PASS_COMPENSATION_PX2 = 0.2
 
 
@@ -38,10 +38,10 @@ def surfels(
 ) -> np.ndarray:
     """Return one flat Gaussian per cell, with the cell's mean color and depth, [M, 16] float32.
 
-    Seen from this camera, each Gaussian looks round. Its standard deviation is `sigma_per_spacing`
-    times the side of its cell. Down the slope of the surface it is longer by the factor 1 / cos of
-    the angle between normal and viewing ray. Along the normal it is `thickness` times as long as
-    across the slope.
+    Seen from this camera, each Gaussian looks round. In the image, its standard deviation is
+    `sigma_per_spacing` times the side of its cell. On a slanted surface, the standard deviation
+    down the slope is longer than across it, by the factor 1 / cos of the angle between normal and
+    viewing ray. Along the normal, it is `thickness` times as long as across the slope.
 
     Args:
         cells: The cells.
@@ -82,6 +82,13 @@ def normals_of(
     On a plane n . p = d, the inverse depth is an affine function of the pixel: 1 / z = n . ray / d.
     The gradient of the inverse depth thus gives the normal. The viewing ray is used as the normal
     if the 5x5 pixels around the center of a cell are not one smooth, fully measured surface.
+
+    Args:
+        cells: The M cells.
+        rays: Viewing rays with z = 1 through the cell centers, [M, 3].
+        z: Depths of the cells, [M], meters.
+        depth_m: Depth image, [H, W]; 0 where not measured.
+        camera: Intrinsics.
     """
     inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, 1e-6), 0).astype(np.float32)
     window = np.ones((5, 5), np.uint8)
@@ -114,14 +121,19 @@ def slope_axes(normals: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.nd
     unit_rays = _unit(rays)
     cosines = np.sum(normals * unit_rays, axis=1, keepdims=True)
     slope = unit_rays - cosines * normals
-    facing = np.linalg.norm(slope, axis=1, keepdims=True) < 1e-3  # Any direction works.
+    # A surface that faces the camera has no slope, so any direction in its plane works.
+    facing = np.linalg.norm(slope, axis=1, keepdims=True) < 1e-3
     x_or_y = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
     slope = _unit(np.where(facing, np.cross(normals, x_or_y), slope))
     return np.stack([slope, np.cross(normals, slope), normals], axis=-1), np.abs(cosines[:, 0])
 
 
 def _two_from_edges(index: np.ndarray, length: int) -> np.ndarray:
-    """Return pixel indices clipped so that their 5x5 window lies in the image, if it fits."""
+    """Clip pixel indices to at least 2 px from both ends of an image side of `length` pixels.
+
+    The 5x5 window around each pixel then lies in the image. On sides below 5 px, where no such
+    window fits, the middle pixel is returned.
+    """
     return index.clip(min(2, length // 2), max(length - 3, length // 2))
 
 
@@ -135,29 +147,34 @@ class DensificationConfig:
 
     The dB values below are changes of PSNR relative to these defaults, which reach 28.2 dB. They
     were measured on 75 frames of a Replica apartment with ground-truth poses. Every 5th frame was
-    densified, and PSNR was measured on the other frames. Nothing was optimized, and pixels without
-    opacity were excluded. The defaults were chosen on the same frames.
+    densified, and PSNR was measured on the other frames. The Gaussians were not optimized, and
+    pixels without opacity were excluded. The defaults were chosen on the same frames.
     """
 
     # Criteria by which the map explains a pixel (paper, III.A).
-    max_transmittance: float = 0.3  # Larger is unexplained. 0.5: -0.5 dB, 4 % fewer Gaussians.
-    # New surface is nearer than the rendered depth by at least this fraction of it.
+    # A pixel with more transmittance is unexplained. 0.5: -0.5 dB, 4 % fewer Gaussians.
+    max_transmittance: float = 0.3
+    # A pixel shows new surface if its depth is less than the rendered depth by more than this
+    # fraction of the rendered depth.
     in_front: float = 0.05
-    # A nearer surface is not new if the map shows it within this distance, because depth is
+    # A nearer surface is not new if the map shows it within this many pixels, because depth is
     # noisy at edges. With 0, each lap of an apartment adds 5 % of the map again although the
     # poses are exact, and kitchen views lose 0.7 dB.
     edge_px: int = 2
-    # Mean error of the channels, 0..1; a larger one is unexplained. Off because colors are not
-    # yet optimized then. 0.1 gives +0.3 dB for +57 % Gaussians, and adds as many at every
-    # visit. Inserting the same 5 frames six times then grows the map from 101 k to 369 k
-    # Gaussians; without, it stays at 79 k.
+    # A pixel is unexplained if its color error, averaged over the channels, exceeds this, 0..1.
+    # The criterion is off, because colors are not yet optimized when a keyframe is inserted. 0.1
+    # gives +0.3 dB for +57 % Gaussians, and adds as many at every visit: inserting the same 5
+    # frames six times grows the map from 101 k to 369 k Gaussians. Without the criterion, the map
+    # stays at 79 k.
     max_color_error: float = inf
     overlap_px: int = 2  # Margin around unexplained pixels; it closes seams. 0: -1.2 dB.
-    # Width of the holes that get the depth around them. Black holes limit the PSNR.
+    # Pixels without depth get the depth found within this distance. Holes that stay black limit
+    # the PSNR.
     hole_px: int = 4
 
     # Placement of the Gaussians.
-    # Largest cell: one Gaussian per 4x4 pixels on uniform areas. 2: +0.4 dB, twice as many.
+    # Side of the largest cells: uniform areas get one Gaussian per 4x4 pixels. 2: +0.4 dB, twice
+    # as many Gaussians.
     coarsest_px: int = 4
     # Largest contrast of one cell and its rim, 0..1. 0.2 gives 30 % more Gaussians, and no better
     # image once they are optimized.
@@ -166,21 +183,30 @@ class DensificationConfig:
     max_depth_step: float = 0.05
 
     # Shape and color of the Gaussians.
-    # Standard deviation as a fraction of the spacing. 0.5: cracks, -2.0 dB; 0.7: blur, -0.6 dB.
+    # Standard deviation as a fraction of the cell's side. 0.5: cracks, -2.0 dB; 0.7: blur, -0.6 dB.
     sigma_per_spacing: float = 0.6
-    thickness: float = 0.1  # Fraction of the width; 0.03 to 0.3 look the same.
-    # Largest factor along a slope: 1 / cos of 75 deg, beyond which normals are unreliable.
+    # Standard deviation along the normal as a fraction of the one across; 0.03 to 0.3 look the
+    # same.
+    thickness: float = 0.1
+    # Largest stretch along a slope, 1 / cos of 75 deg. Normals of steeper slopes are unreliable.
     max_stretch: float = 4.0
     opacity: float = 0.95  # 0.9: -0.2 dB, dark grids on walls when the camera comes nearer.
-    color_steps: int = 1  # Color corrections by the residual. 0: -1.1 dB; 3: -0.4 dB (overfits).
-    max_color_step: float = 0.1  # 0..1; an older Gaussian causes any larger residual.
+    # Number of color corrections by the difference of frame and rendering. 0: -1.1 dB; 3: -0.4 dB
+    # (overfits).
+    color_steps: int = 1
+    # Largest correction of a channel, 0..1. Older Gaussians cause any larger difference.
+    max_color_step: float = 0.1
 
     def __post_init__(self) -> None:
         if self.coarsest_px < 1 or self.coarsest_px & (self.coarsest_px - 1):
-            raise ConfigError(f"coarsest_px={self.coarsest_px} must be a power of 2.")
+            raise ConfigError(
+                f"DensificationConfig.coarsest_px={self.coarsest_px} must be a power of 2."
+            )
         for name in ("max_transmittance", "in_front", "opacity", "thickness"):
             if not 0 < getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)} must lie between 0 and 1.")
+                raise ConfigError(
+                    f"DensificationConfig.{name}={getattr(self, name)} must lie between 0 and 1."
+                )
         for name in (
             "edge_px",
             "overlap_px",
@@ -191,11 +217,18 @@ class DensificationConfig:
             "max_color_step",
         ):
             if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name}={getattr(self, name)} must not be negative.")
+                raise ConfigError(
+                    f"DensificationConfig.{name}={getattr(self, name)} must not be negative."
+                )
         if not self.sigma_per_spacing**2 > LOW_PASS_COMPENSATION_PX2:
-            raise ConfigError(f"sigma_per_spacing={self.sigma_per_spacing} must exceed 0.45.")
+            raise ConfigError(
+                f"DensificationConfig.sigma_per_spacing={self.sigma_per_spacing} must exceed 0.45: "
+                "a smaller splat has no variance left after compensation of the low-pass filter."
+            )
         if not self.max_stretch >= 1:
-            raise ConfigError(f"max_stretch={self.max_stretch} must be at least 1.")
+            raise ConfigError(
+                f"DensificationConfig.max_stretch={self.max_stretch} must be at least 1."
+            )
 
 
 def densify(
@@ -266,7 +299,7 @@ def densify(
     )
     ids = gaussians.add(rows, keyframe)
 
-    # Undo the blur of overlapping neighbors.
+    # Correct the colors, because overlapping neighbors blur them.
     new_colors = gaussians.colors[len(gaussians) - len(ids) :]
     for _ in range(config.color_steps):
         correct_colors(new_colors, cells, frame, seen(), config.max_color_step)
@@ -300,14 +333,14 @@ def densification_mask(
 
 
 def _without(frame: RgbdFrame, ignore_mask: np.ndarray, before: Rendering) -> RgbdFrame:
-    """Return the frame with rendered color and no depth in the masked pixels."""
+    """Return the frame with the color of the rendering `before` and depth 0 in masked pixels."""
     shown = (255 * before.color.clip(0, 1) + 0.5).astype(np.uint8)
     color = np.where(ignore_mask[..., None], shown, frame.color)
     return replace(frame, color=color, depth_m=frame.depth_m * ~ignore_mask)
 
 
 def nearest_around(depth_m: np.ndarray, radius_px: int) -> np.ndarray:
-    """Return the least depth [H, W] within `radius_px` of each pixel; infinite if there is none."""
+    """Return the least depth [H, W] within `radius_px` of each pixel; inf if none is measured."""
     window = np.ones((2 * radius_px + 1,) * 2, np.uint8)
     return cv2.erode(np.where(depth_m > 0, depth_m, np.float32(inf)), window)
 
@@ -333,6 +366,8 @@ def correct_colors(
     max_step: float,
 ) -> None:
     """Correct the colors of new Gaussians by the mean difference of frame and rendering per cell.
+
+    Each channel stays in 0..1.
 
     Args:
         colors: Colors of the new Gaussians, [M, 3], 0..1; changed in place.

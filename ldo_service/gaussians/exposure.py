@@ -5,26 +5,31 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-MIN_GAIN = 0.1  # A smaller gain does not determine the brightness of the map.
+# Least divisor when an exposure is removed from an image. An image of a smaller gain does not
+# determine the brightness of the map.
+MIN_GAIN = 0.1
 # Images are compared as averages over blocks, so that a misplaced edge does not count as a
 # change of brightness.
 MIN_BLOCK_PX = 8
 BLOCKS_ACROSS = 40  # Blocks per image row; more give no more information.
 SATURATED = 0.97  # Fraction of the range above which the sensor saturates.
-MIN_SHARE = 0.15  # Fraction of the image that must be comparable.
-MIN_BLOCKS = 16
+MIN_SHARE = 0.15  # Minimum fraction of the blocks that can be compared.
+MIN_BLOCKS = 16  # Minimum number of these blocks.
 OUTLIER_SIGMAS = 2.5
-MAX_GAIN = 3.0  # The minimum is its inverse: a stop and a half.
-ROUNDS = 6
-# Prior of a camera as standard deviations: its gain changes, and its bias is nearly zero. Where a
-# wall fills the image, gain and bias are ambiguous. With a free bias, such an image gave a gain of
-# 1.7 and wrong colors in the map. The prior gains 0.4 dB on held-out frames of half an apartment.
+MAX_GAIN = 3.0  # Largest plausible gain, a stop and a half; the smallest is its inverse.
+ROUNDS = 6  # Maximum number of rounds of outlier rejection.
+# Standard deviations of the prior: the gain of a camera changes, and its bias is nearly zero. Where
+# a wall fills the image, gain and bias are ambiguous. With a free bias, such an image gave a gain
+# of 1.7 and wrong colors in the map. The prior gains 0.4 dB on held-out frames of half an
+# apartment.
 GAIN_SIGMA = 0.3
 BIAS_SIGMA = 0.02  # Fraction of the range.
-# Most independent measurements in one image; errors of neighboring blocks are correlated.
+# Largest number of independent measurements that an image counts as. It is below the number of
+# blocks, because errors of neighboring blocks are correlated.
 PATCHES = 50
-FIRST_SIGMA, MIN_SIGMA = 0.05, 0.01  # Deviation of a block's color: first round, minimum.
-MAX_SIGMA = 0.1  # The images show different surfaces if the deviation is larger.
+# Standard deviation of a block's color, fraction of the range: in the first round, and the minimum.
+FIRST_SIGMA, MIN_SIGMA = 0.05, 0.01
+MAX_SIGMA = 0.1  # Two images with a larger standard deviation show different surfaces.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -92,7 +97,7 @@ def estimate_exposure(
         rendered: Rendered color, [3, H, W], 0..1.
         opacity: Rendered opacity, [H, W].
         seen: Image of the camera, [3, H, W] uint8.
-        mask: Pixels to use, [H, W] uint8; 0 where a pixel is ignored.
+        mask: Pixels to use, [H, W] uint8; 0 where a pixel is ignored. None to use all.
 
     Returns:
         The exposure. None if the two images probably show different surfaces: too few blocks are
@@ -128,8 +133,8 @@ def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
     + b^2 / BIAS_SIGMA^2 over the inliers, with w = min(PATCHES / M, 1).
 
     Args:
-        x: [M].
-        y: [M].
+        x: Rendered colors of the blocks in one channel, [M], 0..1.
+        y: Colors of the same blocks in the camera image, [M], 0..1.
 
     Returns:
         Slope a and offset b. Then the standard deviation of all M points from that line, estimated

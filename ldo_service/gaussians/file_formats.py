@@ -12,8 +12,8 @@
 
 An .spz file has the axes of OpenGL: x right, y up, z back. `gsply.write_spz` does not convert
 axes, so this module converts them from the axes of the map: x right, y down, z forward. Niantic's
-library calls this conversion RDF to RUB. (`GSData.save` of gsply always writes a PLY, also for
-another file extension.)
+library calls this conversion RDF to RUB. `GSData.save` of gsply is not used, because it always
+writes a PLY, whatever the file extension.
 """
 
 import logging
@@ -37,7 +37,7 @@ PROPERTIES = (
 )
 OF_A_ROW = (
     *("x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-    *("opacity", "f_dc_0", "f_dc_1", "f_dc_2"),  # Columns of RGB in a row.
+    *("opacity", "f_dc_0", "f_dc_1", "f_dc_2"),  # The last three columns of a row hold RGB.
 )
 COLUMNS = {name: column for column, name in enumerate(OF_A_ROW)}
 # Byte order of NumPy by format name.
@@ -63,7 +63,7 @@ SPLAT = np.dtype(
 )
 
 OPENGL = np.array([1, -1, -1], np.float32)  # Map axes to OpenGL axes, and back.
-OPENGL_QUAT = np.array([1, 1, -1, -1], np.float32)  # The same conversion F of a rotation: F R F.
+OPENGL_QUAT = np.array([1, 1, -1, -1], np.float32)  # Rotation R to F R F, with F = diag(OPENGL).
 
 
 def write_ply(path: Path, rows: np.ndarray) -> None:

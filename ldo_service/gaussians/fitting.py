@@ -15,7 +15,8 @@ from .model import GaussianMap
 from .optimizer import GaussianOptimizer, GaussianOptimizerConfig
 from .training_views import TrainingView, covisibility_ratio, sample_training_views, sampled_surface
 
-# Random draws per keyframe that is needed; keyframes that see offloaded Gaussians are skipped.
+# Number of random draws per keyframe that is needed. The spare ones replace keyframes that are
+# skipped, because they see offloaded Gaussians.
 TRIES_PER_DRAW = 4
 
 
@@ -23,16 +24,18 @@ TRIES_PER_DRAW = 4
 class ViewSamplingConfig:
     """Settings of the choice of keyframes to which the map is fitted after a new keyframe.
 
-    Iterations on random keyframes prevent that the map gets worse elsewhere. In published ablations
-    (ALGORITHMS, The map), they gain 4.2 dB PSNR, and iterations on covisible keyframes 1.1 dB.
+    Without iterations on random keyframes, the map would get worse where the newest keyframe does
+    not look. In published ablations, these iterations gain 4.2 dB PSNR, and iterations on covisible
+    keyframes gain 1.1 dB.
     """
 
-    newest_share: float = 0.3  # Fraction of the iterations that take the newest keyframe.
-    covisible_share: float = 0.3  # Fraction of the iterations that take a covisible keyframe.
-    min_shared: float = 0.3  # Least overlap of a covisible keyframe with the newest one.
-    recent: int = 32  # Last keyframes that are checked for covisibility.
-    # Random earlier keyframes that are checked too. The number is fixed, so the cost does not
-    # grow with the length of the run.
+    newest_share: float = 0.3  # Fraction of the iterations that use the newest keyframe.
+    # Fraction of the iterations that use a covisible keyframe; the rest use a random keyframe.
+    covisible_share: float = 0.3
+    min_shared: float = 0.3  # Least overlap of a covisible keyframe with the newest one, 0..1.
+    recent: int = 32  # Number of last keyframes that are checked for covisibility.
+    # Number of random earlier keyframes that are checked too. It is fixed, so that the cost does
+    # not grow with the length of the run.
     earlier: int = 32
 
     def __post_init__(self) -> None:
@@ -50,7 +53,7 @@ class ViewSamplingConfig:
 
 
 class Fitting:
-    """Gaussian optimizer, with the choice of the keyframe for each of its iterations.
+    """Gaussian optimizer, and the choice of the keyframe for each iteration.
 
     Args:
         config: Settings of the Gaussian optimizer.
@@ -77,7 +80,7 @@ class Fitting:
         self._window, self._views, self._is_resident = window, views, is_resident
         self._seed = seed
         self.iterations = 0
-        self.unusable = 0  # Keyframes that were chosen but skipped.
+        self.unusable = 0  # Number of keyframes that were chosen but skipped.
 
     @property
     def threads(self) -> int:
@@ -89,11 +92,11 @@ class Fitting:
         self._optimizer.threads = count
 
     def forget_view(self, keyframe: int) -> None:
-        """Drop what the Gaussian optimizer stores for a keyframe."""
+        """Drop the moments that the Gaussian optimizer keeps for the pose of a keyframe."""
         self._optimizer.forget_view(keyframe)
 
     def plan(self, newest: TrainingView, iterations: int) -> list[int]:
-        """Choose the keyframe of each iteration that follows a new keyframe.
+        """Choose the keyframe of each iteration that runs after a new keyframe.
 
         Args:
             newest: The new keyframe.
@@ -117,9 +120,10 @@ class Fitting:
     def _covisible(
         self, newest: TrainingView, older: list[int], rng: np.random.Generator
     ) -> list[int]:
-        """Return older keyframes that show the same surface as the newest one.
+        """Return the ids of older keyframes that show at least `min_shared` of the same surface.
 
-        The last `recent` keyframes and `earlier` random ones before them are checked.
+        The last `recent` keyframes and `earlier` random ones before them are checked against the
+        measured surface of the newest keyframe.
         """
         window = self._window
         split = max(0, len(older) - window.recent)
@@ -134,15 +138,18 @@ class Fitting:
         return covisibility_ratio(p_map, self._views.cameras[keyframe], self._views.poses[keyframe])
 
     def plan_refinement(self, iterations: int, first: Sequence[int]) -> Iterable[int]:
-        """Return keyframes of `first` and random keyframes alternately, `iterations` in total."""
+        """Return keyframes of `first` and random keyframes alternately, `iterations` in total.
+
+        There are fewer if offloaded Gaussians may be visible in most keyframes.
+        """
         drawn = self._sample_keyframes(iterations - len(first))
         return (k for pair in zip_longest(first, drawn) for k in pair if k is not None)
 
     def _sample_keyframes(self, count: int) -> list[int]:
-        """Return random keyframes in which no offloaded Gaussians may be visible.
+        """Return up to `count` random keyframes in which no offloaded Gaussians may be visible.
 
-        A keyframe may occur several times. There are fewer than `count` if offloaded Gaussians may
-        be visible in most keyframes.
+        A keyframe may occur several times. There are fewer than `count` if most keyframes may see
+        offloaded Gaussians.
         """
         known = self._views.store.keyframes()
         if not known:
@@ -192,7 +199,7 @@ class Fitting:
         return self._optimizer.snapshot()
 
     def restore(self, state: Mapping[str, Any], iterations: int) -> None:
-        """Restore the state of the Gaussian optimizer after a number of iterations."""
+        """Restore the state of the Gaussian optimizer, and the number of iterations run so far."""
         self._optimizer.restore(state)
         self.iterations = iterations
 
@@ -200,7 +207,7 @@ class Fitting:
 def random_for(seed: int, *what: int) -> np.random.Generator:
     """Return a random generator whose seed depends only on the arguments.
 
-    Callers make a new one for each task, so that checkpoints need no generator state.
+    Callers make a new generator for each task, so that checkpoints need no generator state.
 
     Args:
         seed: Seed of the configuration.

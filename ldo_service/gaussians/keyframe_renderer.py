@@ -35,7 +35,10 @@ class KeyframeRenderer:
         *,
         contributions: bool = False,
     ) -> Rendering:
-        """Render the Gaussians from a camera pose."""
+        """Render the Gaussians from a camera pose T_map_camera [4, 4].
+
+        With `contributions`, the contribution of each Gaussian is computed too; see `render`.
+        """
         return render(
             gaussians.rows,
             camera,
@@ -49,7 +52,10 @@ class KeyframeRenderer:
     def render_keyframe(
         self, gaussians: GaussianMap, keyframe: int, *, contributions: bool = False
     ) -> Rendering:
-        """Render the Gaussians at the pose of a keyframe, or return the cached rendering."""
+        """Render the Gaussians at the pose of a keyframe, or return the cached rendering.
+
+        With `contributions`, the contribution of each Gaussian is computed too; see `render`.
+        """
         if self._cached is None or self._cached[0] != keyframe:
             self._cached = None
         if self._cached is None or (contributions and self._cached[1].contributions is None):

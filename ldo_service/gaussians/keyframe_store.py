@@ -45,8 +45,8 @@ class KeyframeStoreConfig:
         ):
             raise ConfigError(
                 named(self, "cache_mb", "quota_mb", "max_keyframes", "newest_kept")
-                + ": cache_mb must be at least 0, quota_mb must be positive, most and newest_kept "
-                "must be at least 1."
+                + ": cache_mb must be at least 0, quota_mb must be positive, max_keyframes and "
+                "newest_kept must be at least 1."
             )
 
 
@@ -177,10 +177,16 @@ class KeyframeStore:
 class KeyframeViews:
     """Training views by keyframe id, with images in a `KeyframeStore` and the rest in memory.
 
-    `poses` has T_map_camera [4, 4] of every keyframe of the run, since Gaussians are anchored to
-    it; this takes 136 bytes each. A training view exists only while its images are stored.
-    `cameras`, `exposures` and `horizons` contain the keyframes with images, all in the same order.
-    Together they take 1.5 kB per keyframe.
+    A training view exists only while its images are stored.
+
+    Attributes:
+        store: The images.
+        cameras: Intrinsics of each keyframe with images.
+        poses: T_map_camera [4, 4] of every keyframe of the run, also without images, since
+            Gaussians are anchored to them. A pose takes 136 bytes.
+        exposures: Exposure of each keyframe with images.
+        horizons: Grid of the farthest depths of each keyframe with images. `cameras`, `exposures`
+            and `horizons` have the same order; together they take 1.5 kB per keyframe.
     """
 
     def __init__(self, store: KeyframeStore) -> None:
@@ -197,7 +203,7 @@ class KeyframeViews:
             The keyframes whose images the store has dropped; only their poses remain.
         """
         if not self.poses:
-            self.store.keep_only(())  # Images of an earlier run in the folder.
+            self.store.keep_only(())  # Drop images of an earlier run in the folder.
         self.store.put(KeyframeImages.of(view))
         self[view.keyframe] = view
         self.horizons[view.keyframe] = MaxDepthGrid.of(view.depth_m)
@@ -225,7 +231,7 @@ class KeyframeViews:
         self.store.put(replace(images, mask=counts.astype(np.uint8)))
 
     def placed(self, keyframe: int) -> PlacedCamera:
-        """Return the camera of a keyframe with its pose and the farthest depths that it measured.
+        """Return the camera of a keyframe, with its pose and the farthest depths in its image.
 
         Raises:
             KeyError: The keyframe is unknown or its images are dropped.

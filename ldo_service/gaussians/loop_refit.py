@@ -32,7 +32,8 @@ class LoopRefitConfig:
     # Keyframes deduplicated with each new keyframe; 100 moved ones take 50 keyframes.
     deduplicated_per_keyframe: int = 2
     deduplicated_at_end: int = 200  # Newest keyframes deduplicated at the end; takes some seconds.
-    # Iterations after the deduplication of each, as for a new keyframe when many wait.
+    # Iterations after the deduplication of each keyframe. A new keyframe gets as many while many
+    # others wait.
     deduplication_iterations: int = 3
     # Refit iterations for a displaced keyframe, half of them on other keyframes; as many as for a
     # new keyframe.
@@ -40,8 +41,8 @@ class LoopRefitConfig:
     # Pending refit iterations that run with each new keyframe while no other waits; mapping then
     # takes 50 % longer. The rest runs while no keyframe arrives, and at the end of offline runs.
     iterations_per_keyframe: int = 6
-    # Pending refit iterations that run at once while no keyframe arrives. A new keyframe waits at
-    # most so long: 0.8 s on two cores at 640x480.
+    # Pending refit iterations that run without a break while no keyframe arrives. They delay the
+    # next keyframe by at most 0.8 s, measured on two cores at 640x480.
     iterations_while_idle: int = 12
 
     def __post_init__(self) -> None:
@@ -143,7 +144,8 @@ class LoopRefit:
         """Do the deduplication and refit iterations that are due with one new keyframe.
 
         Args:
-            is_behind: More new keyframes wait to be mapped. Refit iterations are then postponed.
+            is_behind: Whether more new keyframes wait to be mapped. If True, refit iterations are
+                postponed.
         """
         config = self.config
         self._deduplicate(config.deduplicated_per_keyframe, config.deduplication_iterations)
@@ -157,8 +159,8 @@ class LoopRefit:
     def has_work(self) -> bool:
         """Return whether keyframes wait for deduplication or for refit iterations.
 
-        Iterations of keyframes that see offloaded Gaussians do not count; they wait until the
-        camera is near.
+        Refit iterations of keyframes that see offloaded Gaussians do not count. They wait until the
+        camera is near, and the Gaussians are loaded.
         """
         return bool(self._to_deduplicate) or bool(self._resident_keyframes())
 
@@ -210,9 +212,9 @@ class LoopRefit:
         self._forget()
 
     def _resident_keyframes(self) -> list[int]:
-        """Return the keyframes with pending iterations in which no offloaded Gaussian is visible.
+        """Return the keyframes with pending iterations that see no offloaded Gaussians.
 
-        The map cannot be fitted to the other keyframes now.
+        The map cannot be fitted to the other keyframes until these Gaussians are loaded.
         """
         self._forget()
         return [k for k in self._pending if self._map.is_resident(k)]
@@ -227,8 +229,8 @@ class LoopRefit:
     def metrics(self) -> dict[str, float]:
         return {
             "keyframes_to_deduplicate": len(self._to_deduplicate),
-            # Gaussians held twice after a correction, and removed.
+            # Number of duplicate Gaussians that were removed after corrections.
             "gaussians_deduplicated": self._deduplicated,
-            # Iterations to refit the map to keyframes that corrections moved.
+            # Pending iterations to refit the map to keyframes that corrections moved.
             "iterations_pending": self.pending_iterations,
         }

@@ -13,7 +13,7 @@ from ldo_service.kernels import _loss
 
 from .exposure import Exposure
 
-TILE = 16  # Edge in pixels.
+TILE = 16  # Side of a tile in pixels, as in the rasterizer.
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +66,17 @@ def image_loss(
         planes: Rendering [5, H, W] float32: colors C, weighted depth D in meters, opacity (unused).
         color: Frame [3, H, W] uint8; y = color / 255.
         depth_m: Depth d of the frame, [H, W] float32; 0 where not measured, which is ignored.
-        exposure: Gain and bias of the frame.
+        exposure: Gain and bias of the frame relative to the map.
         weights: Weights of the terms.
-        by_planes: dL/dplanes, [5, H, W] float32; overwritten.
-        mask: [H, W] uint8. Where it is 0, both images are black and depth is ignored.
+        by_planes: Output: dL/dplanes, [5, H, W] float32.
+        mask: [H, W] uint8. Pixels with value 0 count as black in both images, and their depth is
+            ignored. None uses all pixels.
         tiles: [ceil(H / 16), ceil(W / 16)] uint8. The pixels of a tile with value 0 are masked and
-            excluded from the means. At least one tile must not be 0.
+            excluded from the means. At least one tile must not be 0. None uses all tiles.
         threads: Threads of the kernel.
+
+    Returns:
+        The loss and its terms. They do not include the pixels of tiles with value 0.
 
     Raises:
         ValueError: The shapes of the arrays do not match.

@@ -25,7 +25,8 @@ from .renderer import Contributions, Rendering
 from .training_views import TrainingView, visible_in_mask
 from .visibility import BoundingSpheres, MaxDepthGrid, PlacedCamera, chunk_numbers, plan_offload
 
-# Iterations per unit of effort: an iteration that reaches almost no Gaussians counts half.
+# Most iterations per unit of effort (see `GaussianOptimizer.optimize`): an iteration in which
+# almost no Gaussians are visible counts as half a unit.
 MAX_ITERATIONS_PER_EFFORT = 2
 # Files in the folder of a map to which its snapshots refer: keyframe images, offloaded Gaussians.
 FILE_PATTERNS = ("images/*.keyframe", "gaussians/*.gaussians")
@@ -85,14 +86,14 @@ class MapBuilder:
     ) -> None:
         """Add a new keyframe to the map, and fit the map to it and to some older keyframes.
 
-        Where the map lacks surface, new Gaussians are added, which are anchored to the keyframe.
+        Where the map lacks surface, new Gaussians are added and anchored to the keyframe.
 
         Args:
             frame: Color and depth of the keyframe.
             T_map_camera: Pose of the keyframe, [4, 4].
             keyframe: Id of the keyframe, larger than all ids before.
-            iterations: Number of iterations if each one reaches `usual_reach` Gaussians. If more
-                Gaussians are visible, fewer iterations run, so that the time stays the same.
+            iterations: Number of iterations if `usual_reach` Gaussians are visible in each. If more
+                are visible, fewer iterations run, so that the time stays the same.
             dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool.
         """
         self._load_visible(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
@@ -165,10 +166,10 @@ class MapBuilder:
         self._log.mark_added(self.gaussians)
 
     def remove_masked(self, keyframe: int, pixels: np.ndarray) -> int:
-        """Remove what some pixels of a keyframe contributed to the map: they show moving objects.
+        """Remove the Gaussians that a keyframe added at pixels which show moving objects.
 
-        The pixels are excluded from fitting. Gaussians are removed if they are anchored to the
-        keyframe and project into these pixels.
+        Gaussians are removed if they are anchored to the keyframe and project into these pixels.
+        The pixels are excluded from later fitting.
 
         Args:
             keyframe: Id of the keyframe.
@@ -202,7 +203,7 @@ class MapBuilder:
     ) -> int:
         """Fit the map to random keyframes.
 
-        If `first` is given, its keyframes alternate with random ones until all of them are used.
+        The keyframes of `first` alternate with random ones until all keyframes of `first` are used.
 
         Args:
             iterations: Number of iterations.
@@ -238,12 +239,12 @@ class MapBuilder:
     def deduplicate_keyframe(self, keyframe: int, iterations: int) -> int:
         """Remove Gaussians of a keyframe that duplicate older ones, after a loop closure.
 
-        Iterations on this keyframe follow. One call takes a short time, so that the caller can map
-        new keyframes between two calls.
+        The map is then fitted to this keyframe. One call takes a short time, so that the caller can
+        map new keyframes between two calls.
 
         Args:
             keyframe: Id of the keyframe. If its images were dropped, nothing is done.
-            iterations: Number of iterations that follow.
+            iterations: Number of iterations of the fit.
 
         Returns:
             Number of removed Gaussians.
@@ -263,7 +264,7 @@ class MapBuilder:
     def _prune_misshapen(self, touched: np.ndarray) -> None:
         """Remove transparent or oversized Gaussians among the rows where `touched` [N] is true.
 
-        The computing time does not grow with the map.
+        Other rows are not checked, so that the computing time does not grow with the map.
         """
         among = np.flatnonzero(touched)
         mask = np.zeros(len(self.gaussians), bool)
@@ -370,11 +371,14 @@ class MapBuilder:
         }
 
     def saved(self) -> None:
-        """Remove the files that the last snapshot does not refer to; call it once that is saved."""
+        """Remove the files that the last snapshot does not need.
+
+        Call this method once that snapshot is saved to disk.
+        """
         self.offloaded.saved()
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Restore the state of a snapshot. All of the map then counts as published."""
+        """Restore the state of a snapshot. The whole map then counts as published."""
         self.gaussians = GaussianMap.restore(state["map"])
         self.fitting.restore(state["optimizer"], state["iterations"])
         self.views.restore(state["views"])
@@ -389,9 +393,9 @@ class MapBuilder:
             "gaussians": len(self.gaussians),
             "gaussians_pruned": self._pruned,
             "iterations": self.fitting.iterations,
-            # Chosen for fitting, but dropped, unreadable or with offloaded Gaussians in view.
+            # Keyframes chosen for fitting that see offloaded Gaussians or have no readable images.
             "keyframes_skipped": self.fitting.unusable,
-            # Kept in memory beyond the limit, because recent keyframes may see them.
+            # Gaussians in memory beyond the limit, because recent keyframes may see them.
             "gaussians_over_limit": self._excess,
             **self.offloaded.metrics(),
             **self.views.store.metrics(),

@@ -25,7 +25,7 @@ class MapBuilderConfig:
     offload: OffloadConfig = field(default_factory=OffloadConfig)
     recent_cameras: int = 8  # Number of last keyframes whose visible Gaussians stay in memory.
     prune_keyframes: int = 5  # Keyframes between two prunings.
-    # Least translation and rotation of a keyframe by the Gaussian optimizer that is published.
+    # A keyframe pose is published again after the Gaussian optimizer has moved it this far.
     refined_m: float = 2e-4
     refined_rad: float = 2e-4
     seed: int = 0  # Seed of the random choice of keyframes.

@@ -14,7 +14,7 @@ from ldo_service.kernels._rasterize import Bounds
 
 from .rows import ROW, aligned_rows, move_rows
 
-# Bytes of labels per Gaussian (see `semantics.gaussian_labels`); all zero without observations.
+# Bytes of a Gaussian's labels (see `semantics.gaussian_labels`); all are 0 before an observation.
 LABEL_BYTES = 32
 
 
@@ -122,10 +122,10 @@ class GaussianMap:
         return GaussianBatch(self._ids, self._rows, self._anchors, self._labels)
 
     def touch(self, rows: np.ndarray | slice | None = None) -> None:
-        """Record that rows were written through a view.
+        """Record that rows of the map were written through one of its array views.
 
         Args:
-            rows: Indices (uint32) or slice without a step, of the rows that were written. None
+            rows: The rows that were written: indices [M] uint32, or a slice without a step. None
                 means all rows.
         """
         self.version += 1
@@ -177,7 +177,8 @@ class GaussianMap:
         new = _piece(ids, rows, anchors, labels)
         if len(ids) and (ids[0] < self._next_id or np.any(np.diff(ids) <= 0)):
             raise ValueError(
-                f"ids must ascend and be at least {self._next_id}, the next unused id of this map."
+                f"ids must ascend and be at least {self._next_id}, the next unused id of this map: "
+                f"the first is {ids[0]}."
             )
         start, stop = self._size, self._size + len(rows)
         self._reserve(stop)
@@ -350,7 +351,10 @@ def _piece(
     ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray, labels: np.ndarray | None
 ) -> GaussianBatch:
     if rows.ndim != 2 or rows.shape[1] != ROW or not len(ids) == len(anchors) == len(rows):
-        raise ValueError(f"rows have shape {rows.shape}, must be [M, {ROW}], with M ids.")
+        raise ValueError(
+            f"rows have shape {rows.shape}, must be [M, {ROW}], with M ids and M anchors; got "
+            f"{len(ids)} ids and {len(anchors)} anchors."
+        )
     if not np.all(np.isfinite(rows)):
         raise ValueError("rows hold NaN or infinity.")
     labels = new_labels(len(ids)) if labels is None else labels

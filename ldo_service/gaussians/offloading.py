@@ -23,7 +23,7 @@ from .visibility import BoundingSpheres, PlacedCamera
 log = logging.getLogger(__name__)
 
 _DISK_FULL = "Gaussians stay in memory, which may run out: free some disk space."
-MAX_MOTIONS = 32  # Pending motions of a chunk; a chunk with more is rewritten.
+MAX_MOTIONS = 32  # Pending motions of the anchor of a chunk; a chunk with more is rewritten.
 REWRITTEN_PER_CALL = 16  # Chunks rewritten per call of `move_anchors`: 2 ms each.
 
 
@@ -47,8 +47,8 @@ class OffloadedGaussians:
         self._files = ChecksummedFolder(folder, "gaussians", _DISK_FULL)
         self._entries: dict[int, ChunkEntry] = {}  # Key: file number, ascending.
         self._next_number = 0
-        self._retired: list[int] = []  # Unused files, since the last snapshot.
-        self._retired_before: list[int] = []  # Unused files, before the last snapshot.
+        self._retired: list[int] = []  # Files that became unused after the last snapshot.
+        self._retired_before: list[int] = []  # Files that became unused before that snapshot.
         self._spheres: BoundingSpheres | None = None  # Cache; None after a change of the entries.
         self._lost: list[LostIdRange] = []  # Ranges that `pop_lost_ids` will return.
         self._slept = self._awoken = self._damaged = 0
@@ -88,8 +88,8 @@ class OffloadedGaussians:
     def load(self, number: int) -> Chunk:
         """Remove a chunk from the store and return it at the current pose of its anchor.
 
-        If its file is damaged, an empty chunk is returned. Its Gaussians are lost; this is counted
-        and logged.
+        If the file is damaged, an empty chunk is returned, and the Gaussians of the chunk are lost.
+        The loss is counted and logged.
 
         Raises:
             KeyError: There is no such chunk.
@@ -167,7 +167,11 @@ class OffloadedGaussians:
         return [numbers[k] for k in np.flatnonzero(seen)]
 
     def move_anchors(self, T_new_old: Mapping[int, np.ndarray]) -> None:
-        """Move offloaded Gaussians as `GaussianMap.move_anchors` moves resident ones."""
+        """Move offloaded Gaussians as `GaussianMap.move_anchors` moves resident ones.
+
+        Args:
+            T_new_old: Motion [4, 4] in the map frame by id of the anchor keyframe.
+        """
         for number, entry in self._entries.items():
             if entry.anchor in T_new_old:
                 self._entries[number] = entry.moved(T_new_old[entry.anchor])
@@ -204,7 +208,7 @@ class OffloadedGaussians:
         """Return the ids [L], ascending, of Gaussians lost to damaged files since the last call.
 
         Only the id range of a damaged chunk is known. The result contains all ids of this range
-        that exist neither in memory nor on disk, also those of Gaussians removed earlier.
+        that exist neither in memory nor on disk, including ids of Gaussians removed earlier.
 
         Args:
             gaussians: The map with the resident Gaussians.
@@ -243,7 +247,10 @@ class OffloadedGaussians:
         }
 
     def saved(self) -> None:
-        """Remove the files that the last snapshot does not refer to; call it once that is saved."""
+        """Remove the files that the last snapshot does not need.
+
+        Call this method once that snapshot is saved to disk.
+        """
         for number in self._retired_before:
             self._files.remove(number)
         self._retired_before = []
@@ -333,7 +340,7 @@ class OffloadedGaussians:
     def _retire(self, number: int) -> None:
         del self._entries[number]
         self._spheres = None
-        if self._files.is_temporary:  # A restored process cannot use it.
+        if self._files.is_temporary:  # A restored process cannot use this folder.
             self._files.remove(number)
         else:
             self._retired.append(number)
@@ -362,8 +369,8 @@ def iter_all_gaussians(
 ) -> Iterator[GaussianBatch]:
     """Yield all Gaussians, resident and offloaded, in batches; ids ascend throughout.
 
-    This relies on consecutive ids of the Gaussians of one anchor keyframe. Only the offloaded
-    Gaussians of one anchor keyframe are in memory at a time.
+    The Gaussians of one anchor keyframe must have consecutive ids. Only the offloaded Gaussians of
+    one anchor keyframe are in memory at a time.
     """
     resident, start = gaussians.all(), 0
     for chunk in offloaded.chunks():

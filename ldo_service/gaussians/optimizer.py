@@ -17,19 +17,29 @@ from .model import GaussianMap
 from .renderer import Rasterizer
 from .training_views import TrainingView
 
-# Steps of one view are rare, so its moments average over more steps than those of the map.
+# Constants of Adam for keyframe poses. A pose gets few steps, so its moments average over more
+# steps than those of the Gaussians.
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 WIDTH = 6  # Size of a twist.
 
 
 class PoseAdam:
-    """First and second moments of the gradients of each keyframe's pose."""
+    """Adam optimizer of the keyframe poses, with moments for each keyframe."""
 
     def __init__(self) -> None:
-        self._moments: dict[int, np.ndarray] = {}  # [m, v, steps][WIDTH].
+        # By keyframe, [3, WIDTH]: first moments, second moments, and the number of steps.
+        self._moments: dict[int, np.ndarray] = {}
 
     def direction(self, keyframe: int, gradient: np.ndarray) -> np.ndarray:
-        """Update the moments of a keyframe, and return Adam's step for the learning rate 1, [6]."""
+        """Update the moments of a keyframe, and return the direction of the next step.
+
+        Args:
+            keyframe: Id of the keyframe.
+            gradient: dL/dxi of the pose T exp(xi), [6]: rotation rad, translation m.
+
+        Returns:
+            Direction, [6]. The step is the negative of it, times the learning rates.
+        """
         mean, square, steps = self._moments.setdefault(keyframe, np.zeros((3, WIDTH)))
         steps += 1
         mean += (1 - BETA1) * (gradient - mean)
@@ -60,26 +70,29 @@ class GaussianOptimizerConfig:
 
     adam: AdamConfig = field(default_factory=AdamConfig)
     loss: LossWeights = field(default_factory=LossWeights)
-    # Weight of the mean log(longest / middle axis) beyond max_needle_ratio.
+    # Weight of the penalty on needles: the mean of log(longest / middle axis) above
+    # log(max_needle_ratio); see `Rasterizer.gradients`.
     needle_weight: float = 0.01
-    # The ratio that densification gives to surfaces seen at a grazing angle.
+    # Densification gives this ratio to surfaces seen at a grazing angle.
     max_needle_ratio: float = 4.0
 
-    # Longest standard deviation in a view that a step fits; densification gives at most 10. Without
-    # a limit, a single Gaussian grows over a whole wall and over what is observed there later. This
-    # costs 3 dB on held-out frames of the first 240 frames of an apartment. Limits of 14 and 10
-    # cost 0.3 and 0.6 dB in the kitchen.
+    # Longest standard deviation of a Gaussian after a step, in pixels of the view; densification
+    # gives at most 10. Without a limit, a single Gaussian grows over a whole wall and over what is
+    # observed there later. This costs 3 dB on held-out frames of the first 240 frames of an
+    # apartment. Limits of 14 and 10 cost 0.3 and 0.6 dB in the kitchen.
     max_sigma_px: float = 20.0
 
-    # Number of Gaussians at which an iteration takes half its time per pixel, half per Gaussian.
+    # Number of visible Gaussians at which an iteration spends half of its time on the pixels and
+    # half on the Gaussians.
     usual_reach: int = 60_000
 
-    # Fraction of the way to the estimated gain and bias of a frame at each visit; 0 leaves the
-    # exposures as they are, 1 is as good. Gradient steps with a prior of gain 1 lag behind: this
-    # cost 2.3 dB in an apartment where gains vary by a fifth.
+    # Each iteration moves the exposure of its keyframe by this fraction of the way to the
+    # estimate. 0 keeps the exposures constant; 1 is as good. Gradient steps with a prior of gain 1
+    # would lag behind, which cost 2.3 dB in an apartment where gains vary by a fifth.
     exposure_share: float = 0.3
-    # Step of keyframe poses per iteration. 2e-4 gains 0.3 dB there. It adds 1 mm of noise to exact
-    # poses (90 frames of a Replica apartment: ATE 0.02 cm without, 0.13 cm with).
+    # Learning rates of keyframe poses; 0 keeps the poses constant. 2e-4 gains 0.3 dB in that
+    # apartment. It adds 1 mm of noise to exact poses (90 frames of a Replica apartment: ATE 0.02 cm
+    # without, 0.13 cm with).
     rotation_rate_rad: float = 0.0
     translation_rate_m: float = 0.0
 
@@ -99,7 +112,7 @@ class GaussianOptimizerConfig:
         if self.usual_reach < 1:
             raise ConfigError(named(self, "usual_reach") + " must be at least 1.")
         if not self.max_sigma_px > 0:
-            raise ConfigError(named(self, "max_sigma_px") + " must be positive; inf: no limit.")
+            raise ConfigError(named(self, "max_sigma_px") + " must be positive; inf sets no limit.")
         if not self.max_needle_ratio >= 1:
             raise ConfigError(named(self, "max_needle_ratio") + " must be at least 1.")
 
@@ -175,14 +188,14 @@ class GaussianOptimizer:
             plan: Keyframes, in the order of the iterations.
             rates: Factors on the learning rates at the first and at the last iteration; they change
                 geometrically in between. Use 1 while the map grows, less to converge at the end.
-            fixed: Keyframe whose pose and exposure stay constant. They fix the pose and the
-                brightness of the map.
+            fixed: Keyframe whose pose and exposure stay constant, to fix the pose and the
+                brightness of the map. None lets all of them change.
             effort: Limit of the computation: iterations stop when their sum of (1 + r) / 2 reaches
                 it. r is the number of Gaussians that may touch the image, divided by
                 `usual_reach`.
 
         Returns:
-            Losses before each step.
+            Loss before each step, for the iterations that were run.
         """
         losses, spent = [], 0.0
         for rate, keyframe in zip(np.geomspace(*rates, len(plan)), plan, strict=True):
@@ -270,9 +283,9 @@ class GaussianOptimizer:
         return replace(view, T_map_camera=T_map_camera)
 
     def steps(self, gaussians: GaussianMap) -> np.ndarray:
-        """Return the number of steps of each Gaussian, [N] int32.
+        """Return the number of Adam steps of each Gaussian, [N] int32.
 
-        A Gaussian has changed between two calls if its number has increased.
+        The number increases whenever the optimizer changes the Gaussian.
         """
         return self._adam.steps(gaussians)
 

@@ -18,15 +18,17 @@ class PruningConfig:
     """Criteria of the pruning."""
 
     min_opacity: float = 0.005  # Kerbl et al., 2023, sec. 5.2.
-    # Longest axis relative to the mean of its neighborhood (paper, III.A).
+    # Largest length of a Gaussian's longest axis, relative to the mean of the other Gaussians in
+    # its neighborhood (paper, III.A).
     max_relative_scale: float = 10.0
-    neighborhood_m: float = 0.25  # Edge of the cubes that are the neighborhoods.
-    # A Gaussian must be visible in the image of its own keyframe or of the newest one. This is
-    # checked once that many keyframes followed its own, and later at random. Hidden Gaussians are
-    # removed: others have grown over them.
+    neighborhood_m: float = 0.25  # Edge of the cubes of space that are the neighborhoods.
+    # A Gaussian must be visible in the image of its anchor keyframe or of the newest keyframe. This
+    # is checked when this many keyframes have followed the anchor keyframe, and later at random.
+    # Hidden Gaussians are removed, because others have grown over them.
     confirm_keyframes: int = 5
-    # Least sum of its weights over the image; 0 confirms all. In the kitchen, 430 k
-    # Gaussians without and 165 k with it; the PSNR of held-out views differs by 0.1 dB.
+    # Least sum of a visible Gaussian's blending weights over an image; 0 turns the check off. In
+    # the kitchen, the map has 430 k Gaussians without the check and 165 k with it; the PSNR of
+    # held-out views differs by 0.1 dB.
     min_weight_px: float = 0.25
 
     def __post_init__(self) -> None:
@@ -47,7 +49,8 @@ class PruningConfig:
 def prunable_mask(rows: np.ndarray, config: PruningConfig | None = None) -> np.ndarray:
     """Return the mask of Gaussians that are nearly transparent, oversized or not finite.
 
-    Oversized means far larger than the mean of the Gaussians around.
+    A Gaussian is oversized if its longest axis exceeds `max_relative_scale` times the mean of the
+    other Gaussians in its cube of edge `neighborhood_m`.
 
     Args:
         rows: [N, 16].
@@ -67,7 +70,8 @@ def prunable_mask(rows: np.ndarray, config: PruningConfig | None = None) -> np.n
 def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.ndarray:
     """Return, for each Gaussian, the mean value of the other Gaussians in the same cube, [N].
 
-    It is infinite if there is no other Gaussian. Space is divided into cubes of edge `edge_m`.
+    Space is divided into cubes of edge `edge_m`. The mean is infinite if no other Gaussian is in
+    the cube.
     """
     cube = np.floor(np.nan_to_num(means.astype(float)) / edge_m).astype(np.int64)
     cube -= cube.min(axis=0, initial=0)
@@ -80,9 +84,9 @@ def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.nda
 
 
 def weights(rows: np.ndarray) -> np.ndarray:
-    """Return the approximate contribution of each of the rows [N, 16] to an image, [N].
+    """Return the approximate contribution of each Gaussian, rows [N, 16], to an image, [N].
 
-    It is the opacity times an area in m^2: the product of the two larger standard deviations.
+    The contribution is the opacity times the product of the two larger standard deviations, m^2.
     """
     log_scales = rows[:, 3:6]
     return _opacities(rows) * np.exp(log_scales.sum(axis=1) - log_scales.min(axis=1))
@@ -104,19 +108,20 @@ def _opacities(rows: np.ndarray) -> np.ndarray:
 class DeduplicationConfig:
     """Criteria of duplicate Gaussians."""
 
-    # Least difference of keyframe ids. Nearer keyframes were mapped with each other's Gaussians in
-    # view, so they made no duplicates.
+    # Least difference between the ids of the two anchor keyframes. When a keyframe was mapped, the
+    # Gaussians of the keyframes just before it were in view, so it added no duplicates of them.
     keyframes_apart: int = 30
     # Largest distance along the normal. A loop closure is accurate to one or two centimeters, and
     # the two sides of a door are 4 cm apart.
     off_m: float = 0.03
-    # Largest distance in the plane, in longest standard deviations; the corners of the grid of
-    # densification are at 1.18.
+    # Largest distance in the plane of the older Gaussian, relative to its longest standard
+    # deviation. The corners of a densification cell are at 1.18.
     reach_sigmas: float = 1.25
     min_cosine: float = 0.8  # Least |cos| of the angle between the normals: 37 deg.
-    # Largest difference in any channel, 0..1: exposures differ, but a picture on a wall is kept.
+    # Largest difference in any channel, 0..1. It allows for different exposures, but keeps a
+    # picture on a wall.
     max_color: float = 0.25
-    neighbors: int = 4  # Number of nearest older Gaussians that are compared.
+    neighbors: int = 4  # Number of nearest older Gaussians that each Gaussian is compared with.
 
     def __post_init__(self) -> None:
         if self.keyframes_apart < 1 or self.neighbors < 1:
@@ -134,9 +139,9 @@ def find_duplicates(
 ) -> np.ndarray:
     """Return the mask of Gaussians of a keyframe that duplicate much older ones.
 
-    A duplicate lies within `off_m` of the plane of an older, flat Gaussian, and within
-    `reach_sigmas` of its center along that plane. Its normal and color are similar. The older
-    Gaussian is kept, since it was optimized longer together with its neighbors.
+    A duplicate lies within `off_m` of the plane of an older, flat Gaussian. Along that plane, it
+    lies within `reach_sigmas` of the center of the older Gaussian. Both have similar normals and
+    colors. The older Gaussian is kept, since it was optimized longer together with its neighbors.
 
     Only Gaussians near those of the keyframe are compared. Apart from one pass over all means, the
     computing time does not grow with the map.

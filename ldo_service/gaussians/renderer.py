@@ -17,7 +17,7 @@ from ldo_service.kernels import _rasterize
 from .rows import ROW, aligned_rows
 
 PLANES = 5  # Red, green, blue, weighted depth, opacity.
-WEIGHT = 14  # Field of the summed weight in a row of gradients.
+WEIGHT = 14  # Column of the summed blending weight in a row of gradients.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -29,10 +29,10 @@ class AdamStep:
         mean: First moments, [N, 16] float32; changed in place.
         square: Second moments, [N, 16] float32; changed in place.
         steps: Number of steps of each row, [N] int32; changed in place.
-        rates: Step length per field, [16] float32.
+        rates: Learning rate of each column, [16] float32.
         beta1: Decay of the first moments.
         beta2: Decay of the second moments.
-        epsilon: Added to the square root of the second moments.
+        epsilon: Positive constant that is added to the square root of the second moments.
     """
 
     rows: np.ndarray
@@ -109,10 +109,11 @@ class Rasterizer:
         """Render the image planes that the loss needs.
 
         Args:
-            rows: See `render`.
-            camera: See `render`.
-            T_camera_map: See `render`.
-            bounds: See `render`.
+            rows: Gaussians, [N, 16] float32, contiguous; the function `render` lists the columns.
+            camera: Intrinsics without distortion.
+            T_camera_map: [4, 4].
+            bounds: Bounds of these rows (`GaussianMap.bounds`), which save reading invisible rows.
+                None reads all rows.
             tiles: [ceil(H / 16), ceil(W / 16)] uint8. Tiles with value 0 are not rendered, and
                 their pixels are zero. Pass the same array to `image_loss`, which then ignores them.
 
@@ -148,8 +149,8 @@ class Rasterizer:
             needle_weight * mean over pixels of
                 sum_i w_i max(0, log(longest / middle axis of Gaussian i) - log needle_ratio)
 
-        The blending weights w_i count as constants in it. The rows must not have changed since the
-        rendering. The result is bitwise equal for any number of threads.
+        The derivative of this term treats the blending weights w_i as constants. The rows must not
+        have changed since the rendering. The result is bitwise equal for any number of threads.
 
         Args:
             by_planes: dL/dplanes without the additional term, [5, H, W].
@@ -189,12 +190,12 @@ class Rasterizer:
         in place.
 
         Args:
-            by_planes: dL/dplanes, [5, H, W].
+            by_planes: dL/dplanes without the penalty on needles, [5, H, W].
             step: Parameters, moments and rates.
-            needle_weight: See `gradients`.
-            needle_ratio: See `gradients`.
-            max_sigma_px: The step limits the standard deviations of a Gaussian to this size in the
-                image, computed at the depth of its mean.
+            needle_weight: Weight of the penalty on needles; see `gradients`.
+            needle_ratio: Ratio of the longest to the middle axis above which the penalty applies.
+            max_sigma_px: Limit on the standard deviations of each Gaussian that the step changes,
+                in pixels at the depth of its mean.
 
         Raises:
             ValueError: `step.rows` are not the rows of the last rendering, or an earlier step has
@@ -240,7 +241,7 @@ def _new_planes(height: int, width: int) -> np.ndarray:
     return aligned_rows(-(-size // ROW)).reshape(-1)[:size].reshape(PLANES, height, width)
 
 
-RenderMemory = _rasterize.Pass  # Scratch memory that one rendering leaves to the next.
+RenderMemory = _rasterize.Pass  # Scratch memory that several renderings use one after the other.
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,8 +251,8 @@ class Contributions:
     Attributes:
         indices: Rows with a weight above 0, [V] uint32, ascending.
         weights: Blending weight w_i summed over the pixels, [V] float32.
-        top: Row with the largest w_i at each pixel, [H, W] int32. Of equal ones it is the nearest;
-            -1 if no Gaussian touches the pixel. An image of labels is
+        top: Row with the largest w_i at each pixel, [H, W] int32. If several w_i are equal, the
+            nearest Gaussian counts. -1 if no Gaussian touches the pixel. An image of labels is
             `np.where(top >= 0, labels[top], nothing)`.
     """
 

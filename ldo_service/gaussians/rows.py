@@ -38,7 +38,7 @@ def move_rows(
         rows: [M, 16].
         anchors: Anchor keyframe of each row, [M] int32.
         keyframes: Ids of the moved keyframes, [K] int64, ascending. Rows of other anchors stay.
-        T: Transforms T_new_old of these keyframes, [K, 4, 4].
+        T: Motions T_new_old of these keyframes in the map frame, [K, 4, 4].
         q: Rotations of these transforms, [K, 4] wxyz.
     """
     _motion.move_rows(rows, anchors, keyframes, np.ascontiguousarray(T), np.ascontiguousarray(q))

@@ -16,8 +16,8 @@ from ldo_service.geometry import Camera, RgbdFrame, se3
 from .exposure import Exposure
 
 _LEVEL = 1  # Compression level of zstd.
-# Depth that compresses to less than this fraction is quantized: sensors measure in steps, so bytes
-# repeat.
+# A depth image that compresses to less than this fraction counts as quantized: the sensor measures
+# in steps, so the same bytes repeat.
 _QUANTIZED = 0.25
 
 
@@ -51,7 +51,7 @@ class TrainingView:
 
 
 def sampled_surface(view: TrainingView, *, step_px: int = 32) -> np.ndarray:
-    """Return the measured 3D points of every `step_px`-th row and column, in the map, [M, 3]."""
+    """Return the measured 3D points at every `step_px`-th row and column, [M, 3] in the map."""
     coarse = slice(step_px // 2, None, step_px)
     z = view.depth_m[coarse, coarse]
     points = view.camera.rays()[coarse, coarse][z > 0] * z[z > 0][:, None]
@@ -109,17 +109,20 @@ def sample_training_views(
 ) -> list[int]:
     """Choose the keyframe of each iteration at random.
 
-    Where a choice would be from an empty list, the newest keyframe is taken.
+    If the list for an iteration is empty, the iteration uses the newest keyframe.
 
     Args:
-        newest: The newest keyframe. The first iteration takes it unless `newest_share` is 0.
+        newest: The newest keyframe. The first iteration uses it unless `newest_share` is 0.
         covisible: Keyframes covisible with the newest one.
-        others: All other keyframes.
+        others: Keyframes for the remaining iterations; they may include `covisible`.
         iterations: Number of iterations.
         rng: Random generator.
-        newest_share: Fraction of the iterations that take the newest keyframe.
-        covisible_share: Fraction of the iterations that take one of `covisible`; the rest take
-            one of `others`.
+        newest_share: Expected fraction of the iterations that use the newest keyframe.
+        covisible_share: Expected fraction of the iterations that use one of `covisible`; the rest
+            use one of `others`.
+
+    Returns:
+        Ids of the keyframes, one per iteration.
     """
     out = []
     draws = rng.random(iterations)
@@ -176,7 +179,7 @@ class KeyframeImages:
         return cls(view.keyframe, view.camera, view.color, view.depth_m, view.mask)
 
     def view(self, T_map_camera: np.ndarray, exposure: Exposure | None = None) -> TrainingView:
-        """Return the training view at a pose [4, 4] and with an exposure."""
+        """Return the training view at a pose [4, 4] and with an exposure; None: gain 1, bias 0."""
         return TrainingView(
             self.keyframe,
             self.camera,
@@ -212,7 +215,7 @@ def _own(image: np.ndarray) -> np.ndarray:
 class _Stored(msgspec.Struct, frozen=True):
     keyframe: int
     camera: Camera
-    color: bytes  # Compressed with zstd, as all bytes here.
+    color: bytes  # This and the other bytes are compressed with zstd.
     depth: bytes
     is_depth_differences: bool
     mask: bytes | None

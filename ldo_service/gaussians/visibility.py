@@ -14,16 +14,17 @@ from ldo_service.geometry import Camera, se3
 
 from .densification import with_small_holes_filled
 
-BLOCKS = 12, 16  # Blocks of an image, down and to the right: 0.8 kB.
-# Fraction of the depth. A point less than this behind the surface counts as visible, because
-# depth is noisy.
+BLOCKS = 12, 16  # Blocks of an image, vertically and horizontally; a grid takes 0.8 kB.
+# Fraction of the depth: a point that lies less than this behind the surface counts as visible,
+# because depth is noisy.
 BEHIND = 0.1
 LOW_PASS_PX = 2.0  # 3.33 times the square root of the 0.3 px^2 that the renderer adds to a splat.
-_HOLE_PX = 4  # Equals the hole_px of densification: the sensor's shadows lie on the surface behind.
+_HOLE_PX = 4  # Equals the hole_px of densification; holes beside an object show the background.
 
-# `render` draws a Gaussian up to alpha = 1/255: sqrt(2 ln 255) standard deviations. At the rim of
-# the image its affine splats are up to 1.3 times as wide as the ellipsoid there. The Jacobian is
-# computed up to that far outside the image (kernels/projection.hpp).
+# `render` draws a Gaussian up to alpha = 1/255: sqrt(2 ln 255) = 3.33 standard deviations. The
+# affine approximation makes splats near the edge of the image up to 1.3 times as wide as the
+# projected ellipsoid. The Jacobian is evaluated over an area 1.3 times as wide as the image
+# (kernels/projection.hpp).
 REACH_SIGMA = 1.3 * 3.33
 NEAR_M = 0.05  # Near plane of the renderer.
 _MAX_LOG_SCALE = 50.0  # Effectively infinite, but without overflow.
@@ -77,7 +78,7 @@ class MaxDepthGrid:
 def _edges(shape: tuple[int, ...]) -> list[np.ndarray]:
     """Return the block boundaries in pixels: vertical positions, then horizontal positions.
 
-    Each is the first pixel of every block and the number of pixels.
+    Each array has the first pixel of every block, then the number of pixels.
     """
     return [
         np.linspace(0, pixels, blocks + 1).astype(int)
@@ -90,7 +91,8 @@ def _between(
 ) -> np.ndarray:
     """Return whether each sphere may touch each of the B rows (or columns) of blocks.
 
-    The camera and two neighboring block boundaries form a wedge in space, which is tested.
+    The camera sees a row of blocks through a wedge between two planes, one through each boundary
+    of the row. The spheres are tested against these wedges.
 
     Args:
         centers: Coordinates (y, z) of the centers for rows, (x, z) for columns, [K, 2].
@@ -255,18 +257,20 @@ def _spheres(
 class OffloadConfig:
     """Settings of offloading: when Gaussians leave the memory, and which of them."""
 
-    # Gaussians in memory (ALGORITHMS, The map): 300 MB with moments. The limit is checked every
-    # mapper.publish.update_interval_keyframes; new and loaded Gaussians exceed it until then.
+    # Largest number of Gaussians in memory; with the moments of Adam, they take 300 MB. The limit
+    # is checked every mapper.publish.update_interval_keyframes keyframes. Until then, new and
+    # loaded Gaussians may exceed it.
     max_active: int = 1_500_000
     # Fraction of max_active that remains after offloading, so each batch takes about 0.1 s.
     low_water: float = 0.9
-    # Largest distance at which Gaussians count as visible. Depth cameras measure less
-    # far, so nothing is inserted twice where Gaussians are offloaded. Within it, the
+    # Largest distance at which Gaussians count as visible. Depth cameras measure less far, so
+    # densification adds nothing twice where Gaussians are offloaded. Within this distance, the
     # measured surface hides the Gaussians behind it.
     reach_m: float = 20.0
-    # Edge of the cubes; the Gaussians of one keyframe in one cube form a chunk. In an
-    # apartment of two rooms the last 8 keyframes may see 36 % of the map; with 0.5 m 28
-    # %, with 2.0 m 54 %. It is 67 % with whole keyframes as chunks and without occlusion.
+    # Edge of the cubes of space; the Gaussians of one keyframe in one cube form a chunk. In an
+    # apartment of two rooms, the chunks that the last 8 keyframes may see hold 36 % of the map
+    # (28 % with 0.5 m, 54 % with 2.0 m). With one chunk per keyframe and without occlusion, they
+    # would hold 67 %.
     chunk_edge_m: float = 1.0
 
     def __post_init__(self) -> None:
