@@ -11,7 +11,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 
-# Bounds of focal length over image side: fields of view of 175 and 0.6 degrees.
+# Minimum and maximum of focal length over image side: fields of view of 175 and 0.6 degrees.
 MIN_FOCAL_RATIO, NARROWEST = 0.02, 100.0
 
 # Maximum radius in normalized coordinates: 76 degrees from the axis, beyond any pinhole model.
@@ -130,7 +130,7 @@ class Camera:
         return self.rays_at(u, v) * np.asarray(depth_m)[..., None]
 
     def backproject(self, depth_m: np.ndarray) -> np.ndarray:
-        """Return camera points [H, W, 3] of depth [H, W]; the origin where depth is missing."""
+        """Return camera points [H, W, 3] of depth [H, W], meters; the origin where depth is 0."""
         return (self.rays() * depth_m[..., None]).astype(np.float32)
 
     def project(self, points_camera: np.ndarray) -> np.ndarray:
@@ -147,7 +147,11 @@ class Camera:
 
 @lru_cache(maxsize=4)
 def rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normalized coordinates x, y [H, W] float32 of all pixels, without distortion."""
+    """Return the normalized coordinates of all pixels, with the lens distortion removed.
+
+    Returns:
+        x and y, [H, W] float32 each: the viewing ray of a pixel is (x, y, 1). Both are read-only.
+    """
     if any(camera.distortion):
         u, v = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
         pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
@@ -164,8 +168,8 @@ def project(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, n
     """Project normalized coordinates with OpenCV's distortion model.
 
     Args:
-        x: Normalized coordinates, [...] float32.
-        y: Normalized coordinates, [...] float32.
+        x: Normalized horizontal coordinates X / Z, [...] float32.
+        y: Normalized vertical coordinates Y / Z, [...] float32.
         camera: The camera, with its lens distortion.
 
     Returns:

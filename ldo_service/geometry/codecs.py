@@ -177,7 +177,7 @@ def _require_size(image: np.ndarray, width: int, height: int, encoding: str) -> 
 
 
 def shrunk(crop: np.ndarray, side_px: int) -> np.ndarray:
-    """Return an image scaled down so that its longer side is at most `side_px`."""
+    """Return an image scaled down to at most `side_px` on its longer side; it is never enlarged."""
     height, width = crop.shape[:2]
     scale = side_px / max(height, width)
     if scale >= 1:

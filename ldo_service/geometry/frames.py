@@ -49,7 +49,7 @@ class RgbdFrame:
             )
 
 
-Maps = tuple[np.ndarray, np.ndarray]
+Maps = tuple[np.ndarray, np.ndarray]  # Results of `undistortion_maps`.
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +123,11 @@ def _size(image: np.ndarray) -> str:
 
 
 def undistortion_maps(camera: Camera) -> Maps | None:
-    """Return where each pixel of the rectified image lies in the distorted one: u, v [H, W].
+    """Return where each pixel of the rectified image lies in the distorted image.
 
-    Return None if the camera has no distortion.
+    Returns:
+        Columns u and rows v in the distorted image, [H, W] float32 each, in pixels. None if the
+        camera has no distortion.
     """
     if not any(camera.distortion):
         return None
@@ -136,9 +138,11 @@ def undistortion_maps(camera: Camera) -> Maps | None:
 
 
 def valid_pixels(camera: Camera) -> np.ndarray | None:
-    """Return which pixels of a rectified image show the distorted one, [H, W] bool.
+    """Return which pixels of a rectified image lie inside the distorted image.
 
-    The others form a black rim. Return None if the camera has no distortion: all pixels are valid.
+    Returns:
+        Mask [H, W] bool. It is False on the black rim that rectification leaves. None if the camera
+        has no distortion, so that all pixels are valid.
     """
     maps = undistortion_maps(camera)
     if maps is None:
@@ -157,7 +161,7 @@ def rectify(raw: RawFrame, maps: Maps | None) -> RgbdFrame:
 
     Args:
         raw: The frame.
-        maps: Result of `undistortion_maps(raw.camera)`.
+        maps: Result of `undistortion_maps(raw.camera)`; None if there is no distortion.
     """
     color, depth_m = raw.color, raw.depth_m()
     if maps is not None:

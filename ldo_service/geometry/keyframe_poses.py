@@ -14,11 +14,11 @@ from . import se3
 from .point_records import RecordTable
 
 APART_M = 100.0  # Distance between unmerged submaps: beyond the range of depth cameras.
-NO_REFERENCE = -1
+NO_REFERENCE = -1  # Stored if a keyframe has no reference keyframe.
 KEYFRAME = np.dtype(
     [
         ("id", np.int64),
-        ("reference", np.int64),  # Keyframe that it was measured from.
+        ("reference", np.int64),  # Id of the reference keyframe, or NO_REFERENCE.
         ("submap", np.int64),
         ("T_map", float, (4, 4)),  # T_map_keyframe.
         ("T_reference", float, (4, 4)),  # T_reference_keyframe.
@@ -42,13 +42,13 @@ def T_map_submap(submap: int) -> np.ndarray:
 class KeyframePoses:
     """Keyframe poses in the map by id, from relative poses and corrections of the pose graph.
 
-    Each component that receives keyframes has its own instance. Instances with the same keyframes
-    and the same last correction have equal poses, in whatever order these arrived. An instance
-    needs 0.4 kB of memory per keyframe.
+    Each component that receives keyframes has its own instance. Two instances with the same
+    keyframes and the same last correction have equal poses, in whatever order the keyframes and the
+    correction arrived. An instance needs 0.4 kB of memory per keyframe.
     """
 
     def __init__(self) -> None:
-        self.version = 0  # Version of the last correction.
+        self.version = 0  # Graph version of the last correction; 0 before the first one.
         self._known = RecordTable(KEYFRAME)
 
     def __len__(self) -> int:
@@ -83,12 +83,12 @@ class KeyframePoses:
     ) -> np.ndarray:
         """Add a keyframe, and return its T_map_keyframe [4, 4].
 
-        The reference is unknown if its message was missed. The pose then comes from odometry
-        relative to the newest known keyframe of the submap.
+        The reference keyframe is unknown here if its message was missed. The pose then comes from
+        odometry, relative to the newest known keyframe of the submap.
 
         Args:
             keyframe: Id of the keyframe.
-            reference: Keyframe that the relative pose refers to; None without one.
+            reference: Reference keyframe of the relative pose; None if the keyframe has none.
             T_reference_keyframe: Relative pose, [4, 4].
             T_odom_keyframe: Pose in the odometry frame, [4, 4].
             submap: Submap of the keyframe.
@@ -126,9 +126,9 @@ class KeyframePoses:
         Args:
             version: Version of the pose graph.
             T_map: Corrected T_map_keyframe [4, 4] by id.
-            held: Keyframes whose relative pose here is more accurate than the one that the pose
-                graph used. Their poses are also computed again from their references, if these are
-                known.
+            held: Keyframes whose relative pose here is more accurate than the relative pose that
+                the pose graph used. Their poses are not taken from `T_map`: they are computed from
+                their reference keyframes, if those are known.
         """
         if version <= self.version or not T_map:
             return
@@ -184,7 +184,7 @@ class KeyframePoses:
         self._known.keep_only(keyframes)
 
     def T_map_odom(self, keyframe: int) -> np.ndarray:
-        """Return T_map_odom [4, 4] as given by the two poses of a keyframe, in map and odometry."""
+        """Return T_map_odom [4, 4], from the poses of a keyframe in the map and in odometry."""
         record = self._record(keyframe)
         return record["T_map"] @ se3.inverse(record["T_odom"])
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 MIN_ROOM = 64  # Minimum capacity in records.
-GROWTH = 1.25  # Growth of the capacity: at most a fifth of it is unused.
+GROWTH = 1.25  # Factor by which the capacity grows: at most a fifth of it is unused.
 
 
 class RecordTable:
@@ -104,7 +104,7 @@ class RecordTable:
         return {name: self.all[name].copy() for name in self._room.dtype.names or ()}
 
     def restore(self, columns: Mapping[str, np.ndarray]) -> None:
-        """Replace the table by the result of `columns`."""
+        """Replace the table by arrays that `columns` returned."""
         records: np.ndarray = np.zeros(len(columns["id"]), self._room.dtype)
         for name in records.dtype.names or ():
             records[name] = columns[name]

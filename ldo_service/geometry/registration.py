@@ -100,9 +100,9 @@ def _covered(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the range of color pixels that each cell covers along one image axis.
 
-    A cell reaches halfway to its neighbors along `axis`. The projection may be sheared: neighbors
-    along the other axis are then displaced along this one. The cell therefore also extends by half
-    of that displacement.
+    A cell reaches halfway to its neighbors along `axis`. If the projection is sheared, neighbors
+    along the other array axis are displaced along `axis` too. The cell therefore also extends by
+    half of that displacement.
 
     Args:
         center: Centers of the cells in this direction, [Hd, Wd] pixels.
@@ -157,7 +157,14 @@ def _nearest(
 
 
 def _cover_row(nearest: np.ndarray, z: np.ndarray, pixel: np.ndarray, more: np.ndarray) -> None:
-    """Set `nearest` to z at `pixel` and the `more` pixels to its right where z is smaller."""
+    """Set `nearest` to z where z is smaller, at `pixel` and the `more` pixels to the right of it.
+
+    Args:
+        nearest: Least depth of each color pixel so far, [Hc * Wc]; changed in place.
+        z: Depths of the cells, [P].
+        pixel: Index of the first pixel of each cell in this row, [P].
+        more: Number of further pixels of each cell in this row, [P].
+    """
     while len(z):
         np.minimum.at(nearest, pixel, z)
         wider = more > 0
@@ -169,8 +176,8 @@ def resample_color(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Resample a color image to the depth camera, for cameras of equal center and orientation.
 
-    The color image is halved as long as it is more than 1.5 times finer than the depth image. This
-    avoids aliasing. It is then interpolated bilinearly.
+    To avoid aliasing, the color image is first halved until it is at most 1.5 times finer than the
+    depth image. Then it is interpolated bilinearly.
 
     Args:
         color: Color image, [Hc, Wc, 3] uint8.

@@ -57,9 +57,9 @@ def inverse(T: Array) -> Array:
 
 
 def orthonormalize(T: Array) -> Array:
-    """Return T [4, 4] with its rotation replaced by the nearest exact one.
+    """Return T [4, 4] with its upper left 3x3 block replaced by the nearest rotation.
 
-    Products of transforms accumulate rounding errors, which this removes.
+    This removes the rounding errors that products of transforms accumulate.
     """
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)
@@ -92,7 +92,7 @@ def rotation_angles(T: Array) -> Array:
 
 
 def distances(T: Array) -> Array:
-    """Return the lengths [...] of the translations of T [..., 4, 4]."""
+    """Return the lengths [...] of the translations of T [..., 4, 4], in meters."""
     return np.linalg.norm(T[..., :3, 3], axis=-1)
 
 
@@ -167,7 +167,7 @@ def interpolate(T_a: np.ndarray, T_b: np.ndarray, share: np.ndarray) -> np.ndarr
         T = T_a (exp(s omega), s t),   (exp(omega), t) = T_a^-1 T_b
 
     The rotation is about one axis at a constant rate; the translation is on a straight line. The
-    result of a pair is bitwise the same, whatever other pairs are given.
+    result of a pair does not depend on the other pairs of the call, bit for bit.
 
     Args:
         T_a: Transforms at s = 0, [N, 4, 4].

@@ -8,6 +8,7 @@ import numpy as np
 
 from ldo_service.geometry import Camera, RawFrame, Rectifier, RgbdFrame, Trajectory
 
+# Names of classes, in lower case, that data sets give to pixels without a label.
 VOID_NAMES = frozenset({"", "undefined", "unknown", "unlabeled", "unlabelled", "void"})
 
 
@@ -87,7 +88,7 @@ class Sequence(ABC):
 
 
 class Cached(Sequence):
-    """Sequence that keeps all frames in memory after the first read; for short sequences."""
+    """Sequence that keeps each frame in memory after its first read; for short sequences."""
 
     def __init__(self, sequence: Sequence) -> None:
         super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns)

@@ -13,8 +13,8 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, FrameError
 
-# Number of recent intervals; the smallest one is the period of the stream, as drops cause longer
-# ones.
+# Number of recent intervals between stamps. The smallest interval counts as the period of the
+# stream, because dropped measurements make other intervals longer.
 REMEMBERED_INTERVALS = 8
 RECENT_PAIRS = 200  # Number of pairs in the skew statistics: 7 s at 30 Hz.
 
@@ -72,7 +72,7 @@ class StreamBuffer:
     """Buffer of the measurements of one stream that have no partner yet."""
 
     waiting: deque[Stamped] = field(default_factory=deque)  # The oldest first.
-    # The newest stamps that were received.
+    # The newest received stamps, also of measurements that are paired or dropped.
     stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_INTERVALS + 1))
     lost: int = 0  # Number of measurements that were dropped without a partner.
 
@@ -97,7 +97,7 @@ class StreamBuffer:
         self.lost += 1
 
     def period_ns(self) -> int | None:
-        """Return the smallest recent interval, or None before the second stamp."""
+        """Return the smallest recent interval between stamps, or None before the second stamp."""
         return min((b - a for a, b in pairwise(self.stamps_ns)), default=None)
 
 
@@ -107,14 +107,21 @@ class StreamPairer(Generic[A, B]):
     A measurement is called a half of its pair. The stamps of a pair differ by at most
     `max_skew_ns`. Pairs keep the order of both streams, and each half is used at most once.
 
-    The pairer compares the oldest waiting halves of the two streams. The stream of the earlier half
-    may still deliver one that is nearer to the later half. If the stamps differ by at most half
-    the period of that stream, none can be nearer, and the pair is returned at once. Otherwise the
-    pairer waits for the next half of that stream. While the period is unknown, the pairer accepts
-    any difference up to `max_skew_ns`.
+    The pairer compares the oldest waiting halves of the two streams: an earlier and a later half.
+    The stream of the earlier half may still deliver a half that is nearer to the later half. If the
+    two stamps differ by at most half the period of that stream, no nearer half can come, and the
+    pair is returned at once. Otherwise the pairer waits for the next half of that stream. While the
+    period is unknown, the pairer accepts any difference up to `max_skew_ns`.
 
-    At most `buffer` halves of a stream wait. If there are more, the oldest one is paired with the
+    At most `buffer` halves of a stream wait. If there are more, the oldest half is paired with the
     best available half or dropped. Equal input gives equal pairs, because no clock is read.
+
+    Args:
+        max_skew_ns: Largest difference between the stamps of a pair, nanoseconds.
+        buffer: Largest number of halves of a stream that wait for a partner.
+
+    Raises:
+        ConfigError: An argument is out of range.
     """
 
     def __init__(self, max_skew_ns: int, buffer: int) -> None:
@@ -156,7 +163,7 @@ class StreamPairer(Generic[A, B]):
         return self._b.lost
 
     def skews_ms(self) -> list[float]:
-        """Return the stamp differences of recent pairs in milliseconds."""
+        """Return the stamp differences of the last 200 pairs, in milliseconds, at least 0."""
         return [skew * 1e-6 for skew in self._skews_ns]
 
     def _decided(self) -> Iterator[tuple[A, B]]:
@@ -179,15 +186,23 @@ class StreamPairer(Generic[A, B]):
 
     @staticmethod
     def _has_nearer(earlier: StreamBuffer, later: StreamBuffer, skew: int) -> bool:
-        """Return whether the second half of `earlier` is nearer to the first half of `later`.
+        """Return whether the second waiting half of one stream makes a better pair than the first.
 
-        It is compared with the first half of `earlier`, which differs by `skew`.
+        Args:
+            earlier: Stream whose oldest half is earlier.
+            later: The other stream; its oldest half is the partner.
+            skew: Difference between the stamps of the two oldest halves, nanoseconds.
         """
         target = later.waiting[0].stamp_ns
         return len(earlier.waiting) > 1 and abs(earlier.waiting[1].stamp_ns - target) < skew
 
     @staticmethod
     def _may_get_nearer(earlier: StreamBuffer, skew: int) -> bool:
-        """Return whether a half that `earlier` has yet to receive may be nearer than its first."""
+        """Return whether a half that one stream has yet to receive may make a better pair.
+
+        Args:
+            earlier: Stream whose oldest half is earlier.
+            skew: Difference between the stamps of the two oldest halves, nanoseconds.
+        """
         period = earlier.period_ns()
         return len(earlier.waiting) == 1 and period is not None and 2 * skew > period
