@@ -16,7 +16,7 @@ from skimage import measure
 
 from ldo_service.errors import ConfigError
 
-STEPS = np.array([1 << 40, 1 << 20, 1])  # Step of a packed triple along each axis.
+STEPS = np.array([1 << 40, 1 << 20, 1])  # Change of a packed triple per step along each axis.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -61,13 +61,14 @@ def marching_cubes(blocks: Iterable[LatticeBlock], attributes: int) -> Surface:
 
     Args:
         blocks: Blocks of the grid.
-        attributes: Number C of attributes, which is needed if there are no blocks.
+        attributes: Number C of attributes, for the shape of the result if there are no blocks.
     """
     points, values, triangles = [np.zeros((0, 3))], [np.zeros((0, attributes))], []
     count = 0
     for block in blocks:
-        # scikit-image reads the mask of a cell at its upper corner. On an ambiguous face it
-        # separates the corners above 0. With negated values, these are the corners inside.
+        # scikit-image reads the mask of a cell at the upper corner of the cell. On an ambiguous
+        # face, it separates the corners with values above 0. Values are negated here, so these are
+        # the corners inside the surface.
         mask = np.pad(block.is_used, ((1, 0),) * 3)
         here, faces, _, _ = measure.marching_cubes(
             -block.values, 0.0, mask=mask, method="lorensen", gradient_direction="ascent"
@@ -86,7 +87,15 @@ def marching_cubes(blocks: Iterable[LatticeBlock], attributes: int) -> Surface:
 
 
 def _interpolated(attributes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Interpolate attributes [V, C] at points [V, 3] on edges of grid cells."""
+    """Interpolate attributes at points on edges of grid cells.
+
+    Args:
+        attributes: Values at the grid points, [S + 1, S + 1, S + 1, C].
+        points: Points in grid coordinates of the block, [V, 3].
+
+    Returns:
+        [V, C].
+    """
     lower = np.floor(points).astype(int)
     upper = np.ceil(points).astype(int)
     share = (points - lower).sum(axis=1)[:, None]
@@ -94,7 +103,7 @@ def _interpolated(attributes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def pack(lattice: np.ndarray) -> np.ndarray:
-    """Pack integer triples [..., 3] into one int64 each, [...], below 2^60; order is preserved.
+    """Pack each integer triple of [..., 3] into one int64 below 2^60; the order is preserved.
 
     Raises:
         ConfigError: A coordinate is 2^19 or more from the origin: 10 km with voxels of 2 cm.

@@ -20,8 +20,8 @@ from .viewpoints import Viewpoint, surface_depth_m
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 SLAB = 1 << 18  # Voxels processed at a time.
 
-# Axes by the name of the map axis that is up: the two that become x (right) and y (ahead) of the
-# plan seen from above, the vertical one, and the sign of up.
+# Key: map axis that is up. Value: the map axes that become x (right) and y (ahead) of the plan seen
+# from above, the vertical map axis, and the sign of up along it.
 UP = {
     "x": (1, 2, 0, 1),
     "y": (2, 0, 1, 1),
@@ -30,7 +30,7 @@ UP = {
     "-y": (0, 2, 1, -1),
     "-z": (1, 0, 2, -1),
 }
-GRAY = {UNKNOWN: 205, FREE: 254, OCCUPIED: 0}  # Values of map_saver.
+GRAY = {UNKNOWN: 205, FREE: 254, OCCUPIED: 0}  # Gray values that map_saver of ROS writes.
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,8 @@ class OccupancyConfig:
 
     voxel_m: float = 0.1
     min_opacity: float = 0.5  # Least opacity of a Gaussian that occupies voxels.
-    # Least area of the Gaussians in an occupied voxel, as a fraction of one side of the voxel. A
-    # wall through its middle has 1, single stray Gaussians have less than a hundredth.
+    # Least area of the Gaussians in an occupied voxel, as a fraction of the area of a voxel face. A
+    # wall through the middle of a voxel has 1, single stray Gaussians have less than a hundredth.
     min_cover: float = 0.1
     max_sigma_voxels: float = 10.0  # Larger Gaussians are background and occupy nothing.
     max_voxels: int = 200_000_000  # One byte each.
@@ -117,8 +117,9 @@ def occupancy(
 def occupied_voxels(rows: np.ndarray, config: OccupancyConfig) -> np.ndarray:
     """Return the integer coordinates of the voxels that opaque Gaussians cover, [V, 3].
 
-    They are positions divided by the voxel size and rounded down. The area that a Gaussian covers
-    is its opacity times 2 pi s1 s2, with the standard deviations s1 and s2 of its two longer axes.
+    The coordinates of a voxel are positions divided by the voxel size and rounded down. A Gaussian
+    covers the area 2 pi s1 s2 times its opacity, with the standard deviations s1 and s2 of its two
+    longer axes. A large Gaussian distributes its area over several voxels.
     """
     sigmas_m, opacities = np.exp(rows[:, 3:6]), 1 / (1 + np.exp(-rows[:, 10]))
     matter = (opacities >= config.min_opacity) & (
@@ -140,15 +141,15 @@ def _split(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Split Gaussians into parts until no axis is longer than `max_sigma_m`.
 
-    A Gaussian with the longest standard deviation s becomes two Gaussians with s / 2 along that
-    axis. Their means lie at +- sqrt(3)/2 s on the axis, so that both together have the original
-    variance. The parts of a large Gaussian are evenly spaced, at most 2 sqrt(3) `max_sigma_m`
-    apart.
+    A Gaussian is split along its longest axis, with standard deviation s, into two Gaussians with
+    s / 2 along that axis. Their means lie at +- sqrt(3)/2 s on the axis, so that both together have
+    the original variance. The parts of a large Gaussian are evenly spaced, at most
+    2 sqrt(3) `max_sigma_m` apart.
 
     Args:
         means: [N, 3].
         axes: Axes scaled by their standard deviations, [N, axis, 3].
-        cover: Covered areas, [N].
+        cover: Covered areas, [N], m^2.
         max_sigma_m: Maximum standard deviation along any axis, meters.
 
     Returns:
@@ -193,10 +194,17 @@ def _carve(
     viewpoint: Viewpoint,
     voxel_m: float,
 ) -> None:
-    """Mark voxels as free that are visible from a camera and lie in front of a surface.
+    """Mark the voxels between a camera and the surface that it sees as free.
 
-    These are the voxel with the camera, and all voxels whose center lies at least one voxel in
-    front of the rendered surface.
+    These are the voxel that contains the camera, and all visible voxels whose center lies at least
+    one voxel size in front of the rendered surface.
+
+    Args:
+        states: States of the grid, [X, Y, Z]; changed in place.
+        lowest: Coordinates of voxel (0, 0, 0) of the grid, [3].
+        depth_m: Rendered depth, [H, W], meters; 0 where unknown.
+        viewpoint: Camera and pose.
+        voxel_m: Side of a voxel, meters.
     """
     stood = np.floor(viewpoint.T_map_camera[:3, 3] / voxel_m).astype(int)
     states[tuple(stood - lowest)] = FREE
@@ -242,7 +250,7 @@ class FloorPlan:
 
     Attributes:
         states: [X, Y] uint8: 0 unknown, 1 free, 2 occupied.
-        origin_m: Lower corner of cell (0, 0) along the axes `x` and `y`.
+        origin_m: Lower corner of cell (0, 0) along the map axes `x` and `y`, meters.
         cell_m: Side of a cell.
         x: Axis of the map along the first dimension.
         y: Axis of the map along the second dimension.
@@ -312,7 +320,8 @@ def write_floor_plan(path: Path, plan: FloorPlan) -> None:
         "origin": [*plan.origin_m, 0.0],  # Position of the lower left pixel, and yaw.
         "negate": 0,
         "occupied_thresh": 0.65,
-        "free_thresh": 0.196,  # 205 is an occupancy of 0.196, so it is unknown.
+        # The gray value 205 is an occupancy of 0.196, which is not below this, so it is unknown.
+        "free_thresh": 0.196,
     }
     low_m, high_m = plan.heights_m
     axes = f"# x is the map's {plan.x}, y its {plan.y}; {low_m} to {high_m} m along {plan.up}\n"

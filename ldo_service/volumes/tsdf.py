@@ -20,9 +20,10 @@ BLOCK = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), -1).reshape
 GRID = np.stack(np.meshgrid(*[np.arange(SIDE + 1)] * 3, indexing="ij"), -1)  # [9, 9, 9, 3].
 CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])  # c = x + 2 y + 4 z.
 VOXEL_BYTES = 4 + 4 + 3 * 4  # Distance, weight, color.
-# Tolerance between the mean and the median depth of one surface. In the synthetic room, 2 voxels of
-# 2 cm put 0.3 % of the vertices off by 4 cm and omit 1 % of the surface. With 4 voxels 1.1 % are
-# off; with 1 voxel 0.06 % are off and 3.5 % is omitted.
+# Largest difference, in voxels, between the mean and the median depth of a pixel that is used. In
+# the synthetic room with voxels of 2 cm, 2 voxels put 0.3 % of the vertices off by 4 cm and omit
+# 1 % of the surface. With 4 voxels, 1.1 % are off; with 1 voxel, 0.06 % are off and 3.5 % are
+# omitted.
 SURE_VOXELS = 2.0
 CHUNK = 512  # Blocks processed at a time: a quarter of a million voxels.
 
@@ -32,7 +33,8 @@ class TsdfConfig:
     """Settings of the fusion of depth images into a TSDF."""
 
     voxel_m: float = 0.02
-    # Smaller values leave holes in noisy walls, larger ones in thin objects seen from both sides.
+    # Truncation distance in voxels. Smaller values leave holes in noisy walls, larger values leave
+    # holes in thin objects that are seen from both sides.
     truncation_voxels: float = 4.0
     max_memory_mb: int = 1024  # Memory of the voxels: 1000 m2 of surface at 2 cm.
 
@@ -132,7 +134,10 @@ class Tsdf:
             self._update(slots[start : start + CHUNK], depth_m, color, viewpoint)
 
     def _touched(self, depth_m: np.ndarray, viewpoint: Viewpoint) -> np.ndarray:
-        """Return the blocks [B, 3] within the truncation distance of the surface on any ray."""
+        """Return the coordinates [B, 3] of the blocks near the surface on the ray of any pixel.
+
+        Each ray is sampled at the surface, and at the truncation distance before and behind it.
+        """
         seen, reach = depth_m > 0, self.config.truncation_m
         block_m, origin_m = SIDE * self.config.voxel_m, viewpoint.T_map_camera[:3, 3]
         rays_map = viewpoint.camera.rays()[seen] @ viewpoint.T_map_camera[:3, :3].T
@@ -174,7 +179,7 @@ class Tsdf:
         offsets_camera = BLOCK * voxel_m @ T_camera_map[:3, :3].T
         at = viewpoint.look_up(corners_camera[:, None] + offsets_camera, depth_m)  # [B, 512]
         reach_m = self.config.truncation_m
-        # Voxels far behind are hidden.
+        # Voxels farther behind the surface than the truncation distance are hidden.
         is_observed = (at.seen_m > 0) & (at.seen_m - at.z_m >= -reach_m)
         block, voxel = np.nonzero(is_observed)
         slot, z_m, seen_m = slots[block], at.z_m[is_observed], at.seen_m[is_observed]

@@ -7,7 +7,7 @@ import numpy as np
 from ldo_service.gaussians import Rendering, render
 from ldo_service.geometry import Camera, se3
 
-NEAR_M = 0.01
+NEAR_M = 0.01  # Points nearer than this, or behind the camera, project to no pixel.
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +53,14 @@ class Viewpoint:
 def surface_depth_m(rendering: Rendering, tolerance_m: float) -> np.ndarray:
     """Return the depth [H, W] of the rendered surface; 0 where it is missing or ambiguous.
 
-    The result is the mean depth, which is smoother than the median. At the outline of an object the
-    mean lies between object and background, far from the median. Pixels where both differ by more
-    than `tolerance_m` are therefore 0.
+    The result is the mean depth, which is smoother than the median depth. At the outline of an
+    object, the mean lies between object and background, far from the median. Therefore the result
+    is 0 where mean and median differ by more than `tolerance_m`.
     """
     mean_m, median_m = rendering.depth_m, rendering.median_depth_m
     return np.where(np.abs(mean_m - median_m) <= tolerance_m, mean_m, 0).astype(np.float32)
 
 
 def surface_color(rendering: Rendering) -> np.ndarray:
-    """Return the color [H, W, 3], 0..1, without the contribution of the black background."""
+    """Return the color [H, W, 3], 0..1, of the Gaussians alone, without the black background."""
     return rendering.color / np.maximum(rendering.opacity, 1e-6)[..., None]
