@@ -1,1 +1,1 @@
-"""Conversions between messages and internal types, kept in one package."""
+"""Conversions between messages and internal types, in one package for all actors."""

@@ -78,7 +78,7 @@ def tracked_pose_message(
     Args:
         frame: The frame.
         result: Its tracking result.
-        T_base_camera: Pose of the camera on the robot, [4, 4].
+        T_base_camera: Pose of the camera in the base frame of the robot, [4, 4].
     """
     keyframe = result.keyframe
     return TrackedPose(
@@ -147,16 +147,18 @@ def camera_correction_to_message(correction: CameraCorrection) -> schemas.Camera
 
 
 def keyframe_measurements_message(keyframe: Keyframe) -> KeyframeMeasurements:
-    """Return the message with the measurements of a keyframe, without its images.
-
-    Each of its fields is a field of `Keyframe` too.
-    """
+    """Return the message with the measurements of a keyframe, without its images."""
     fields = KeyframeMeasurements.__struct_fields__
     return KeyframeMeasurements(**{name: getattr(keyframe, name) for name in fields})
 
 
 def keyframe_from_message(message: Keyframe, config: PyramidConfig) -> ReferenceKeyframe:
-    """Convert a message to a keyframe that frames can be aligned to; dynamic pixels are masked."""
+    """Convert a message to a keyframe that frames can be aligned to.
+
+    Args:
+        message: The message; the pixels of its dynamic mask are excluded from alignment.
+        config: Settings of the image pyramid.
+    """
     view = pyramid_of(frame_from_message(message), config)
     return ReferenceKeyframe(
         view,

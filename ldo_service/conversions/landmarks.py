@@ -1,6 +1,7 @@
-"""Conversion of object observations to observations of landmarks, which need the pose graph.
+"""Conversion of messages of object observations to landmark observations of the pose graph.
 
-`objects` does not contain it, because every actor would then import gtsam.
+The conversion has a module of its own, because the pose graph imports gtsam. In the module
+`objects`, it would make every actor import gtsam.
 """
 
 from collections.abc import Callable
@@ -18,12 +19,12 @@ from .objects import dense_distribution
 def landmark_observation_from_message(
     message: ObjectObservation, camera: Camera, class_index: Callable[[str], int]
 ) -> LandmarkObservation:
-    """Return the observation of a landmark of the pose graph.
+    """Convert the observation of an object to that of a landmark of the pose graph.
 
     Args:
         message: Observation of the object in a keyframe.
         camera: Intrinsics of this keyframe.
-        class_index: Function from a label to its class, below `MAX_CLASSES`.
+        class_index: Function from a label to the index of its class, below `MAX_CLASSES`.
     """
     return LandmarkObservation(
         message.keyframe,

@@ -96,7 +96,8 @@ def landmark_to_message(
         landmark: Id of the object.
         centroid: Centroid of the object in the map, [3] meters.
         p: Distribution over the classes, [C]. Only classes that have a name are in the message.
-        names: Names of the first classes, at most C. The other classes were never observed.
+        names: Names of the classes in the order of `p`, at most C. Classes without a name were
+            never observed.
     """
     return GraphLandmark(
         object=landmark,
@@ -114,7 +115,7 @@ def dense_distribution(
     Args:
         distribution: Pairs of label and probability. If their sum is below 1, the rest is assigned
             to the class `other`.
-        index: Function from a label to its class.
+        index: Function from a label to the index of its class.
         classes: Number of classes C.
     """
     p = np.zeros(classes)
@@ -124,7 +125,12 @@ def dense_distribution(
 
 
 def map_objects(table: np.ndarray, names: Sequence[str]) -> tuple[MapObject, ...]:
-    """Convert a table of K objects to messages, in the same order."""
+    """Convert a table of K objects (see `semantics.object_landmarks`) to messages, in its order.
+
+    Args:
+        table: The objects, [K] records.
+        names: Names of the classes.
+    """
     p = distributions(table)
     columns = zip(table, labels_of(table).tolist(), p, entropy(p).tolist(), strict=True)
     return tuple(_object_to_message(*column, names) for column in columns)
@@ -190,11 +196,15 @@ def _box(box: np.ndarray) -> Box:
 
 
 def scale_boxes(detections: Sequence[Detection], times: float) -> list[MovableBox]:
-    """Return the boxes of detections in a smaller image.
+    """Convert the boxes of detections to a smaller image.
 
     Args:
         detections: Detections, in pixels of the original image.
-        times: Factor by which the image is smaller. The boxes are in its pixel-edge coordinates.
+        times: Size of the original image divided by the size of the smaller one.
+
+    Returns:
+        Boxes in pixels of the smaller image, with the origin at the corner of its first pixel
+        instead of the center.
     """
     return [
         MovableBox(one.label, *((edge + 0.5) / times for edge in one.box_px)) for one in detections

@@ -88,7 +88,8 @@ def correction_to_message(
         graph_version: Version of the pose graph.
         T_map_keyframe: Corrected poses [4, 4] by id of the keyframe.
         refinements: Number of the last `keyframe/refinement` message that the correction includes.
-        merged: For each merged submap, the oldest submap that it is merged with.
+        merged: For each submap that is merged with older ones, the oldest of these submaps. None
+            if no submap is merged.
         closures: Accepted loop closures, as pairs of keyframes.
         rejected: Rejected loop closures, as pairs of keyframes.
         landmarks: Objects of the pose graph.
@@ -130,7 +131,7 @@ def keyframe_poses_from_correction(
 
 
 def map_correction_of(correction: GraphCorrection) -> MapCorrection:
-    """Convert a correction message for tracking; poses are decoded only when they are read."""
+    """Convert a correction message for tracking; its poses are decoded only when they are used."""
     return MapCorrection(
         version=correction.graph_version,
         roots=dict(correction.merged_submaps),
