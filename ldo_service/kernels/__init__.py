@@ -1,9 +1,9 @@
-"""C++17 kernels, bound with nanobind: small and stateless, with checked arguments.
+"""C++17 kernels, bound with nanobind: small functions that check their arguments.
 
-The kernels release the GIL. Each is compiled once per instruction set. The process uses the widest
-instruction set of the machine; the environment variable `LDO_ISA=avx512|avx2|baseline` forces one.
-Results are bitwise equal for any number of threads. Between instruction sets, they differ in the
-last bits.
+The kernels release the GIL. Each kernel is compiled once per instruction set. The process uses the
+widest instruction set of the machine; the environment variable `LDO_ISA=avx512|avx2|baseline`
+forces one of them. Results are bitwise equal for any number of threads. Between instruction sets,
+results differ in the last bits.
 """
 
 from ldo_service.errors import ConfigError

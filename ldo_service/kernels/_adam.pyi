@@ -18,8 +18,8 @@ def adam_step(
 ) -> None:
     """Apply one step of Adam to the rows `indices`, in place.
 
-    Rows with a gradient of zero in every field stay untouched, moments and step count included.
-    The function releases the GIL. The result is bitwise equal for any number of threads.
+    Rows whose gradient is zero in every field keep their values, moments and step counts. The
+    function releases the GIL. The result is bitwise equal for any number of threads.
 
     Args:
         rows: Parameters, [N, 16], changed in place.

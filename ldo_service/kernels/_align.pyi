@@ -9,7 +9,7 @@ Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy, pixels.
 isa: str
 
 # Average the 2x2 blocks of an image [H, W] to [H // 2, W // 2]. Zeros are missing values. Only
-# values within the relative `tolerance` of the lowest value of a block are averaged. A block with
+# values of at most (1 + `tolerance`) times the lowest value of a block are averaged. A block with
 # fewer than `least` such values gives 0.
 def halve(values: Image, tolerance: float, least: int = 1) -> Image: ...
 
@@ -24,10 +24,13 @@ def normals(depth_m: Image, intrinsics: Intrinsics, radius: int) -> Image: ...
 # is 0 0 0.
 def points(texels: Image, normals: Image, intrinsics: Intrinsics) -> Image: ...
 
-# Compute the Hessian [8, 8] and the gradient [8] of all residuals, and seven sums. The sums are
-# visible points, then count, inliers and weighted squares of the photometric and the geometric
-# residuals.
-# `noise` is floor, growth and nearest depth; `gate` and `occlusion` are relative to the depth.
+# Compute the Hessian [8, 8] and the gradient [8] of all residuals, and seven sums. The unknowns are
+# rotation, translation, gain and bias. The sums are the number of visible points, then the number,
+# the number of inliers and the sum of weighted squares of the photometric residuals, then the same
+# three of the geometric residuals.
+# `noise` is (floor, growth, nearest) of the depth noise: sigma = floor + growth (z - nearest)^2, in
+# meters. `gate` is the largest depth difference of a pair of points, and `occlusion` the distance
+# behind the measured surface at which a point is hidden; both are fractions of the depth.
 def normal_equations(
     points: Image,
     texels: Image,

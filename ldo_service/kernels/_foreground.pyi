@@ -25,7 +25,7 @@ def surfaces(
         fy: Focal length, pixels.
         cx: Principal point, pixels.
         cy: Principal point, pixels.
-        max_step: Maximum relative step of depth within 3x3 pixels of one surface.
+        max_step: Maximum step of depth within 3x3 pixels of one surface, fraction of depth.
         min_cosine: Minimum cosine of normals 4 px apart on one surface.
         labels: Output, [H, W]: the piece of each pixel; 0 on edges and where depth is missing.
 
@@ -63,8 +63,8 @@ def foreground(
         sizes: Sizes that `surfaces` returned, [S].
         row: Row of the window's first pixel.
         column: Column of the window's first pixel.
-        min_inside: Minimum fraction of a surface inside the window.
-        max_gap: Maximum relative step of depth within 3x3 pixels of one object.
+        min_inside: Minimum fraction of a surface's pixels that lie inside the window.
+        max_gap: Maximum step of depth within 3x3 pixels of one object, fraction of depth.
         depth_bin: Width of a bin of the depth mode, fraction of depth.
         near_mode: Maximum distance from the mode, fraction of depth.
         grow_px: Number of pixels by which the mask grows.

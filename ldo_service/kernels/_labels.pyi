@@ -40,10 +40,11 @@ def assign(
         depth_m: Depth of the image, [H, W], meters; 0 where not measured.
         boxes: Boxes x0 y0 x1 y1 of the regions, [M, 4], pixels.
         scores: Scores of the regions, [M], 0..1.
-        rects: Column, row, width and height of the rectangle that each region's table covers,
-            [M, 4]; width 0 selects the whole box.
-        sums: Summed-area tables [height + 1, width + 1] of the rectangles, one after the other.
-        by_iou: Whether overlap is the IoU; else it is the covered fraction of the splat.
+        rects: Column, row, width and height of the rectangle that each region's mask covers,
+            [M, 4]. A region of width 0 has no mask and is its whole box.
+        sums: Summed-area tables [height + 1, width + 1] of the masks, one after the other.
+        by_iou: Whether the overlap is the IoU of region and splat. If False, it is the fraction of
+            the splat that the region covers.
         min_overlap: Overlap that a region must exceed.
         max_depth_gap_m: Maximum distance between a Gaussian and the measured surface, meters.
         region: Output, [V]: number of the region; -1 for no region, -2 for a Gaussian that is not
@@ -83,9 +84,9 @@ def update(
         confidence: Confidences of the labels, [V], 0..1.
         extent_m: Extent of the label's object, [V], meters; for a miss, the minimum extent of an
             object that counts as missed.
-        is_corrected: Whether the corrected average is used; else the paper's.
+        is_corrected: Whether the corrected moving average is used. If False, the paper's is used.
         keep: Factor on earlier observations, in [0, 1).
-        miss_weight: Evidence of a miss for background, 0..1.
+        miss_weight: Weight of a miss as an observation of background, 0..1.
         miss_limit: Misses in a row that reset a row to background, for the paper's average.
         usual_extent_m: Extent of objects where it is unknown, meters.
         hold_back: Damping of uncertain observations of settled Gaussians, 0..1.
@@ -120,7 +121,9 @@ def agree(
         threads: Number of threads.
 
     Returns:
-        The literal and the expected disagreement before the step, summed over the Gaussians.
+        Two measures of the disagreement between neighbors before the step, as weighted sums over
+        all pairs: the first counts pairs with different top labels, the second is the probability
+        that two labels drawn from their distributions differ.
 
     Raises:
         ValueError: An array has the wrong shape, type or strides, indices do not ascend, or a

@@ -34,8 +34,8 @@ def rasterize(
         width: Width of the images, pixels.
         height: Height of the images, pixels.
         threads: Number of threads.
-        memory: Scratch memory kept for the next call, because fresh pages cost up to half a
-            rendering. The previous rendering in it is lost.
+        memory: Scratch memory to reuse in the next call, which saves up to half of the time of a
+            rendering. The previous rendering in this memory is lost.
         bounds: Bounds of the blocks of these rows. Blocks out of view are not read; the images are
             bitwise equal to those without bounds.
 
@@ -48,11 +48,11 @@ def rasterize(
     """
 
 class Bounds:
-    """Bounds of each block of 256 consecutive rows, for one array of rows.
+    """Bounding volumes of the Gaussians of one array of rows, one per block of 256 rows.
 
     The owner of the rows must report changed rows before the next rendering, by `forget` or
-    `forget_rows`. A rendering detects by itself rows that were appended, and an array that moved
-    in memory. Only one call at a time may use the bounds.
+    `forget_rows`. Rows that were appended, and an array that moved in memory, need no report. Only
+    one call at a time may use the bounds.
     """
 
     def __init__(self) -> None: ...
@@ -89,7 +89,7 @@ def contributions(
         indices: Output, [V]: row numbers of the visible Gaussians, ascending.
         weights: Output, [V]: weights of these Gaussians, summed over the pixels.
         top: Output, [H, W]: row with the largest weight at each pixel; -1 if no Gaussian has
-            weight. Of equal weights the nearer Gaussian counts.
+            weight there. If weights are equal, the nearest Gaussian counts.
         threads: Number of threads.
 
     Raises:
@@ -125,8 +125,8 @@ def rasterize_planes(
         planes: Output, [5, H, W].
         threads: Number of threads.
         bounds: Bounds of the blocks of these rows, as for `rasterize`.
-        tiles: Tiles to render, [ceil(H / 16), ceil(W / 16)]. Where it is 0, the planes are zero and
-            are not computed. None renders all tiles.
+        tiles: Tiles to render, [ceil(H / 16), ceil(W / 16)]. The planes of tiles with value 0 are
+            zero and are not computed. None renders all tiles.
 
     Returns:
         The number V of Gaussians that may touch the image.
@@ -156,7 +156,7 @@ def backpropagate(
         indices: Output, [V]: row numbers of the visible Gaussians, ascending.
         row_gradients: Output, [V, 16]: derivatives of L by these rows, with the sum of the
             Gaussian's weights in field 14.
-        needle_weight: Weight of the penalty on needles, which is added to L.
+        needle_weight: Weight of the penalty on needle-shaped Gaussians, which is added to L.
         needle_log_ratio: Logarithm of the ratio of the longest to the middle axis from which the
             penalty applies.
         threads: Number of threads.
@@ -190,9 +190,9 @@ def descend(
 ) -> NDArray[np.float64]:
     """Run `backpropagate` and `adam_step` in one pass that never stores the row gradients.
 
-    `rows`, `mean`, `square` and `steps` change in place, to the same bits as by `adam_step`. Then
-    the standard deviations of rows that moved are limited to `max_sigma_px`. The rendering cannot
-    be used again.
+    `rows`, `mean`, `square` and `steps` change in place; the result is bitwise equal to that of
+    `adam_step`. Then the standard deviations of changed rows are limited to `max_sigma_px`. The
+    rendering in `forward` cannot be differentiated again.
 
     Args:
         forward: Pass of the last `rasterize_planes`, with V visible Gaussians.

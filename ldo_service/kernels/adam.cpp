@@ -1,4 +1,4 @@
-// Adam step on the rows of a view, compiled once per instruction set (macro LDO_ISA).
+// Adam step on the rows visible in a view, compiled once per instruction set (macro LDO_ISA).
 #include "adam_step.hpp"
 #include "parallel.hpp"
 

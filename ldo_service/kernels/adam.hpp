@@ -1,4 +1,5 @@
-// Interface of the Adam step on the rows that a view reached; independent of the instruction set.
+// Interface of the Adam step on the rows visible in a view. It is independent of the instruction
+// set.
 #pragma once
 #include <cstdint>
 

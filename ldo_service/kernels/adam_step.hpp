@@ -1,7 +1,7 @@
 // One step of Adam on one row.
 //
-// The step follows Kingma and Ba, Adam, 2015, algorithm 1, with one step count per row. A row that
-// no view reached keeps its values and its step count.
+// The step follows Kingma and Ba, Adam, 2015, algorithm 1, with one step count per row. A row whose
+// gradient is zero keeps its values, moments and step count.
 #pragma once
 #include "adam.hpp"
 #include "buffer.hpp"
@@ -22,7 +22,7 @@ class AdamStep {
     }
   }
 
-  // Update one row and return whether it moved. Only one thread at a time may process a row.
+  // Update one row and return whether it changed. Only one thread at a time may process a row.
   bool operator()(uint32_t row, Floats gradient) const {
     if (!any(Floats(0.0f) < abs(gradient))) return false;  // The Gaussian is occluded.
     const int64_t at = static_cast<int64_t>(row) * kAdamFloats;

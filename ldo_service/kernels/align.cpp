@@ -41,7 +41,7 @@ void halve(const float* values, int width, int height, float tolerance, int leas
   }
 }
 
-// Return the central difference per pixel; 0 where either value is clipped.
+// Return the central difference per pixel; 0 if either value is 0, which marks a clipped pixel.
 float difference(float after, float before) {
   return (after > 0) & (before > 0) ? 0.5f * (after - before) : 0.0f;
 }
@@ -128,9 +128,10 @@ struct alignas(64) Block {
   float column[kBlock], row[kBlock];      // Nearest pixel.
   float visible[kBlock];
   float intensity[kBlock], gradient_u[kBlock], gradient_v[kBlock], depth[kBlock];
-  // sqrt(w) [J | r] of the photometric observations, then of the geometric ones.
+  // sqrt(w) [J | r] of the photometric residuals, then of the geometric residuals.
   float rows[kUnknowns + 1][2 * kBlock];
-  float photometric[3][kBlock], geometric[3][kBlock];  // Used, inlier, w (r/sigma)^2.
+  // Three values of each residual: 1 if it is used, 1 if it is an inlier, and w (r/sigma)^2.
+  float photometric[3][kBlock], geometric[3][kBlock];
 };
 
 void load(const Problem& p, std::int64_t first, Block& b) {
@@ -189,7 +190,8 @@ void sample(const Problem& p, Block& b) {
 
 float robust_weight(float square) { return (kDegrees + 1.0f) / (kDegrees + square); }
 
-// r = I(project(p)) - gain * shade - bias;  dp = skew(p) omega - v under T_reference_camera exp(xi)
+// Compute the photometric residuals r = I(project(p)) - gain * shade - bias and their Jacobians. A
+// perturbation T_reference_camera exp(xi) moves a point by dp = skew(p) omega - v.
 void weigh_photometric(const Problem& p, Block& b) {
   const float inverse_sigma = 1.0f / p.intensity_sigma;
   for (int i = 0; i < kBlock; ++i) {
@@ -221,7 +223,8 @@ void weigh_photometric(const Problem& p, Block& b) {
   }
 }
 
-// r = n . (p - q) with n = R n_reference; q is the target's surface at the nearest pixel.
+// Compute the geometric residuals r = n . (p - q) and their Jacobians, with n = R n_reference. The
+// point q is the measured surface of the target image at the nearest pixel.
 void weigh_geometric(const Problem& p, Block& b) {
   const float* T = p.T_camera_reference;
   const float ifx = 1.0f / p.camera.fx, ify = 1.0f / p.camera.fy;

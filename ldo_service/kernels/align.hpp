@@ -10,7 +10,8 @@ struct Pinhole {
 };
 
 // A target image holds four floats per pixel, so that one load fetches all values of a sample. An
-// intensity of 0 is missing, like a depth of 0: the pixel was clipped, black or white.
+// intensity or a depth of 0 is missing. An intensity is missing if the pixel was clipped, black or
+// white.
 enum Texel { kIntensity, kGradientU, kGradientV, kDepth, kTexelSize };
 
 // Reference points are stored as rows of N floats: coordinates, intensity and normal. A missing
@@ -33,8 +34,8 @@ struct Problem {
   float intensity_sigma;         // Gray levels.
   float depth_noise_scale;       // Factor on DepthNoise.
   DepthNoise noise;
-  float gate;  // Maximum depth difference of a pair, relative to the depth.
-  // Distance behind the target's surface at which a point is hidden, relative to the depth.
+  float gate;  // Maximum depth difference of a point and the target, relative to the depth.
+  // Distance behind the target's surface beyond which a point is hidden, relative to the depth.
   float occlusion;
 };
 
@@ -51,7 +52,7 @@ struct Equations {
 
 // Entry points, compiled once per instruction set.
 struct Kernels {
-  // Average each 2x2 block over the values within the relative `tolerance` of its lowest value.
+  // Average each 2x2 block over the values of at most (1 + `tolerance`) times its lowest value.
   // Zeros are missing values. A block with fewer than `least` such values gives 0.
   void (*halve)(const float* values, int width, int height, float tolerance, int least, float* out);
   // Combine an image and its depth into texels. Depth beyond `max_depth` becomes 0. Gradients are

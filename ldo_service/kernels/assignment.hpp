@@ -66,8 +66,8 @@ class SplatBoxer {
     for (int j = 0; j < kRowFloats; ++j) matrix[j].store(columns[j]);
   }
 
-  // Return the depth at the pixels that contain these points. Just below the image's end, u + 0.5
-  // can round up to the width, hence the minimum.
+  // Return the depth at the pixels that contain these points. Just below the end of the image,
+  // u + 0.5 can round up to the width. The index is therefore limited to the last pixel.
   Floats depth_at(Floats u, Floats v) const {
     alignas(64) float column[kLanes], row[kLanes], depth_m[kLanes];
     min(u + 0.5f, view_.width - 1.0f).store(column);
@@ -84,8 +84,9 @@ class SplatBoxer {
   const float max_gap_m_;
 };
 
-// Return the area of a region left of x and above y in pixels, fractions included. It is
-// interpolated between the entries of the table, which is bilinear where the mask is constant.
+// Return the area of a region's mask left of x and above y, in pixels with fractions. Bilinear
+// interpolation between the entries of the summed-area table is exact, because the mask is constant
+// in each pixel.
 inline double sum_before(const int32_t* sums, int width, int height, double x, double y) {
   x = std::min(std::max(x, 0.0), static_cast<double>(width));
   y = std::min(std::max(y, 0.0), static_cast<double>(height));
@@ -186,12 +187,12 @@ class Candidates {
 
  private:
   std::vector<Region> regions_;
-  std::vector<float> bounds_[4];  // Component k of `bound` of each region.
+  std::vector<float> bounds_[4];  // bounds_[k][j] is bound[k] of region j.
 };
 
 // Selection of the region with the largest reliability for each of sixteen splats. Reliability is
-// overlap times score; of equal values the first region is selected. The constructor and `enter`
-// write the region and the overlap of the first `count` splats.
+// overlap times score; if several are equal, the first region is selected. The constructor and
+// `enter` write the selected region and its overlap for the first `count` splats.
 class Contest {
  public:
   Contest(uint32_t expected, int count, int32_t* region, float* overlap)

@@ -5,7 +5,7 @@
 namespace ldo::LDO_ISA {
 
 constexpr float kLog2MaxAlpha = -0.0144995697f;  // log2(0.99)
-constexpr float kStop = 1e-4f;                   // A pixel with less transmittance is complete.
+constexpr float kStop = 1e-4f;                   // A pixel of less transmittance is finished.
 constexpr int kBlocks = 16;                      // Blocks of 4x4 pixels in a tile.
 constexpr int kBatch = 256;                      // Splats gathered before the blocks are blended.
 
@@ -66,8 +66,8 @@ class PixelBlock {
 };
 
 // Return a mask with bit i set if the ellipse alpha >= 1/255 reaches block i of the tile at (x, y).
-// The ridge lines give the point of largest alpha on the two sides of the block nearest to the
-// center.
+// In a block without the center of the splat, alpha is largest on one of the two sides that are
+// nearest to the center. The ridge lines give the point of largest alpha on each of these sides.
 inline uint32_t touched_blocks(const Splat& s, const Lanes& lanes, float x, float y) {
   const Floats x0 = lanes.x * 4.0f + (x - s.u), x1 = x0 + 3.0f;
   const Floats y0 = lanes.y * 4.0f + (y - s.v), y1 = y0 + 3.0f;
@@ -77,7 +77,7 @@ inline uint32_t touched_blocks(const Splat& s, const Lanes& lanes, float x, floa
   const auto exponent = [&](Floats dx, Floats dy) {
     return dx * (dx * s.a + dy * s.b) + dy * dy * s.c;
   };
-  // The slack prevents rounding from dropping a pixel that the blending would count.
+  // The margin of 1e-3 ensures that rounding here drops no pixel that the blending would count.
   const float least = kLog2MinAlpha - s.log2_opacity - 1e-3f;
   return bits(max(exponent(side_x, best_y), exponent(best_x, side_y)) >= least);
 }
@@ -88,7 +88,7 @@ inline uint32_t touched_blocks(const Splat& s, const Lanes& lanes, float x, floa
   return dx * (dx * s.a + dy * s.b) + (dy * dy * s.c + s.log2_opacity);
 }
 
-constexpr float kCapped = 0.98999f;  // An alpha from here on was capped, up to rounding.
+constexpr float kCapped = 0.98999f;  // A larger alpha was capped at 0.99, up to rounding.
 [[gnu::always_inline]] inline Floats capped_alpha(Floats log2_alpha) {
   return select(log2_alpha >= kLog2MinAlpha, exp2(min(log2_alpha, kLog2MaxAlpha)), 0.0f);
 }
@@ -102,8 +102,8 @@ template <bool WithMedian>
   block.blue = block.blue + weight * s.color[2];
   block.depth = block.depth + weight * s.z;
   block.transmittance = block.transmittance - weight;
-  // Splats arrive by increasing z. The minimum is therefore the first z behind which less than half
-  // of the transmittance is left.
+  // Splats are blended by increasing z. The minimum is therefore the first z behind which the
+  // transmittance is below one half.
   if constexpr (WithMedian)
     block.median_depth =
         select(block.transmittance < 0.5f, min(block.median_depth, s.z), block.median_depth);

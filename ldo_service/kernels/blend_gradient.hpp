@@ -1,12 +1,13 @@
 // Derivative of the blending of one tile, computed front to back like the blending itself.
 //
-// Let w_i = alpha_i T_i and q_i = dL/dC . c_i + dL/dD z_i + dL/dO. Splat i contributes w_i q_i to
-// the part of L of a pixel. The derivative is
+// At a pixel, let w_i = alpha_i T_i and q_i = dL/dC . c_i + dL/dD z_i + dL/dO. To first order, the
+// contribution of splat i to L is w_i q_i. The derivative is
 //   dL/d ln(alpha_i) = w_i (q_i - m_i),  m_i = sum_{j > i} w_j q_j / T_{i+1}.
 // This compares the value q_i of the splat with the mean value m_i of the splats behind it. The sum
-// over all j is known from the images. Subtracting the splats in front gives m behind every
-// sixteenth splat. From there, m_{i-1} = alpha_i q_i + (1 - alpha_i) m_i leads back through the
-// sixteen splats without a division. The rounding error of m shrinks as T_{i+1} / T_i.
+// of w_j q_j over all j is known from the images. Subtracting the terms of the splats in front
+// gives m behind every sixteenth splat. From there, m_{i-1} = alpha_i q_i + (1 - alpha_i) m_i gives
+// m of the sixteen splats, back to front, without a division. At each of these steps, the rounding
+// error of m shrinks by the factor T_{i+1} / T_i.
 #pragma once
 #include "blend.hpp"
 
@@ -75,13 +76,13 @@ struct BlockGradient {
   }
 
  private:
-  // Floor that prevents 0 / 0. Its effect on pixels below it is far smaller than their
-  // contribution.
+  // Lower bound of the divisor, which prevents 0 / 0. In a pixel of less transmittance, the error
+  // that it causes is far smaller than the contribution of the pixel.
   static constexpr float kLeastTransmittance = 1e-30f;
 };
 
-// Compute the moments of v about the splats' means (mx, my), given relative to the center of the
-// block. Each vector of `v` holds one pixel, with one lane per splat.
+// Compute the moments of v about the centers (mx, my) of the splats, which are relative to the
+// center of the block. Each vector of `v` holds one pixel, with one lane per splat.
 [[gnu::always_inline]] inline void moments_about_mean(const Floats (&v)[kLanes], Floats mx,
                                                       Floats my, Floats* out) {
   const Moments r0(v[0], v[1], v[2], v[3]), r1(v[4], v[5], v[6], v[7]),
@@ -104,8 +105,8 @@ class TileGradient {
   TileGradient(int column, int row, const View& view, const float* planes, const float* gradients)
       : x_(column * kTile), y_(row * kTile), view_(view), planes_(planes), gradients_(gradients) {}
 
-  // Write kSumFloats sums for each of the n splats of the list. The next `ahead` entries of the
-  // list are splats of the next tile, which are prefetched meanwhile.
+  // Write kSumFloats sums for each of the n splats of the list. The `ahead` entries that follow in
+  // the list are splats of the next tile; they are prefetched meanwhile.
   void operator()(const Splat* splats, const uint32_t* list, int64_t n, int64_t ahead,
                   const TileRecord& record, float* sums) {
     std::memset(sums, 0, n * kSumFloats * sizeof(float));
@@ -118,7 +119,7 @@ class TileGradient {
   }
 
  private:
-  // Prefetch row `row` of the next tile's pixels, which lies in a separate place for each image.
+  // Prefetch pixel row `row` of the next tile, from all planes and from all gradients.
   [[gnu::always_inline]] inline void prefetch_row(int row) const {
     if (x_ + kTile >= view_.width || y_ + row >= view_.height) return;
     const int64_t size = static_cast<int64_t>(view_.width) * view_.height;

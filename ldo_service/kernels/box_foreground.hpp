@@ -13,7 +13,7 @@ namespace ldo::LDO_ISA {
 // Minimum fraction of the near-mode pixels that a part of the object holds.
 constexpr double kLeastShare = 0.1;
 
-// Floats of a window, surrounded by zeros.
+// Image of floats for a window, with a border of zeros.
 class Plane {
  public:
   Plane(int width, int height)
@@ -27,8 +27,8 @@ class Plane {
   Buffer<float> values_;
 };
 
-// Mode of depths. The width of a bin is a fraction of its depth, and each bin is smoothed with its
-// neighbors.
+// Mode of depths. The width of a bin is a fraction of the depth, and the count of each bin is
+// smoothed with those of its neighbors.
 class DepthMode {
  public:
   DepthMode(double bin_share, size_t most_pixels)
@@ -107,7 +107,7 @@ class BoxForeground {
   int64_t at(int y) const {  // Index in the image of the first pixel of a window row.
     return static_cast<int64_t>(window_.row + y) * image_.width + window_.column;
   }
-  // Return the length before the middle half of a side, which equals the length after it.
+  // Return the number of pixels before the middle half of a side of the window; as many follow it.
   static int margin(int side) { return side / 4; }
 
   bool find_mode() {
@@ -136,9 +136,10 @@ class BoxForeground {
     return out;
   }
 
-  // Copy the depths of pixels that may belong to the object. Such a pixel lies on an edge, or on a
-  // surface that is mostly inside the box. It is closer to the mode than the box is wide, or than
-  // near_mode times the mode if that is more. Return false if a label has no size.
+  // Copy the depths of pixels that may belong to the object. Such a pixel lies on an edge (label 0)
+  // or on a surface that is mostly inside the box. Its depth differs from the mode by less than the
+  // longer side of the box in meters, or by less than near_mode times the mode if that is more.
+  // Return false if a label has no size.
   bool find_what_belongs() {
     const std::vector<Run> all = runs();
     std::vector<int64_t> inside(found_.count, 0);
@@ -163,8 +164,9 @@ class BoxForeground {
     return true;
   }
 
-  // Keep the connected parts without depth steps that hold at least a tenth of the near-mode pixels
-  // in the middle. Return false if the middle has no near-mode pixel.
+  // Keep the connected parts without depth steps that hold at least a tenth of the seeds. Seeds are
+  // the pixels in the middle of the window whose depth is near the mode. Return false if there are
+  // no seeds.
   bool keep_what_hangs_together() {
     const Components parts(joined());
     std::vector<int64_t> seeds(parts.count() + 1, 0);
@@ -209,7 +211,8 @@ class BoxForeground {
     return count;
   }
 
-  // Grow the mask by one pixel, over pixels of `belongs_` at the depth of a neighbor in the mask.
+  // Grow the mask by one pixel, over pixels of `belongs_` at about the depth of the farthest of the
+  // neighbors in the mask.
   void grow() {
     Plane grown(window_.width, window_.height);
     const float near = static_cast<float>(rule_.near_mode);
@@ -236,7 +239,7 @@ class BoxForeground {
   const Window window_;
   const ForegroundRule rule_;
   double mode_m_ = 0.0;
-  Plane belongs_, mask_;  // Depth of the pixels inside, 0 of the others.
+  Plane belongs_, mask_;  // Depths of the pixels that are selected, 0 elsewhere.
 };
 
 }  // namespace ldo::LDO_ISA

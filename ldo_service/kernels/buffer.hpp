@@ -13,8 +13,8 @@ namespace ldo::LDO_ISA {
 
 constexpr size_t kCacheLine = 64, kHugePage = size_t{1} << 21;
 
-// Allocate memory. Memory that is kept uses huge pages where the system has them. Reads in random
-// order then miss only the cache, and not the page table as well.
+// Allocate memory. If it is kept, it uses huge pages where the system has them. Reads in random
+// order then cause cache misses alone, without additional page-table lookups.
 inline void* allocate(size_t bytes, bool kept) {
   const bool huge = kept && bytes >= kHugePage;
   const size_t alignment = huge ? kHugePage : kCacheLine;
@@ -39,8 +39,9 @@ class Buffer {
   // Declare that the buffer will be used repeatedly. Call this before the first `resize`.
   void keep() { kept_ = true; }
 
-  // Make room for `size` items, whose values are then undefined. Memory is allocated only on growth
-  // and then kept, because the first touch of every fresh page costs more than its use.
+  // Make room for `size` items, whose values are then undefined. Memory is allocated only when the
+  // buffer grows and is kept when it shrinks, because the first access to a new page takes longer
+  // than the use of the page.
   void resize(size_t size) {
     size_ = size;
     if (size <= capacity_) return;

@@ -14,8 +14,8 @@ class BitImage {
 
   const uint64_t* row(int y) const { return bits_.data() + y * words; }
 
-  // Set the pixels marked in `lanes`, of the sixteen from `column`, which is a multiple of sixteen.
-  // Pixels beyond the image are not set.
+  // Set those of the sixteen pixels from `column` whose bit is set in `lanes`. `column` is a
+  // multiple of sixteen. Pixels beyond the image are not set.
   void set(int y, int column, uint32_t lanes) {
     lanes &= within(column, 0, width);
     bits_[y * words + column / 64] |= static_cast<uint64_t>(lanes) << column % 64;
@@ -88,8 +88,8 @@ class Components {
     begin = -1;
   }
 
-  // Connect the runs of a row with those of the row above. Until the runs are numbered, the part of
-  // a run is an earlier run that it is connected to, or the run itself.
+  // Connect the runs of a row with those of the row above (union-find). Until `number` is called,
+  // `part` of a run is the index of an earlier connected run, or of the run itself.
   void join(size_t above, size_t here) {
     size_t first = above;
     for (size_t k = here; k < runs_.size(); ++k) {

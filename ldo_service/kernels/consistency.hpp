@@ -18,7 +18,7 @@ inline uint8_t top_label(const LabelRow& row) {
   return row.weights[0] > background(row) ? row.ids[0] : static_cast<uint8_t>(kBackground);
 }
 
-// Columns of at most sixteen Gaussians.
+// Means and labels of at most sixteen neighboring Gaussians, one lane per Gaussian.
 class Neighbors16 {
  public:
   Neighbors16(const float* rows, const uint32_t* indices, const LabelRow* labels,
@@ -41,8 +41,8 @@ class Neighbors16 {
     return sum(select((tops >= own) & (own >= tops), 0.0f, weights));
   }
 
-  // Return exp(-d^2 / sigma^2) / |N| of each Gaussian within the radius of `mean`, else 0. The
-  // Gaussian in lane `self` is excluded; -1 excludes none.
+  // Return the weight exp(-d^2 / sigma^2) / n of each of the n Gaussians within the radius of
+  // `mean`, and 0 for the others. The Gaussian in lane `self` is excluded; -1 excludes none.
   Floats weights(const float* mean, int self, const ConsistencyRule& rule) const {
     const Floats x = Floats::load(mean_[0]) - mean[0], y = Floats::load(mean_[1]) - mean[1],
                  z = Floats::load(mean_[2]) - mean[2];

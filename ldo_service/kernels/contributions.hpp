@@ -10,8 +10,8 @@ class TileContributions {
       : x_(column * kTile), y_(row * kTile), view_(view) {}
 
   // Write the weights of the n splats of the list, summed over the pixels of the tile. Write to the
-  // image `top` the row of the Gaussian with the largest weight at each pixel. Of equal weights the
-  // first splat counts; -1 if no splat has weight.
+  // image `top` the row of the Gaussian with the largest weight at each pixel; -1 if no splat has
+  // weight there. If weights are equal, the first splat counts.
   void operator()(const VisibleSplats& visible, const uint32_t* list, int64_t n,
                   const TileRecord& record, float* weights, int32_t* top) const {
     std::fill(weights, weights + n, 0.0f);

@@ -11,7 +11,7 @@ namespace ldo::LDO_ISA {
 // Minimum squared norm of a quaternion; a shorter one gives no accurate rotation.
 constexpr float kMinNorm2 = 1e-30f;
 
-// Bound of some rows, accumulated sixteen at a time.
+// Accumulator of the bound of some rows, sixteen rows at a time.
 class Measure {
  public:
   void add(const float (&columns)[kRowFloats][kLanes], int count) {
@@ -50,7 +50,8 @@ class Measure {
   Floats log_sigma_ = -kFar;
 };
 
-// Half spaces of the map, n . mean + d + s sigma >= 0, that contain every Gaussian that is drawn.
+// Half spaces n . mean + d + s sigma >= 0 in the map frame. Every Gaussian that is drawn fulfills
+// all of these conditions.
 //
 // The box of a splat extends by r = sqrt(2 ln(255 o) S_uu) on both sides of u = fx x / z + cx. Its
 // variance is S_uu = 0.3 + |du . axes|^2 <= 0.3 + (fx / z)^2 m^2 sigma^2. Here m^2 bounds
@@ -68,7 +69,8 @@ class ViewFrustum {
     sides_[kSides - 1].offset -= kNearPlane;
   }
 
-  // Return whether all of a block lies outside. NaN gives false.
+  // Return whether no Gaussian of a block is drawn. The answer is conservative: false is always
+  // safe, and NaN gives false.
   bool misses(const BlockBound& bound) const {
     for (const Side& side : sides_) {
       float value = side.offset + side.per_sigma * bound.sigma;
@@ -85,13 +87,13 @@ class ViewFrustum {
   static constexpr int kSides = 5;
   static constexpr float kReachSigmas = 3.34f;     // More than sqrt(2 ln 255).
   static constexpr float kLowPassSigma = 0.5478f;  // More than sqrt(kLowPass).
-  // Fraction of each term, because the projection rounds as well.
+  // Tolerance as a fraction of each term, for the rounding errors of the projection.
   static constexpr float kSlack = 1e-4f;
   struct Side {
     float normal[3], slack[3], offset, per_sigma;
   };
 
-  // Add the two sides across image axis `row`: 0 for u, 1 for v.
+  // Add the two side planes of the frustum that limit image axis `row`: 0 for u, 1 for v.
   void add_sides(const View& view, int row, float focal, float center, int size, float tangent) {
     const float *a = view.T_camera_map + 4 * row, *b = view.T_camera_map + 8;
     const auto dot = [](const float* p, const float* q) {

@@ -17,7 +17,7 @@ struct Pinhole {
 };
 
 struct SurfaceRule {
-  float max_ratio;   // Depths within 3x3 pixels of one surface have a ratio below this.
+  float max_ratio;   // Maximum ratio of depths within 3x3 pixels of one surface.
   float min_cosine;  // Minimum cosine of normals 4 px apart on one surface.
 };
 
@@ -32,7 +32,7 @@ struct Window {  // Window of an image, in pixels.
 };
 
 struct ForegroundRule {
-  double min_inside;  // Minimum fraction of a surface inside the box.
+  double min_inside;  // Minimum fraction of a surface's pixels inside the box.
   float max_ratio;    // Maximum ratio of depths within 3x3 pixels of one object.
   double depth_bin;   // Width of a bin of the depth mode, fraction of depth.
   double near_mode;   // Maximum distance from the mode, fraction of depth.

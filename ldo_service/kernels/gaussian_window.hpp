@@ -15,7 +15,7 @@ constexpr float kTap[kReach + 1] = {0.26601171f, 0.21300553f, 0.10936069f,
 template <int K>
 using Offset = std::integral_constant<int, K>;
 
-// Add the taps K, K + 1, ... on both sides to `sum`.
+// Add the values K, K + 1, ... kReach places away on both sides, times their taps, to `sum`.
 template <int K, class At>
 [[gnu::always_inline]] inline Floats add_taps(const At& at, Floats sum) {
   if constexpr (K > kReach)
@@ -31,8 +31,8 @@ template <class At>
   return add_taps<1>(at, at(Offset<0>()) * kTap[0]);
 }
 
-// Columns of an image that are processed together, and a margin on each side for windows of
-// windows, in whole vectors. The width is constant, so that rows lie at known distances.
+// kStrip columns of an image are processed together. The margin on each side, in whole vectors,
+// serves two windows one after the other. The constant width puts rows at constant distances.
 constexpr int kMargin = kLanes;
 constexpr int kStrip = 320;
 constexpr int kColumns = kStrip + 2 * kMargin;

@@ -14,8 +14,8 @@ inline int mirrored(int i, int size) {
   return i;
 }
 
-// Return the floats per row. Its first pixel lies on a cache line, with one more vector on each
-// side.
+// Return the number of floats of a row in memory: the pixels in whole vectors, and one more vector
+// on each side. The first pixel lies at the start of a cache line.
 inline int padded(int width) { return (width + kLanes - 1) / kLanes * kLanes + 2 * kLanes; }
 
 // Write the mirrored values of `reach` pixels beyond both ends of a row.
@@ -32,8 +32,8 @@ template <class F>
   for (int column = 0; column < width; column += kLanes) f(column);
 }
 
-// Ring of the last five rows of a few images. Row numbers beyond the image are mirrored. The rows
-// from y - 2 to y + 2 are available once row y + 2, if there is one, is written.
+// Ring buffer of the last five rows of a few images. Row numbers beyond the image are mirrored.
+// Rows y - 2 to y + 2 are available once row y + 2, or the last row of the image, is written.
 class RowsOfImages {
  public:
   RowsOfImages(int images, int width, int height)

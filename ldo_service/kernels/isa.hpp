@@ -31,9 +31,9 @@ inline bool has(Isa isa) {
   return isa == Isa::baseline;
 }
 
-// Return the instruction set to use; called once, when a module is imported. It throws
-// std::runtime_error for a set that is unknown or that this machine lacks. A run that requests one
-// set must not silently use another.
+// Return the instruction set to use; called once, when a module is imported. Throw
+// std::runtime_error if LDO_ISA names a set that is unknown or that this machine lacks: a run that
+// requests one set must not silently use another.
 inline Isa chosen_isa() {
   const char* forced = std::getenv("LDO_ISA");
   const bool any = forced == nullptr || *forced == '\0';

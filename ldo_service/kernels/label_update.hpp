@@ -7,8 +7,8 @@
 
 namespace ldo::LDO_ISA {
 
-// Label slots of a Gaussian, heaviest first; of equal weights the older label comes first. If all
-// slots are taken, the lightest label gives its weight to `other`.
+// Label slots of a Gaussian, by descending weight; if weights are equal, the older label comes
+// first. If all slots are taken, the weight of the lightest label is moved to the label `other`.
 class Slots {
  public:
   explicit Slots(LabelRow& row) : row_(row) {}
@@ -29,7 +29,7 @@ class Slots {
  private:
   void raise(int k, float weight) { place(k, row_.ids[k], weight); }
 
-  // Write slot k and move it before lighter ones.
+  // Write a label to slot k, then move it before all slots of smaller weight.
   void place(int k, uint8_t id, float weight) {
     for (; k > 0 && row_.weights[k - 1] < weight; --k) {
       row_.weights[k] = row_.weights[k - 1];
@@ -39,8 +39,8 @@ class Slots {
     row_.ids[k] = id;
   }
 
-  // Resolve full slots: the weight of the lightest label, which may be the new one, goes to
-  // `other`.
+  // Add a label when all slots are taken: the weight of the lightest label, which may be the new
+  // one, is moved to `other`.
   void put_on_other(uint8_t id, float weight) {
     int other = -1;
     for (int k = 0; k < kSlots; ++k)
@@ -55,7 +55,7 @@ class Slots {
     add(kOther, given);
   }
 
-  // Create the slot of `other` by merging the two lightest of six labels.
+  // Create the slot of `other` from the two lightest of the five stored labels and the new label.
   void merge_two_lightest(uint8_t id, float weight) {
     const int last = kSlots - 1;
     float given = row_.weights[last] + weight;
@@ -129,8 +129,8 @@ class LabelUpdate {
     row = LabelRow{};
   }
 
-  // Add an observation to the evidence. Return its fraction of the mean of all observations, whose
-  // weights fade by `keep` at each observation.
+  // Add the weight of an observation to the evidence, in which earlier observations fade by the
+  // factor `keep`. Return the weight as a fraction of the new evidence.
   float step_of(LabelRow& row, float weight) const {
     if (!(weight > 0.0f)) return 0.0f;
     row.evidence = rule_.keep * row.evidence + weight;

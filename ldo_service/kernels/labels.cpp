@@ -48,7 +48,7 @@ Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices,
   const Voxels voxels(rows, indices, v, 2.0f * rule.sigma_m);
   Buffer<LabelRow> before(v);
   for (int64_t i = 0; i < v; ++i) before[i] = labels[indices[i]];
-  // Other voxels hold only background, where neighbors agree.
+  // The Gaussians of all other voxels and their neighbors are background, so they agree.
   const auto active = voxels.about([&](uint32_t place) { return before[place].weights[0] > 0.0f; });
   const ConsistencyStep step(rule);
   const int64_t n = static_cast<int64_t>(active.size());

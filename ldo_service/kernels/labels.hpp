@@ -10,12 +10,12 @@ namespace ldo {
 constexpr int kSlots = 5;  // Labels per Gaussian, background excluded.
 enum Label : uint8_t { kBackground = 0, kOther = 1 };
 
-// Distribution over labels: the labels in the slots, heaviest first, and background with the rest.
-// If all fields are zero, the Gaussian is background and was never observed.
+// Distribution over labels: the labels in the slots, by descending weight; background has the rest
+// of the probability. If all fields are zero, the Gaussian is background and was never observed.
 struct LabelRow {
   float weights[kSlots];
-  float evidence;      // Sum of the weights of all observations, older ones faded.
-  uint16_t extent_mm;  // Extent of the object that it was last observed as a part of.
+  float evidence;      // Sum of the weights of all observations; older observations are faded.
+  uint16_t extent_mm;  // Extent of the object that the Gaussian was last observed as a part of.
   uint8_t misses;      // Keyframes with a miss since that observation.
   uint8_t ids[kSlots];
 };
@@ -32,7 +32,7 @@ struct Regions {
 };
 
 struct AssignmentRule {
-  bool by_iou;            // Overlap is the IoU; if false, the covered fraction of the splat.
+  bool by_iou;            // Overlap is the IoU; if false, it is the covered fraction of the splat.
   float min_overlap;      // Minimum overlap of an assigned region.
   float max_depth_gap_m;  // Maximum distance between a Gaussian and the measured surface.
 };
@@ -55,19 +55,23 @@ struct Observations {       // Each array is [V].
 };
 
 struct UpdateRule {
-  bool is_corrected;
-  float keep;         // Lambda of the moving average.
-  float miss_weight;  // Evidence of a miss for background.
-  int miss_limit;
+  bool is_corrected;     // Use the corrected moving average; if false, the paper's.
+  float keep;            // Lambda of the moving average.
+  float miss_weight;     // Weight of a miss as an observation of background, 0..1.
+  int miss_limit;        // Misses in a row that reset a Gaussian, for the paper's average.
   float usual_extent_m;  // Extent of objects where it is unknown.
   float hold_back;       // Damping of uncertain observations of settled Gaussians, 0..1.
 };
 
+// Length scale of the weights, maximum distance of a neighbor, and size of the step, 0..1.
 struct ConsistencyRule {
   float sigma_m, radius_m, rate;
 };
 
-struct Disagreement {  // Disagreement between neighbors, summed over Gaussians.
+// Disagreement between neighbors, as weighted sums over all pairs. `literal` counts pairs with
+// different top labels. `expected` is the probability that two labels drawn from the distributions
+// of a pair differ.
+struct Disagreement {
   double literal = 0.0, expected = 0.0;
 };
 

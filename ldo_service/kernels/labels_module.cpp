@@ -26,7 +26,8 @@ Kernels kernels_for(Isa isa) {
 
 Kernels kernels;  // Set when the module is imported.
 
-// Check the indices and return them. Two threads would write a row that is listed twice.
+// Check the indices and return them. They must be distinct, because two threads might otherwise
+// write the same row.
 const uint32_t* indices_of(const Array& indices, size_t n) {
   require(indices.ndim() == 1, "indices must have shape [V].");
   const uint32_t* which = values_of<uint32_t>(indices, "indices");

@@ -1,8 +1,9 @@
 // Image loss, compiled once per instruction set (macro LDO_ISA).
 //
 // SSIM (Wang et al. 2004) of the frame y and the rendering x needs the windowed means of x, y,
-// x^2 + y^2 and x y. Rows stream through two rings of eleven rows: the means, then the derivatives
-// of SSIM by three of them. The same window carries the derivatives back to the pixels.
+// x^2 + y^2 and x y. The rows of the image pass through two ring buffers of eleven rows. The first
+// holds the means, the second the derivatives of SSIM by three of the means. Applying the same
+// window to the derivatives gives the derivatives by the pixels.
 #include "loss.hpp"
 
 #include <algorithm>
@@ -16,7 +17,8 @@ namespace ldo::LDO_ISA {
 namespace {
 
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Constants of SSIM, for values in 0..1.
-// Maximum rows of a job: more rows lose less at the seams, fewer rows balance the threads better.
+// Maximum rows of a job. With more rows, fewer are computed twice at the seams between jobs; with
+// fewer rows, the load of the threads is more equal.
 constexpr int kBand = 240;
 
 inline Floats sign(Floats x) {
@@ -204,7 +206,7 @@ class PartLoss {
 
   const LossInput& in_;
   const Part part_;
-  const int first_column_;  // Image column of column 0 of the rows below.
+  const int first_column_;  // Image column that column 0 of all row buffers holds.
   const int end_;           // Column after the last vector with pixels of this part.
   const float* rendered_;
   const uint8_t* target_;
@@ -217,8 +219,8 @@ class PartLoss {
   RowRing<kDerivatives> derivatives_;
 };
 
-// Call f(pixel, count, depths) for each sixteen depths of a row. A depth is zero where it was not
-// measured or is masked.
+// Call f(index of the first pixel, count, depths) for each sixteen pixels of a row. The depth is
+// zero where it was not measured or is masked.
 template <class F>
 void each_depth(const LossInput& in, int64_t row, F f) {
   const int64_t begin = row * in.width;

@@ -35,7 +35,7 @@ void move_rows(float* rows, const int32_t* anchors, int64_t n, const Motions& mo
                int threads) {
   constexpr int64_t kJobRows = 16384;
   Team(threads).each((n + kJobRows - 1) / kJobRows, [&](int64_t job) {
-    // Gaussians of one keyframe are mostly neighbors, so the last index is usually right.
+    // Gaussians of one keyframe are mostly in adjacent rows, so the last index usually still holds.
     int32_t anchor = -1;
     int64_t which = -1;
     for (int64_t r = job * kJobRows; r < std::min(n, (job + 1) * kJobRows); ++r) {

@@ -10,7 +10,8 @@
 
 namespace ldo::LDO_ISA {
 
-// Steps from a voxel to itself, then to those that share a face, an edge, a corner.
+// Steps from a voxel to itself, then to the voxels that share a face, an edge or a corner with it,
+// in this order.
 struct Stencil {
   int8_t step[27][3];
   constexpr Stencil() : step{} {
@@ -37,7 +38,8 @@ class Voxels {
   // voxel.
   Voxels(const float* rows, const uint32_t* indices, int64_t v, float edge_m)
       : table_(size_t{1} << table_bits_, -1), cell_of_(v), members_(v) {
-    // Keys are computed in blocks. Loading a row then never waits for a branch on another key.
+    // Keys are computed in blocks of 64, so that loads of rows do not wait for the branches in
+    // `enter`.
     uint64_t keys[64];
     for (int64_t begin = 0; begin < v; begin += 64) {
       const int64_t n = std::min<int64_t>(64, v - begin);
@@ -56,8 +58,8 @@ class Voxels {
   const uint32_t* begin(int64_t cell) const { return members_.data() + starts_[cell]; }
   int64_t count(int64_t cell) const { return starts_[cell + 1] - starts_[cell]; }
 
-  // Return the voxels, ascending, that hold a member for which `is_one` is true, or touch such a
-  // voxel.
+  // Return the voxels that have a member for which `is_one` is true, and all voxels that touch such
+  // a voxel, ascending.
   template <class F>
   std::vector<int64_t> about(const F& is_one) const {
     std::vector<uint8_t> has_one(keys_.size(), 0), is_about(keys_.size(), 0);
@@ -76,9 +78,9 @@ class Voxels {
     return out;
   }
 
-  // Write at most sixteen Gaussians to `out` and return their number. The first kOwn of the voxel
-  // come first. Then follow the first of each voxel around it, nearest voxels first, the second of
-  // each, and so on.
+  // Write at most sixteen Gaussians to `out` and return their number. The first kOwn Gaussians of
+  // the voxel itself come first. Then follow the first Gaussian of each voxel around it, nearest
+  // voxels first, then the second Gaussian of each, and so on.
   int around(int64_t cell, uint32_t (&out)[kLanes]) const {
     int64_t cells[27], n_cells = 0, most = 0;
     for (const auto& step : kStencil.step) {
@@ -106,8 +108,8 @@ class Voxels {
     const auto axis = [&](int shift) { return static_cast<int64_t>(key >> shift) & kMask; };
     return packed(axis(42) + step[0], axis(21) + step[1], axis(0) + step[2]);
   }
-  // Return the slot from the highest bits of the product, because the other bits do not depend on
-  // x.
+  // Return the first slot of the table to try for a key. It is taken from the highest bits of the
+  // product, because the lower bits do not depend on x.
   size_t slot_of(uint64_t key) const {
     return static_cast<size_t>(key * 0x9e3779b97f4a7c15u >> (64 - table_bits_));
   }
@@ -130,9 +132,9 @@ class Voxels {
     return table_[slot] >= 0 ? table_[slot] : added(key, slot);
   }
 
-  // Add a voxel to the table. The table is indexed by voxel, not by Gaussian, so that it stays in
-  // the cache. Three of four slots are empty, so that most lookups hit at once. A mispredicted
-  // branch costs more than the space.
+  // Add a voxel to the table. The table has an entry per voxel, not per Gaussian, so that it fits
+  // in the cache. At least three of four slots are empty, so that most lookups succeed at once: a
+  // mispredicted branch takes more time than the additional memory.
   int32_t added(uint64_t key, size_t slot) {
     const int32_t cell = static_cast<int32_t>(keys_.size());
     keys_.push_back(key);

@@ -1,7 +1,7 @@
 // Jobs that run in parallel.
 //
 // Every job writes its own part of the output. Where floats are summed, the division into jobs does
-// not depend on the number of threads. The result is then bitwise equal for any number.
+// not depend on the number of threads. The result is then bitwise equal for any number of threads.
 #pragma once
 #include <pthread.h>
 #include <unistd.h>
@@ -18,7 +18,8 @@
 
 namespace ldo::LDO_ISA {
 
-// Jobs that several threads take one after the other.
+// Jobs of one call. Each thread takes the next job until none is left. A seat is a place for one
+// helper thread in the round.
 class Round {
  public:
   template <class F>
@@ -43,12 +44,13 @@ class Round {
   std::condition_variable left_;
 };
 
-// Threads that help with the rounds of every call in this process, and block between rounds. Their
-// number grows to the number of seats that are open at once.
+// Helper threads that take part in the rounds of every call in this process, and block between
+// rounds. Their number grows to the largest number of seats that are open at the same time.
 class Helpers {
  public:
-  // Return the helpers of this process. A forked child has none of its parent's threads and creates
-  // its own. The object is never destroyed, because its threads block in it until the process ends.
+  // Return the helpers of this process. A forked child process has none of the threads of its
+  // parent and creates new helpers. The object is never destroyed, because the helper threads use
+  // it until the process ends.
   static Helpers& of_this_process() {
     static std::atomic<Helpers*> known{nullptr};
     Helpers* helpers = known;
@@ -72,8 +74,8 @@ class Helpers {
     for (int i = 0; i < seats; ++i) opened_.notify_one();
   }
 
-  // Wait for the helpers that have begun, and close the round. A helper that starts later finds the
-  // round closed.
+  // Wait until the helpers that took a seat are done, and close the round, so that no other helper
+  // can take a seat.
   void close(Round& round) {
     yield_while([&] { return round.working_ > 0; });
     std::unique_lock<std::mutex> lock(mutex_);
@@ -83,8 +85,8 @@ class Helpers {
   }
 
  private:
-  // Start a helper. Return false if the system has no more threads; the existing ones then do the
-  // work.
+  // Start a helper. Return false if the system cannot create more threads; the existing threads
+  // then do all the work.
   bool start_one() {
     sigset_t every, before;  // Python's threads handle all signals.
     sigfillset(&every);
@@ -124,8 +126,8 @@ class Helpers {
     return round;
   }
 
-  // Yield while the condition holds, at most 1024 times. The next round is usually a few
-  // microseconds away, and blocking costs more.
+  // Yield while the condition holds, at most 1024 times. The next round usually starts within a few
+  // microseconds, and blocking takes longer.
   template <class Condition>
   static void yield_while(Condition condition) {
     for (int i = 0; i < 1024 && condition(); ++i) std::this_thread::yield();

@@ -1,6 +1,6 @@
-// Projection of Gaussians in the map to splats in the image. It is EWA splatting (Zwicker et al.
-// 2001), with the clamped Jacobian and the low-pass filter of Kerbl et al. 2023, sec. 4 and its
-// code.
+// Projection of Gaussians in the map to splats in the image. The method is EWA splatting (Zwicker
+// et al. 2001), with the low-pass filter and the clamped Jacobian of Kerbl et al. 2023 (sec. 4 and
+// the published code).
 #pragma once
 #include <algorithm>
 
@@ -27,7 +27,7 @@ struct alignas(64) Splat {
 // Tiles [x0, x1] x [y0, y1] that a splat may touch.
 struct TileRange {
   uint16_t x0, y0, x1, y1;
-  uint32_t first_pair;  // First pair of the splat and a tile, among the pairs of its piece.
+  uint32_t first_pair;  // Position of the splat's first (splat, tile) pair in its piece.
 };
 
 inline uint32_t area(const TileRange& r) { return (r.x1 - r.x0 + 1) * (r.y1 - r.y0 + 1); }
@@ -41,8 +41,8 @@ inline void transpose_rows(const float* rows, int count, float (&columns)[kRowFl
   for (int j = 0; j < kRowFloats; ++j) matrix[j].store(columns[j]);
 }
 
-// Return the lanes with finite fields. NaN and infinity times zero are NaN, and NaN fails every
-// comparison.
+// Return the lanes whose fields are all finite. NaN and infinity times zero are NaN, and NaN fails
+// every comparison.
 inline Mask is_finite(const float (&columns)[kRowFloats][kLanes]) {
   Floats sum = 0.0f;
   for (int j = 0; j < kFields; ++j) sum = sum + Floats::load(columns[j]);
@@ -102,9 +102,9 @@ struct Projection {
     return {row(0), row(1), row(2)};
   }
 
-  // Compute the rows of J R, the derivative of (u, v) with respect to a point of the map. It is
-  // linearized at a direction clamped to slightly more than the image, where the affine model still
-  // holds.
+  // Compute the rows of J R, the derivative of (u, v) with respect to a point of the map. The
+  // viewing direction is clamped to an area slightly larger than the image, because the affine
+  // model fails farther outside.
   void jacobian(Floats x, Floats y, Floats inverse_z, Vector3& du, Vector3& dv) const {
     const float* T = view.T_camera_map;
     const Floats ju = inverse_z * view.fx, jv = inverse_z * view.fy;
@@ -131,7 +131,7 @@ struct Projection {
     const Floats scale = Floats(-0.5f * kLog2e) / (uu * vv - uv * uv);
     const Floats log2_opacity =
         Floats(0.0f) - log2(Floats(1.0f) + exp(Floats(0.0f) - column(kOpacity)));
-    // Maximum of q = d' C^-1 d.
+    // Largest q = d' C^-1 d at which alpha >= 1/255.
     const Floats reach = (log2_opacity - kLog2MinAlpha) * (2.0f / kLog2e);
 
     (x * view.fx + view.cx).store(out.u);
@@ -153,7 +153,7 @@ struct Projection {
 };
 
 // Find the first and last pixel of [0, size) within `radius` of `center`. Return false if there is
-// none, which includes NaN.
+// no such pixel or if an argument is NaN.
 inline bool pixels_within(float center, float radius, int size, int& first, int& last) {
   const float low = std::max(center - radius, 0.0f), high = std::min(center + radius, size - 1.0f);
   if (!(low <= high)) return false;

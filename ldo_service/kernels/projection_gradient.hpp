@@ -1,4 +1,5 @@
-// Derivative of the projection: from the sums over pixels of a splat to its row and the pose.
+// Derivative of the projection. It converts the gradient sums of a splat over its pixels to
+// derivatives by the row of the Gaussian and by the camera pose.
 #pragma once
 #include "blend_gradient.hpp"
 
@@ -132,7 +133,8 @@ struct ProjectionGradient {
         w * (c2.x - c0.z) + x * (c1.x + c0.y) + z * (c2.y + c1.z) - y * 2.0f * (c0.x + c2.z);
     const Floats g_z =
         w * (c0.y - c1.x) + x * (c2.x + c0.z) + y * (c2.y + c1.z) - z * 2.0f * (c0.x + c1.y);
-    const Floats radial = w * g_w + x * g_x + y * g_y + z * g_z;  // The length has no effect.
+    // The length of the quaternion has no effect, so the radial part of the gradient is removed.
+    const Floats radial = w * g_w + x * g_x + y * g_y + z * g_z;
     const Floats twice = shorten * 2.0f;
     out[0] = (g_w - w * radial) * twice;
     out[1] = (g_x - x * radial) * twice;

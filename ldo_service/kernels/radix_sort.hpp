@@ -9,11 +9,12 @@ struct Keyed {
   uint32_t key, value;
 };
 
-constexpr int kMaxDigitBits = 12;  // The histogram and the ends of all bins stay in the cache.
+// The histogram and the cache lines that all bins are written to fit in the cache.
+constexpr int kMaxDigitBits = 12;
 
-// Pieces in which an array of n items is sorted. A single thread sorts one piece. Several threads
-// sort four pieces each, because one of them may be delayed. A stable sort has only one result, so
-// the number of threads may decide the division.
+// Pieces in which an array of n items is sorted: one piece for a single thread, else four pieces
+// per thread, because a thread may be delayed. The number of threads may decide the division,
+// because a stable sort has only one possible result.
 struct Pieces {
   Pieces(int64_t n, const Team& team) : n(n) {
     const int64_t wanted = team.size() == 1 ? 1 : int64_t{4} * team.size();
@@ -25,9 +26,9 @@ struct Pieces {
   int64_t n, length;
 };
 
-// Turn the counts of bins, which lie `stride` apart for each piece, into the positions where each
-// piece starts writing each bin. Bins are in order, and within a bin the pieces are in order.
-// Return the total.
+// Replace the counts of each piece and bin by the position where the piece starts to write the bin.
+// The counts of successive pieces lie `stride` apart. The output is ordered by bin, and within a
+// bin by piece. Return the sum of all counts.
 inline uint32_t to_offsets(uint32_t* counts, int64_t pieces, int64_t bins, int64_t stride) {
   uint32_t sum = 0;
   for (int64_t bin = 0; bin < bins; ++bin)

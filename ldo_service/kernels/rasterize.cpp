@@ -19,14 +19,15 @@ struct RecordedPass final : Pass {
   VisibleSplats splats;
   TileLists lists;
   Buffer<uint32_t> touched;  // [lists.splats], blocks that each splat of a tile reaches.
-  Buffer<uint32_t> blended;  // [tiles, kBlocks], number of splats.
+  Buffer<uint32_t> blended;  // [tiles, kBlocks], number of splats that each block blended.
   Buffer<float> sums;        // [lists.splats, kSumFloats].
 
   int64_t size_of_tile(int64_t tile) const {
     const bool exists = tile < static_cast<int64_t>(lists.columns) * lists.rows;
     return exists ? lists.start[tile + 1] - lists.start[tile] : 0;
   }
-  // Return the sums of all pairs with tiles that are not wanted.
+  // Return the entry of `sums`, of `floats` values, that all pairs with unwanted tiles share. It
+  // holds zeros.
   float* sums_of_nothing(int floats) {
     return &sums[int64_t{lists.start[lists.start.size() - 1]} * floats];
   }
@@ -36,7 +37,7 @@ struct RecordedPass final : Pass {
 };
 
 // Call f for every tile. A job takes a few adjacent tiles, because they share splats and cache
-// lines of the image, and one prefetches what the next will read.
+// lines of the image, and each tile prefetches what the next tile reads.
 template <class F>
 void each_tile(const TileLists& lists, Team& team, const F& f) {
   constexpr int64_t kJobTiles = 4;
@@ -50,7 +51,8 @@ void each_tile(const TileLists& lists, Team& team, const F& f) {
   });
 }
 
-// Sums over the tiles of one splat after the other, in the order of the tiles.
+// Iterator over the splats of a piece. `next` returns the sums of the next splat over its tiles,
+// added in the order of the tiles.
 class SumsOverTiles {
  public:
   SumsOverTiles(const RecordedPass& pass, int64_t piece)
@@ -68,7 +70,8 @@ class SumsOverTiles {
   }
 
  private:
-  // Pairs to prefetch ahead; the sums of pairs lie in the order of the tiles.
+  // Number of pairs to prefetch ahead. The sums are stored tile by tile, so the sums of successive
+  // pairs of a splat lie far apart.
   static constexpr int kAhead = 64;
   const float* sums_of(uint32_t slot) const { return sums_ + int64_t{slot} * kSumFloats; }
   const float* sums_;
@@ -87,7 +90,7 @@ void differentiate_piece(const RecordedPass& pass, const ProjectionGradient& dif
     const int64_t first = piece * kProjectionPiece + done, to = counts.first_splat + done;
     const uint32_t* gaussians = &pass.splats.gaussians[first];
     Floats matrix[kLanes], sums[kLanes], gradient[kLanes];
-    for (int k = 0; k < kLanes; ++k) {  // The last row is repeated, with no gradient.
+    for (int k = 0; k < kLanes; ++k) {  // Spare lanes repeat the last row, with zero sums.
       matrix[k] = Floats::load(pass.rows + int64_t{gaussians[std::min(k, count - 1)]} * kRowFloats);
       sums[k] = k < count ? sum_over_tiles.next(pass.splats.tiles[first + k]) : Floats(0.0f);
     }
@@ -147,7 +150,7 @@ void add_up(const Buffer<PoseSums>& poses, double* out) {
   }
 }
 
-// Limit on the size of a row in a view.
+// Limit on the standard deviations of a Gaussian in a view.
 class SizeBound {
  public:
   SizeBound(const View& view, SizeLimit limit)

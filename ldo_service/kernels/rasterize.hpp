@@ -25,8 +25,8 @@ struct View {
   int width, height;
 };
 
-// Bound of kBlockRows consecutive rows. Keyframes add Gaussians in the order of their pixels, so
-// that such a block is a small patch. A block that is far from all rays of the view is not read.
+// Bound of a block of kBlockRows consecutive rows. Keyframes add Gaussians in the order of their
+// pixels, so that a block covers a small patch of surface. Blocks out of view are not read.
 struct BlockBound {
   float low[3], high[3];  // Bounds of the means, meters.
   float sigma;            // Maximum standard deviation, meters.
@@ -49,7 +49,8 @@ struct Images {         // Row-major, height x width.
   float* opacity;       // 1 - transmittance.
 };
 
-// Images that gradients flow through, one after the other, each row-major height x width.
+// Image planes that have derivatives. They are stored one after the other, each row-major height x
+// width.
 enum Plane { kRed, kGreen, kBlue, kDepth, kPlaneOpacity, kPlanes };
 
 // A row of gradients has the fields of a row of Gaussians. The unused fields begin with this one:
@@ -64,21 +65,22 @@ class Pass {
   View view{};
 };
 
-// Penalty that turns needles into discs. It adds to the loss that is differentiated
-//   weight * mean over the pixels of sum_i w_i max(0, log(longest / middle axis) - log_ratio),
-// with the w_i held fixed.
+// Penalty that turns needle-shaped Gaussians into discs. The following term is added to the loss:
+//   weight * mean over the pixels of sum_i w_i max(0, log(longest / middle axis) - log_ratio).
+// The derivative treats the w_i as constants.
 struct NeedlePenalty {
   float weight, log_ratio;
 };
 
-// Maximum standard deviation of a Gaussian, in pixels of the view that optimizes it. A Gaussian
-// that grows over a wall without texture would dominate all content that appears there later.
+// Maximum standard deviation of a Gaussian, in pixels of the view that it is optimized against. A
+// Gaussian that grows over a wall without texture would dominate all content that appears there
+// later.
 struct SizeLimit {
   float most_px;
 };
 
 struct Gradients {
-  uint32_t* indices;  // [visible], rows that the view reaches, ascending.
+  uint32_t* indices;  // [visible], rows that may touch the image, ascending.
   float* rows;        // [visible, kRowFloats], their gradients.
   double* pose;       // [6], derivative by xi in T_map_camera exp(xi): rotation, then translation.
 };

@@ -62,7 +62,7 @@ class Exclusive {
   std::unique_lock<std::mutex> lock_;
 };
 
-// Pass object of Python.
+// Python object `Pass`: a pass with a lock.
 class PassOfPython {
  public:
   PassOfPython() : pass_(kernels.new_pass()) {}
@@ -157,7 +157,7 @@ Image image(float* data, std::initializer_list<size_t> shape) {
   return Image(data, shape, owner);
 }
 
-// Rows that a rendering reads: all of them, or those whose bounds come near the view.
+// Gaussians of one rendering. Bounds that the caller gave are locked while this object exists.
 class Seen {
  public:
   Seen(const Array& rows, BoundsOfPython* bounds)

@@ -1,10 +1,10 @@
 // Vectors of sixteen float lanes: one 4x4 block of pixels, or sixteen Gaussians.
 //
 // The code uses the vector extensions of GCC and Clang. A value is an array of native registers:
-// 1 of 64, 2 of 32 or 4 of 16 bytes. One 64-byte vector on a narrower machine would have its
-// compares and selects lowered to scalar code. Everything lives in a namespace named after the
-// instruction set. The linker therefore never merges an inline function of one translation unit
-// with that of another, compiled for a different machine.
+// 1 of 64, 2 of 32 or 4 of 16 bytes. A single 64-byte vector would be slow on a machine with
+// narrower registers, because compilers turn its compares and selects into scalar code. All code is
+// in a namespace named after the instruction set. The linker therefore never merges inline
+// functions that were compiled for different instruction sets.
 #pragma once
 #include <cstdint>
 #include <cstring>
@@ -29,7 +29,7 @@ typedef float FloatRegister __attribute__((vector_size(kRegisterBytes)));
 typedef int32_t IntRegister __attribute__((vector_size(kRegisterBytes)));
 static_assert(sizeof(FloatRegister) == kRegisterBytes);
 
-// Apply f to every register index. The loop is unrolled, so that the arrays live in registers.
+// Apply f to every register index. The loop is unrolled, so that the arrays stay in registers.
 template <class F>
 [[gnu::always_inline]] inline void each_register(F f) {
 #pragma GCC unroll 4
@@ -48,7 +48,7 @@ struct Floats {
     each_register([&](int k) { v[k] = x - FloatRegister{}; });  // x - 0 folds; 0 + x does not.
   }
   static Floats load(const float* p) {
-    Floats out;  // Copies register by register: GCC copies 64 bytes at once through the stack.
+    Floats out;  // Copy each register alone: GCC would copy 64 bytes at once through the stack.
     each_register([&](int k) { std::memcpy(&out.v[k], p + k * kPerRegister, kRegisterBytes); });
     return out;
   }
@@ -127,8 +127,8 @@ inline Floats select(Mask m, Floats yes, Floats no) {
   return out;
 }
 
-// Return the lower value of each lane. Compilers turn `a < b ? a : b` into two instructions where
-// the machine has one.
+// Return the lower value of each lane. Compilers turn `a < b ? a : b` into two instructions,
+// although one instruction exists.
 inline FloatRegister least(FloatRegister a, FloatRegister b) {
 #if defined(__AVX512F__)
   return _mm512_min_ps(a, b);
@@ -246,8 +246,8 @@ inline Floats sqrt(Floats x) {
 }
 
 // Return the sum of the lanes, in an order that is the same on every machine. The upper half is
-// repeatedly added to the lower half. In halves of registers, no compiler joins the addition with a
-// product.
+// repeatedly added to the lower half. Because only halves of registers are added, compilers cannot
+// fuse an addition with the product that computed x.
 inline float sum(Floats x) {
 #if defined(__AVX512F__)
   const __m256 eight = _mm512_castps512_ps256(x.v[0]) + _mm512_extractf32x8_ps(x.v[0], 1);
@@ -288,8 +288,9 @@ inline Floats reciprocal(Floats x) {
 #endif
 }
 
-// Sixteen values at `p`, which lies on a cache line, and the values around them. They are shifted
-// in registers where the machine can, because loads that straddle cache lines cost twice.
+// Sixteen values at `p`, which is the start of a cache line, and the values on both sides of them.
+// With AVX-512, shifted values are computed in registers, because a load that spans two cache lines
+// takes twice as long.
 class Neighbors {
  public:
 #if defined(__AVX512F__)
@@ -298,7 +299,7 @@ class Neighbors {
         middle_(_mm512_load_si512(p)),
         right_(_mm512_load_si512(p + kLanes)) {}
 
-  template <int Right>  // Values `Right` places to the right; to the left if it is negative.
+  template <int Right>  // Values `Right` places to the right, or to the left if negative.
   [[gnu::always_inline]] inline Floats at() const {
     __m512i out = middle_;
     if constexpr (Right > 0) out = _mm512_alignr_epi32(right_, middle_, Right);
@@ -340,8 +341,9 @@ struct SetBits {  // Set bits of every byte, from the lowest, and their number.
 inline constexpr SetBits kSetBits;
 #endif
 
-// Write the i in [0, n) whose words[i] has the bit set, in order, and return their number. The loop
-// has no branches, because the bits follow no pattern. `out` has room for kLanes beyond n.
+// Write all i in [0, n) for which bit `bit` of words[i] is set, ascending, and return their number.
+// The loop has no branches, because the bits follow no pattern that a processor could predict.
+// `out` has room for n + kLanes values.
 inline int indices_with_bit(const uint32_t* words, int n, int bit, uint32_t* out) {
   int count = 0;
 #if defined(__AVX512F__)

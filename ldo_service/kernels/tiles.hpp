@@ -8,7 +8,7 @@ namespace ldo::LDO_ISA {
 constexpr int64_t kPieceBlocks = 16;
 constexpr int64_t kProjectionPiece = kPieceBlocks * kBlockRows;  // Gaussians.
 
-struct PieceCounts {  // Numbers of the splats of a piece and of their pairs with tiles.
+struct PieceCounts {  // Number of splats of a piece, and number of their (splat, tile) pairs.
   int64_t splats;
   uint32_t pairs;
   int64_t first_splat = 0, first_pair = 0;  // Positions among all pieces.
@@ -126,7 +126,8 @@ class PieceProjection {
   alignas(64) SplatColumns splats_;
 };
 
-// Compute where the splats and the pairs of each piece begin among all.
+// Compute the positions of the first splat and the first pair of each piece among those of all
+// pieces.
 inline void sum_counts(VisibleSplats& visible) {
   visible.count = visible.pairs = 0;
   for (size_t piece = 0; piece < visible.counts.size(); ++piece) {
@@ -138,8 +139,9 @@ inline void sum_counts(VisibleSplats& visible) {
   }
 }
 
-// Sort the splats by depth. Depths are positive, so their bits have the same order. Ties go to the
-// lower index, because splats are in the order of the Gaussians and the sort is stable.
+// Sort the splats by depth. Depths are positive, so their bits have the same order. At equal depth,
+// the lower index comes first, because splats are in the order of the Gaussians and the sort is
+// stable.
 inline void order_by_depth(VisibleSplats& visible, Team& team) {
   const size_t pieces = visible.counts.size();
   Buffer<uint32_t> lowest(pieces), highest(pieces);
@@ -185,7 +187,7 @@ inline void project(const Gaussians& gaussians, const View& view, const TileGrid
   order_by_depth(out, team);
 }
 
-// Splats to prefetch ahead, while those of a tile are read in list order.
+// Number of splats to prefetch ahead, while the splats of a tile are read in the order of its list.
 constexpr int kPrefetchAhead = 24;
 
 struct TileLists {
@@ -198,8 +200,8 @@ struct TileLists {
   Buffer<uint32_t> slots;
 };
 
-// Number of splats that touch each tile. Each range is added at its corners, without a loop over
-// its tiles. The sums of these over rows and columns are the counts.
+// Number of splats that touch each tile. A range of tiles is added as four corner values, without a
+// loop over its tiles. Cumulative sums of the corner values over columns and rows give the counts.
 class TileCounts {
  public:
   static int64_t room(const TileGrid& grid) { return int64_t{grid.columns + 1} * (grid.rows + 1); }

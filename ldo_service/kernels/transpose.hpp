@@ -16,8 +16,8 @@ FloatRegister shuffle(FloatRegister a, FloatRegister b) {
   return shuffle<Pattern>(a, b, std::make_integer_sequence<int, kPerRegister>());
 }
 
-// Pattern that alternates pieces of `Width` lanes of a and b in each group of four lanes, from the
-// low or high half.
+// Pattern that alternates pieces of `Width` lanes of a and b in each group of four lanes. Pieces
+// come from the low or the high half of each group.
 template <int Width, bool High>
 struct Interleave {
   static constexpr int source(int lane) {
@@ -27,8 +27,8 @@ struct Interleave {
   }
 };
 
-// Pattern that swaps the off-diagonal pieces of `Width` lanes in a 2x2 matrix of pieces, rows a and
-// b.
+// Pattern that swaps the off-diagonal pieces of the 2x2 matrix whose rows are a and b, each with
+// pieces of `Width` lanes.
 template <int Width, bool Second>
 struct Swap {
   static constexpr int source(int lane) {
@@ -37,7 +37,7 @@ struct Swap {
   }
 };
 
-// Swap the off-diagonal blocks of Width x Width in blocks twice as large.
+// Swap the two off-diagonal blocks of Width x Width in each block of twice this size.
 template <int Width>
 void transpose_blocks(Floats (&rows)[kLanes]) {
   for (int i = 0; i < kLanes; ++i) {

@@ -19,7 +19,8 @@ double now_s() {
   return duration<double>(steady_clock::now().time_since_epoch()).count();
 }
 
-// Writes the age of the current step to a file descriptor, as a double in seconds; 0 between steps.
+// Thread that periodically writes the age of the current step to a file descriptor. The age is a
+// double in seconds, and 0 between steps.
 class Heartbeat {
  public:
   Heartbeat(int fd, double period_s) : fd_(fd), period_s_(period_s) {
@@ -52,7 +53,8 @@ class Heartbeat {
     while (!stopped_) {
       const double began_s = began_s_;
       const double age_s = began_s > 0.0 ? now_s() - began_s : 0.0;
-      // The descriptor does not block. A beat that does not fit or has no reader is skipped.
+      // The descriptor does not block. A heartbeat that cannot be written at once, or that has no
+      // reader, is skipped.
       [[maybe_unused]] const ssize_t written = ::write(fd_, &age_s, sizeof(age_s));
       changed_.wait_for(lock, std::chrono::duration<double>(period_s_));
     }
