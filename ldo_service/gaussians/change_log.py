@@ -75,7 +75,7 @@ class ChangeLog:
 
         Args:
             gaussians: The map.
-            with_changed: Include changed rows. If False, they are published by a later call.
+            with_changed: Include changed rows. If False, a later call returns them.
         """
         first_new = int(np.searchsorted(gaussians.ids, self._next_untold))
         changed = np.zeros(0, np.int64)

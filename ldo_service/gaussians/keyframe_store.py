@@ -96,7 +96,7 @@ class KeyframeStore:
         return sorted(self._files.sizes.keys() | self._cache.keys())
 
     def keep_only(self, keyframes: Iterable[int]) -> None:
-        """Drop all keyframes except for the given ones, which a restored checkpoint contains."""
+        """Drop all keyframes except the given ones, such as the keyframes of a checkpoint."""
         kept = set(keyframes)
         for keyframe in self.keyframes():
             if keyframe not in kept:

@@ -107,7 +107,7 @@ class LoopRefit:
     def mark_moved(self, T_map: KeyframePoses) -> None:
         """Schedule deduplication and refit for the keyframes that a correction displaces.
 
-        Call it before `MapBuilder.move` applies the correction to the map.
+        Call this method before `MapBuilder.move_keyframes` applies the correction to the map.
 
         Args:
             T_map: The corrected poses of the keyframes.
@@ -126,10 +126,7 @@ class LoopRefit:
 
     @property
     def pending_iterations(self) -> int:
-        """Number of pending refit iterations.
-
-        It is at most `iterations` for each keyframe with images.
-        """
+        """Number of pending refit iterations, at most `iterations` per keyframe with images."""
         return sum(self._pending.values())
 
     @property

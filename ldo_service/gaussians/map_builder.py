@@ -94,7 +94,8 @@ class MapBuilder:
             keyframe: Id of the keyframe, larger than all ids before.
             iterations: Number of iterations if `usual_reach` Gaussians are visible in each. If more
                 are visible, fewer iterations run, so that the time stays the same.
-            dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool.
+            dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool. None if there
+                are none.
         """
         self._load_visible(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
         self._renderer.forget()
@@ -119,15 +120,19 @@ class MapBuilder:
     def render_from(
         self, camera: Camera, T_map_camera: np.ndarray, *, contributions: bool = False
     ) -> Rendering:
-        """Render the resident Gaussians from a camera pose."""
+        """Render the Gaussians in memory from a camera pose T_map_camera [4, 4].
+
+        With `contributions`, the contribution of each Gaussian is computed too.
+        """
         return self._renderer.render_from(
             self.gaussians, camera, T_map_camera, contributions=contributions
         )
 
     def render_keyframe(self, keyframe: int, *, contributions: bool = False) -> Rendering:
-        """Render the map at the pose of a keyframe, or return the cached rendering.
+        """Render the Gaussians in memory at the pose of a keyframe, or return the cached rendering.
 
-        The cache is valid until the map changes.
+        The cache is valid until the map changes. With `contributions`, the contribution of each
+        Gaussian is computed too.
         """
         return self._renderer.render_keyframe(self.gaussians, keyframe, contributions=contributions)
 
@@ -135,7 +140,7 @@ class MapBuilder:
         """Estimate the exposure of a frame relative to the map.
 
         If that fails, for example because the map covers too little of the image, the exposure of
-        the previous keyframe is returned.
+        the previous keyframe is returned. The first keyframe then gets gain 1 and bias 0.
         """
         rendered, seen = before.color.transpose(2, 0, 1), frame.color.transpose(2, 0, 1)
         estimated = estimate_exposure(rendered, before.opacity, seen, counts)
@@ -231,7 +236,7 @@ class MapBuilder:
         """Return whether all Gaussians that may be visible in a keyframe are in memory.
 
         If some are offloaded, do not fit the map to this keyframe: the Gaussians in memory would
-        move to where the offloaded ones are missing.
+        move to where the offloaded Gaussians are missing.
         """
         return not self.offloaded.visible_chunks(self.views.placed(keyframe), self._reach_m)
 
@@ -338,9 +343,12 @@ class MapBuilder:
         return self._log.drain(self.gaussians, with_changed=with_changed)
 
     def refined(self) -> dict[int, np.ndarray]:
-        """Return the poses T_map_keyframe that the Gaussian optimizer has changed noticeably.
+        """Return the keyframe poses to publish, because the Gaussian optimizer has moved them.
 
-        The caller publishes them; the next call returns only poses that changed again.
+        The caller must publish them: the next call returns only poses that have moved again.
+
+        Returns:
+            T_map_keyframe [4, 4] by id of the keyframe.
         """
         return self._published.drain(self.views.poses)
 

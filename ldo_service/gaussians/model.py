@@ -233,7 +233,7 @@ class GaussianMap:
         anchors: np.ndarray,
         labels: np.ndarray | None = None,
     ) -> None:
-        """Insert Gaussians that were extracted from this map before, sorted by id.
+        """Insert Gaussians that were extracted from this map, at their places in the order of ids.
 
         The computing time is linear in the size N of the map.
 

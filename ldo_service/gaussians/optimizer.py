@@ -20,7 +20,7 @@ from .training_views import TrainingView
 # Constants of Adam for keyframe poses. A pose gets few steps, so its moments average over more
 # steps than those of the Gaussians.
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
-WIDTH = 6  # Size of a twist.
+WIDTH = 6  # Size of the tangent vector of a pose: rotation, then translation.
 
 
 class PoseAdam:
@@ -190,9 +190,9 @@ class GaussianOptimizer:
                 geometrically in between. Use 1 while the map grows, less to converge at the end.
             fixed: Keyframe whose pose and exposure stay constant, to fix the pose and the
                 brightness of the map. None lets all of them change.
-            effort: Limit of the computation: iterations stop when their sum of (1 + r) / 2 reaches
-                it. r is the number of Gaussians that may touch the image, divided by
-                `usual_reach`.
+            effort: Limit of the computing time, in iterations with `usual_reach` visible Gaussians.
+                An iteration with r times as many visible Gaussians counts as (1 + r) / 2. No
+                iteration starts once the sum has reached `effort`.
 
         Returns:
             Loss before each step, for the iterations that were run.

@@ -128,7 +128,7 @@ class PlacedCamera:
     horizon: MaxDepthGrid | None = None
 
     def distances_m(self, centers_map: np.ndarray, radii_m: np.ndarray) -> np.ndarray:
-        """Return the distance in meters to the surface of each sphere, [K]; negative inside it."""
+        """Return the distances in meters from the camera to K spheres, [K]; negative if inside."""
         return np.linalg.norm(centers_map - self.T_map_camera[:3, 3], axis=1) - radii_m
 
     def may_see(

@@ -127,8 +127,8 @@ class KeyframePoses:
             version: Version of the pose graph.
             T_map: Corrected T_map_keyframe [4, 4] by id.
             held: Keyframes whose relative pose here is more accurate than the relative pose that
-                the pose graph used. Their poses are not taken from `T_map`: they are computed from
-                their reference keyframes, if those are known.
+                the pose graph used. If their reference keyframe is known, their poses are computed
+                from it instead of taken from `T_map`.
         """
         if version <= self.version or not T_map:
             return
