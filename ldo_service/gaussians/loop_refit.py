@@ -162,7 +162,7 @@ class LoopRefit:
         return bool(self._to_deduplicate) or bool(self._resident_keyframes())
 
     def while_idle(self, threads: int) -> None:
-        """Do a part of the work while no keyframe arrives.
+        """Do a part of the pending deduplication and refit while no keyframe arrives.
 
         Args:
             threads: Threads of the iterations. The tracker has little to do then.
