@@ -9,10 +9,11 @@ Each point has two residuals:
 I is the gray image of the frame, and R is the rotation of T_camera_reference. q is the 3D point
 that the frame's depth image measures at the pixel nearest to project(p_c).
 
-The weights follow a t-distribution with 5 degrees of freedom, w = 6 / (5 + (r / sigma)^2) / sigma^2
-(Kerl, Sturm and Cremers, "Robust odometry estimation for RGB-D cameras", 2013, III). The unknowns
-are the pose increment xi in T_reference_camera * exp(xi), gain and bias.
-Conventions: `ldo_service.geometry`.
+Alignment minimizes the sum of w r^2 / sigma^2, where sigma is the noise of the residual. The
+weights follow a t-distribution with 5 degrees of freedom, w = 6 / (5 + (r / sigma)^2) (Kerl, Sturm
+and Cremers, "Robust odometry estimation for RGB-D cameras", 2013, III). The unknowns are gain, bias
+and the pose increment xi, which changes the pose to T_reference_camera * exp(xi). Conventions:
+`ldo_service.geometry`.
 """
 
 from dataclasses import dataclass, field, replace
@@ -29,7 +30,7 @@ DEGREES_OF_FREEDOM = 5.0  # Kerl et al. 2013, III.B; the kernel uses the same va
 INLIER_SIGMA = 3.0
 
 POSE, BRIGHTNESS = slice(0, 6), slice(6, 8)
-# Inverse variances of gain and bias: gain within 3 %, bias within 3 gray levels.
+# Prior of gain and bias as inverse variances: standard deviations of 3 % and of 3 gray levels.
 BRIGHTNESS_PRIOR = np.array([1e3, 0.1])
 
 
@@ -38,8 +39,10 @@ class ResidualConfig:
     """Settings of the photometric and geometric residuals."""
 
     noise: DepthNoise = field(default_factory=DepthNoise)
-    gate: float = 0.1  # Largest depth difference of a geometric pair, relative to depth.
-    # A point this far behind the camera's surface is hidden; relative to depth.
+    # Largest depth difference between a point and its measured point q, as a fraction of depth.
+    gate: float = 0.1
+    # A point farther than this behind the surface measured by the frame is hidden; fraction of
+    # depth.
     occlusion: float = 0.08
 
     def __post_init__(self) -> None:
@@ -53,13 +56,13 @@ class ResidualConfig:
 class BrightnessModel:
     """Brightness change and residual noise of a frame relative to its reference keyframe.
 
-    Alignment estimates them together with the pose, starting from the defaults.
+    Alignment estimates all four values together with the pose, starting from the defaults.
     """
 
     gain: float = 1.0
     bias: float = 0.0  # Gray levels.
     intensity_sigma: float = 8.0  # Photometric noise, gray levels.
-    depth_noise_scale: float = 2.0  # Geometric noise, times DepthNoise.
+    depth_noise_scale: float = 2.0  # Geometric noise as a multiple of `DepthNoise`.
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +81,10 @@ class ResidualStatistics:
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Gauss-Newton approximation of half the weighted squared residuals."""
+    """Gauss-Newton approximation of half the sum of weighted squared residuals.
+
+    The order of the unknowns is the pose increment xi [6], gain, bias.
+    """
 
     hessian: np.ndarray  # [8, 8]
     gradient: np.ndarray  # [8]
@@ -106,7 +112,7 @@ def normal_equations(
         config: Settings of the residuals.
 
     Raises:
-        ValueError: An array has another shape, or the transform is not rigid.
+        ValueError: An array has a wrong shape, or the transform is not rigid.
     """
     hessian, gradient, counts = _align.normal_equations(
         points,
@@ -137,20 +143,23 @@ class AlignConfig:
     residuals: ResidualConfig = field(default_factory=ResidualConfig)
     start: BrightnessModel = field(default_factory=BrightnessModel)
     iterations: tuple[int, ...] = (8, 8, 10, 10)  # Maximum per level, the finest first.
-    # A level has converged when the last step moves the image by less; pixels of the level.
+    # A level has converged when a step moves the image by less than this; pixels of the level.
     stop_px: float = 0.02
     # Limit of one step: rotation in rad, and translation as a fraction of the median depth.
     max_step: float = 0.15
-    # Damping of the normal equations, fraction of their diagonal: unobserved directions stay fixed.
+    # Damping of the normal equations as a fraction of their diagonal, so that directions which the
+    # residuals do not constrain stay fixed.
     damping: float = 1e-6
-    # Lower bound of the photometric noise, gray levels: rounding and interpolation.
+    # Lower bound of the photometric noise, gray levels: the noise of rounding and interpolation.
     min_intensity_sigma: float = 1.0
-    # Lower bound of the geometric noise, 0.24 mm at the noise floor: rounding to millimeters.
+    # Lower bound of the geometric noise as a multiple of `DepthNoise`: 0.24 mm at its floor of
+    # 1.2 mm, for depth that is rounded to millimeters.
     min_depth_noise_scale: float = 0.2
-    # Fraction of the residuals that count as independent: the errors of neighboring residuals are
-    # correlated. The measured errors fit a fraction of 0.1 on exact renders. On a Kinect against
-    # KinectFusion they fit 1e-4 (next frame) to 3e-5 (half a second), which includes the error of
-    # KinectFusion. The default lies between these values and is not validated.
+    # Fraction of the residuals that count as independent, because the errors of neighboring
+    # residuals are correlated. Pose errors measured on exact renders fit a fraction of 0.1. Pose
+    # errors of a Kinect, measured against KinectFusion and thus including its error, fit 1e-4 from
+    # frame to frame and 3e-5 over half a second. The default lies between these values and is not
+    # validated.
     independent_fraction: float = 2e-3
 
     def __post_init__(self) -> None:
@@ -178,9 +187,10 @@ class Alignment:
     # [6, 6] for T_reference_camera * exp(xi), xi = (rotation rad, translation m).
     information: np.ndarray
     photometric_inliers: float  # Fraction of the visible points within 3 sigma.
-    geometric_inliers: float  # Fraction of the paired points within 3 sigma.
+    # Fraction of the points paired with a measured depth whose residual is within 3 sigma.
+    geometric_inliers: float
     intensity_sigma: float  # Photometric noise, gray levels.
-    depth_noise_scale: float  # Geometric noise, times the sensor model.
+    depth_noise_scale: float  # Geometric noise as a multiple of `DepthNoise`.
     overlap: float  # Visible fraction of the reference points.
     paired: float  # Fraction of the reference points that are paired with a measured depth.
     gain: float
@@ -213,6 +223,9 @@ def align(
         frame: Pyramid of the frame.
         T_camera_reference: Initial guess, [4, 4].
         config: Settings.
+
+    Returns:
+        The pose, with its quality on the finest pyramid level.
     """
     T, appearance = se3.orthonormalize(T_camera_reference), config.start
     count, converged = 0, False

@@ -1,13 +1,13 @@
 """Poses from sparse features with PnP RANSAC, and from point clouds with GICP.
 
-Neither method needs an accurate initial guess, so both serve large motions and relocalization. ORB
-is fast and sufficient from frame to frame. SIFT takes ten times as long and also matches surfaces
-at half or twice the distance.
+Neither method needs an accurate initial guess. Tracking uses both after large motions, and
+relocalization uses features. ORB is fast and sufficient from frame to frame. SIFT takes ten times
+as long and also matches surfaces at half or twice the distance.
 
-GICP (`small_gicp`) estimates the pose of scenes without texture from their shape. It pairs each
-point with its nearest neighbors in the other cloud. The module `alignment` pairs points along the
-viewing ray instead. GICP converges from larger initial errors than `alignment` and is less
-accurate. Conventions: `ldo_service.geometry`.
+GICP (`small_gicp`) estimates the pose of scenes without texture from their shape. GICP pairs each
+point with the nearest point of the other cloud, whereas the module `alignment` pairs points along
+the viewing ray. GICP converges from larger initial errors than `alignment` and is less accurate.
+Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from ldo_service.geometry import Camera, se3
 
 from .pyramid import Level, Pyramid, ReferencePoints
 
-SIFT_SIZE = 128
+SIFT_SIZE = 128  # Length of a SIFT descriptor.
 
 NEIGHBORS = 10  # Neighbors that the covariance of a point is estimated from; small_gicp's default.
 
@@ -32,16 +32,23 @@ class FeatureConfig:
     """Settings of feature detection, matching and PnP RANSAC."""
 
     count: int = 1000  # Maximum number of ORB features, as in ORB-SLAM3 at 640x480.
-    # FAST threshold, gray levels: ORB-SLAM3's lower one, for corners in blurred images.
+    # FAST threshold, gray levels: the lower one of ORB-SLAM3, which finds corners in blurred
+    # images.
     fast_threshold: int = 7
-    ratio: float = 0.8  # Maximum ratio of best to second distance (Lowe 2004, 7.1, uses 0.8).
+    # Maximum ratio of the distances to the nearest and to the second nearest descriptor (Lowe 2004,
+    # 7.1, uses 0.8).
+    ratio: float = 0.8
     # Maximum Hamming distance of ORB matches, bits of 256 (ORB-SLAM3: 100 loose, 50 tight).
     max_distance: int = 64
-    # Maximum number of SIFT features of a frame, the strongest; half as many of a database entry.
+    # Maximum number of SIFT features of a frame, the strongest ones. A keyframe record has at most
+    # half as many.
     count_across_scales: int = 1000
-    # SIFT contrast threshold, fraction of the gray range; OpenCV's 0.04 finds little indoors.
+    # SIFT contrast threshold as a fraction of the gray range. OpenCV's default of 0.04 finds few
+    # features indoors.
     contrast: float = 0.01
-    reprojection_px: float = 3.0  # Inlier threshold at an image width of 640; scaled with it.
+    # Maximum reprojection error of an inlier, pixels at an image width of 640; scales with the
+    # width.
+    reprojection_px: float = 3.0
     ransac_iterations: int = 200
     min_inliers: int = 15  # ORB-SLAM3 relocalizes from 15 RANSAC inliers.
 
@@ -67,7 +74,7 @@ class FeatureConfig:
 class Features:
     """Image features with their measured 3D points."""
 
-    pixels: np.ndarray  # [N, 2]
+    pixels: np.ndarray  # [N, 2] u and v in pixels.
     points_camera: np.ndarray  # [N, 3] meters in the camera; z = 0 where unmeasured.
     descriptors: np.ndarray  # [N, 32] uint8 bits of ORB, or [N, 128] uint8 gradients of SIFT.
 
@@ -159,8 +166,11 @@ def _nearest_gradients(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the nearest frame descriptor of each reference descriptor, by Euclidean distance.
 
-    Returns the same as `_nearest_bits`. The sums are integers below 2^24. float32 represents them
-    exactly, so the result does not depend on the order of summation.
+    The squared distances are integers below 2^24, which float32 represents exactly. The result
+    therefore does not depend on the order of summation.
+
+    Returns:
+        As `_nearest_bits`.
     """
     a, b = reference.astype(np.float32), frame.astype(np.float32)
     squares = np.sum(a * a, axis=1)[:, None] + np.sum(b * b, axis=1) - 2.0 * (a @ b.T)
@@ -175,7 +185,13 @@ def estimate_pose(
 ) -> FeaturePose | None:
     """Estimate the pose of a frame by PnP RANSAC from the 3D points of the reference features.
 
-    This function seeds RANSAC, so that equal input gives an equal result.
+    RANSAC starts from a fixed seed, so that equal input gives an equal result.
+
+    Args:
+        reference: Features of the reference keyframe; those without a measured depth are not used.
+        frame: Features of the frame.
+        camera: Intrinsics of the frame.
+        config: Settings.
 
     Returns:
         The pose, or None if there are fewer inliers than `config.min_inliers`.
@@ -207,9 +223,10 @@ class GicpConfig:
 
     level: int = 2  # Pyramid level of the points: 80 pixels wide.
     spacing: float = 0.03  # Voxel size of the downsampled points, in median depths.
-    # Maximum distance between corresponding points, in median depths: a large step of a robot.
+    # Maximum distance between corresponding points, in median depths; covers a large step of a
+    # robot.
     reach: float = 0.25
-    iterations: int = 30  # Maximum number.
+    iterations: int = 30  # Maximum number of GICP iterations.
     min_partners: float = 0.6  # Minimum fraction of the frame's points with a correspondence.
 
     def __post_init__(self) -> None:

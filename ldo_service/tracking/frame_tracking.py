@@ -1,10 +1,10 @@
 """Frame-to-keyframe tracking: the pose of a frame against its reference keyframe.
 
 The tracker aligns a frame from the pose that constant velocity predicts. If the tracking status of
-the result is not OK, the tracker also aligns the frame from all other initial guesses. It chooses
-the best result, whose quality determines the tracking status. A LOST camera is relocalized in the
-keyframe database. The module `odometry` decides whether the frame becomes a keyframe.
-Conventions: `ldo_service.geometry`.
+the result is not OK or the image moved far, the tracker also aligns the frame from all other
+initial guesses. The tracker chooses the best result, whose quality determines the tracking status.
+A LOST camera is relocalized in the keyframe database. The module `odometry` decides whether the
+frame becomes a keyframe. Conventions: `ldo_service.geometry`.
 """
 
 import logging
@@ -61,7 +61,7 @@ class FrameTracker:
 
     @property
     def can_reuse_keyframes(self) -> bool:
-        """True once `keyframe_reuse.after` keyframes were made; 0 there disables the reuse."""
+        """True once `keyframe_reuse.after` keyframes have been made; never if that setting is 0."""
         return 0 < self.config.keyframe_reuse.after <= self.state.next_id
 
     def track(self, frame: RgbdFrame, prior: PriorPose | None = None) -> TrackedFrame:
@@ -69,9 +69,9 @@ class FrameTracker:
 
         Args:
             frame: The frame; it may have neither texture nor depth.
-            prior: Camera pose from another odometry, such as wheels. It is an additional initial
-                guess. A new submap after a loss starts at the pose that it predicts. It does not
-                replace the images: a frame is OK only if its images confirm the pose.
+            prior: Camera pose from another odometry, such as wheels; None if unknown. It yields an
+                additional initial guess and the start pose of a new submap after a loss. A frame is
+                OK only if its images confirm the pose.
         """
         view, keyframe = self.view(frame), self.state.keyframe
         self._prior = prior
@@ -90,7 +90,8 @@ class FrameTracker:
             if found is None:
                 return self._lost_result(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, TrackingStatus.OK
-            # Reset both: noise differs between scenes, and motion evidence belongs to one keyframe.
+            # Reset the noise history, since noise differs between scenes. Reset the motion
+            # evidence, which is valid for one keyframe only.
             origin = KeyframeOrigin.KNOWN if self.can_reuse_keyframes else KeyframeOrigin.NEW
             self.state = replace(
                 self.state, history=ResidualHistory(), motion_evidence=None, origin=origin
@@ -175,9 +176,9 @@ class FrameTracker:
     def _track_against(
         self, keyframe: ReferenceKeyframe, view: Pyramid, stamp_ns: int
     ) -> PoseHypothesis:
-        """Align from the predicted pose, and try the other initial guesses if that is not enough.
+        """Align from the predicted pose; if the result is unsure, also from all other guesses.
 
-        It is not enough if the status is not OK or if the image moved far since the last frame.
+        The result is unsure if its status is not OK or if the image moved far since the last frame.
         """
         motion = self.state.motion
         T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
@@ -250,7 +251,8 @@ class FrameTracker:
     ) -> TrackedFrame:
         """Search the keyframes of other submaps at intervals.
 
-        If a match is confirmed, the returned frame needs a keyframe, which then merges the submaps.
+        If a match is confirmed, the returned frame needs a keyframe, and that keyframe merges the
+        submaps.
         """
         before, config = self.state.submaps, self.config.submaps
         if tracked.status is not TrackingStatus.OK or not before.is_search_due(config):
@@ -306,12 +308,13 @@ class FrameTracker:
         self._remember(
             frame, keyframe, motion if is_steady else motion.without_velocity(), history, status
         )
-        # Static surfaces contradict each other too if the pose is uncertain.
+        # Static surfaces would look dynamic too if the pose is uncertain.
         dynamic_mask = None
         if status is TrackingStatus.OK:
             dynamic_mask = self._segment_motion(keyframe, self.view(frame), alignment)
         if self.state.origin is KeyframeOrigin.KNOWN:
-            # A known keyframe may be old: a static object placed since then is not dynamic.
+            # A known keyframe may be old. An object that was placed since then looks dynamic, but
+            # stands still.
             dynamic_mask = None
             self.state = replace(self.state, dynamic_mask=None)
         needed = (
@@ -348,9 +351,10 @@ class FrameTracker:
     def _segment_motion(
         self, keyframe: ReferenceKeyframe, view: Pyramid, alignment: Alignment
     ) -> np.ndarray | None:
-        """Return the dynamic mask of a frame, [H, W] bool.
+        """Return the dynamic mask of a frame, [H, W] bool; None if motion segmentation is off.
 
-        Surface of the keyframe that has moved away since is added to the keyframe's ignore mask.
+        If much of the keyframe's surface has moved away, the ignore mask of the keyframe is
+        renewed.
         """
         config = self.config.moving
         if not config.is_on:

@@ -28,9 +28,10 @@ from .motion_segmentation import resized
 from .pyramid import Pyramid, PyramidConfig, build_pyramid
 from .tracking_quality import ResidualHistory
 
-# Columns and rows; coarse enough that a motion of 10 cm changes little.
+# Columns and rows of a thumbnail; so coarse that a camera motion of 10 cm changes it little.
 THUMBNAIL = 20, 15
-# Steps per standard deviation. Sums of products of 300 int8 are exact in float32.
+# Thumbnail values per standard deviation of the gray level. The correlation of two thumbnails, a
+# sum of 300 products of int8, is exact in float32.
 CONTRAST = 32.0
 # 16 bits reach 32 m in steps of half a millimeter, which is below the noise of any sensor.
 DEPTH_STEPS_PER_M = 2000.0
@@ -44,15 +45,18 @@ OLD_DATABASE_FILE = "places.msgpack"  # File name up to version 0.1; read for on
 class KeyframeDatabaseConfig:
     """Settings of the keyframe database."""
 
-    # Maximum number of records, 0.13 MB each at 640x480 (kitchen); beyond it the path is thinned.
+    # Maximum number of records, 0.13 MB each at 640x480 (sequence kitchen). Beyond it, the record
+    # with the closest neighbors on the path is removed.
     count: int = 1000
-    # ORB features of a record: half of those of a frame, which halves the time to match.
+    # Maximum number of ORB features of a record: half of those of a frame, to halve the time of
+    # matching.
     features: int = 500
-    # A new record replaces one within this distance, rad (`motion.image_motion_rad`): the newer
-    # one shows the current state. Half a step between keyframes, so that the database stops
-    # growing while a robot repeats its route.
+    # A new record replaces an older one within this distance, rad as in `motion.image_motion_rad`,
+    # because the new one shows the current state of the scene. The value is half the distance
+    # between keyframes, so that the database stops growing while a robot repeats its route.
     same: float = 0.1
-    # The newest records are not replaced: new keyframes are measured against them.
+    # Number of newest records that are never replaced, since new keyframes are measured against
+    # them.
     recent: int = 16
 
     def __post_init__(self) -> None:
@@ -73,11 +77,11 @@ class KeyframeRecord:
     submap: int
     T_odom_keyframe: np.ndarray  # [4, 4]
     median_depth_m: float
-    # Median photometric noise of the frames tracked before it, gray levels; 0 if unknown.
+    # Median photometric noise of the frames before the keyframe, gray levels; 0 if unknown.
     intensity_sigma: float
-    # Median geometric noise of the same frames, times the sensor model; 0 if unknown.
+    # Median geometric noise of these frames as a multiple of `DepthNoise`; 0 if unknown.
     depth_noise_scale: float
-    thumbnail: np.ndarray  # [300] int8 with mean 0 and normalized contrast.
+    thumbnail: np.ndarray  # [300] int8 with mean 0 and normalized contrast; see `make_thumbnail`.
     points_camera: np.ndarray  # Points of the features, [N, 3] float32 meters; all are measured.
     descriptors: np.ndarray  # [N, 32] uint8 ORB descriptors.
     camera: Camera  # Intrinsics of `gray` and `depth`.
@@ -102,9 +106,10 @@ class KeyframeRecord:
         return self.__dict__["_across_scales"]
 
     def history(self, otherwise: ResidualHistory) -> ResidualHistory:
-        """Return the usual residual noise of frames near this keyframe, to judge an alignment by.
+        """Return the residual noise that is usual near this keyframe, as a history.
 
-        Noise differs between scenes, so the history is made of the noise stored in this record.
+        Alignments to this keyframe are compared with this noise, because noise differs between
+        scenes.
 
         Args:
             otherwise: The history to return if the noise of this record is unknown.
@@ -293,7 +298,7 @@ class KeyframeDatabase:
     def with_reused(self, record: KeyframeRecord) -> "KeyframeDatabase":
         """Return the database with the record of a reused keyframe moved to the end.
 
-        The given record replaces the older one with the same id; its pose in odometry is new.
+        The given record has a new pose in odometry and replaces the record with the same id.
         """
         return KeyframeDatabase((*(other for other in self.all if other.id != record.id), record))
 
@@ -359,7 +364,7 @@ def neighbor_distances(path: Sequence[KeyframeRecord]) -> np.ndarray:
 
 
 def _apart(records: tuple[KeyframeRecord, ...], other: KeyframeRecord) -> np.ndarray:
-    """Return the distance of each record to another one.
+    """Return the distance of each record to `other`.
 
     Returns:
         [N], rad, as `motion.image_motion_rad` defines it; infinite for records of another submap.

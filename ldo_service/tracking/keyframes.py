@@ -25,23 +25,24 @@ class KeyframeConfig:
     min_overlap: float = 0.85
     max_rotation_rad: float = radians(15.0)
     max_translation: float = 0.08  # Fraction of the median depth.
-    # Frames per keyframe at least. A camera that turns by 10 degrees per frame needs a new one at
-    # every frame.
+    # Minimum number of frames between reference keyframes. A camera that turns by 10 degrees per
+    # frame needs a new one at every frame.
     min_frames: int = 1
-    # Frames per keyframe at most: at least every 30th frame becomes one while the camera moves.
+    # Maximum number of frames between reference keyframes while the camera moves.
     max_frames: int = 30
-    # If no keyframe may be made, a frame beyond this multiple of max_rotation_rad or
-    # max_translation, or with an overlap below min_overlap divided by it, becomes a reference for
-    # tracking alone (`Relay`). With 1, each frame that is held out would add a link to the chain.
+    # A frame can become a reference for tracking alone (`Relay`) while the caller allows no
+    # keyframe. It does if its motion exceeds this multiple of max_rotation_rad or max_translation,
+    # or if its overlap is below min_overlap divided by this ratio. With 1, each held-out frame that
+    # needs a keyframe would become a relay and add a link to the chain of relative poses.
     relay_ratio: float = 1.5
     # The camera stands still if the overlap is above still_overlap, and rotation (rad) and
     # translation (fraction of the median depth) are below still_motion.
     still_overlap: float = 0.97
     still_motion: float = 0.01
     # A frame becomes a mapping keyframe beyond this fraction of max_rotation_rad and
-    # max_translation; the reference keyframe stays. The map gains by more views, tracking by fewer
-    # references. Kitchen, held-out views at equal iterations: +0.4 dB, the worst +2 dB. Above 1: no
-    # mapping keyframes.
+    # max_translation; the reference keyframe stays. More views improve the map, and fewer
+    # references improve tracking. At equal iterations on the sequence kitchen, held-out views gain
+    # 0.4 dB, and the worst of them 2 dB. With a value above 1, there are no mapping keyframes.
     mapping_only_ratio: float = 0.33
 
     def __post_init__(self) -> None:
@@ -69,7 +70,10 @@ class KeyframeConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Relay:
-    """Pose of a reference that is no keyframe, in the last keyframe before it."""
+    """Pose of a relay, relative to the last keyframe before it.
+
+    A relay is a frame that later frames are aligned to although it is no keyframe.
+    """
 
     T_keyframe_relay: np.ndarray  # [4, 4]
     # [6, 6] for T_keyframe_relay * exp(xi), xi = (rotation rad, translation m).
@@ -82,7 +86,7 @@ class Relay:
 
         Args:
             T_relay_camera: Pose of the camera in the relay, [4, 4].
-            information: Its information, [6, 6]; zero for an unknown pose.
+            information: Information of that pose, [6, 6]; zero if the pose is unknown.
         """
         T_keyframe_camera = self.T_keyframe_relay @ T_relay_camera
         if not information.any():
@@ -93,26 +97,30 @@ class Relay:
 
 
 def covariance_of(information: np.ndarray) -> np.ndarray:
-    """Return the inverse of an information matrix [6, 6]; unobserved directions get 1 rad or m."""
+    """Return the covariance [6, 6] of an information matrix [6, 6].
+
+    Directions without information get a standard deviation of 1 rad or 1 m.
+    """
     return np.linalg.inv(information + np.eye(6))
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceKeyframe:
-    """Keyframe that frames are aligned to, or a relay between a keyframe and the frames."""
+    """Reference that frames are aligned to: a keyframe, or a relay (see `Relay`)."""
 
     view: Pyramid
     T_odom_keyframe: np.ndarray  # [4, 4]
-    # Ascending number from odometry, independent of the camera's frame numbers, which may restart.
+    # Ascending number that odometry assigns. The camera's frame numbers may restart, so they are
+    # not used.
     id: int
-    submap: int = 0  # Submap whose odometry frame T_odom_keyframe leads to.
-    # Pixels that have moved, [H, W] bool at working resolution; found by `segment_motion`.
+    submap: int = 0  # Submap in whose odometry frame T_odom_keyframe is expressed.
+    # Pixels whose surface has moved, [H, W] bool at working resolution; found by `segment_motion`.
     moved_mask: np.ndarray | None = None
     ignore_mask: np.ndarray | None = None  # `moved_mask` grown by `grow_mask`, [H, W] bool.
     dynamic_class_mask: np.ndarray | None = None  # Objects of dynamic classes, [H, W] bool.
     # ORB features of a keyframe record; they come from a larger image than `view`.
     stored_features: Features | None = None
-    # The view is that of a frame after the keyframe `id`, which is no keyframe itself.
+    # Pose of the relay relative to the keyframe `id`, if `view` is a relay; None for a keyframe.
     relay: Relay | None = None
 
     @cached_property
@@ -124,7 +132,8 @@ class ReferenceKeyframe:
     def features(self, config: FeatureConfig) -> Features:
         """Return the ORB features.
 
-        The features are detected on the first call and cached. Most keyframes never need them.
+        The features are detected on the first call and cached, because most keyframes never need
+        any.
         """
         if self.stored_features is not None:
             return self.stored_features
@@ -214,7 +223,14 @@ def needs_keyframe(
 def left_keyframe_view(
     T_keyframe_camera: np.ndarray, overlap: float, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
-    """Return whether a frame is too far from its keyframe or shows too little of its surface."""
+    """Return whether a frame is too far from a keyframe or shows too little of its surface.
+
+    Args:
+        T_keyframe_camera: Pose of the frame in the keyframe, [4, 4].
+        overlap: Fraction of the keyframe's surface that the frame shows, 0..1.
+        median_depth_m: Median depth of the keyframe.
+        config: Limits.
+    """
     is_elsewhere = bool(limit_ratios(T_keyframe_camera, median_depth_m, config) > 1)
     return is_elsewhere or overlap < config.min_overlap
 
@@ -222,9 +238,12 @@ def left_keyframe_view(
 def needs_mapping_keyframe(
     T_mapped_camera: np.ndarray, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
-    """Return whether a frame should become a mapping keyframe.
+    """Return whether the camera has moved far enough for a mapping keyframe.
 
-    It should if the camera has moved far enough since the last mapped frame.
+    Args:
+        T_mapped_camera: Pose of the camera relative to the last mapped frame, [4, 4].
+        median_depth_m: Median depth of the reference keyframe.
+        config: Limits.
     """
     left = float(limit_ratios(T_mapped_camera, median_depth_m, config))
     return left > config.mapping_only_ratio and config.mapping_only_ratio <= 1

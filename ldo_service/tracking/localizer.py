@@ -22,34 +22,40 @@ from .submaps import SubmapConfig, SubmapMatch
 from .tracking_quality import TrackingStatus
 from .tracking_result import KeyframeKind, TrackedFrame, TrackingResult, make_tracking_result
 
-MAP = -1  # The map, in place of the number of a submap.
+MAP = -1  # Value of `SubmapMatch.there` for the map, which has no submap number.
 
 
 @dataclass(frozen=True, slots=True)
 class MapFix:
     """Pose of the odometry frame in the map, and the last relocalization match."""
 
-    submap: int = 0  # Submap of odometry.
-    T_map_odom: np.ndarray | None = None  # [4, 4]; None before the camera is found.
-    pending_match: SubmapMatch | None = None
-    frames_since_search: int = 0  # Frames since the last search.
+    submap: int = 0  # Current submap of odometry.
+    T_map_odom: np.ndarray | None = None  # [4, 4]; None before the camera is found in the map.
+    pending_match: SubmapMatch | None = None  # Last relocalization match; None before the first.
+    frames_since_search: int = 0  # Frames since the last search of the map.
 
     def is_search_due(self, config: SubmapConfig) -> bool:
-        """Return whether to search the map with this frame.
+        """Return whether to relocalize the current frame in the map.
 
-        Every frame is searched until the camera is found, then one in
+        Every frame is relocalized until the camera is found, then one in
         `config.search_interval_frames`.
         """
         return self.T_map_odom is None or self.frames_since_search >= config.search_interval_frames
 
     def after(self, tracked: TrackedFrame) -> "MapFix":
-        """Return the fix after one more frame; a new submap of odometry has an unknown pose."""
+        """Return the fix after one more frame.
+
+        If odometry has started a new submap, T_map_odom is unknown again.
+        """
         if tracked.submap != self.submap:
             return MapFix(tracked.submap)
         return replace(self, frames_since_search=self.frames_since_search + 1)
 
     def with_search_result(self, look: SubmapMatch, config: SubmapConfig) -> "MapFix":
-        """Return the fix after a match; T_map_odom changes only if the previous match agrees."""
+        """Return the fix after a relocalization match.
+
+        T_map_odom changes only if the previous match agrees with the new one.
+        """
         is_confirmed = self.pending_match is not None and self.pending_match.is_consistent_with(
             look, config
         )
@@ -72,7 +78,7 @@ class MapFix:
 class Localizer(Odometry):
     """Odometry of one camera, with its pose in a finished map.
 
-    It makes keyframes for tracking only; they do not change the map.
+    The localizer makes keyframes for tracking only, which do not change the map.
     """
 
     def __init__(
@@ -110,7 +116,7 @@ class Localizer(Odometry):
             The pose of the frame in odometry and in the map. The status is LOST until the camera is
             found in the map. `reference` is None, since the keyframes made here are not in the map.
         """
-        # Track in odometry with its own keyframes.
+        # Track the frame in odometry, against keyframes that are not in the map.
         reading = self._read(prior, frame)
         tracked = self._frames.track(frame, reading)
         if tracked.should_start_submap:

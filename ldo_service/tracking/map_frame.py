@@ -16,7 +16,8 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 
 from .tracking_result import TrackedFrame
 
-# Four credit windows of keyframe/new; the pose-graph optimizer cannot lag further behind.
+# Number of newest keyframes whose poses are stored: four credit windows of the topic keyframe/new.
+# The pose-graph optimizer cannot lag behind by more keyframes.
 RECENT_KEYFRAMES = 32
 
 
@@ -25,16 +26,17 @@ class MapCorrection:
     """Keyframe poses of one version of the pose graph, decoded on demand."""
 
     version: int
-    roots: Mapping[int, int]  # Oldest merged submap, by submap.
-    # Returns T_map_keyframe [4, 4] by id, for all keyframes or for the given ones and the newest.
+    roots: Mapping[int, int]  # Oldest submap that a submap is merged with, by submap.
+    # Function that returns T_map_keyframe [4, 4] by id. Its argument is the ids of the keyframes to
+    # return besides the newest one; None returns all keyframes.
     read_poses: Callable[[Iterable[int] | None], Mapping[int, np.ndarray]]
 
 
 class MapFrame:
     """Pose of the odometry frame in the map, by keyframe.
 
-    It stores the poses of the last keyframes and of the reference keyframe. The poses of older
-    keyframes come from the last correction by the pose-graph optimizer.
+    The class stores the poses of the last keyframes and of the reference keyframe. The poses of
+    older keyframes come from the last correction by the pose-graph optimizer.
     """
 
     def __init__(self) -> None:
@@ -67,11 +69,11 @@ class MapFrame:
         return is_newer
 
     def T_map_odom(self, reference: int | None) -> np.ndarray:
-        """Return T_map_odom [4, 4] of a stored keyframe; None as keyframe gives the identity."""
+        """Return T_map_odom [4, 4] of a stored keyframe; the identity if `reference` is None."""
         return np.eye(4) if reference is None else self._poses.T_map_odom(reference)
 
     def T_map_camera(self, tracked: TrackedFrame) -> np.ndarray | None:
-        """Return the camera pose in the map [4, 4], or None if its reference is not stored."""
+        """Return the pose [4, 4] of a frame in the map, or None if its reference is not stored."""
         if tracked.reference is None or tracked.reference not in self._poses:
             return None
         return self._poses[tracked.reference] @ tracked.T_reference_camera
@@ -101,9 +103,10 @@ class MapFrame:
         self._keep(keyframe, tracked.reference, next_reference)
 
     def place_reference(self, tracked: TrackedFrame) -> None:
-        """Add the reference of a frame, a known keyframe whose pose is not stored here any more.
+        """Store the pose of a frame's reference, a known keyframe whose pose is no longer stored.
 
-        The pose comes from the last correction, or from odometry if the correction lacks it.
+        The pose comes from the last correction, or from odometry if the correction lacks the
+        keyframe.
         """
         keyframe = tracked.reference
         if keyframe is None:
@@ -131,7 +134,7 @@ class MapFrame:
     def _keep(self, newest: int, *references: int | None) -> None:
         """Drop all keyframes except for the references and the last `RECENT_KEYFRAMES`.
 
-        The last correction may not contain the most recent keyframes yet.
+        The last keyframes are kept because the last correction may not contain them yet.
         """
         self._poses.keep_only(self._needed(newest, references))
 

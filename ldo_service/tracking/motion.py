@@ -14,15 +14,16 @@ class ConstantVelocity:
     """Constant-velocity motion model: the last accepted pose and the motion before it."""
 
     T_odom_camera: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4]
-    # Motion to the last pose over `interval_ns`, [6]: rotation rad, then translation m.
+    # Motion from the pose before to the last pose, [6]: rotation rad, then translation m.
     twist: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    interval_ns: int = 0
-    stamp_ns: int = 0
+    interval_ns: int = 0  # Time between these two poses; 0 if unknown.
+    stamp_ns: int = 0  # Stamp of the last pose.
 
     def predicted(self, stamp_ns: int) -> np.ndarray:
         """Return T_odom_camera [4, 4] at a stamp: T * exp(twist * elapsed / interval).
 
-        If a stamp is missing or not later than the last one, the elapsed time is one interval.
+        The elapsed time is limited to MAX_STEPS intervals. It counts as one interval if the stamp
+        is not later than the last one, or if the interval is unknown.
         """
         elapsed_ns = stamp_ns - self.stamp_ns
         timed = elapsed_ns > 0 and self.interval_ns > 0

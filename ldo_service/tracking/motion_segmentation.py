@@ -1,13 +1,14 @@
 """Motion segmentation by depth differences between a keyframe and an aligned frame.
 
-The points of each image are projected into the other one and compared with its depth:
+Points of the frame are projected into the keyframe, and points of the keyframe into the frame. Each
+point is compared with the depth measured there:
 
 - A point of the frame lies in front of the keyframe's surface: it has appeared since the keyframe.
 - A point of the keyframe lies in front of the frame's surface: it has disappeared since the
   keyframe, as the frame measured depth behind it.
 
-Both cases contradict a static scene. A point of the frame behind the keyframe's surface does not
-contradict it, since that surface may have hidden the point. Conventions: `ldo_service.geometry`.
+Both cases contradict a static scene. A point of the frame behind the keyframe's surface is no
+contradiction, since that surface may have hidden the point. Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
@@ -30,26 +31,30 @@ class MotionSegmentationConfig:
 
     is_on: bool = True  # False: the scene is assumed to be static.
     level: int = 1  # Pyramid level of the comparison: 160 pixels wide.
-    # Minimum depth difference that contradicts a static scene. It covers pose errors within the
-    # range of a keyframe.
+    # Minimum depth difference that contradicts a static scene. It covers the pose errors of frames
+    # that are tracked against one keyframe.
     min_m: float = 0.06
-    # Multiple of the depth noise, as estimated by alignment, that is added to the minimum.
+    # Multiple of the depth noise, as estimated by alignment, that is added to min_m.
     sigmas: float = 4.0
-    # Radius within which the nearest surface counts as the measured one; tolerates outlines that
-    # are slightly off.
+    # Radius, pixels, within which the nearest surface counts as the measured one. It tolerates
+    # object outlines that are off by a few pixels.
     edge_px: int = 2
     # Minimum size of a connected region, fraction of the image; smaller regions are noise.
     min_share: float = 0.0015
-    # A region must be within this distance of a contradicting pixel of the previous frame.
+    # A region counts only if the previous frame had a pixel within this distance, in pixels, that
+    # contradicted a static scene too.
     streak_px: int = 5
-    # The dynamic mask grows to pixels within this distance and this difference of depth. They
-    # belong to parts of the same object that were there already or stand on the floor.
+    # The dynamic mask grows to pixels within this distance and this depth difference. Such pixels
+    # show parts of the same object that do not contradict a static scene: parts that were there
+    # already, or that stand on the floor.
     spread_px: int = 8
     spread_m: float = 0.12
     rim_px: int = 1  # Margin around the grown mask, for mixed pixels.
-    # Frames that must see through a keyframe's point before it counts as moved.
+    # Number of frames that must measure a depth behind a point of the keyframe before the point
+    # counts as moved.
     gone_frames: int = 2
-    # Fraction of the keyframe that must have moved in addition before its mask is updated.
+    # The keyframe's mask is updated when more than this fraction of the keyframe's pixels has moved
+    # since the last update.
     renewed_share: float = 0.005
 
     def __post_init__(self) -> None:
@@ -80,7 +85,8 @@ class MotionEvidence:
     """State of motion segmentation between frames, at pyramid level `config.level`."""
 
     contradicts: np.ndarray  # Pixels of the last frame that contradict a static scene, [h, w] bool.
-    # Number of frames that saw through each point of the keyframe, [h, w] uint8; None if zero.
+    # Number of frames that measured a depth behind each point of the keyframe, [h, w] uint8; None
+    # if it is zero everywhere.
     gone: np.ndarray | None
 
     def fits(self, now: Level, then: Level) -> bool:
@@ -135,7 +141,7 @@ class _Pair:
         """Return the pixels [h, w] bool of the frame that have appeared since the keyframe.
 
         Such a pixel lies in front of the keyframe's surface. A pixel that projects onto a moved
-        pixel of the keyframe also counts if it lies on the surface.
+        pixel of the keyframe counts too, unless it lies behind the surface.
         """
         ahead_m = depth_gap_m(self.now, self.then, self.T_then_now, self.config)
         limit_m = self.limit_m(self.now)
@@ -143,9 +149,11 @@ class _Pair:
         return (ahead_m > limit_m) | (on_moved & (ahead_m > -limit_m))
 
     def gone(self, before: MotionEvidence | None) -> np.ndarray:
-        """Return how many frames saw through each point of the keyframe, [h, w] uint8.
+        """Return how many frames measured a depth behind each point of the keyframe, [h, w] uint8.
 
-        A frame sees through a point if it measures a depth behind it.
+        Args:
+            before: Counts of the previous frames, to which this frame is added; None if there are
+                none.
         """
         ahead_m = depth_gap_m(self.then, self.now, se3.inverse(self.T_then_now), self.config)
         through = _bytes(ahead_m > self.limit_m(self.then))
@@ -175,10 +183,13 @@ def segment_motion(
             none.
         T_keyframe_camera: Pose of the frame in the keyframe, [4, 4].
         noise_scale: Factor on the depth noise, as estimated by alignment.
-        before: State after the previous frame, or None. If the keyframe has changed since, pass
-            the result of `MotionEvidence.of_new_keyframe`.
+        before: State after the previous frame; None if there is none. If the keyframe has changed
+            since, pass the result of `MotionEvidence.of_new_keyframe`.
         config: Settings.
         noise: Depth noise of the camera.
+
+    Returns:
+        The masks of the frame and of the keyframe, and the state for the next frame.
     """
     now, then = _level(view, config), _level(keyframe, config)
     pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)
@@ -293,8 +304,8 @@ def _in_pieces(
 
     Args:
         contradicts: Pixels that contradict a static scene, [h, w] bool.
-        before: Such pixels of the previous frame; a region must come within `streak_px` pixels of
-            one of them. None skips this test.
+        before: Pixels of the previous frame that contradict a static scene, [h, w] bool. A region
+            must come within `streak_px` pixels of one of them. None skips this test.
         config: Settings.
 
     Returns:

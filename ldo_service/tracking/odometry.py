@@ -15,10 +15,10 @@
    submaps if a match between them is confirmed.
 5. Compute T_map_odom from the last correction of the pose graph (`MapFrame`).
 
-The caller decides with `may_map` whether step 4 may make a keyframe. It passes False while the
-mapper is too slow to take another one. Tracking then continues against the same reference keyframe.
-If that leaves the view, a frame becomes the reference without being a keyframe (`Relay`).
-Conventions: `ldo_service.geometry`.
+The caller decides with `may_map` whether step 4 may make a keyframe. The caller passes False while
+the mapper is too busy for another keyframe. Tracking then continues against the same reference
+keyframe. If the camera leaves the view of that keyframe, a frame becomes the reference without
+being a keyframe (`Relay`). Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -93,8 +93,8 @@ class Odometry:
             prior: The last poses of another odometry, such as wheels. They yield an additional
                 initial guess, and dead reckoning while tracking is LOST. They do not replace the
                 images: a frame is OK only if its images confirm the pose.
-            may_map: Allow a new keyframe or submap. If it is False and a keyframe is needed,
-                `TrackingResult.denied_keyframe` names its kind.
+            may_map: True allows a new keyframe or submap. If it is False and a keyframe is needed,
+                `TrackingResult.denied_keyframe` names the kind of keyframe.
 
         Returns:
             The pose of the frame, and the keyframe that was made of it, if any.
@@ -108,9 +108,10 @@ class Odometry:
         needed = KeyframeKind.FIRST if tracked.should_start_submap else tracked.needed_keyframe
         if tracked.should_start_submap and may_map:
             tracked = self._frames.start_submap(frame)
-        # Reuse a known keyframe as the reference instead of making a new one. After new keyframes,
-        # one more is made first and measured from the known one. It connects the known one to the
-        # last references in the pose graph.
+        # Reuse a known keyframe as the reference instead of making a new keyframe. If the current
+        # reference has no measured pose relative to a known keyframe, one more keyframe is made
+        # first. It is measured from the known keyframe, to connect the known keyframe to the last
+        # references in the pose graph.
         known, reused = self._find_reusable_keyframe(frame, tracked), None
         if known is not None and self._is_connected_to_map:
             tracked = self._switch_to_keyframe(known, tracked)
@@ -124,7 +125,7 @@ class Odometry:
             self._frames.state = self._frames.state.with_relay(
                 view, T_odom_camera, tracked.relay(), tracked.dynamic_mask
             )
-        # Compute odometry in the map, at the reference.
+        # Return T_map_odom of the reference with the pose.
         reference = tracked.reference
         if reference is None and keyframe is not None:
             reference = keyframe.id
@@ -168,7 +169,7 @@ class Odometry:
         return CameraMotion(state.motion.T_odom_camera, depth_m)
 
     def mask_dynamic_objects(self, keyframe: int, boxes: Sequence[Box]) -> None:
-        """Mask objects of dynamic classes in the reference keyframe.
+        """Mask objects of dynamic classes in the reference keyframe and in its record.
 
         Args:
             keyframe: Id of the keyframe in which the boxes were detected. If it is no longer the
@@ -197,8 +198,8 @@ class Odometry:
         """Return the state that the next results depend on, except for the last correction.
 
         Returns:
-            Arrays and plain values. An entry that has not changed since the last snapshot is the
-            same object (keyframes and their records), so the caller can detect changes by identity.
+            Arrays and plain values. A keyframe or record that has not changed since the last
+            snapshot is the same object, so the caller can detect changes by identity.
         """
         return {**pack(self._frames.state), "poses": self._map.snapshot()}
 
@@ -226,7 +227,10 @@ class Odometry:
         return self._frames.state.origin is not KeyframeOrigin.NEW
 
     def _has_left_keyframe(self, tracked: TrackedFrame) -> bool:
-        """Return whether an OK frame is so far from its reference that tracking needs another."""
+        """Return whether an OK frame is so far from its reference that it must become a relay.
+
+        The limits are those of `KeyframeConfig.relay_ratio`.
+        """
         keyframe = self._frames.state.keyframe
         if keyframe is None:
             return False
@@ -238,7 +242,12 @@ class Odometry:
     def _find_reusable_keyframe(
         self, frame: RgbdFrame, tracked: TrackedFrame
     ) -> ReusedKeyframe | None:
-        """Return a known keyframe to use instead of the new one that a frame needs, or None."""
+        """Find a known keyframe to use instead of the new keyframe that a frame needs.
+
+        Returns:
+            The known keyframe. None if the frame needs no keyframe or merges submaps, if reuse is
+            off, or if no known keyframe is verified.
+        """
         is_needed = tracked.needed_keyframe is not None and tracked.submap_measurement is None
         if not is_needed or not self._frames.can_reuse_keyframes:
             return None
@@ -258,7 +267,7 @@ class Odometry:
         return self._reuse.find(self._frames.view(frame), near, state.history)
 
     def _switch_to_keyframe(self, known: ReusedKeyframe, tracked: TrackedFrame) -> TrackedFrame:
-        """Make a known keyframe the reference, and return the frame's result relative to it.
+        """Make a known keyframe the reference, and return the pose of the frame relative to it.
 
         The pose of the frame in odometry does not change. The keyframe gets a new pose in odometry
         and moves to the current submap.
@@ -323,8 +332,8 @@ class Odometry:
         Args:
             frame: The frame.
             tracked: The tracking result of the frame, not LOST.
-            is_connected: The new keyframe is measured from a known one. The next frames may then
-                reuse known keyframes.
+            is_connected: True if the new keyframe is measured from a known one. The next frames may
+                then reuse known keyframes.
         """
         frames = self._frames
         if tracked.pose_source == "first":
@@ -343,8 +352,8 @@ class Odometry:
     def _add_mapping_keyframe(self, frame: RgbdFrame, tracked: TrackedFrame) -> int:
         """Make the frame a mapping keyframe, and return its id; the reference stays.
 
-        The record of the last mapping keyframe is kept: it is the keyframe closest to the camera if
-        tracking is lost next.
+        The record of the mapping keyframe is kept, because this keyframe is the closest one to the
+        camera if tracking is lost next.
         """
         keyframe = self._keyframe_of(frame, tracked)
         self._frames.state = replace(

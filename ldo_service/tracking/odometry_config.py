@@ -38,8 +38,8 @@ class OdometryConfig:
     moving: MotionSegmentationConfig = field(default_factory=MotionSegmentationConfig)
     movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
-    # Image motion from which all initial guesses are tried, image widths per frame: 2 pixels of the
-    # coarsest level.
+    # Image motion, in image widths per frame, above which all initial guesses are tried. The
+    # default is 2 pixels of the coarsest pyramid level.
     large_motion: float = 0.05
 
     def __post_init__(self) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
-# Number of poses kept: a third of a second at 200 Hz; frames are not tracked later than that.
+# Number of poses kept: a third of a second at 200 Hz. A frame is tracked within that time.
 KEPT = 64
 
 
@@ -25,17 +25,22 @@ KEPT = 64
 class PriorConfig:
     """Settings of the odometry prior."""
 
-    # Maximum time between two poses for interpolation; a longer path is not straight.
+    # Maximum time between two poses that are interpolated; over a longer time, the path between the
+    # poses is not straight.
     max_gap_s: float = 0.25
-    # Maximum extrapolation past the newest pose at its velocity: one period of wheels at 20 Hz.
+    # Maximum time of extrapolation past the newest pose: one period of wheel odometry at 20 Hz.
     max_extrapolation_s: float = 0.05
-    # A faster motion between two poses is a jump: tracking follows no camera that fast.
+    # Speed between two poses above which the motion is a jump; tracking cannot follow a faster
+    # camera.
     max_speed_m_per_s: float = 10.0
-    # A faster turn between two poses is a jump; a hand turns a camera at up to 10 rad/s.
+    # Turn rate between two poses above which the motion is a jump; a hand turns a camera at up to
+    # 10 rad/s.
     max_turn_rad_per_s: float = 20.0
-    # A stamp that is this much earlier is not jitter: the source has restarted.
+    # If a stamp is earlier than the last one by more than this, the source has restarted. Smaller
+    # differences are jitter.
     restart_after_s: float = 1.0
-    # Maximum time of dead reckoning since the last OK frame: 2 % drift at 0.5 m/s are 30 cm then.
+    # Maximum time of dead reckoning since the last OK frame. At 0.5 m/s, a drift of 2 % is then
+    # 30 cm.
     max_dead_reckoning_s: float = 30.0
 
     def __post_init__(self) -> None:
@@ -60,7 +65,7 @@ class PriorConfig:
 
 
 class PriorCheck(StrEnum):
-    """Outcome of adding a pose to the buffer. Each value is the end of a log line on the pose."""
+    """Outcome of adding a pose to the buffer; each value is the predicate of a log line."""
 
     FOLLOWS = "follows the last one"
     LATE = "has a stamp that is not after the last one's, and is dropped"
@@ -83,7 +88,7 @@ class PriorPose:
 
     stamp_ns: int
     T_prior_camera: np.ndarray  # [4, 4]
-    session: int  # The relative motion of two poses is known within one session only.
+    session: int  # Number of the session; motion between poses of different sessions is unknown.
 
 
 @dataclass(frozen=True, slots=True)

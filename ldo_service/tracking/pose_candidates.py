@@ -26,10 +26,11 @@ PHOTOMETRIC_ONLY_WEIGHT = 0.05
 class PoseHypothesisConfig:
     """Settings of the selection between pose hypotheses."""
 
-    # Two poses agree within this rotation plus parallax; the error of 9 of 10 ORB-PnP poses was
-    # 3 cm or less.
+    # Two poses agree if their rotation plus parallax (`image_motion_rad`) is below this. Of the
+    # poses by ORB features and PnP, 9 of 10 had an error of at most 3 cm.
     agreement_rad: float = 0.06
-    # Fraction of the best support; the images refute a hypothesis with less.
+    # Minimum support of a hypothesis as a fraction of the best hypothesis's support. The images
+    # refute a hypothesis with less support.
     min_support_ratio: float = 0.5
 
     def __post_init__(self) -> None:
@@ -46,16 +47,17 @@ class PoseHypothesis:
 
     alignment: Alignment
     # Initial guess: "direct" from constant velocity or rest, "prior" from another odometry,
-    # "features" from ORB, "gicp" from point clouds.
+    # "features" from ORB, "gicp" from point clouds, "relocalized" from features of a keyframe
+    # record, "reused" from the map.
     pose_source: str
     median_depth_m: float  # Median depth of the keyframe.
-    # An independent estimate agrees (True) or contradicts (False); None without an independent
-    # estimate, or if the images refute it.
+    # True if an independent estimate of the pose, by features or GICP, agrees; False if it
+    # disagrees. None if there is no such estimate, or if the images refute the estimate.
     is_confirmed: bool | None = None
     # Distance to the farthest other hypothesis that the images support.
     hypothesis_spread_rad: float = 0.0
-    agrees_with_prior: bool = False  # The odometry prior predicts this pose.
-    # Distance to the pose by features alone; infinite without one.
+    agrees_with_prior: bool = False  # True if the odometry prior predicts this pose.
+    # Distance to the pose by features alone; infinite if unknown.
     feature_distance_rad: float = inf
 
 
@@ -89,11 +91,13 @@ def support(
     view: Pyramid,
     config: AlignConfig,
 ) -> float:
-    """Return the support of a hypothesis: the fraction of the keyframe's points it explains, 0..1.
+    """Return the support of a hypothesis: a weighted fraction of inliers, 0..1.05.
+
+    The inliers are counted among the reference points of the keyframe.
 
     Alignment has estimated the noise of each hypothesis separately, and a wrong pose inflates the
-    estimate. All hypotheses are therefore evaluated with the smallest of these estimates. Points
-    with a measured depth dominate; points with gray level alone have the weight 0.05.
+    noise. All hypotheses are therefore evaluated with the smallest of these noise estimates. Points
+    that are paired with a measured depth have the weight 1, all visible points a weight of 0.05.
 
     Args:
         candidate: The hypothesis.
@@ -161,7 +165,7 @@ def hypothesis_distance_rad(candidate: PoseHypothesis, T_keyframe_camera: np.nda
 
 @dataclass(frozen=True, slots=True)
 class InitialGuessAligner:
-    """Direct alignment of a frame from one or several initial guesses; stateless."""
+    """Direct alignment of a frame from one or several initial guesses, without state."""
 
     align: AlignConfig
     features: FeatureConfig
@@ -190,7 +194,7 @@ class InitialGuessAligner:
         """Align from all initial guesses besides constant velocity; return the best hypothesis.
 
         Args:
-            predicted: Hypothesis from the constant-velocity guess, which takes part in the choice.
+            predicted: Hypothesis from the constant-velocity guess; it may be the best one.
             keyframe: The keyframe.
             view: Pyramid of the frame.
             T_keyframe_previous: Initial guess that the camera has not moved: T_keyframe_camera
@@ -205,7 +209,8 @@ class InitialGuessAligner:
         if second is not None:
             candidates.append(align_hypothesis(keyframe, view, second, pose_source, self.align))
         chosen = select_hypothesis(candidates, second, keyframe, view, self.candidates, self.align)
-        # The hypothesis that started at the pose by features confirms it only if it converged.
+        # A hypothesis that started at the feature pose may still be there if alignment has not
+        # converged. Its distance to the feature pose is then no evidence.
         is_independent = chosen.pose_source != "features" or chosen.alignment.converged
         if second is not None and pose_source == "features" and is_independent:
             distance_rad = hypothesis_distance_rad(chosen, second)

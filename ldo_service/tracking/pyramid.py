@@ -2,8 +2,8 @@
 
 Gray images and depth are halved by averaging 2x2 blocks, as `Camera.halved` expects. The center of
 a coarse pixel is the corner between the four fine pixels of its block. `cv2.pyrDown` would center
-it on one of these pixels; this offset of half a pixel doubles the trajectory error. The reference
-points are the surface points of a keyframe, to which frames are aligned.
+the coarse pixel on one of these four; this offset of half a pixel doubles the trajectory error. The
+reference points are the surface points of a keyframe, to which frames are aligned.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -16,7 +16,8 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame
 from ldo_service.kernels import _align
 
-# Gray levels from here on are clipped: one color channel is saturated and the others nearly are.
+# Gray level from which a pixel counts as overexposed: at least one color channel is saturated, and
+# the others nearly are.
 CLIPPED = 250
 ANY_DIFFERENCE = 1e3  # Relative tolerance that excludes no value.
 
@@ -28,13 +29,15 @@ Intrinsics = tuple[float, float, float, float]
 class PyramidConfig:
     """Settings of the image pyramid."""
 
-    # Width of the finest level: the image is halved until it is below 1.5 times this width.
+    # Width of the finest level: the image is halved until it is narrower than 1.5 times this width.
     working_width_px: int = 320
     levels: int = 4  # Maximum number of levels: 320, 160, 80, 40 pixels wide.
     min_side_px: int = 12  # Minimum side of a level; smaller images have too few pixels.
-    # Relative depth difference within a 2x2 block; blocks across an edge keep the nearer surface.
+    # Maximum depth difference within a 2x2 block that is averaged, as a fraction of the nearest
+    # depth. In a block across an edge, only the nearer surface is averaged.
     depth_tolerance: float = 0.03
-    # Larger depths are dropped: no depth camera measures beyond, and 65 m is a stray value.
+    # Larger depths are dropped, because no depth camera measures farther. Values such as 65 m are
+    # errors of the camera.
     max_depth_m: float = 30.0
 
     def __post_init__(self) -> None:
@@ -53,7 +56,8 @@ class PyramidConfig:
 class Level:
     """One level of an image pyramid."""
 
-    # [H, W, 4] float32: gray level, its gradients along u and v per pixel, depth in meters.
+    # [H, W, 4] float32: gray level, gradients of the gray level along u and v per pixel, depth in
+    # meters.
     texels: np.ndarray
     camera: Camera
 
@@ -116,8 +120,8 @@ def halved_depth(depth_m: np.ndarray, tolerance: float) -> np.ndarray:
 
     Args:
         depth_m: Depth, [H, W] float32 meters; 0 where unknown.
-        tolerance: Largest depth difference to the nearest pixel of the block, as a fraction of its
-            depth. Pixels farther away are excluded from the average.
+        tolerance: Maximum depth difference to the nearest pixel of the block, as a fraction of the
+            nearest depth. Pixels farther away are excluded from the average.
 
     Returns:
         [H//2, W//2] float32 meters.
@@ -137,9 +141,10 @@ def build_pyramid(
         smallest = min(scaled.width, scaled.height) // 2
         if len(levels) == config.levels or smallest < config.min_side_px:
             break
-        # The valid pixels of a partly clipped block are darker than the whole block. Such blocks
-        # are excluded down to the finest level. Coarser levels, which only give the initial
-        # guess of finer ones, keep them: they would have too few pixels otherwise.
+        # The valid pixels of a partly overexposed block are darker than the whole block. Such
+        # blocks are excluded until the finest level is reached. The coarser levels keep them, since
+        # too few pixels would remain, and since these levels only yield the initial guess of finer
+        # levels.
         image = halved_image(image, least=1 if levels else 4)
         depth, scaled = halved_depth(depth, config.depth_tolerance), scaled.halved()
     if not levels:  # The image is wide and too low to be halved.
@@ -156,7 +161,7 @@ def pyramid_of(frame: RgbdFrame, config: PyramidConfig) -> Pyramid:
 
 @dataclass(frozen=True, slots=True)
 class DepthNoise:
-    """Axial noise sigma(z) = floor + growth (z - nearest)^2 of a depth camera.
+    """Noise of a depth camera along the optical axis: sigma(z) = floor + growth (z - nearest)^2.
 
     The defaults are those of the Kinect (Nguyen, Izadi and Lovell 2012, equation 5). The shape of
     the curve matters more than its scale: alignment estimates a factor on the curve for each frame.
@@ -218,6 +223,6 @@ def _without(level: Level, ignore_mask: np.ndarray | None) -> Level:
 
 def _level_points(level: Level, index: int) -> np.ndarray:
     smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(level.depth_m), 3), np.float32)
-    radius_px = max(1, 3 - index)  # The angle is about the same on each level.
+    radius_px = max(1, 3 - index)  # The radius spans about the same angle on each level.
     normals = _align.normals(smooth, level.intrinsics, radius_px)
     return _align.points(level.texels, normals, level.intrinsics)

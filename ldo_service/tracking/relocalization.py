@@ -1,10 +1,10 @@
 """Relocalization of a lost camera, and keyframe reuse. Conventions: `ldo_service.geometry`.
 
 Relocalization. A lost frame is compared with the keyframe records whose thumbnails are most similar
-to it. It is also compared with a few further records, which change from search to search. The time
-per frame is thus independent of the size of the database, and every record is tried eventually. If
-ORB features find no match, SIFT features are tried on the newest records and a few others. SIFT
-matches at twice the distance and takes ten times as long.
+to that of the frame. It is also compared with a few further records, which change from search to
+search. The time per frame is thus independent of the size of the database, and every record is
+tried eventually. If ORB features find no match, SIFT features are tried on the newest records and a
+few others. SIFT matches at half and twice the distance and takes ten times as long.
 
 A record is accepted if features and direct alignment agree on the pose. The criteria are stricter
 than in tracking, since no predicted pose supports the result. A match is ambiguous and rejected if
@@ -14,9 +14,9 @@ is unknown here.
 
 Keyframe reuse. A robot that repeats its route would make similar keyframes on every run, and the
 map would grow without limit. This is avoided once the map has many keyframes. Before a new keyframe
-is made, the tracker searches for a known keyframe that shows the same surface. It is reused only if
-the map and the images agree on the pose of the camera. If they disagree, odometry has drifted. New
-keyframes are then made, so that a loop closure can correct the map.
+is made, the tracker searches for a known keyframe that shows the same surface. The known keyframe
+is reused only if the map and the images agree on the pose of the camera. If they disagree, odometry
+has drifted. New keyframes are then made, so that a loop closure can correct the map.
 
 A camera may come from newly mapped surface back to a known keyframe. The tracker then makes one
 more keyframe, measured relative to the known one, to connect both in the pose graph.
@@ -65,24 +65,31 @@ PosedRecord = tuple[KeyframeRecord, FeaturePose]
 class RelocalizationConfig:
     """Settings of relocalization."""
 
-    # Records per lost frame by similarity of the thumbnail, as in the prototype.
+    # Number of records with the most similar thumbnails that a frame is compared with, as in the
+    # prototype.
     appearance_candidates: int = 5
-    in_turn: int = 3  # Further records in rotation: 1000 records take 11 s at 30 Hz.
-    # Further records in rotation by SIFT, which matches across scales; 0: none.
+    # Number of further records that a frame is compared with, in rotation. 1000 records take 11 s
+    # at 30 Hz.
+    in_turn: int = 3
+    # Number of further records that a lost frame is compared with by SIFT, in rotation. SIFT
+    # matches across scales. 0: none.
     across_scales: int = 8
-    attempts: int = 3  # Maximum direct alignments per search; the best feature poses first.
-    # Minimum fraction of inliers among the depths that meet a surface, as in the prototype.
+    # Maximum number of direct alignments per search, from the feature poses with most inliers.
+    attempts: int = 3
+    # Minimum inlier fraction of the points paired with a measured depth, as in the prototype.
     min_geometric_inliers: float = 0.85
-    # Maximum rotation plus parallax between feature pose and alignment.
+    # Maximum rotation plus parallax between the feature pose and the pose by alignment.
     agreement_rad: float = 0.06
-    # Similar records within this distance of each other count as one candidate.
+    # Records of similar appearance within this distance of each other count as one candidate.
     variety_rad: float = 0.25
-    # A match is ambiguous if another record far away has more than this fraction of its inliers.
+    # A match is ambiguous if a distant record has more than this fraction of the match's inliers.
     ambiguous_inlier_ratio: float = 0.3
-    # Minimum distance of the camera poses by both records: 57 degrees, or one median depth.
+    # A record is distant from the match if the camera poses by both differ by more than this: 57
+    # degrees of rotation, or one median depth of translation.
     ambiguous_rad: float = 1.0
-    # Minimum correlation with the thumbnail of the last OK frame; a WEAK frame below it shows
-    # another place. Kitchen, frame to frame: above 0.93; against another place: 97 % below.
+    # Minimum correlation with the thumbnail of the last OK frame. A WEAK frame below it shows
+    # another place and is LOST. On the sequence kitchen, successive frames correlate above 0.93,
+    # and 97 % of the frames from different places correlate below 0.4.
     familiar: float = 0.4
 
     def __post_init__(self) -> None:
@@ -115,7 +122,7 @@ class RelocalizationConfig:
 
 @dataclass(frozen=True, slots=True)
 class Relocalizer:
-    """Relocalization of a frame in a keyframe database; stateless."""
+    """Relocalization of a frame in a keyframe database, without state."""
 
     pyramid: PyramidConfig
     align: AlignConfig
@@ -139,7 +146,7 @@ class Relocalizer:
             database: Keyframe database to search.
             turn: Number of searches before this one. It selects which further records are tried.
             history: Residual noise of the last frames, for records that store none.
-            is_lost: Allow the search by SIFT, which is too slow while tracking works.
+            is_lost: True allows the search by SIFT, which is too slow while tracking works.
 
         Returns:
             The keyframe and the alignment of the frame to it. None if no keyframe is verified or
@@ -161,13 +168,18 @@ class Relocalizer:
         return sure[1]
 
     def resembles_last_trusted(self, view: Pyramid, trusted: np.ndarray) -> bool:
-        """Return whether a frame looks similar to the last OK frame, given its thumbnail [300]."""
+        """Return whether a frame looks similar to the last OK frame.
+
+        Args:
+            view: Pyramid of the frame.
+            trusted: Thumbnail of the last OK frame, [300] int8.
+        """
         seen, trusted = make_thumbnail(view).astype(float), trusted.astype(float)
         scale = np.linalg.norm(seen) * np.linalg.norm(trusted)
         return bool(seen @ trusted >= self.config.familiar * scale > 0)
 
     def _distinct_candidates(self, ranked: Iterable[KeyframeRecord]) -> list[KeyframeRecord]:
-        """Return at most `appearance_candidates` of the ranked records, distinct places alone."""
+        """Return the first `appearance_candidates` ranked records that show distinct places."""
         likely: list[KeyframeRecord] = []
         for record in islice(ranked, RANKED * self.config.appearance_candidates):
             if len(likely) == self.config.appearance_candidates:
@@ -249,7 +261,13 @@ class Relocalizer:
 
 
 def _due(database: KeyframeDatabase, turn: int, count: int) -> list[KeyframeRecord]:
-    """Return the next `count` records of the database, which turns visit one after the other."""
+    """Return the records of one search in rotation; successive turns visit all records in order.
+
+    Args:
+        database: The database.
+        turn: Number of searches before this one.
+        count: Number of records per search.
+    """
     numbers = range(turn * count, (turn + 1) * count)
     return [database.all[number % len(database)] for number in numbers]
 
@@ -269,21 +287,23 @@ def _is_apart(record: KeyframeRecord, other: KeyframeRecord, limit_rad: float) -
     return is_far or record.submap != other.submap
 
 
-Nearby = tuple[KeyframeRecord, np.ndarray]  # A record, and T_keyframe_camera [4, 4] by the map.
+# A record, and T_keyframe_camera [4, 4] as the map predicts it.
+Nearby = tuple[KeyframeRecord, np.ndarray]
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeReuseConfig:
     """Settings of keyframe reuse."""
 
-    # Number of keyframes, mapping keyframes included, from which known ones are reused;
-    # 0: never. Below it, the map gains more by new views than they cost, a few kB each.
+    # Number of keyframes, mapping keyframes included, after which known keyframes are reused; 0:
+    # never. Before that, the gain of new views is worth their cost, a few kB each.
     after: int = 1500
-    tries: int = 2  # Maximum records per frame, the nearest first; 8 ms each at 640x480.
-    # Maximum rotation plus parallax between map and images, 3 % of the median depth; above it, new
-    # keyframes are made until a loop closure.
+    # Maximum number of records that a frame is aligned to, the nearest first; 8 ms each at 640x480.
+    tries: int = 2
+    # Maximum rotation plus parallax between the poses by map and by images: 0.03 rad, or 3 % of the
+    # median depth. Above it, new keyframes are made until a loop closure corrects the map.
     agreement_rad: float = 0.03
-    # Minimum fraction of inliers among the depths that meet a surface, as in relocalization.
+    # Minimum inlier fraction of the points paired with a measured depth, as in relocalization.
     min_geometric_inliers: float = 0.85
 
     def __post_init__(self) -> None:
@@ -307,10 +327,10 @@ class ReusedKeyframe:
     candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
     def measures(self, keyframe: int) -> RelativePose:
-        """Return the measured pose of a new keyframe, made of this frame, relative to this one.
+        """Return the measured pose of a new keyframe relative to this known keyframe.
 
         Args:
-            keyframe: Id of the new keyframe.
+            keyframe: Id of the new keyframe, which is made of the aligned frame.
         """
         seen = self.candidate.alignment
         return RelativePose(self.record.id, keyframe, seen.T_reference_camera, seen.information)
@@ -318,7 +338,7 @@ class ReusedKeyframe:
 
 @dataclass(frozen=True, slots=True)
 class KeyframeReuse:
-    """Search for a known keyframe to reuse as the reference; stateless."""
+    """Search for a known keyframe to reuse as the reference, without state."""
 
     pyramid: PyramidConfig
     align: AlignConfig
@@ -334,10 +354,10 @@ class KeyframeReuse:
         Args:
             view: Pyramid of the frame.
             near: Records with T_keyframe_camera as the map predicts it, the nearest first.
-            history: Residual noise of the last frames. The alignment must not be much noisier.
+            history: Residual noise of the last frames, which limits the noise of the alignment.
 
         Returns:
-            The keyframe, or None if no alignment is verified or all keyframes are too far.
+            The keyframe, or None if all keyframes are too far or no alignment is verified.
         """
         for record, T_record_camera in near[: self.config.tries]:
             keyframe = record.keyframe(self.pyramid)
@@ -375,7 +395,8 @@ def find_nearby_keyframes(
 ) -> list[Nearby]:
     """Return the records near a camera pose, the nearest first.
 
-    Near means that a frame with this pose would not need a new keyframe beside that record.
+    A record is near if its rotation and translation to the camera are within the limits of
+    `config`. A frame there would not need a new keyframe.
 
     Args:
         records: Records to choose from; those without a pose in the map are skipped.

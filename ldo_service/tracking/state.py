@@ -22,8 +22,8 @@ class KeyframeOrigin(StrEnum):
     """Origin of the reference keyframe; keyframe reuse depends on it."""
 
     NEW = "new"
-    MEASURED = "tied"  # New, and measured from a known keyframe.
-    KNOWN = "known"  # Made long before; its surface is mapped.
+    MEASURED = "tied"  # New, with a measured pose relative to a known keyframe.
+    KNOWN = "known"  # Made earlier and reused; its surface is mapped.
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,23 +38,24 @@ class OdometryState:
     motion: ConstantVelocity = field(default_factory=ConstantVelocity)
     history: ResidualHistory = field(default_factory=ResidualHistory)
     status: TrackingStatus = TrackingStatus.OK
-    frames_since_keyframe: int = 0
+    frames_since_keyframe: int = 0  # Frames since the reference keyframe was set.
     next_id: int = 0  # Id of the next keyframe.
     origin: KeyframeOrigin = KeyframeOrigin.NEW
-    # Thumbnail of the last OK frame, [300] int8; empty before it.
+    # Thumbnail of the last OK frame, [300] int8; empty before the first OK frame.
     trusted_thumbnail: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))
     relocalization_count: int = 0  # Number of searches in the keyframe database.
     submaps: Submaps = field(default_factory=Submaps)
     # Pose of the last mapped frame, [4, 4].
     T_odom_last_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))
-    dynamic_mask: np.ndarray | None = None  # Last frame, [H, W] bool at working resolution.
+    # Dynamic pixels of the last frame, [H, W] bool at working resolution; None if unknown.
+    dynamic_mask: np.ndarray | None = None
     motion_evidence: MotionEvidence | None = None
-    # The last OK frame, if the prior had a pose at its time.
+    # Poses of the last OK frame; None if the odometry prior had no pose at the time of that frame.
     dead_reckoning_start: DeadReckoningStart | None = None
 
     @property
     def is_relayed(self) -> bool:
-        """True if the reference is no keyframe."""
+        """True if the reference is a relay, which is no keyframe."""
         return self.keyframe is not None and self.keyframe.relay is not None
 
     def with_new(
@@ -71,7 +72,7 @@ class OdometryState:
             keyframe: The frame as a keyframe.
             record: The record of the keyframe, which is added to the database.
             config: Settings of the database.
-            is_measured: The pose of the keyframe was measured relative to a known keyframe.
+            is_measured: True if the pose of the keyframe was measured relative to a known keyframe.
         """
         return replace(
             self._against(keyframe, keyframe.T_odom_keyframe),
@@ -109,7 +110,7 @@ class OdometryState:
         Args:
             view: Pyramid of the frame.
             T_odom_camera: Pose of the frame, [4, 4].
-            relay: Its pose in the last keyframe.
+            relay: Pose of the frame relative to the last keyframe.
             ignore_mask: Dynamic pixels of the frame, [H, W] bool at working resolution.
         """
         assert self.keyframe is not None

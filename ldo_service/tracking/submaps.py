@@ -24,15 +24,17 @@ from .motion import image_motion_rad
 class SubmapConfig:
     """Settings of submaps."""
 
-    # Uninterrupted LOST time before a new submap starts, as in ORB-SLAM3; 0: never.
+    # Time that tracking must be LOST without interruption before a new submap starts, as in
+    # ORB-SLAM3; 0: never.
     begin_after_s: float = 3.0
     # Frames between searches of the other submaps: twice a second at 30 Hz. A prime number, so that
     # the searches do not coincide with the frames that are held out from mapping.
     search_interval_frames: int = 17
     confirm_after: int = 7  # Frames between searches while a match is pending.
     confirm_rad: float = 0.06  # Maximum rotation plus parallax between two consistent matches.
-    # Minimum rotation plus a third of the parallax between the views of two matches: the field of
-    # view of a depth camera. Lower values merge sooner and accept perceptual aliases.
+    # Minimum rotation plus a third of the parallax between the camera poses of two matches. The
+    # default is the field of view of a depth camera. Lower values merge sooner and accept
+    # perceptual aliases.
     confirm_apart_rad: float = 1.0
     misses: int = 3  # Maximum searches in a row without a match before a pending match is dropped.
 
@@ -54,7 +56,7 @@ class SubmapConfig:
 class SubmapMeasurement:
     """Pose of the camera relative to a keyframe of another submap."""
 
-    keyframe: int
+    keyframe: int  # Id of the keyframe.
     submap: int  # Submap of the keyframe.
     T_keyframe_camera: np.ndarray  # [4, 4]
     information: np.ndarray  # [6, 6], as in `TrackingResult`.
@@ -68,10 +70,10 @@ class SubmapMeasurement:
         )
 
     def measures(self, keyframe: int) -> RelativePose:
-        """Return the measured pose of a new keyframe, made of this frame, relative to this one.
+        """Return the measured pose of a new keyframe relative to the keyframe of the other submap.
 
         Args:
-            keyframe: Id of the new keyframe.
+            keyframe: Id of the new keyframe, which is made of the measured frame.
         """
         return RelativePose(self.keyframe, keyframe, self.T_keyframe_camera, self.information)
 
@@ -113,7 +115,7 @@ class SubmapMatch:
     def is_distinct_from(self, other: "SubmapMatch", config: SubmapConfig) -> bool:
         """Return whether the frames of two matches have clearly different camera poses.
 
-        Perceptual aliases in both of them are then unlikely.
+        It is then unlikely that both matches are perceptual aliases.
         """
         moved = se3.inverse(self.T_here_camera) @ other.T_here_camera
         return image_motion_rad(moved, 3.0 * self.median_depth_m) >= config.confirm_apart_rad
@@ -121,11 +123,13 @@ class SubmapMatch:
 
 @dataclass(frozen=True, slots=True)
 class Submaps:
-    """State of all submaps: which are merged, and how the search for further merges stands."""
+    """Merged submaps, and the state of the search for further merges."""
 
-    # Oldest submap that each submap is merged with, or itself.
+    # Oldest submap that each submap is merged with, by submap; the submap itself if it is not
+    # merged.
     roots: tuple[int, ...] = ()
-    lost_since_ns: int | None = None  # Stamp of the first LOST frame in a row.
+    # Stamp of the first of the successive LOST frames; None if the last frame was not LOST.
+    lost_since_ns: int | None = None
     frames_since_search: int = 0
     pending_match: SubmapMatch | None = None  # Match that awaits confirmation.
     missed: int = 0  # Searches in a row without a match.
@@ -141,7 +145,7 @@ class Submaps:
         earliest stamp.
 
         Args:
-            is_lost: The tracking status of the frame is LOST.
+            is_lost: True if the tracking status of the frame is LOST.
             stamp_ns: Stamp of the frame.
         """
         known = self.lost_since_ns
@@ -159,7 +163,10 @@ class Submaps:
         return stamp_ns - self.lost_since_ns >= 1e9 * config.begin_after_s
 
     def is_search_due(self, config: SubmapConfig) -> bool:
-        """Return whether unmerged submaps exist and enough frames have passed since the search."""
+        """Return whether to search the other submaps with the current frame.
+
+        A search is due if unmerged submaps exist and enough frames have passed since the last one.
+        """
         wait = config.search_interval_frames if self.pending_match is None else config.confirm_after
         return len(set(self.roots)) > 1 and self.frames_since_search >= wait
 
@@ -170,7 +177,8 @@ class Submaps:
     def is_confirmed_by(self, look: SubmapMatch, config: SubmapConfig) -> bool:
         """Return whether a match confirms the pending match.
 
-        It must agree on the relative pose, and its frame must have a clearly different pose.
+        Both matches must agree on the relative pose of the submaps, and the camera poses of their
+        frames must clearly differ.
         """
         last = self.pending_match
         return (
@@ -182,7 +190,7 @@ class Submaps:
     def with_search_result(self, found: SubmapMatch | None, config: SubmapConfig) -> "Submaps":
         """Return the state after a search of the other submaps.
 
-        A match that is inconsistent with the pending match replaces it.
+        A match that is inconsistent with the pending match becomes the pending match.
 
         Args:
             found: The match, or None if the search found none. More than `config.misses` searches

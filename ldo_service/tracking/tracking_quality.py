@@ -1,12 +1,13 @@
 """Tracking status from the quality of an alignment.
 
-Inlier fractions do not detect that alignment converged to a wrong local minimum. The noise estimate
-is too large there, so that every residual counts as an inlier. The status therefore depends on
+Inlier fractions do not detect that alignment converged to a wrong local minimum. The estimated
+noise is so large there that every residual counts as an inlier. The status therefore depends on
 other measures: overlap with the reference keyframe, noise relative to its running median, condition
-number of the information, and confirmation by features.
+number of the information, and confirmation by features or GICP.
 
-The noise of a frame also grows for good reasons: blur, a new exposure, a steep view, a larger step.
-Features have errors of another kind, so a pose that they confirm closely may have more noise.
+The noise also grows at right poses: after blur, a change of exposure, at a steep view, or after a
+large motion. Features have errors of another kind, so a pose that features confirm closely is
+accepted with more noise.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from .alignment import Alignment
 from .motion import image_motion_rad
 from .pose_candidates import PoseHypothesis
 
-MIN_GAIN = 0.05  # Lower bound of the gain; a darker frame shows nothing.
+MIN_GAIN = 0.05  # Lower bound of the gain that noise is divided by; a darker frame shows nothing.
 
 
 class TrackingStatus(StrEnum):
@@ -36,42 +37,47 @@ class TrackingStatus(StrEnum):
 class TrackingQualityConfig:
     """Limits that decide whether the tracking status is OK, WEAK or LOST."""
 
-    # Minimum visible fraction of the reference points; chosen on apartment_floor1, not elsewhere.
+    # Minimum visible fraction of the reference points of an OK frame; chosen on the sequence
+    # apartment_floor1 alone.
     min_overlap: float = 0.15
-    # Minimum fraction of the reference points with a measured depth; below it, only color counts.
+    # Minimum fraction of the reference points paired with a measured depth; with fewer pairs, the
+    # pose would depend on gray levels alone.
     min_paired: float = 0.05
     # Maximum condition number of the information, with translation in median depths.
     max_condition: float = 1e5
-    # Maximum gain, and inverse of the minimum: 1.5 stops, as of a camera that steps into the light.
+    # Maximum gain, and inverse of the minimum gain: 1.5 stops, as of a camera that moves into
+    # light.
     max_gain: float = 3.0
-    weak_residual: float = 2.5  # Maximum residual of an OK frame, times the running median.
-    lost_residual: float = 5.0  # A frame with a larger one is LOST, times the running median.
+    # The limits named residual are ratios of the noise of an alignment to its running median.
+    weak_residual: float = 2.5  # Maximum ratio of an OK frame.
+    lost_residual: float = 5.0  # A frame with a larger ratio is LOST.
     lost_overlap: float = 0.08  # A frame with a smaller overlap is LOST.
-    # Limits of the residual for a pose within confirmed_rad of the pose by features. They apply if
-    # they are larger, and not while tracking is LOST. Chosen on the ScanNet parts and on
-    # freiburg1_rpy: of the frames above weak_residual, those within 0.03 rad were right to 0.01
-    # rad, and those beyond erred by up to 0.07 rad.
+    # Residual limits of a pose within confirmed_rad of the pose by features. They replace smaller
+    # limits, except while tracking is LOST. They were chosen on the ScanNet parts and on
+    # freiburg1_rpy. Of the frames above weak_residual, those within 0.03 rad of the feature pose
+    # erred by at most 0.01 rad, and the others by up to 0.07 rad.
     confirmed_rad: float = 0.03
     confirmed_weak_residual: float = 6.0
     confirmed_lost_residual: float = 15.0
-    # Lower bounds of the running medians: the noise of any camera. Intensity in gray levels.
+    # Lower bounds of the running medians, which any camera reaches. Intensity in gray levels.
     min_intensity_sigma: float = 2.0
     min_depth_noise_scale: float = 0.5
-    # A relocalized camera must have more overlap, unless features confirm the pose: 43 of 43
-    # confirmed poses below 0.35 were right (kitchen and flat). It must also fit better. The
-    # limit is relocalized_residual times the running median at the same pose. It grows by
-    # relocalized_residual_per_rad per radian of image motion from the keyframe
-    # (`motion.image_motion_rad`), up to weak_residual. The noise of right poses grows likewise
-    # (kitchen, p50 1.4 at 0.15 rad, 2.0 at 0.55). A fixed limit of 1.6 found a third fewer
-    # frames of the kitchen, and one more false pose in the ambiguous corridor of the flat.
+    # Minimum overlap of the first OK frame after a loss, unless an independent estimate confirms
+    # the pose. Of the confirmed poses with less overlap, 43 of 43 were right (kitchen and flat).
     relocalized_overlap: float = 0.35
+    # Residual limit of the first OK frame after a loss, at the pose of the keyframe. The limit
+    # grows by relocalized_residual_per_rad per radian of image motion from the keyframe
+    # (`motion.image_motion_rad`), up to weak_residual, because the noise of right poses grows too:
+    # its median in the kitchen is 1.4 at 0.15 rad and 2.0 at 0.55 rad. A fixed limit of 1.6 found a
+    # third fewer frames of the kitchen, and one more false pose in the ambiguous corridor of the
+    # flat.
     relocalized_residual: float = 1.3
     relocalized_residual_per_rad: float = 2.0
     # Expected noise while the history is empty. Intensity in gray levels.
     first_intensity_sigma: float = 8.0
     first_depth_noise_scale: float = 2.0
     recovery_margin: float = 0.8  # Limits are stricter by this factor until a frame is OK again.
-    history: int = 30  # Frames of the running median: one second.
+    history: int = 30  # Number of OK frames in the running median: one second at 30 Hz.
 
     def __post_init__(self) -> None:
         if not 0 <= self.lost_overlap <= self.min_overlap <= 1:
@@ -106,13 +112,13 @@ class ResidualHistory:
     """Photometric and geometric noise of the last OK frames."""
 
     intensity_sigmas: tuple[float, ...] = ()  # Gray levels of the reference.
-    depth_noise_scales: tuple[float, ...] = ()  # Times the sensor model.
+    depth_noise_scales: tuple[float, ...] = ()  # Multiples of `DepthNoise`.
 
     def extended(self, alignment: Alignment, config: TrackingQualityConfig) -> "ResidualHistory":
         """Return the history with the noise of one more alignment.
 
-        A pose that features confirm may have much noise. It counts as at most `weak_residual` times
-        the running median, so that a few blurred frames do not hide a wrong pose after them.
+        The noise is limited to `weak_residual` times the running median. A pose that features
+        confirm may have more noise, and a few such frames must not hide a wrong pose after them.
         """
         keep, sigma = config.history - 1, exposure_corrected_sigma(alignment)
         usual_sigma, usual_scale = self._usual(config)
@@ -124,7 +130,7 @@ class ResidualHistory:
         )
 
     def _usual(self, config: TrackingQualityConfig) -> tuple[float, float]:
-        """Return the running medians of photometric and geometric noise."""
+        """Return the running medians of photometric (gray levels) and geometric noise."""
         usual_sigma = median(self.intensity_sigmas or (config.first_intensity_sigma,))
         usual_scale = median(self.depth_noise_scales or (config.first_depth_noise_scale,))
         return (
@@ -133,9 +139,9 @@ class ResidualHistory:
         )
 
     def residual_ratio(self, alignment: Alignment, config: TrackingQualityConfig) -> float:
-        """Return the noise of an alignment divided by its running median.
+        """Return the ratio of the noise of an alignment to its running median.
 
-        Of the photometric and the geometric ratio, the larger one is returned.
+        The result is the larger one of the photometric and the geometric ratio.
         """
         intensity, depth = self._usual(config)
         return max(
@@ -159,10 +165,11 @@ def classify_tracking(
 ) -> TrackingStatus:
     """Return the tracking status of a frame, judged by its best alignment.
 
-    The limits have hysteresis. After a WEAK frame they are stricter, unless features confirm the
-    pose. After a LOST frame they are strictest, unless features and the odometry prior both confirm
-    the pose. The status changes from LOST to OK directly, never to WEAK. A pose that features
-    confirm closely may have a larger residual, except after a LOST frame.
+    The limits have hysteresis. They are stricter after a WEAK frame, unless an independent estimate
+    (features or GICP) confirms the pose. They are strictest after a LOST frame, unless such an
+    estimate and the odometry prior both confirm the pose. The status changes from LOST to OK
+    directly, never to WEAK. A pose that features confirm closely may have a larger residual, except
+    after a LOST frame.
 
     Args:
         candidate: Best hypothesis of the frame.

@@ -24,30 +24,31 @@ class KeyframeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TrackedFrame:
-    """Pose of a frame relative to its reference keyframe, and the kind of keyframe it needs.
+    """Pose of a frame relative to its reference, and the kind of keyframe it should become.
 
     While the status is LOST, the pose is the last accepted one and `information` is zero.
     """
 
     status: TrackingStatus
-    # Initial guess of the selected hypothesis: "first", "direct", "prior", "features", "gicp", ...
+    # Initial guess of the pose: see `PoseHypothesis.pose_source`. "first" for the first frame of a
+    # submap; "none" while LOST.
     pose_source: str
     T_odom_camera: np.ndarray  # [4, 4]
     T_reference_camera: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4]
     reference: int | None = None  # Keyframe that the frame was aligned to; None before the first.
-    submap: int = 0  # Submap whose odometry frame T_odom_camera leads to.
+    submap: int = 0  # Submap in whose odometry frame T_odom_camera is expressed.
     # [6, 6] for T_reference_camera * exp(xi) with xi = (rotation rad, translation m).
     information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     overlap: float = 0.0  # Visible fraction of the reference's surface.
     inlier_fraction: float = 0.0  # The smaller of the photometric and the geometric fraction.
-    intensity_sigma: float = 0.0  # Photometric residual, gray levels.
-    depth_noise_scale: float = 0.0  # Geometric residual, times the noise of the sensor model.
-    iterations: int = 0
+    intensity_sigma: float = 0.0  # Photometric noise, gray levels.
+    depth_noise_scale: float = 0.0  # Geometric noise as a multiple of `DepthNoise`.
+    iterations: int = 0  # Iterations of alignment over all pyramid levels.
     hypothesis_spread_rad: float = 0.0  # Spread of the supported hypotheses; 0 for a single one.
     # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
     dynamic_mask: np.ndarray | None = None
     needed_keyframe: KeyframeKind | None = None  # Set for OK frames only.
-    should_start_submap: bool = False  # LOST for so long that a new submap should start.
+    should_start_submap: bool = False  # True if LOST for so long that a new submap should start.
     # Measurement that merges two submaps once the frame is a keyframe.
     submap_measurement: SubmapMeasurement | None = None
 
@@ -70,10 +71,10 @@ class TrackedFrame:
             T_odom_camera: Pose of the camera, [4, 4].
             keyframe: The reference keyframe.
             status: Tracking status of the frame.
-            pose_source: The initial guess that the alignment started from.
-            needed_keyframe: The keyframe that the frame should become.
+            pose_source: Name of the initial guess that the alignment started from.
+            needed_keyframe: The kind of keyframe that the frame should become; None if none.
             hypothesis_spread_rad: Spread of the supported hypotheses.
-            dynamic_mask: Moving pixels, [H, W] bool at working resolution.
+            dynamic_mask: Dynamic pixels, [H, W] bool at working resolution; None if unknown.
         """
         T_reference_camera, information = alignment.T_reference_camera, alignment.information
         if keyframe.relay is not None:
@@ -99,7 +100,7 @@ class TrackedFrame:
         )
 
     def relay(self) -> Relay:
-        """Return the pose of the frame in its keyframe, to align later frames to it."""
+        """Return the pose of the frame in its keyframe, to align later frames to the frame."""
         return Relay(self.T_reference_camera, covariance_of(self.information))
 
 
@@ -109,10 +110,10 @@ class NewKeyframe:
 
     id: int
     kind: KeyframeKind
-    submap: int  # The submap that it was made in, not the root of merged ones.
-    # Measurements from earlier keyframes other than the reference.
+    submap: int  # Submap that the keyframe was made in, even if it is merged with an older one.
+    # Measured poses relative to earlier keyframes other than the reference.
     window: tuple[RelativePose, ...] = ()
-    # Measurement from a keyframe of another submap, which merges the submaps.
+    # Measured pose relative to a keyframe of another submap, which merges the submaps.
     submap_measurement: RelativePose | None = None
 
 
@@ -125,32 +126,38 @@ class TrackingResult:
 
     # Pose.
     status: TrackingStatus
-    # Initial guess of the selected hypothesis: "first", "direct", "prior", "features", "gicp", ...
+    # Initial guess of the pose: see `PoseHypothesis.pose_source`. "first" for the first frame of a
+    # submap; "none" while LOST.
     pose_source: str
     T_odom_camera: np.ndarray  # [4, 4]
     T_map_odom: np.ndarray  # [4, 4]
-    graph_version: int  # Version of the pose graph that T_map_odom follows.
+    graph_version: int  # Version of the pose graph that T_map_odom comes from.
     submap: int  # The oldest submap that the pose graph has merged with the frame's own.
-    # Alignment.
-    reference: int | None  # The first keyframe refers to itself; None before it.
+    # Alignment. Id of the keyframe that the pose refers to: the frame itself for the first keyframe
+    # of a submap. None before any keyframe, and while localizing in a finished map.
+    reference: int | None
     T_reference_camera: np.ndarray  # [4, 4]
     # [6, 6] for T_reference_camera * exp(xi) with xi = (rotation rad, translation m).
     information: np.ndarray
     overlap: float  # Visible fraction of the reference's surface.
     # Quality.
     inlier_fraction: float  # The smaller of the photometric and the geometric fraction.
-    intensity_sigma: float  # Photometric residual, gray levels.
-    depth_noise_scale: float  # Geometric residual, times the noise of the sensor model.
-    iterations: int
+    intensity_sigma: float  # Photometric noise, gray levels.
+    depth_noise_scale: float  # Geometric noise as a multiple of `DepthNoise`.
+    iterations: int  # Iterations of alignment over all pyramid levels.
     hypothesis_spread_rad: float  # Spread of the supported hypotheses; 0 for a single one.
     # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
     dynamic_mask: np.ndarray | None
-    has_prior: bool  # The odometry prior covers the time of the frame.
+    has_prior: bool  # True if the odometry prior covers the time of the frame.
     # Keyframes.
-    keyframe: NewKeyframe | None = None
-    reused_keyframe: int | None = None  # Known keyframe that is the reference from now on.
-    denied_keyframe: KeyframeKind | None = None  # Needed, but not allowed by `may_map`.
-    awaits_mapping: bool = False  # Odometry has not started: its first frame may not be mapped.
+    keyframe: NewKeyframe | None = None  # Keyframe made of the frame; None if none was made.
+    # Id of a known keyframe that is the reference from now on; None if none is reused.
+    reused_keyframe: int | None = None
+    # Kind of keyframe that was needed but not allowed by `may_map`; None otherwise.
+    denied_keyframe: KeyframeKind | None = None
+    # True if odometry has not started, because `may_map` did not allow a keyframe of its first
+    # frame.
+    awaits_mapping: bool = False
 
 
 def make_tracking_result(
@@ -173,12 +180,13 @@ def make_tracking_result(
         T_map_odom: Odometry frame in the map, [4, 4]; its rotation is orthonormalized here.
         graph_version: Version of the pose graph that T_map_odom comes from.
         submap: The oldest submap that the pose graph has merged with the frame's submap.
-        reference: The keyframe that the pose refers to.
-        has_prior: The odometry prior covers the time of the frame.
-        keyframe: The new keyframe made of the frame, if any.
-        reused_keyframe: The known keyframe that is the reference from now on.
-        denied_keyframe: The kind of keyframe that was needed but not allowed by `may_map`.
-        awaits_mapping: Odometry has not started, because its first frame may not be mapped.
+        reference: Id of the keyframe that the pose refers to; None before any keyframe.
+        has_prior: True if the odometry prior covers the time of the frame.
+        keyframe: The new keyframe made of the frame; None if none was made.
+        reused_keyframe: Id of the known keyframe that is the reference from now on; None if none.
+        denied_keyframe: Kind of keyframe that was needed but not allowed by `may_map`, or None.
+        awaits_mapping: True if odometry has not started, because `may_map` did not allow a keyframe
+            of its first frame.
     """
     return TrackingResult(
         status=tracked.status,

@@ -1,9 +1,10 @@
 """Relative-pose measurements of a new keyframe from earlier ones.
 
 If each keyframe were measured relative to the previous one alone, errors would accumulate. The last
-keyframes show much of the same surface, so each new keyframe is measured relative to several of
-them. The pose-graph optimizer combines these measurements. On the sequence `synthetic:flat-exact`
-this reduces the trajectory error to less than half. Conventions: `ldo_service.geometry`.
+keyframes show much of the surface that a new keyframe shows, so the new one is measured relative to
+several of them. The pose-graph optimizer combines these measurements. On the sequence
+`synthetic:flat-exact`, this reduces the trajectory error to less than half.
+Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -23,13 +24,16 @@ from .pyramid import PyramidConfig
 class WindowConfig:
     """Settings of the measurements of a new keyframe from earlier ones."""
 
-    # Maximum measurements per keyframe; more change little and cost 4 ms each. 0: none.
+    # Maximum number of measurements per keyframe; more change little and take 4 ms each. 0: none.
     measurements: int = 3
     reach: int = 6  # Number of the last keyframes to try, newest first.
-    # Minimum overlap with the older keyframe; a smaller one is mostly its edges.
+    # Minimum overlap with the older keyframe; a smaller overlap consists mostly of image borders.
     min_overlap: float = 0.35
-    max_noise: float = 1.5  # Maximum noise of a measurement, in multiples of that of tracking.
-    levels: int = 2  # Number of finest pyramid levels to use: the initial guess is good.
+    # Maximum noise of a measurement, as a multiple of the noise of tracking.
+    max_noise: float = 1.5
+    # Number of finest pyramid levels to use. Coarse levels are not needed, as the initial guess is
+    # good.
+    levels: int = 2
     iterations: tuple[int, ...] = (10, 4)  # Maximum per level, the finest first.
 
     def __post_init__(self) -> None:
