@@ -11,7 +11,7 @@ from ldo_service.schemas import CameraModel, CameraRgbd, Image
 
 WAIT_MS = 5000  # Maximum time to wait for a frame; the first one may take two seconds.
 GRID = 16, 12  # Columns and rows of the image points that the lens distortion is fitted to.
-MAX_FIT_PX = 0.5  # Maximum error of OpenCV's distortion model relative to that of the device.
+MAX_FIT_PX = 0.5  # Maximum difference of OpenCV's distortion model from that of the device, pixels.
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,8 @@ def messages(rs: Any, source: Any, camera: CameraModel) -> Iterator[CameraRgbd]:
                 camera=camera,
                 color=Image.raw("rgb8", np.asanyarray(color.get_data())),
                 depth=Image.raw("z16", np.asanyarray(depth.get_data())),
-                # The units are a float32; rounding restores the decimal value.
+                # get_units() returns meters per unit as float32; rounding restores the decimal
+                # value.
                 depth_scale=1 / round(depth.get_units(), 9),
             )
             frame += 1
@@ -105,7 +106,7 @@ def camera_model(rs: Any, intrinsics: Any) -> CameraModel:
 
         x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2),
 
-    and y likewise. This is linear in the coefficients, so that least squares can fit them.
+    and y likewise. The model is linear in its coefficients, so least squares can fit them.
 
     Args:
         rs: The module pyrealsense2.
@@ -122,8 +123,8 @@ def camera_model(rs: Any, intrinsics: Any) -> CameraModel:
         if error_px > MAX_FIT_PX:
             raise ConfigError(
                 f"the lens of this RealSense ({intrinsics.model}) differs from OpenCV's model by "
-                f"{error_px:.1f} px, expected at most {MAX_FIT_PX} px: it is too wide. Use a "
-                "camera with a narrower lens."
+                f"{error_px:.1f} px, expected at most {MAX_FIT_PX} px. The lens is too wide for "
+                "that model. Use a camera with a narrower lens."
             )
     return CameraModel(
         width=intrinsics.width,
@@ -163,8 +164,8 @@ def _config(rs: Any, stream: RealSenseStream) -> Any:
 def _seen_through(rs: Any, intrinsics: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sample the distortion model of the device on a grid of points.
 
-    The inverse Brown-Conrady model is defined from distorted to undistorted points, so the grid
-    consists of distorted points. For all other models, it consists of undistorted points.
+    The inverse Brown-Conrady model maps distorted to undistorted points, so the grid consists of
+    distorted points. All other models map undistorted points, so the grid consists of those.
 
     Returns:
         Distorted coordinates [N, 2], and undistorted coordinates x and y [N]; all are normalized by
@@ -190,8 +191,8 @@ def _fitted(
 
     Args:
         seen: Distorted coordinates, [N, 2], normalized by the focal length.
-        x: Undistorted coordinates, [N], normalized likewise.
-        y: Undistorted coordinates, [N], normalized likewise.
+        x: Undistorted x coordinates, [N], normalized likewise.
+        y: Undistorted y coordinates, [N], normalized likewise.
         focal_px: Focal length in pixels.
 
     Returns:

@@ -1,7 +1,7 @@
 """RGB-D camera of ROS 2, whose topics a Zenoh bridge forwards.
 
 The bridge, zenoh-bridge-ros2dds, publishes each message of a topic `/a/b` on the Zenoh key `a/b`,
-encoded as CDR. It does so only while that key has a subscriber.
+encoded as CDR. It publishes a topic only while its key has a subscriber.
 """
 
 import time
@@ -28,11 +28,16 @@ from .ros_messages import (
     typestore,
 )
 
-KEEP = 4  # Maximum waiting samples per topic: a burst, as in the service's own input.
-PAIR_BUFFER = 8  # Maximum images that wait for their counterpart: 0.27 s at 30 Hz.
-RESTARTED_AFTER_NS = 1_000_000_000  # A stamp this much earlier is not jitter.
-SILENT_AFTER_S = 5.0  # Interval of messages about silent topics.
-MAX_REASONS = 20  # Maximum reported reasons; a stream of garbage has a new one for each message.
+# Maximum number of waiting samples per topic: enough for a burst, as in the service's own input.
+KEEP = 4
+# Maximum number of images of a topic that wait for their counterpart: 0.27 s at 30 Hz.
+PAIR_BUFFER = 8
+# If a stamp is earlier than the newest one by more than this, the camera has restarted.
+RESTARTED_AFTER_NS = 1_000_000_000
+# Time without a message after which a topic is reported as silent; interval of these reports.
+SILENT_AFTER_S = 5.0
+# Maximum number of reported reasons. A stream of invalid data may have a new reason per message.
+MAX_REASONS = 20
 Notify = Callable[[str], None]
 
 
@@ -42,11 +47,13 @@ class RosTopics:
 
     color: str
     depth: str
-    info: str = ""  # Camera info of color; empty: `camera_info` in the namespace of color.
+    info: str = ""  # Topic of camera info of color; empty: `camera_info` in the namespace of color.
     # Maximum difference of the stamps of color and depth: less than half a period at 30 Hz.
     max_skew_s: float = 0.015
-    is_rectified: bool = False  # The images have no distortion; the intrinsics are P of the info.
-    # Depth is on the pixels of color, although its frame_id differs.
+    # True if the images have no distortion. The intrinsics are then the matrix P of the camera
+    # info.
+    is_rectified: bool = False
+    # True if depth is registered to color although the frame_ids of both images differ.
     is_registered: bool = False
 
     def __post_init__(self) -> None:
@@ -85,7 +92,7 @@ class Inbox:
     _changed: Condition = field(default_factory=Condition)
 
     def put(self, topic: str, sample: zenoh.Sample) -> None:
-        """Add a sample; runs on Zenoh's thread."""
+        """Add a sample of a topic; Zenoh calls this method on its own thread."""
         body = sample.payload.to_bytes()
         with self._changed:
             of_topic = [entry for entry in self._waiting if entry[0] == topic]
@@ -147,7 +154,7 @@ class RosCamera:
                 self._notice_silence()
 
     def take(self, topic: str, body: bytes) -> Iterator[CameraRgbd]:
-        """Process a message of a topic, and iterate over the frames that it completes."""
+        """Process a message of a topic, and iterate over the frames that the message completes."""
         self._last_s[topic] = time.monotonic()
         try:
             for color, depth in self._pairs(topic, body):
@@ -156,7 +163,7 @@ class RosCamera:
             self.rejected += 1
             reason = f"{topic}: {str(error)[:30]}"
             if reason not in self._reasons and len(self._reasons) < MAX_REASONS:
-                self._notify(f"{topic}: {error} Further ones are only counted.")
+                self._notify(f"{topic}: {error} Further such messages are only counted.")
                 self._reasons.add(reason)
 
     def _pairs(self, topic: str, body: bytes) -> Iterator[tuple[RosImage, RosImage]]:

@@ -15,7 +15,7 @@ from ldo_service.geometry.codecs import read_image_size
 from ldo_service.schemas import CameraModel, CameraRgbd, Image
 from ldo_service.schemas.frames import MAX_PIXELS, ImageEncoding
 
-# Big and little endian; ROS 2 does not send the other versions.
+# First bytes of CDR, big and little endian. ROS 2 does not send the other versions of CDR.
 CDR_HEADERS = (
     b"\0\0",
     b"\0\1",
@@ -27,7 +27,7 @@ DEPTH_KINDS: dict[str, tuple[ImageEncoding, str, float]] = {
     "mono16": ("z16", "u2", 1000.0),
     "32FC1": ("f32", "f4", 1.0),
 }
-# Bytes before the PNG: a format and two quantization parameters.
+# Number of bytes before the PNG of compressed depth: a format and two quantization parameters.
 COMPRESSED_DEPTH_HEADER = 12
 PLUMB_BOB, RATIONAL, UNDISTORTED = "plumb_bob", "rational_polynomial", ("", "none")
 
@@ -52,7 +52,7 @@ def read_color(body: bytes, topic: str) -> RosImage:
 
     Args:
         body: The message in CDR.
-        topic: Name of its topic, which determines the type of the message.
+        topic: Name of the topic, which determines the type of the message.
 
     Raises:
         FrameError: The message is invalid, or its encoding is not supported.
@@ -78,7 +78,7 @@ def read_depth(body: bytes, topic: str) -> RosImage:
 
     Args:
         body: The message in CDR.
-        topic: Name of its topic, which determines the type of the message.
+        topic: Name of the topic, which determines the type of the message.
 
     Raises:
         FrameError: The message is invalid, or its encoding is not supported.
@@ -107,7 +107,7 @@ def read_camera(body: bytes, is_rectified: bool) -> CameraModel:
 
     Args:
         body: The message in CDR.
-        is_rectified: Use the left 3x3 of P without distortion instead of K and D.
+        is_rectified: True uses the left 3x3 of P, without distortion, instead of K and D.
 
     Raises:
         FrameError: The message is invalid, or its distortion model is not supported.
@@ -138,16 +138,17 @@ def joined(
         depth: Depth image.
         camera: The color camera.
         frame: Number of the frame.
-        is_registered: Assume that depth is registered to color even if the frame_ids differ.
+        is_registered: True accepts depth as registered to color even if the frame_ids differ.
 
     Raises:
-        FrameError: The images and the camera do not fit together.
+        FrameError: The frame_ids differ, or the size of an image is wrong.
     """
     if depth.frame_id != color.frame_id and not is_registered:
         raise FrameError(
             f"depth has frame_id {depth.frame_id!r} and color {color.frame_id!r}. Subscribe to "
             "depth that is registered to color (realsense2_camera: align_depth.enable:=true; else "
-            "the node `register` of depth_image_proc), or give --registered if it is registered."
+            "the node `register` of depth_image_proc), or give --registered if this depth is "
+            "registered too."
         )
     if (color.image.width, color.image.height) != (camera.width, camera.height):
         raise FrameError(
@@ -193,7 +194,7 @@ def _message(body: bytes, kind: str) -> Any:
     store = typestore()
     try:
         return store.deserialize_cdr(body, kind)
-    except Exception as error:  # rosbags raises its own exception, and passes on any other.
+    except Exception as error:  # rosbags does not convert all errors of decoding to its own.
         raise FrameError(f"{len(body)} bytes are not a valid {kind}: {error}.") from error
 
 
@@ -221,7 +222,13 @@ def _pixels(message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
 
 
 def _compressed(message: Any, start: int, depth_scale: float = 1.0) -> RosImage:
-    """Wrap a compressed image without decoding it; the receiving service decodes it."""
+    """Wrap a compressed image without decoding it; the receiving service decodes it.
+
+    Args:
+        message: The message, a sensor_msgs/CompressedImage.
+        start: Number of bytes before the PNG or JPEG.
+        depth_scale: Units of a depth image per meter.
+    """
     data = memoryview(message.data.tobytes())[start:]
     size = read_image_size(data)
     if size is None:
