@@ -27,8 +27,8 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
 
     Args:
         source: A folder, whose layout is detected, or `synthetic[:name]`.
-        options: Registration of depth to color, for ScanNet and 7-Scenes only, where depth and
-            color come from two cameras.
+        options: Registration of depth to color; None uses the defaults. Other values are valid for
+            ScanNet and 7-Scenes only, where depth and color come from two cameras.
 
     Raises:
         DataError: The source does not exist or has no known layout.

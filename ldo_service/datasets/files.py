@@ -43,7 +43,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that contains an object.
 
     Raises:
-        DataError: The file cannot be read, or it contains another type.
+        DataError: The file cannot be read, or it does not contain an object.
     """
     try:
         content = json.loads(path.read_text())
@@ -98,7 +98,9 @@ def pinhole(fields: dict[str, Any], width: str, height: str, path: Path) -> Came
 
 
 def read_matrix(path: Path, size: int) -> np.ndarray:
-    """Read a matrix [size, size] float64 from a text file; it may contain NaN and infinity.
+    """Read a matrix [size, size] float64 from a text file.
+
+    The values may be NaN or infinity.
 
     Raises:
         DataError: The file cannot be read, or a line is invalid.
@@ -156,9 +158,18 @@ def read_intrinsics(path: Path, size: int, image: tuple[int, int]) -> Camera:
 
 
 def read_trajectory(stamps_ns: np.ndarray, paths: list[Path]) -> Trajectory | None:
-    """Read `T_world_camera` from one file per stamp, [N]; None if no file has a pose.
+    """Read the poses `T_world_camera` from one file per frame.
 
-    Stamps without a file, or with an unknown pose, are skipped.
+    Args:
+        stamps_ns: Stamps of the frames, [N] int64.
+        paths: Files of the poses, one per stamp. Frames without a file, or with an unknown pose,
+            are skipped.
+
+    Returns:
+        The trajectory, or None if no frame has a pose.
+
+    Raises:
+        DataError: A file cannot be read, or it contains no rigid transform.
     """
     poses = [read_transform(path) if path.is_file() else None for path in paths]
     known = [k for k, T in enumerate(poses) if T is not None]
@@ -215,7 +226,7 @@ def numbered(folder: Path, pattern: str) -> dict[int, Path]:
 
     Args:
         folder: The folder.
-        pattern: Regular expression of the whole file name; its group is the number.
+        pattern: Regular expression of the whole file name; its first group is the number.
     """
     matches = ((re.fullmatch(pattern, path.name), path) for path in sorted(folder.glob("*")))
     return {int(match[1]): path for match, path in matches if match}

@@ -8,10 +8,10 @@ import numpy as np
 from ldo_service.errors import FrameError
 from ldo_service.geometry.codecs import read_image_size
 
-# Last bytes of a complete file, by its first bytes. OpenCV decodes a truncated file without an
-# error.
+# Last bytes of a complete image file, by the first bytes of the file. They are checked because
+# OpenCV decodes a truncated file without an error.
 _ENDS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
-MAX_PIXELS = 1 << 25  # The limit of images in messages.
+MAX_PIXELS = 1 << 25  # Maximum number of pixels of an image, as in messages.
 _TRAILING_BYTES = 64  # Maximum padding at the end of a file, as some programs write it.
 
 
@@ -79,7 +79,7 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         data = path.read_bytes()
     except OSError as error:
         raise FrameError(
-            f"{path} cannot be read ({error.strerror}). Restore the file or remove its entry."
+            f"{path} cannot be read ({error.strerror}). Restore it, or remove it from the sequence."
         ) from error
     if not _is_complete(data):
         raise FrameError(f"{path} is truncated at {len(data)} bytes. Copy or download it again.")
@@ -108,7 +108,7 @@ def _require_size(path: Path, data: bytes) -> None:
 
 
 def _is_complete(data: bytes) -> bool:
-    """Return whether a PNG or JPEG has its end marker."""
+    """Return whether a PNG or JPEG has its end marker; files of other types count as complete."""
     if len(data) < 16:
         return False
     for start, end in _ENDS.items():

@@ -2,8 +2,9 @@
 
     results/frame*.jpg results/depth*.png    numbered images
     traj.txt                                 optional: 16 numbers per line, camera to world by rows
-    cam_params.json                          here or one folder up: {"camera": {"w", "h", "fx",
-                                             "fy", "cx", "cy", "scale"}}, scale in units per meter
+    cam_params.json                          in this folder or one folder up: {"camera": {"w", "h",
+                                             "fx", "fy", "cx", "cy", "scale"}}; scale is the number
+                                             of depth units per meter
 
 Optional labels, as Habitat renders them:
 
@@ -82,7 +83,7 @@ class ReplicaLabels:
 
 
 def _class_names(path: Path) -> tuple[str, ...]:
-    """Read the class names, indexed by class id; an id without a name gets the void name."""
+    """Read the class names, indexed by class id; an id without a name gets an empty name."""
     found: Any = read_json(path).get("classes")
     try:
         names = {int(number): str(name) for number, name in found.items()}
@@ -126,7 +127,8 @@ class ReplicaSequence(Sequence):
         if not path.is_file():
             return None
         poses = _poses(path)
-        # traj.txt has one line per frame, or one per number if some frames were removed.
+        # traj.txt has one line per frame, or one line per original frame number if files of frames
+        # were removed.
         lines = self._files.numbers if len(poses) > len(self) else np.arange(len(self))
         known = lines < len(poses)
         return Trajectory(self.stamps_ns[known] / 1e9, poses[lines[known]])
@@ -142,7 +144,7 @@ def _calibration(folder: Path) -> Calibration:
     if path is None:
         raise DataError(
             f"the intrinsics are missing: neither {candidates[0]} nor {candidates[1]} exists. Copy "
-            "the cam_params.json of the data set there."
+            "the cam_params.json of the data set to one of these paths."
         )
     fields = read_json(path).get("camera")
     if not isinstance(fields, dict):

@@ -17,7 +17,8 @@ class Rig:
 
     color_camera: Camera
     depth_camera: Camera
-    T_color_depth: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4], meters.
+    # Transform from depth to color coordinates, [4, 4], meters.
+    T_color_depth: np.ndarray = field(default_factory=lambda: np.eye(4))
 
     @property
     def is_one_view(self) -> bool:
@@ -25,7 +26,14 @@ class Rig:
         return bool(np.linalg.norm(se3.log(self.T_color_depth)) < 1e-4)
 
     def register(self, depth_m: np.ndarray) -> np.ndarray:
-        """Register depth [Hd, Wd] in meters to the color camera, [Hc, Wc] float32."""
+        """Register a depth image to the color camera.
+
+        Args:
+            depth_m: Depth in the depth camera, [Hd, Wd], meters; 0 where not measured.
+
+        Returns:
+            Depth in the color camera, [Hc, Wc] float32, meters; 0 where unknown.
+        """
         return register_depth(depth_m, self.depth_camera, self.color_camera, self.T_color_depth)
 
     def T_world_color(self, T_world_depth: np.ndarray) -> np.ndarray:
@@ -41,11 +49,13 @@ class SequenceOptions:
         ConfigError: T_color_depth is not a rigid transform.
     """
 
-    register_depth: bool = False  # Register depth to the color camera, at the size of color.
-    # Cameras to use instead of those of the files or of the data set's documentation.
+    # True registers depth to the color camera, at the size of the color image.
+    register_depth: bool = False
+    # Values that replace those of the files or of the data set's documentation; None: no
+    # replacement.
     color_camera: Camera | None = None
     depth_camera: Camera | None = None
-    T_color_depth: np.ndarray | None = None  # [4, 4], meters.
+    T_color_depth: np.ndarray | None = None  # Depth to color coordinates, [4, 4], meters.
 
     def __post_init__(self) -> None:
         if self.T_color_depth is not None and not is_rigid(self.T_color_depth):

@@ -1,16 +1,17 @@
 """Sequences as ScanNet's SensReader exports them (Dai et al., CVPR 2017).
 
-color/*.jpg depth/*.png           numbered images of different size; depth in millimeters
+color/*.jpg depth/*.png           numbered images; sizes may differ; depth in millimeters
 pose/*.txt                        optional: 4x4 camera to world by rows, -inf where unknown
 intrinsic/intrinsic_color.txt     4x4 by rows, for the size of the color images
-intrinsic/intrinsic_depth.txt     the same for depth
-intrinsic/extrinsic_*.txt         optional: 4x4 from that camera to the sensor
+intrinsic/intrinsic_depth.txt     4x4 by rows, for the size of the depth images
+intrinsic/extrinsic_color.txt     optional: 4x4 from the color camera to the sensor
+intrinsic/extrinsic_depth.txt     optional: 4x4 from the depth camera to the sensor
 
-ScanNet's exports are aligned: their extrinsics are the identity, although color is larger than
-depth (1296x968 and 640x480). In this case, color is resampled to the depth image, and depth does
-not change. With other extrinsics, or with `SequenceOptions.register_depth`, depth is registered to
-the color camera. Poses are assumed to be those of the depth camera. In an aligned export, the poses
-of both cameras are equal.
+ScanNet's own exports are aligned: their extrinsics are the identity. Their color images have
+1296x968 pixels and their depth images 640x480. In an aligned export, color is resampled to the
+depth image, and depth does not change. With other extrinsics, or with
+`SequenceOptions.register_depth`, depth is registered to the color camera instead. Poses are assumed
+to be those of the depth camera. In an aligned export, the poses of both cameras are equal.
 """
 
 from dataclasses import replace
@@ -63,7 +64,11 @@ class ScanNetSequence(Sequence):
         return RawFrame(index, stamp_ns, color, depth, depth_scale, self.raw_camera)
 
     def truth(self) -> Trajectory | None:
-        """Return the trajectory of the camera of the frames, or None without poses."""
+        """Return the ground-truth trajectory, or None without poses.
+
+        The poses are those of the color camera if depth is registered to it, else of the depth
+        camera.
+        """
         paths = [self._folder / "pose" / f"{path.stem}.txt" for path in self._files.color]
         depth = read_trajectory(self.stamps_ns, paths)
         if depth is None or not self._is_registering:
@@ -75,8 +80,12 @@ class ScanNetSequence(Sequence):
     ) -> tuple[np.ndarray, np.ndarray, float]:
         """Bring color and depth to the pixel grid of this sequence's camera.
 
+        Args:
+            color: Color image, [Hc, Wc, 3] uint8 RGB.
+            depth: Depth, [Hd, Wd] uint16 millimeters.
+
         Returns:
-            Color, depth, and the units of depth per meter.
+            Color [H, W, 3], depth [H, W], and the units of depth per meter.
         """
         if self._is_registering:
             return color, self._rig.register(depth.astype(np.float32) / DEPTH_SCALE), 1.0

@@ -26,14 +26,16 @@ from .images import first_size, read_color, read_depth
 from .rig import Rig, SequenceOptions
 
 DEPTH_SCALE = 1000.0  # Units per meter.
-NOT_MEASURED = 65535  # Invalid like 0, by the data set's page.
+NOT_MEASURED = 65535  # Depth value that means unknown, as 0 does; from the data set's page.
 
 # The calibration of the depth camera is that of the data set's page. The color camera has the
 # Kinect's nominal focal length of 525 px, which Brachmann et al. (ICCV 2021) also use for 7-Scenes.
 # The baseline comes from two published calibrations of other Kinects (25.4 mm, ROS
-# kinect_calibration; 25.6 mm, LIRIS human activities data set). They agree along x, and on no other
-# component above 2.2 mm. Their rotations belong to their own principal points. With row 238 and no
-# rotation, edges of depth lie within a pixel of those of color in RedKitchen.
+# kinect_calibration; 25.6 mm, LIRIS human activities data set). Both calibrations agree along x,
+# and along y and z they agree on no offset above 2.2 mm. Their rotations are not used, since they
+# belong to their own principal points. The rotation here is the identity, and the principal point
+# is at row 238. Edges of depth then lie within a pixel of edges of color in the sequence
+# RedKitchen.
 DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 COLOR_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 238.0)
 T_COLOR_DEPTH = np.array([[1.0, 0, 0, -0.0254], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -67,7 +69,11 @@ class SevenScenesSequence(Sequence):
         return RawFrame(index, stamp_ns, color, depth, depth_scale, self.raw_camera)
 
     def truth(self) -> Trajectory | None:
-        """Return the trajectory of the camera of the frames, or None without poses."""
+        """Return the ground-truth trajectory, or None without poses.
+
+        The poses are those of the color camera if depth is registered to it, else of the depth
+        camera.
+        """
         paths = [
             path.with_name(path.name.split(".")[0] + ".pose.txt") for path in self._files.depth
         ]

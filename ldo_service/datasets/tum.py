@@ -26,7 +26,8 @@ CAMERA_JSON = (
     '{"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, '
     '"distortion": [k1, k2, p1, p2, k3], "depth_scale": 5000}, the last two optional'
 )
-ASSOCIATION_TOLERANCE_NS = 20_000_000  # The value of TUM's associate.py.
+# Maximum stamp difference of paired color and depth images; the value of TUM's associate.py.
+ASSOCIATION_TOLERANCE_NS = 20_000_000
 LAST_STAMP_NS = 2**63 - 1  # Maximum of int64, in the year 2262.
 DEPTH_SCALE = 5000.0  # Units per meter in all recordings of the benchmark.
 
@@ -44,10 +45,10 @@ PUBLISHED_CAMERAS = {
 
 @dataclass(frozen=True, slots=True)
 class _Listing:
-    """Contents of a list file."""
+    """Contents of rgb.txt or depth.txt."""
 
     stamps_ns: np.ndarray  # [N] int64, ascending.
-    files: list[str]
+    files: list[str]  # Paths of the N images, relative to the folder of the sequence.
 
 
 class TumSequence(Sequence):
@@ -92,7 +93,7 @@ class TumSequence(Sequence):
 
 
 def _listing(path: Path) -> _Listing:
-    """Read lines of `stamp file`, and sort them by stamp.
+    """Read rgb.txt or depth.txt: lines of `stamp file`, which are sorted by stamp.
 
     Raises:
         DataError: The file cannot be read, or a line is invalid.
@@ -113,7 +114,7 @@ def _listing(path: Path) -> _Listing:
 def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
     words = line.split(maxsplit=1)
     try:
-        # A float cannot represent nanoseconds since 1970.
+        # The stamp is parsed as Decimal, since a float cannot represent nanoseconds since 1970.
         stamp_ns = int(Decimal(words[0]) * 10**9)
         name = words[1].strip()
         if abs(stamp_ns) > LAST_STAMP_NS or "\0" in name:
