@@ -47,8 +47,8 @@ class SuiteRunner:
         suite: The suite.
         data: Folder with the sources.
         out: Folder for the runs.
-        settings: Settings of all runs; those of a variant override them.
-        overwrite: Repeat finished runs too.
+        settings: Settings of all runs; the settings of a variant override these.
+        overwrite: True repeats finished runs too.
     """
 
     suite: Suite
@@ -65,7 +65,7 @@ class SuiteRunner:
         """Run the suite and yield the outcome of each run.
 
         Args:
-            begun: Called before each run.
+            begun: Function that is called with each run before the run starts.
         """
         for entry in self.entries():
             begun(entry)
@@ -79,7 +79,9 @@ class SuiteRunner:
             failed = self._run(entry, folder)
             if failed:
                 log.error(
-                    "suite: run %s failed: %s The table shows it as failed.", entry.folder, failed
+                    "suite: run %s failed: %s The table shows this run as failed.",
+                    entry.folder,
+                    failed,
                 )
                 return Outcome(entry, None, "failed")
         try:
@@ -144,7 +146,8 @@ def read_evaluated_run(folder: Path) -> EvaluatedRun:
         return EvaluatedRun(*map(json.loads, texts))
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"{folder} has no valid results ({error}). Remove it to run it again."
+            f"{folder} has no valid results ({error}). Remove this folder, and start the suite "
+            "again to repeat the run."
         ) from error
 
 

@@ -13,10 +13,12 @@ from msgspec import field
 from ldo_service.errors import ConfigError
 from ldo_service.storage.yaml_io import load_yaml
 
+# Names of the protocols of rendering in the output of `ldo eval --json`.
 HELD_OUT, TRAINING = "A held out", "B training"
 
 HERE = Path(__file__).parent
 SYNTHETIC = "synthetic:"
+# Metrics that depend on the front end: tracker and detector.
 OF_FRONT_END = frozenset({"fps", "tracking_s", "ate_online_cm"})
 NAME = re.compile(r"[\w][\w .+-]{0,60}")  # Valid names of folders.
 
@@ -43,7 +45,11 @@ class EvaluatedRun:
         Args:
             protocol: Protocol of the evaluation, HELD_OUT or TRAINING.
             figure: Name of the metric.
-            newest: Use the refined map if there is one, not the map at the end of the stream.
+            newest: True uses the refined map if there is one. False uses the map at the end of the
+                stream.
+
+        Returns:
+            The mean in the unit of the metric; None if the metric has no value.
         """
         rows = [row for row in self.results["rendering"] if row["protocol"] == protocol]
         return rows[-1 if newest else 0]["mean"][figure]
@@ -51,7 +57,7 @@ class EvaluatedRun:
     def labels(self) -> dict[str, Any]:
         """Return the label metrics of the newest map.
 
-        They cover background and the COCO classes with at least 0.2 % of the pixels.
+        The metrics cover background and the COCO classes with at least 0.2 % of the pixels.
         """
         return self.results["labels"][-1]["lists"]["COCO"]["from 0.2 %"]
 
@@ -66,7 +72,7 @@ class Score:
 
     Attributes:
         title: Title of the column.
-        form: Number format.
+        form: Format specification of the value, such as ".2f".
         read: Returns the value from the results. Without a value it returns None or raises
             KeyError, IndexError or TypeError.
     """
@@ -137,7 +143,8 @@ class SuiteRun:
     source: str
     settings: tuple[str, ...]
     seed: int | None  # Seed of a synthetic source, else None.
-    # Variant that provides the recorded front end; None if the run has its own.
+    # Variant whose recorded front end (outputs of tracker and detector) the run reuses; None if the
+    # run has its own.
     front_end: str | None = None
 
     @property
@@ -165,21 +172,24 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     title: str
     about: str = ""
-    sequences: dict[str, str]  # Name: source, a folder within the data folder or synthetic:...
+    # Source by name of the sequence: a folder within the data folder, or synthetic:...
+    sequences: dict[str, str]
+    # Settings by name of the variant, as for `ldo run --set`.
     variants: dict[str, tuple[str, ...]] = field(default_factory=lambda: {"LDO-SLAM": ()})
-    # Name: settings, as for `ldo run --set`.
-    figures: tuple[str, ...]
-    # First variant, if only it runs the front end. The others reuse the recorded outputs of its
-    # tracker and detector, so that all poses are equal.
+    figures: tuple[str, ...]  # Names of the metrics in the tables, from FIGURES.
+    # Name of the first variant, if this variant alone runs the front end. The other variants reuse
+    # the recorded outputs of its tracker and detector, so that all poses are equal. None: each
+    # variant runs its own front end.
     front_end: str | None = None
-    # Seeds of synthetic sources. A data set has none, because its runs are identical.
+    # Seeds of synthetic sources. A data set needs no seed, because its runs are identical.
     seeds: tuple[int, ...] = (0,)
+    # Options of `ldo run`: --hold-out-every, --refine-iterations, --stride and --max-frames.
     hold_out: int = 0
     refine: int = 0
     stride: int = 1
-    max_frames: int | None = None
+    max_frames: int | None = None  # `None` uses all frames.
+    # Published values by method, sequence and metric.
     published: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
-    # Method: sequence: metric.
 
     def __post_init__(self) -> None:
         if not self.sequences or not self.variants or not self.figures or not self.seeds:
@@ -228,7 +238,7 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                     yield SuiteRun(sequence, variant, where, settings, seed, front_end)
 
     def front_end_settings(self) -> tuple[str, ...] | None:
-        """Return the settings of the variant whose front end others reuse; None without one."""
+        """Return the settings of the variant whose front end the others reuse; None without one."""
         return None if self.front_end is None else self.variants[self.front_end]
 
     def options(self) -> list[str]:

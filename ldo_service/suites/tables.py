@@ -14,8 +14,8 @@ def markdown(suite: Suite, outcomes: Sequence[Outcome]) -> str:
     """Return the outcomes of a suite as tables in Markdown.
 
     If the suite has one sequence, one table shows all metrics. Otherwise there is one table for
-    each metric, with a column for each sequence. A cell has the mean and the standard deviation
-    over the seeds. The first rows are published values.
+    each metric, with a column for each sequence. A cell has the mean over the seeds, and with
+    several seeds the standard deviation. The first rows are published values.
     """
     parts = [f"# {suite.title}", suite.about.strip()]
     if len(suite.sequences) == 1:
