@@ -17,7 +17,7 @@ from .values import (
 
 @dataclass(frozen=True, slots=True)
 class RetrievalSettings:
-    """Search for subgraphs of keyframes that look like the newest one."""
+    """Search for subgraphs of keyframes that look like the newest subgraph."""
 
     # Comparison of subgraphs: by labels and images (two_stage), by labels alone (semantic), or by
     # images alone (geometric). The latter two serve for evaluation.
@@ -40,7 +40,7 @@ class VerificationSettings:
     # Minimum number of features that agree on the pose. A lower value finds more loop closures, and
     # more false ones.
     min_inliers: Annotated[int, Meta(ge=6)] = 20
-    # Minimum fraction of the new surface that the old keyframe sees too.
+    # Minimum fraction of the surface in the new keyframe that the old keyframe shows too.
     min_overlap: Ratio = advanced(0.2)
     # Maximum RMSE between the two surfaces along their normals, meters.
     max_rmse_m: PositiveFloat = advanced(0.03)
@@ -53,7 +53,7 @@ class DriftGateSettings:
     # Drift that a loop closure may correct on a path of any length, meters.
     max_drift_m: NonNegativeFloat = advanced(0.5)
     # Additional drift that a loop closure may correct, as a fraction of the path length. The
-    # default is ten times the drift of depth cameras.
+    # default is ten times the usual drift of odometry with depth cameras.
     max_drift_ratio: NonNegativeFloat = advanced(0.1)
 
 
@@ -72,13 +72,14 @@ class LoopCloserSettings:
 class NoiseSettings:
     """Noise of measurements in the pose graph."""
 
-    # Random walk of odometry rotations, in radians per square root of a meter. With 0, a loop
-    # closure cannot spread its correction over the odometry.
+    # Random walk of odometry rotations, in radians per square root of a meter. With 0, the
+    # correction of a loop closure cannot be spread over the path.
     drift_rad_per_sqrt_m: NonNegativeFloat = advanced(0.02)
-    # Random walk of odometry translations, in meters per square root of a meter: about 1 % after
-    # some meters.
+    # Random walk of odometry translations, in meters per square root of a meter. The default is 4
+    # cm, or 1 %, after 4 m.
     drift_m_per_sqrt_m: NonNegativeFloat = advanced(0.02)
-    # Rotation noise of a loop closure, radians. It covers unmodeled calibration and exposure.
+    # Rotation noise of a loop closure, radians. It covers errors of calibration and exposure, which
+    # the measurement does not model.
     loop_rotation_rad: PositiveFloat = advanced(0.01)
     # Translation noise of a loop closure, meters.
     loop_translation_m: PositiveFloat = advanced(0.01)
@@ -105,7 +106,7 @@ class LandmarkSettings:
     # Maximum number of landmarks in the pose graph. Beyond it, those not observed for the longest
     # time are removed.
     max_landmarks: PositiveInt = 1000
-    # Schedule of object observations in the pose graph: after enough of them are pending
+    # Time at which object observations are added to the pose graph: when enough of them are pending
     # (adaptive), or at every keyframe (fixed).
     schedule: Literal["adaptive", "fixed"] = advanced("adaptive")
 

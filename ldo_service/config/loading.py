@@ -31,7 +31,7 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
     """Return the defaults, changed by a YAML file and then by single settings.
 
     Args:
-        path: The YAML file; None uses none.
+        path: The YAML file; None for no file.
         settings: Settings as `section.field=value`.
 
     Raises:

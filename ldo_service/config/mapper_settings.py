@@ -42,7 +42,8 @@ class DensifySettings:
 class LearningRateSettings:
     """Learning rates of Adam per iteration, 5 to 10 times those of 3DGS."""
 
-    # Learning rate of a center, meters. A keyframe gets tens of iterations, not thousands.
+    # Learning rate of a center, meters. It is high, because a keyframe gets tens of iterations
+    # instead of thousands.
     mean_m: NonNegativeFloat = advanced(5e-4)
     # Learning rate of the logarithm of a scale.
     log_scale: NonNegativeFloat = advanced(0.06)
@@ -52,10 +53,10 @@ class LearningRateSettings:
     opacity_logit: NonNegativeFloat = advanced(0.1)
     # Learning rate of a color in 0..1.
     color: NonNegativeFloat = advanced(0.01)
-    # Learning rate of keyframe rotations, radians. 0 keeps them. 2e-4 gains 0.3 dB and adds 1 mm of
-    # noise to exact poses.
+    # Learning rate of keyframe rotations, radians. 0 does not change the rotations. 2e-4 gains 0.3
+    # dB and adds 1 mm of noise to exact poses.
     pose_rotation_rad: NonNegativeFloat = advanced(0.0)
-    # Learning rate of keyframe positions, meters. 0 keeps them.
+    # Learning rate of keyframe positions, meters. 0 does not change the positions.
     pose_translation_m: NonNegativeFloat = advanced(0.0)
 
 
@@ -69,8 +70,8 @@ class LossSettings:
     d_ssim: NonNegativeFloat = advanced(0.2)
     # Weight of the depth error per meter.
     depth: NonNegativeFloat = advanced(0.5)
-    # Maximum standard deviation of a Gaussian in the image, pixels. Without it one Gaussian would
-    # cover a whole wall. 10 costs 0.6 dB.
+    # Maximum standard deviation of a Gaussian in the image, pixels. Without a limit, one Gaussian
+    # could cover a whole wall. 10 costs 0.6 dB.
     max_sigma_px: PositiveFloat = advanced(20.0)
 
 
@@ -94,8 +95,8 @@ class KeyframeImageSettings:
     # Maximum size of keyframe images on disk, MB. The default holds some 8,000 keyframes of
     # 640x480. Beyond it, the most redundant ones are deleted.
     disk_mb: PositiveFloat = 4096.0
-    # Maximum number of keyframes with images on disk, because each takes 3 kB of memory, however
-    # small its image.
+    # Maximum number of keyframes with images on disk. Each of them takes 3 kB of memory,
+    # independent of the size of its image.
     max_keyframes: PositiveInt = advanced(20_000)
 
 
@@ -125,7 +126,8 @@ class ObjectSettings:
 
     # Number of keyframes that must observe a candidate before it becomes an object (III.C).
     min_observations: PositiveInt = 3
-    # Maximum number of objects in the map, 6 MB. A keyframe takes some ms with all of them in view.
+    # Maximum number of objects in the map. The default number takes 6 MB of memory, and some ms per
+    # keyframe if all objects are in view.
     max_objects: PositiveInt = 2000
     # Minimum IoU of the boxes of a detection and an object that are associated (III.C).
     min_iou: PositiveRatio = advanced(0.4)
@@ -145,7 +147,8 @@ class OpenVocabularySettings:
     # True counts detector boxes as votes for the label of a region. False leaves the label to the
     # labeller alone.
     detector_votes: bool = advanced(True)
-    # Minimum confidence of a label result. 0.5 costs 7 points of recall on the flat.
+    # Minimum confidence of a label result. 0.5 lowers the recall on synthetic:flat by 7 percentage
+    # points.
     min_confidence: Ratio = advanced(0.3)
 
 
@@ -155,11 +158,11 @@ class PublishSettings:
 
     # Minimum number of keyframes between two snapshots of the map, which limits the bandwidth.
     snapshot_interval_keyframes: PositiveInt = advanced(10)
-    # Maximum number of Gaussians per message, so that it blocks no other for long. 16,384 take 1.2
-    # MB, or 1.8 MB with labels.
+    # Maximum number of Gaussians per message, so that a message does not delay others for long.
+    # 16,384 Gaussians take 1.2 MB, or 1.8 MB with labels.
     max_gaussians_per_message: PositiveInt = advanced(16_384)
-    # Number of keyframes between messages with changed old Gaussians, because each keyframe
-    # changes all Gaussians in view.
+    # Number of keyframes between messages with changed old Gaussians. These Gaussians are not sent
+    # at every keyframe, because each keyframe changes all Gaussians in view.
     update_interval_keyframes: PositiveInt = advanced(5)
 
 
@@ -170,7 +173,8 @@ class RefitSettings:
     # Refit iterations for each keyframe that a correction moves by more than 1 cm or 0.01 rad. Its
     # motion counts against the oldest keyframe within a cube of 2 m.
     iterations: NonNegativeInt = advanced(12)
-    # Pending refit iterations that run with each new keyframe if no other keyframe is queued.
+    # Maximum number of pending refit iterations that run with each new keyframe, if no other
+    # keyframe is queued.
     iterations_per_keyframe: NonNegativeInt = advanced(6)
 
 
@@ -183,10 +187,11 @@ class MapperSettings:
     iterations: NonNegativeInt = 12
     # Threads of the renderer. 0 uses all cores but one, which is left for the tracker.
     threads: NonNegativeInt = 0
-    # Number of keyframes between checkpoints of the map. After a crash, up to so many keyframes are
-    # mapped again.
+    # Number of keyframes between checkpoints of the map. After a crash, up to this many keyframes
+    # are mapped again.
     checkpoint_interval_keyframes: PositiveInt = 5
-    # Folder of the keyframe images. Empty uses the state folder, or a temporary one.
+    # Folder of the keyframe images. Empty uses the state folder, or a temporary folder if there is
+    # no state folder.
     image_folder: str = advanced("")
     # Seed of the random choice of keyframes that are optimized.
     seed: NonNegativeInt = advanced(0)

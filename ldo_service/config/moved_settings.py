@@ -31,10 +31,13 @@ def refuse_moved(tree: dict[str, Any]) -> None:
 
 
 def moved(path: str) -> str:
-    """Return a sentence with the new name of a setting.
+    """Return a sentence that gives the new name of a setting, or the constant that replaces it.
 
-    The sentence of a setting that is now a constant has its value. The result is empty if the
-    setting has not moved.
+    Args:
+        path: Path of a setting in this or an earlier version, such as `stage.nice`.
+
+    Returns:
+        The sentence; empty if the setting has not moved.
     """
     kind, new = _table().get(path, ("", ""))
     if kind == "setting":
@@ -51,7 +54,7 @@ def was_section(path: str) -> bool:
 
 @functools.cache
 def _table() -> dict[str, tuple[str, str]]:
-    """Return the kind and the new name of each old path."""
+    """Return the kind ("setting" or "constant") and the new name of each setting, by old path."""
     text = files("ldo_service.config").joinpath("moved_settings.tsv").read_text()
     rows = [line.split("\t") for line in text.splitlines()[1:]]
     return {old: (kind, new) for old, kind, new in rows}

@@ -23,14 +23,15 @@ class DetectorSettings:
 
     # Detection network: a name from `ldo models list`, or an ONNX file. Empty disables detection.
     model: str = ""
-    # File with one class name per line. Empty uses the names in the network, or the 80 of COCO.
+    # File with one class name per line. Empty uses the names in the file of the network, or the 80
+    # names of COCO if it has none.
     class_names: str = ""
     # Minimum score of a detection. The default is that of YOLOv5 and YOLOX.
     min_score: Ratio = 0.25
     # COCO classes of objects that may move by themselves. Tracking and loop closing ignore their
     # pixels.
     dynamic_classes: tuple[str, ...] = DynamicClassConfig().classes
-    # Output layout of the network. Empty recognizes it by the shape of the output.
+    # Output layout of the network. Empty recognizes the layout by the shape of the output.
     layout: Literal["", "yolov5", "yolox", "yolov8"] = advanced("")
     # Width and height of the input of a network that accepts any size, pixels.
     input_size_px: tuple[PositiveInt, PositiveInt] = advanced((640, 480))
@@ -58,14 +59,16 @@ class EncoderSettings:
     prompts: Annotated[tuple[str, ...], Meta(min_length=1)] = advanced(
         ("a photo of a {}.", "a cropped photo of a {}.", "a {} in a room.")
     )
-    # Mean that normalizes RGB in 0..1. Empty uses the mean of the encoder, or that of CLIP.
+    # Mean that normalizes RGB in 0..1. Empty uses the mean in the file of the encoder, or the mean
+    # of CLIP if the file has none.
     image_mean: tuple[float, ...] = advanced(())
-    # Standard deviation that normalizes RGB in 0..1. Empty uses that of the encoder, or of CLIP.
+    # Standard deviation that normalizes RGB in 0..1. Empty uses the value in the file of the
+    # encoder, or the value of CLIP if the file has none.
     image_std: tuple[PositiveFloat, ...] = advanced(())
-    # Factor on the similarities before the softmax over names; a larger one sharpens it. 0
-    # uses that of the pair, or 100 as in CLIP.
+    # Factor on the similarities before the softmax over names. A larger factor sharpens the
+    # softmax. 0 uses the factor in the files of the pair, or 100 as in CLIP if they have none.
     logit_scale: NonNegativeFloat = advanced(0.0)
-    # Names such as wall and floor that compete with the others but are never reported.
+    # Names such as wall and floor that compete with the other names but are never reported.
     background_names: tuple[str, ...] = advanced(())
 
     def __post_init__(self) -> None:
@@ -88,14 +91,15 @@ class EncoderSettings:
 class HttpSettings:
     """Vision-language model on an OpenAI-compatible server."""
 
-    # Name of the model on the server. Empty uses the only one.
+    # Name of the model on the server. Empty uses the only model of the server.
     model: str = ""
     # Confidence of a label if the server returns no log-probabilities.
     default_confidence: Ratio = 0.3
     # Timeout of one attempt of a request to the server, seconds.
     timeout_s: PositiveFloat = 10.0
-    # Timeout of the label of one region, with all views, attempts and waits, seconds. Together with
-    # timeout_s it must be below service.control_timeout_s and supervision.backend_step_timeout_s.
+    # Timeout of the label of one region, with all views, attempts and waits, seconds. The sum of
+    # deadline_s and timeout_s must be below service.control_timeout_s and
+    # supervision.backend_step_timeout_s.
     deadline_s: PositiveFloat = 40.0
     # Environment variable with the API key. Empty sends no key.
     api_key_variable: str = ""
@@ -103,7 +107,7 @@ class HttpSettings:
     max_views: PositiveInt = advanced(2)
     # Maximum number of attempts of a request.
     max_attempts: PositiveInt = advanced(3)
-    # Maximum number of attempts per minute, evenly spaced, which limits the cost.
+    # Maximum number of attempts per minute, which limits the cost. Attempts are evenly spaced.
     max_requests_per_minute: PositiveFloat = advanced(60.0)
 
     def __post_init__(self) -> None:
@@ -122,8 +126,8 @@ class VlmLabellerSettings:
     model: str = ""
     # URL of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1. Empty uses none.
     url: str = ""
-    # File with one name per line to choose from. Empty uses the names of the pair, or the 80 of
-    # COCO.
+    # File with one name per line to choose from. Empty uses the names of the encoder pair, or the
+    # 80 names of COCO if it has none.
     class_names: str = ""
     encoder: EncoderSettings = field(default_factory=EncoderSettings)
     http: HttpSettings = field(default_factory=HttpSettings)

@@ -24,7 +24,8 @@ class PaperSettings:
     """
 
     # Rule that labels a Gaussian: the fraction of its splat that a region covers, or the paper's
-    # IoU of box and Gaussian (III.A). IoU labels almost none, because a splat has few pixels.
+    # IoU of box and Gaussian (III.A). IoU labels almost no Gaussian, because a splat has few
+    # pixels.
     assignment_rule: Literal["coverage", "iou"] = advanced("coverage")
     # Pixels that a detection labels: the foreground in its box, or the whole box as in the paper
     # (III.A).
@@ -32,14 +33,15 @@ class PaperSettings:
     # Maximum distance of a labelled Gaussian from the measured depth, meters. This is delta_z
     # (III.A).
     max_depth_gap_m: PositiveFloat = advanced(0.1)
-    # Rule of the moving average of labels: corrected, or as in the paper (III.A).
+    # Rule of the moving average of labels: that of this implementation (corrected), or that of the
+    # paper (III.A).
     ema_rule: Literal["corrected", "paper"] = advanced("corrected")
     # Fraction of its past that the moving average keeps. This is lambda (III.A).
     ema_keep_ratio: Annotated[float, Meta(ge=0, lt=1)] = advanced(0.9)
     # Fraction by which the corrected rule weakens uncertain observations of settled Gaussians.
     ema_hold_back_ratio: Ratio = advanced(1.0)
-    # Number of missed keyframes after which the paper's rule removes a label. This is N_miss
-    # (III.A).
+    # Number of successive keyframes without an observation after which the paper's rule removes a
+    # label. This is N_miss (III.A).
     label_max_misses: Annotated[int, Meta(ge=1, le=255)] = advanced(5)
     # Rule that fuses detector and labeller: by entropy (adaptive), by a fixed weight, or not at all
     # (detector).
@@ -48,14 +50,16 @@ class PaperSettings:
     fusion_beta: PositiveFloat = advanced(2.0)
     # Constant epsilon of the adaptive fusion (III.B).
     fusion_epsilon: PositiveFloat = advanced(1e-6)
-    # Weight of the fixed fusion, an ablation (IV.C).
+    # Weight of the detector in the fixed fusion, an ablation (IV.C).
     fusion_fixed_weight: Ratio = advanced(0.5)
     # Distance scale of the weights with which neighbors average their labels, meters. This is
     # sigma_cons (III.A).
     consistency_sigma_m: PositiveFloat = advanced(0.05)
-    # Maximum distance of neighbors, meters: three sigma, where a weight is below 2e-4.
+    # Maximum distance of neighbors, meters. The default is three times the distance scale, where a
+    # weight is below 2e-4.
     consistency_radius_m: PositiveFloat = advanced(0.15)
-    # Fraction by which one step moves a label. This is 1 - lambda (III.A).
+    # Fraction by which one step moves a label toward the average of its neighbors. This is 1 -
+    # lambda (III.A).
     consistency_rate: Ratio = advanced(0.1)
     # Maximum KL divergence of the classes of a detection and an object that are associated (III.C).
     object_max_divergence_nats: NonNegativeFloat = advanced(0.2)

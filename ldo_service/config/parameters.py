@@ -1,8 +1,8 @@
 """Conversion of the configuration to the parameters of the actors and of the runtime.
 
-Only this module knows which parameters a setting determines. Some settings determine parameters of
-several actors. A parameter without a setting keeps the default of its class, where a comment gives
-the reason.
+This module and `network_parameters` alone define which parameters a setting determines. Some
+settings determine parameters of several actors. A parameter without a setting keeps the default of
+its class, where a comment gives the reason.
 """
 
 from ldo_service.actors.frame_source import FrameSourceConfig
@@ -63,7 +63,7 @@ from ldo_service.tracking.window import WindowConfig
 from .network_parameters import detector_parameters, labeller_parameters
 from .sections import Config
 
-FOREGROUND = ForegroundConfig()  # Labels, regions and landmarks of loops share one foreground test.
+FOREGROUND = ForegroundConfig()  # Foreground test of labels, regions and landmarks of loops.
 
 
 def actor_parameters(config: Config) -> ActorParameters:

@@ -18,13 +18,13 @@ from .values import ADVANCED
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Setting of the configuration: its path, its value, that value as YAML, and its comment."""
+    """Setting of the configuration."""
 
     path: str
     value: Any
-    text: str
+    text: str  # The value as YAML.
     comment: str
-    is_public: bool
+    is_public: bool  # False for an advanced setting.
 
 
 def config_yaml(config: Config) -> str:
@@ -98,8 +98,8 @@ _COMMENT = re.compile(r"^ {4,}# (?P<comment>.+)$")
 def _comments(schema: type) -> dict[str, str]:
     """Return the comment of each field in the source of a dataclass.
 
-    A comment starts behind the field and continues on the lines below. A field without one takes
-    the lines above it, if they begin with a capital letter.
+    A comment starts behind the field and continues on the lines below. A field with no comment
+    behind it takes the comment lines above it, if they begin with a capital letter.
     """
     comments: dict[str, list[str]] = {}
     last, block = "", list[str]()

@@ -46,10 +46,11 @@ class Config:
         """Check that the service waits long enough for the server of the labeller.
 
         Raises:
-            ConfigError: A label request may take longer than a timeout of the service.
+            ConfigError: A label request, with one attempt as margin, may take longer than a timeout
+                of the service.
         """
         http = self.vlm_labeller.http
-        max_s = http.deadline_s + http.timeout_s  # The time to connect counts separately.
+        max_s = http.deadline_s + http.timeout_s  # Deadline of a label, with one attempt as margin.
         limits = {
             "supervision.backend_step_timeout_s": self.supervision.backend_step_timeout_s,
             "service.control_timeout_s": self.service.control_timeout_s,

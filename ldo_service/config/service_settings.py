@@ -35,8 +35,8 @@ class DatasetSettings:
 
     # True registers depth to the color camera. False uses the depth as it is in the files.
     register_depth: bool = False
-    # The 16 numbers of T_color_depth, row by row, translation in meters. Empty uses those of the
-    # data set.
+    # Transform from depth to color coordinates: the 16 numbers of the 4x4 matrix, row by row, with
+    # the translation in meters. Empty uses the transform of the data set.
     T_color_depth: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -64,7 +64,7 @@ class DatasetSettings:
 
 @dataclass(frozen=True, slots=True)
 class LatencySettings:
-    """Latency of actors on the logical clock of `ldo run`; the other actors have none."""
+    """Latency of actors on the logical clock of `ldo run`; other actors have no latency."""
 
     # Frames between a keyframe and its detections.
     detector: NonNegativeInt = advanced(3)
@@ -95,15 +95,15 @@ class ServiceSettings:
     # Actors that run in processes of their own. The default is the actor that uses gtsam, which
     # holds the GIL during every call.
     process_actors: tuple[str, ...] = ("optimizer",)
-    # Actors that run on another machine, by `ldo serve --client --actor NAME`. This service waits
-    # for none of them.
+    # Actors that run on another machine, by `ldo serve --client --actor NAME`. This service does
+    # not wait for them.
     remote_actors: tuple[Literal["detector", "vlm_labeller", "loop_closer", "optimizer"], ...] = ()
     # Maximum time for each actor to handle its queued messages when the service stops, seconds.
     shutdown_timeout_s: PositiveFloat = 10.0
     # Seconds without a heartbeat after which a process is killed and started again.
     heartbeat_timeout_s: PositiveFloat = 10.0
-    # True calls fsync after each step, before its outputs are published, which takes 12 ms. False
-    # may lose the state in a power cut.
+    # True calls fsync after each step, before the outputs of the step are published. This takes 12
+    # ms. With False, a power cut may lose the state.
     fsync: bool = False
     # Folder with the TLS keys that `ldo keys add` made. The option --keys overrides it.
     keys: str = ""
@@ -112,8 +112,8 @@ class ServiceSettings:
     # Address on which Prometheus metrics are served. With 0.0.0.0 anyone on the network can
     # see when the robot works.
     metrics_address: str = LOOPBACK
-    # Maximum time for all actors to execute `ldo control`, seconds. The slowest measured took 0.6
-    # s; a labeller may wait 50 s for its server.
+    # Maximum time for all actors to execute `ldo control`, seconds. The slowest measured command
+    # took 0.6 s, but a labeller may wait 50 s for its server.
     control_timeout_s: PositiveFloat = advanced(55.0)
     # Maximum size of a message that is decoded, MB. Raw color and depth of 8 megapixels have 58 MB.
     max_decoded_message_mb: PositiveFloat = advanced(64.0)
@@ -125,8 +125,8 @@ class RecordingSettings:
 
     # Maximum size of the folder of a recording in GB, at which the recording ends.
     max_gb: PositiveFloat = 50.0
-    # Minimum free disk space in GB, which the states of actors need. The recording ends when
-    # less is left.
+    # Minimum free disk space in GB, which the states of actors need. The recording ends when less
+    # space is free.
     min_free_gb: NonNegativeFloat = 1.0
 
 
@@ -135,21 +135,22 @@ class SupervisionSettings:
     """Supervision of actors."""
 
     # Maximum number of restarts of an actor within a minute. A further failure ends the service,
-    # because a restart does not help.
+    # because restarts do not help then.
     max_restarts: NonNegativeInt = 5
     # Maximum duration of one step of an actor, seconds. The default is 100 times the slowest step
     # measured.
     step_timeout_s: PositiveFloat = 60.0
-    # The same for the actors for which no other waits (optimizer, loop closer, detector and
-    # labeller), seconds. One optimization of a large pose graph may take minutes.
+    # Maximum duration of one step of the optimizer, loop closer, detector or labeller, seconds. No
+    # other actor waits for these four. One optimization of a large pose graph may take minutes.
     backend_step_timeout_s: PositiveFloat = advanced(600.0)
-    # Maximum disk space for the messages of one topic that these actors have not handled yet, MB.
-    # The oldest are dropped beyond. The default holds 11 minutes of keyframes of 640x480 at 2 Hz.
+    # Maximum disk space, MB, for waiting messages of one topic to the optimizer, loop closer,
+    # detector or labeller. Beyond it, the oldest messages are dropped. The default holds 11 minutes
+    # of keyframes of 640x480 at 2 Hz.
     backlog_mb: PositiveFloat = 2000.0
     # Niceness of threads that may run late (Linux). The default gives them a tenth of the CPU
     # weight of the tracker.
     background_nice: Annotated[int, Meta(ge=0, le=19)] = 10
-    # Interval of heartbeats, seconds. A missing heartbeat shows within two intervals.
+    # Interval of heartbeats, seconds. A missing heartbeat is noticed within two intervals.
     heartbeat_s: PositiveFloat = advanced(0.5)
     # Time without handling a message after which a consumer with a full queue is evicted, seconds.
     # Such a consumer blocks its producers.
@@ -160,14 +161,14 @@ class SupervisionSettings:
 class ViewerSettings:
     """Browser view (`ldo view`)."""
 
-    # Address on which the window is served. It needs no keys: anyone who reaches it can see the
-    # map.
+    # Address on which the window is served. The window needs no keys, so anyone who can reach this
+    # address can see the map.
     address: str = LOOPBACK
     # Port on which the window is served. If it is in use, the next free port is taken. 0 uses any
     # free port.
     port: Annotated[int, Meta(ge=0, le=65535)] = 8080
-    # Maximum number of Gaussians in the browser, at 32 bytes each. Those of the largest weight are
-    # sent.
+    # Maximum number of Gaussians in the browser, at 32 bytes each. The Gaussians of the largest
+    # weight are sent.
     max_gaussians: PositiveInt = 300_000
     # Interval of updates of the window, seconds. The default shows poses at 5 Hz.
     update_interval_s: PositiveFloat = advanced(0.2)

@@ -92,8 +92,8 @@ class FeatureSettings:
 class KeyframeSettings:
     """Selection of keyframes."""
 
-    # Minimum fraction of the visible surface that overlaps with the last keyframe. Below it, a
-    # keyframe is made.
+    # Minimum fraction of the surface in the last keyframe that a frame shows. Below it, a keyframe
+    # is made.
     min_overlap: Ratio = 0.85
     # Maximum rotation from the last keyframe, radians. Above it, a keyframe is made. The default is
     # 15 degrees.
@@ -106,11 +106,11 @@ class KeyframeSettings:
     min_interval_frames: PositiveInt = advanced(1)
     # Maximum number of frames between keyframes, if the camera moved at all.
     max_interval_frames: PositiveInt = advanced(30)
-    # Fraction of the rotation and translation limits after which a mapping keyframe is made. With a
-    # value above 1 there are none. Mapping keyframes gain 0.4 dB on the sequence kitchen.
+    # Fraction of the rotation and translation limits above which a mapping keyframe is made. With a
+    # value above 1, none is made. Mapping keyframes gain 0.4 dB on the sequence kitchen.
     mapping_only_ratio: PositiveFloat = advanced(0.33)
-    # Number of keyframes after which the tracker searches for a known keyframe before it makes a
-    # new one. Before that, every new keyframe improves the map. 0 never searches.
+    # Number of keyframes after which the tracker searches for a known keyframe before it makes a new
+    # keyframe. With fewer keyframes, every new one improves the map. 0 never searches.
     reuse_after: NonNegativeInt = 1500
 
     def __post_init__(self) -> None:
@@ -125,8 +125,8 @@ class KeyframeSettings:
 class WindowSettings:
     """Relative-pose measurements between a new keyframe and earlier keyframes."""
 
-    # Maximum number of earlier keyframes to which a new keyframe is aligned, at 4 ms each. More of
-    # them change little. 0 uses none.
+    # Maximum number of earlier keyframes to which a new keyframe is aligned, at 4 ms each. A larger
+    # number changes little. 0 aligns to none.
     max_measurements: NonNegativeInt = advanced(3)
 
 
@@ -157,15 +157,16 @@ class SubmapSettings:
 class QualitySettings:
     """Limits between the tracking statuses OK, WEAK and LOST."""
 
-    # Minimum fraction of the visible reference surface that is matched. Below it, a pose is WEAK.
-    # Chosen on one apartment.
+    # Minimum fraction of the surface in the reference keyframe that a frame shows. Below it, a pose
+    # is WEAK. The default was chosen on one apartment.
     weak_overlap: Ratio = advanced(0.15)
     # Maximum ratio of the residual to its running median. Above it, a pose is WEAK. A pose that
-    # features confirm closely may have a ratio of 6, and is LOST above 15.
+    # features confirm closely may have a ratio of up to 6, and is LOST above 15.
     weak_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(2.5)
     # Maximum ratio of the residual to its running median. Above it, a pose is LOST.
     lost_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(5.0)
-    # Minimum fraction of the visible reference surface that is matched. Below it, a pose is LOST.
+    # Minimum fraction of the surface in the reference keyframe that a frame shows. Below it, a pose
+    # is LOST.
     lost_overlap: Ratio = advanced(0.08)
 
     def __post_init__(self) -> None:
@@ -193,11 +194,11 @@ class DynamicsSettings:
 class OdometryPriorSettings:
     """Use of poses of another odometry as initial guesses."""
 
-    # Maximum time between two poses of the other odometry that are interpolated, seconds. The path
-    # between more distant poses is not straight.
+    # Maximum time between two poses of the other odometry that are interpolated, seconds. Over a
+    # longer time, the path is not straight.
     max_gap_s: PositiveFloat = advanced(0.25)
-    # Maximum duration of dead reckoning by the other odometry while LOST, seconds. At 0.5 m/s, a
-    # drift of 2 % is then 30 cm.
+    # Maximum duration of dead reckoning by the other odometry while LOST, seconds. With the
+    # default, a drift of 2 % at 0.5 m/s grows to 30 cm.
     max_dead_reckoning_s: PositiveFloat = advanced(30.0)
 
 
@@ -217,11 +218,11 @@ class TrackerSettings:
     quality: QualitySettings = field(default_factory=QualitySettings)
     dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
     odometry_prior: OdometryPriorSettings = field(default_factory=OdometryPriorSettings)
-    # Estimates vignetting and smooth depth bias of the camera in the first seconds. They are
+    # Estimation of vignetting and smooth depth bias of the camera in the first seconds. They are
     # corrected only if held-out frames confirm the estimate.
     self_calibration: bool = advanced(True)
-    # Folder of a finished run for localization in its map, which is not changed. Empty makes a new
-    # map.
+    # Folder of a finished run, in whose map the camera is localized. The map is not changed. Empty
+    # makes a new map.
     localization_map: str = ""
     # Interval of held-out frames, which are tracked but never mapped, to evaluate the map on them.
     # 0 maps every frame.
