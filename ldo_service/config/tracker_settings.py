@@ -109,8 +109,8 @@ class KeyframeSettings:
     # Fraction of the rotation and translation limits above which a mapping keyframe is made. With a
     # value above 1, none is made. Mapping keyframes gain 0.4 dB on the sequence kitchen.
     mapping_only_ratio: PositiveFloat = advanced(0.33)
-    # Number of keyframes after which the tracker searches for a known keyframe before it makes a new
-    # keyframe. With fewer keyframes, every new one improves the map. 0 never searches.
+    # Number of keyframes after which the tracker searches for a known keyframe before it makes a
+    # new keyframe. With fewer keyframes, every new one improves the map. 0 never searches.
     reuse_after: NonNegativeInt = 1500
 
     def __post_init__(self) -> None:
