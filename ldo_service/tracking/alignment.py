@@ -48,7 +48,8 @@ class ResidualConfig:
     def __post_init__(self) -> None:
         if not (self.gate > 0 and self.occlusion > 0):
             raise ConfigError(
-                f"gate={self.gate:g} and occlusion={self.occlusion:g} must be positive."
+                f"ResidualConfig.gate={self.gate:g} and occlusion={self.occlusion:g} must be "
+                "positive."
             )
 
 
@@ -165,16 +166,17 @@ class AlignConfig:
     def __post_init__(self) -> None:
         if not self.iterations or min(self.iterations) < 1:
             raise ConfigError(
-                f"iterations={self.iterations} must have at least 1 iteration for each level."
+                f"AlignConfig.iterations={self.iterations} must have at least 1 iteration for each "
+                "level."
             )
         if min(self.stop_px, self.max_step, self.independent_fraction) <= 0:
             raise ConfigError(
-                f"stop_px={self.stop_px:g}, max_step={self.max_step:g} and "
+                f"AlignConfig.stop_px={self.stop_px:g}, max_step={self.max_step:g} and "
                 f"independent_fraction={self.independent_fraction:g} must be positive."
             )
         if min(self.min_intensity_sigma, self.min_depth_noise_scale) <= 0:
             raise ConfigError(
-                f"min_intensity_sigma={self.min_intensity_sigma:g} and "
+                f"AlignConfig.min_intensity_sigma={self.min_intensity_sigma:g} and "
                 f"min_depth_noise_scale={self.min_depth_noise_scale:g} must be positive."
             )
 

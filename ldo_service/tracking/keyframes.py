@@ -48,22 +48,26 @@ class KeyframeConfig:
     def __post_init__(self) -> None:
         if not (0 <= self.still_overlap <= 1 and self.still_motion >= 0):
             raise ConfigError(
-                f"still_overlap={self.still_overlap:g} must be within 0..1, "
+                f"KeyframeConfig.still_overlap={self.still_overlap:g} must be within 0..1, "
                 f"still_motion={self.still_motion:g} at least 0."
             )
         if not min(self.max_rotation_rad, self.max_translation, self.mapping_only_ratio) > 0:
             raise ConfigError(
-                f"max_rotation_rad={self.max_rotation_rad:g}, max_translation="
+                f"KeyframeConfig.max_rotation_rad={self.max_rotation_rad:g}, max_translation="
                 f"{self.max_translation:g} and "
                 f"mapping_only_ratio={self.mapping_only_ratio:g} must be positive."
             )
         if not self.relay_ratio >= 1:
-            raise ConfigError(f"relay_ratio={self.relay_ratio:g} must be at least 1.")
+            raise ConfigError(
+                f"KeyframeConfig.relay_ratio={self.relay_ratio:g} must be at least 1."
+            )
         if not 0 <= self.min_overlap <= 1:
-            raise ConfigError(f"min_overlap={self.min_overlap:g} must be within 0..1.")
+            raise ConfigError(
+                f"KeyframeConfig.min_overlap={self.min_overlap:g} must be within 0..1."
+            )
         if not 1 <= self.min_frames <= self.max_frames:
             raise ConfigError(
-                f"min_frames={self.min_frames} must be at least 1 and at most "
+                f"KeyframeConfig.min_frames={self.min_frames} must be at least 1 and at most "
                 f"max_frames={self.max_frames}."
             )
 

@@ -44,4 +44,6 @@ class OdometryConfig:
 
     def __post_init__(self) -> None:
         if not self.large_motion > 0:
-            raise ConfigError(f"large_motion={self.large_motion:g} must be positive.")
+            raise ConfigError(
+                f"OdometryConfig.large_motion={self.large_motion:g} must be positive."
+            )

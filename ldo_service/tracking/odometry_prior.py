@@ -60,7 +60,8 @@ class PriorConfig:
             )
         if not self.max_extrapolation_s >= 0:
             raise ConfigError(
-                f"max_extrapolation_s={self.max_extrapolation_s:g} must not be negative."
+                f"PriorConfig.max_extrapolation_s={self.max_extrapolation_s:g} must not be "
+                "negative."
             )
 
 

@@ -36,7 +36,7 @@ class PoseHypothesisConfig:
     def __post_init__(self) -> None:
         if not (self.agreement_rad > 0 and 0 < self.min_support_ratio <= 1):
             raise ConfigError(
-                f"agreement_rad={self.agreement_rad:g} must be positive, "
+                f"PoseHypothesisConfig.agreement_rad={self.agreement_rad:g} must be positive, "
                 f"min_support_ratio={self.min_support_ratio:g} within 0..1."
             )
 

@@ -43,13 +43,15 @@ class PyramidConfig:
     def __post_init__(self) -> None:
         if min(self.working_width_px, self.levels, self.min_side_px) < 1:
             raise ConfigError(
-                f"working_width_px={self.working_width_px}, levels={self.levels} and "
+                f"PyramidConfig.working_width_px={self.working_width_px}, levels={self.levels} and "
                 f"min_side_px={self.min_side_px} must be at least 1."
             )
         if not self.max_depth_m > 0:
-            raise ConfigError(f"max_depth_m={self.max_depth_m:g} must be positive.")
+            raise ConfigError(f"PyramidConfig.max_depth_m={self.max_depth_m:g} must be positive.")
         if not 0 < self.depth_tolerance < 1:
-            raise ConfigError(f"depth_tolerance={self.depth_tolerance:g} must be within 0..1.")
+            raise ConfigError(
+                f"PyramidConfig.depth_tolerance={self.depth_tolerance:g} must be within 0..1."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +176,7 @@ class DepthNoise:
     def __post_init__(self) -> None:
         if not (self.floor_m > 0 and self.growth_per_m >= 0):
             raise ConfigError(
-                f"depth noise floor_m={self.floor_m:g} must be positive and "
+                f"DepthNoise.floor_m={self.floor_m:g} must be positive and "
                 f"growth_per_m={self.growth_per_m:g} must not be negative."
             )
 

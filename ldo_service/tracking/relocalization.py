@@ -117,7 +117,10 @@ class RelocalizationConfig:
                 + " must be within 0..1."
             )
         if not 0 <= self.familiar <= 1:
-            raise ConfigError(f"familiar={self.familiar:g} must be a correlation within 0..1.")
+            raise ConfigError(
+                f"RelocalizationConfig.familiar={self.familiar:g} must be a correlation within "
+                "0..1."
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,13 +41,13 @@ class SubmapConfig:
     def __post_init__(self) -> None:
         if not self.begin_after_s >= 0 or min(self.search_interval_frames, self.confirm_after) < 1:
             raise ConfigError(
-                f"begin_after_s={self.begin_after_s:g} must be at least 0, "
+                f"SubmapConfig.begin_after_s={self.begin_after_s:g} must be at least 0, "
                 f"search_interval_frames={self.search_interval_frames} and "
                 f"confirm_after={self.confirm_after} at least 1."
             )
         if not (self.confirm_rad > 0 and self.confirm_apart_rad >= 0 and self.misses >= 0):
             raise ConfigError(
-                f"confirm_rad={self.confirm_rad:g} must be positive, "
+                f"SubmapConfig.confirm_rad={self.confirm_rad:g} must be positive, "
                 f"confirm_apart_rad={self.confirm_apart_rad:g} and misses={self.misses} at least 0."
             )
 

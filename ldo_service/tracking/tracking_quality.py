@@ -82,28 +82,29 @@ class TrackingQualityConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.lost_overlap <= self.min_overlap <= 1:
             raise ConfigError(
-                f"lost_overlap={self.lost_overlap:g} must be within 0..1 and at most "
-                f"min_overlap={self.min_overlap:g}, which must be at most 1."
+                f"TrackingQualityConfig.lost_overlap={self.lost_overlap:g} must be within 0..1 and "
+                f"at most min_overlap={self.min_overlap:g}, which must be at most 1."
             )
         if not 1 < self.weak_residual <= self.lost_residual:
             raise ConfigError(
-                f"weak_residual={self.weak_residual:g} must be above 1 and at most "
-                f"lost_residual={self.lost_residual:g}."
+                f"TrackingQualityConfig.weak_residual={self.weak_residual:g} must be above 1 and "
+                f"at most lost_residual={self.lost_residual:g}."
             )
         if not self.confirmed_weak_residual <= self.confirmed_lost_residual:
             raise ConfigError(
-                f"confirmed_weak_residual={self.confirmed_weak_residual:g} must be at most "
-                f"confirmed_lost_residual={self.confirmed_lost_residual:g}."
+                f"TrackingQualityConfig.confirmed_weak_residual={self.confirmed_weak_residual:g} "
+                f"must be at most confirmed_lost_residual={self.confirmed_lost_residual:g}."
             )
         if self.relocalized_residual < 1 or self.relocalized_residual_per_rad < 0:
             raise ConfigError(
-                f"relocalized_residual={self.relocalized_residual:g} must be at least 1, "
+                f"TrackingQualityConfig.relocalized_residual={self.relocalized_residual:g} must be "
+                "at least 1, "
                 f"relocalized_residual_per_rad={self.relocalized_residual_per_rad:g} at least 0."
             )
         if not 0 < self.recovery_margin <= 1 or self.history < 1:
             raise ConfigError(
-                f"recovery_margin={self.recovery_margin:g} must be within 0..1 and "
-                f"history={self.history} at least 1."
+                f"TrackingQualityConfig.recovery_margin={self.recovery_margin:g} must be within "
+                f"0..1 and history={self.history} at least 1."
             )
 
 

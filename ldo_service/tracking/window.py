@@ -49,7 +49,8 @@ class WindowConfig:
             )
         if not self.iterations or min(self.iterations) < 1:
             raise ConfigError(
-                f"iterations={self.iterations} must have at least 1 iteration for each level."
+                f"WindowConfig.iterations={self.iterations} must have at least 1 iteration for "
+                "each level."
             )
 
 
