@@ -85,7 +85,8 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(tree or {}, dict):
         raise ConfigError(
-            f"{path} must hold sections such as `tracker:`. `ldo config` prints all of them."
+            f"{path} must contain sections such as `tracker:`. `ldo config --all` prints all "
+            "sections."
         )
     return tree or {}
 

@@ -208,7 +208,7 @@ def make_keyframe_record(
         keyframe: The keyframe.
         features: Settings of ORB.
         config: Settings of the database.
-        history: Noise of the frames tracked before the keyframe. Its medians are stored.
+        history: Noise of the frames before the keyframe. The medians of this noise are stored.
     """
     view, level = keyframe.view, keyframe.view.levels[0]
     ignore_mask = resized(keyframe.ignore_mask, level.depth_m.shape)

@@ -132,7 +132,7 @@ class _Pair:
     def limit_m(self, level: Level) -> np.ndarray:
         """Return the largest depth difference [h, w] in meters that is possible in a static scene.
 
-        It covers errors of the pose and noise of the depth.
+        This limit covers errors of the pose and noise of the depth.
         """
         sigma_m = self.noise_scale * self.noise.sigma_m(level.depth_m)
         return self.config.min_m + self.config.sigmas * sigma_m
@@ -211,7 +211,7 @@ def grow_mask(
 ) -> np.ndarray:
     """Grow a dynamic mask to nearby pixels of similar depth, then by a margin.
 
-    Do not pass the grown mask to `segment_motion`: it would grow from frame to frame.
+    Do not pass the grown mask to `segment_motion`, since the mask would grow from frame to frame.
 
     Args:
         dynamic_mask: Mask of `segment_motion`, [H, W] bool at working resolution.

@@ -10,9 +10,10 @@
 
 1. Align the frame to the reference keyframe, or relocalize a lost camera (`FrameTracker`).
 2. Start a submap if the camera has been lost for long.
-3. If a keyframe is needed, reuse a known keyframe that shows the same surface as the reference.
-4. Otherwise make a new keyframe and measure its pose relative to earlier keyframes. Merge two
-   submaps if a match between them is confirmed.
+3. If a keyframe is needed, search for a known keyframe that shows the same surface as the frame,
+   and make it the reference.
+4. If none is found, make a new keyframe and measure its pose relative to earlier keyframes. Merge
+   two submaps if a match between them is confirmed.
 5. Compute T_map_odom from the last correction of the pose graph (`MapFrame`).
 
 The caller decides with `may_map` whether step 4 may make a keyframe. The caller passes False while

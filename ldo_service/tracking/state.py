@@ -21,7 +21,7 @@ from .tracking_quality import ResidualHistory, TrackingStatus
 class KeyframeOrigin(StrEnum):
     """Origin of the reference keyframe; keyframe reuse depends on it."""
 
-    NEW = "new"
+    NEW = "new"  # New, without a measured pose relative to a known keyframe.
     MEASURED = "tied"  # New, with a measured pose relative to a known keyframe.
     KNOWN = "known"  # Made earlier and reused; its surface is mapped.
 

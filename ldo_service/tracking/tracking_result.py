@@ -18,8 +18,8 @@ class KeyframeKind(StrEnum):
     """Role of a keyframe in tracking and mapping."""
 
     FIRST = "first"  # Starts a submap and is measured from no other keyframe.
-    REFERENCE = "reference"  # The next frames are aligned to it.
-    MAPPING = "mapping"  # It is mapped; the reference keyframe stays.
+    REFERENCE = "reference"  # Becomes the reference: the next frames are aligned to this keyframe.
+    MAPPING = "mapping"  # Is mapped, but does not become the reference.
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class TrackedFrame:
     pose_source: str
     T_odom_camera: np.ndarray  # [4, 4]
     T_reference_camera: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4]
-    reference: int | None = None  # Keyframe that the frame was aligned to; None before the first.
+    reference: int | None = None  # Id of the keyframe that the pose refers to; None if none.
     submap: int = 0  # Submap in whose odometry frame T_odom_camera is expressed.
     # [6, 6] for T_reference_camera * exp(xi) with xi = (rotation rad, translation m).
     information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
@@ -133,8 +133,8 @@ class TrackingResult:
     T_map_odom: np.ndarray  # [4, 4]
     graph_version: int  # Version of the pose graph that T_map_odom comes from.
     submap: int  # The oldest submap that the pose graph has merged with the frame's own.
-    # Alignment. Id of the keyframe that the pose refers to: the frame itself for the first keyframe
-    # of a submap. None before any keyframe, and while localizing in a finished map.
+    # Alignment. `reference` is the id of the keyframe that the pose refers to. The first frame of a
+    # submap refers to itself. None before any keyframe, and while localizing in a finished map.
     reference: int | None
     T_reference_camera: np.ndarray  # [4, 4]
     # [6, 6] for T_reference_camera * exp(xi) with xi = (rotation rad, translation m).

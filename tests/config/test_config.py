@@ -140,7 +140,10 @@ def test_transform_that_is_not_rigid_is_refused() -> None:
 def test_invalid_file_is_refused_with_the_reason(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         load_config(tmp_path / "absent.yaml")
-    for text, expected in (("tracker: [", "not valid YAML"), ("- a\n- b\n", "must hold sections")):
+    for text, expected in (
+        ("tracker: [", "not valid YAML"),
+        ("- a\n- b\n", "must contain sections"),
+    ):
         (tmp_path / "wrong.yaml").write_text(text)
         with pytest.raises(ConfigError, match=expected):
             load_config(tmp_path / "wrong.yaml")
