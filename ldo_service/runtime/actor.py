@@ -38,9 +38,10 @@ class Lossless:
 class Backlog(Lossless):
     """Policy of a lossless input for which the producer never waits.
 
-    The producer stores the messages that the consumer has not handled on disk, up to
-    `supervision.backlog_mb`. A slow, stopped or dead consumer therefore delays no other actor, and
-    it receives every message in order once it continues. `window` bounds its own queue alone.
+    The producer stores on disk all messages that the consumer has not handled, up to
+    `supervision.backlog_mb`. A slow, stopped or dead consumer therefore delays no other actor. When
+    the consumer continues, it receives every message in order. `window` bounds only the consumer's
+    queue in memory.
     """
 
     def __str__(self) -> str:
@@ -52,8 +53,9 @@ class Latest:
     """Policy of an input that queues the newest messages; older ones are dropped and counted."""
 
     depth: int = 1  # Maximum number of queued messages; with `per_key`, for each key.
-    per_key: bool = False  # Keep one queue for each value of the topic's key.
-    max_keys: int = 32  # Maximum number of queues; a new key drops the oldest one.
+    per_key: bool = False  # Keep one queue for each value of the message field `Topic.key`.
+    # Maximum number of queues; a new key beyond it drops the queue with the oldest message.
+    max_keys: int = 32
 
     def __post_init__(self) -> None:
         if self.depth < 1 or self.max_keys < 1:
@@ -89,7 +91,7 @@ class Out:
     """Output port of an actor."""
 
     topic: Topic
-    # The actor checks its credits before it produces a message; sending never waits.
+    # The actor checks `has_credit` before it produces a message, so that sending never waits.
     is_nonblocking: bool = False
     is_final: bool = False  # `on_stop` may yield messages of this topic.
 
@@ -110,22 +112,27 @@ class FlowStatus:
 
 
 class Actor:
-    """Unit of computation that handles messages; the stage sets `situation` before each step."""
+    """Unit of computation that handles messages.
+
+    A step is the handling of one message. Before each step, the stage, which is the runtime around
+    the actor, sets `situation` to the current credits and backlogs.
+    """
 
     name: ClassVar[str]
     inputs: ClassVar[tuple[In, ...]] = ()
     outputs: ClassVar[tuple[Out, ...]] = ()
-    # `snapshot` may return the state of an earlier step. The stage then also saves the inputs that
-    # the actor has handled since that step.
+    # True if `snapshot` may return the state of an earlier step. The stage then also saves the
+    # inputs that the actor has handled since that step.
     lags = False
     # Time without messages after which the stage calls `on_idle`, seconds.
     idle_after_s = 0.2
-    # The actor queries an external server, whose answers no journal records. A replay skips the
-    # actor and feeds its consumers from their own recorded inputs.
+    # True if the actor queries an external server, whose answers no journal records. A replay
+    # skips the actor and feeds its consumers from their own recorded inputs.
     talks_outside = False
     # True if no other actor waits for the outputs. A step may then take minutes.
     is_backend = False
-    # A robot waits for the outputs, so this actor's thread has priority over other actors' threads.
+    # True if a robot waits for the outputs. This actor's thread then has priority over the threads
+    # of other actors.
     is_prompt = False
 
     def __init__(self) -> None:
@@ -142,42 +149,44 @@ class Actor:
     def on_restored(self) -> Iterator[Message]:
         """Yield the messages that a restored actor publishes before its first input.
 
-        The stage calls it after it has restored the actor from a saved state. The previous process
+        The stage calls this method after a restore from a saved state, because the previous process
         may have stopped before it published its last messages.
         """
         return iter(())
 
     def has_idle_work(self) -> bool:
-        """Return whether `on_idle` has work to do; the stage calls it between steps."""
+        """Return whether `on_idle` has work to do; the stage calls this method between steps."""
         return False
 
     def on_idle(self) -> Iterator[Message]:
-        """Do a part of the work that has to be done while no message arrives.
+        """Do one part of the idle work, and yield the output messages.
 
-        New messages wait until it is done, so it must be short.
+        The stage calls this method while no message arrives. A message that arrives meanwhile waits
+        until the part is done, so each part must be short.
         """
         return iter(())
 
     def on_stop(self) -> Iterator[Message]:
         """Yield the final messages of the actor.
 
-        The stage calls it on a soft stop, after the actor has handled all queued messages, in the
-        order of `actor_graph.finish_order`. Only messages of ports with `is_final` are allowed.
+        On a soft stop, the stage calls this method after the actor has handled all queued messages.
+        The actors stop in the order of `actor_graph.finish_order`. Only messages of ports with
+        `is_final` are allowed.
         """
         return iter(())
 
     def snapshot(self) -> State:
         """Return the state that a restored actor needs to continue.
 
-        The stage calls it after every step, so it must be cheap.
+        The stage calls this method after every step, so it must be cheap.
         """
         return {}
 
     def checkpoint(self) -> State:
         """Return the complete state, including changes that `snapshot` may omit.
 
-        It may take seconds. The stage calls it for the command `save`, when its write-ahead log is
-        full, and with the messages of `on_restored` and `on_stop`.
+        The call may take seconds. The stage makes it for the command `save`, after `on_restored`
+        and `on_stop`, and when its write-ahead log (the inputs since the last new state) is full.
         """
         return self.snapshot()
 
@@ -185,7 +194,7 @@ class Actor:
         """Handle the notification that the last snapshot or checkpoint was written."""
 
     def restore(self, state: State) -> None:
-        """Set the state of this new actor from the snapshot or checkpoint of an earlier one."""
+        """Set the state of this new actor from a snapshot or checkpoint of an earlier instance."""
 
     def metrics(self) -> dict[str, float]:
         """Return the actor's own metrics for its health message, by name."""

@@ -9,7 +9,7 @@ from .actor import Backlog, In, Lossless, Out
 
 
 class HasPorts(Protocol):
-    """Actor class, or another description of an actor's ports."""
+    """Protocol of objects with the name and ports of an actor, such as an actor class."""
 
     @property
     def name(self) -> str: ...
@@ -27,7 +27,8 @@ T = TypeVar("T", bound=HasPorts)
 def check_graph(actors: Iterable[HasPorts]) -> None:
     """Reject two producers of one topic and a cycle of lossless inputs.
 
-    In such a cycle each actor could wait forever for credit from the next.
+    In such a cycle each actor could wait forever for credit from the next. Inputs with policy
+    `Backlog` do not count, because their producer never waits.
 
     Raises:
         ConfigError: A topic has two producers.
@@ -60,9 +61,10 @@ def check_graph(actors: Iterable[HasPorts]) -> None:
 def finish_order(actors: Iterable[T]) -> list[T]:
     """Return the actors in the order in which they finish, producers first where possible.
 
-    The final messages of an actor may lead to new inputs of others: the last loop closure leads to
-    a correction of the map. An actor with final messages of its own therefore finishes after all
-    actors on the way of such messages to it.
+    The final messages of an actor may cause new inputs of other actors, directly or through actors
+    in between. For example, the last loop closure causes a correction of the map. An actor with
+    final messages therefore finishes after the actors whose final messages reach it, and after the
+    actors in between. There is no such rule for two actors whose final messages reach each other.
 
     Args:
         actors: The actors, producers first.
@@ -92,7 +94,7 @@ def _final_topics(actor: HasPorts) -> set[str]:
 
 
 def _reached(topics: set[str], actors: Sequence[HasPorts]) -> set[str]:
-    """Return the names of the actors that messages of some topics reach, also through others."""
+    """Return the names of the actors that topics reach, directly or through other actors."""
     reached: set[str] = set()
     while True:
         new = {

@@ -21,11 +21,15 @@ class Checkpointer:
     def __init__(self, store: StateStore) -> None:
         self._store, self._ledger = store, DeliveryState()
         self.past = RestoredState()
-        self.is_unsaved = False  # The last step is not saved.
+        self.is_unsaved = False  # True if the last step is not saved.
         self._failed = 0
 
     def restore_actor(self, make: Callable[[], Actor]) -> Actor:
-        """Create an actor and restore the state that was saved last."""
+        """Create an actor and restore its last saved state, if there is one.
+
+        Args:
+            make: Function that creates a new actor.
+        """
         fresh = make()
         self.past = RestoredState.of(self._store.load(fresh.name))
         if self.past.of_actor:
@@ -40,7 +44,7 @@ class Checkpointer:
     def links(
         self, inputs: Mapping[str, InletPosition], outputs: Mapping[str, OutletPosition | None]
     ) -> State:
-        """Return the offsets and the unhandled outputs of the stage, as parts to save.
+        """Return the offsets and the unhandled outputs of the stage, as parts of its state.
 
         Args:
             inputs: Position on each lossless input, by topic name.
@@ -59,7 +63,8 @@ class Checkpointer:
             actor: The actor of the stage.
             links: Offsets and unhandled outputs of the stage, as `links` returns them.
             taken: Input of the last step, for the write-ahead log; None unless `Actor.lags`.
-            whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`.
+            whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`. A full
+                write-ahead log has the same effect.
         """
         is_whole = whole or self._ledger.is_long
         own = actor.checkpoint() if is_whole else actor.snapshot()
@@ -88,8 +93,8 @@ class Checkpointer:
         if is_first:
             log.error(
                 "%s: saving the state after the last step failed: %r. The stage retries. Until a "
-                "save succeeds, it sends no message that a killed process would lose. Free some "
-                "disk space, or choose another folder with --state.",
+                "save succeeds, it sends no outputs to required consumers. Free some disk space, "
+                "or choose another folder with --state.",
                 name, error,
             )  # fmt: skip
         return is_first

@@ -10,16 +10,18 @@ from .actor import UNLIMITED
 
 @dataclass
 class Consumer:
-    """State of one consumer of a topic, as its producer knows it."""
+    """State of one consumer of a topic, which the producer updates from its messages."""
 
-    is_awaited: bool = True  # The producer waits for its credit; False: it has a backlog.
-    alive: bool = False
-    handled: int = 0  # Offset of the first message that it has not handled.
-    arrived: int = 0  # Offset of the first message that it has not received.
-    limit: int = 0  # Offset of the first message that exceeds its window.
+    # True: the producer waits for the consumer's credit. False: the consumer has a backlog.
+    is_awaited: bool = True
+    alive: bool = False  # The consumer is connected.
+    handled: int = 0  # Offset of the first message that the consumer has not handled.
+    arrived: int = 0  # Offset of the first message that the consumer has not received.
+    limit: int = 0  # Offset of the first message that exceeds the consumer's window.
     repeated_from: int = -1  # Offset at which the last retransmission began; -1: none.
     repeated_at_s: float = 0.0  # Event-loop time of the last retransmission.
-    shut_since_s: float | None = None  # Event-loop time at which its window became full.
+    # Event-loop time at which the window became full; None while it has room.
+    shut_since_s: float | None = None
     # Offset after the last message sent to a consumer with a backlog, and the event-loop time at
     # which it was sent.
     pushed: int = 0
@@ -33,8 +35,8 @@ class Consumers:
     no credit while one of them is disconnected. Other consumers limit the credit only while they
     are connected. The argument `seq` of all methods is the offset of the producer's next message.
 
-    The producer never waits for a consumer with a backlog, required or not. Its credit only decides
-    how many messages of the backlog it receives next.
+    The producer never waits for a consumer with a backlog, required or not. The credit of such a
+    consumer only decides how many messages of the backlog the producer sends next.
     """
 
     def __init__(
@@ -45,7 +47,7 @@ class Consumers:
         Args:
             expected: Names of the required consumers.
             handled: Each required consumer has handled every message before this offset.
-            with_backlog: Names of those for which the producer does not wait.
+            with_backlog: Names of the consumers for which the producer does not wait.
         """
         self.with_backlog = frozenset(with_backlog)
         self._known = {
@@ -67,25 +69,31 @@ class Consumers:
         return name in self._known
 
     def credits(self, seq: int) -> int:
-        """Return the number of messages that may be sent now without waiting for a consumer."""
+        """Return the number of messages that may be sent now without waiting for a consumer.
+
+        The result is UNLIMITED if the producer need not wait for any consumer.
+        """
         awaited = [c for c in self._known.values() if c.is_awaited]
         limits = [c.limit - seq if c.alive else 0 for c in awaited]
         return max(0, min(limits, default=UNLIMITED))
 
     def window_room(self, seq: int) -> int:
-        """Return the room in the windows of all consumers, also of those with a backlog."""
+        """Return the number of messages that fit into the windows of all consumers.
+
+        This includes consumers with a backlog. The result is 0 without consumers.
+        """
         limits = [c.limit - seq if c.alive else 0 for c in self._known.values()]
         return max(0, min(limits, default=0))
 
     def handled(self, seq: int) -> int:
-        """Return the offset of the first message that some consumer has not handled."""
+        """Return the offset of the first message not handled by all consumers, at most `seq`."""
         return min((c.handled for c in self._known.values()), default=seq)
 
     def all_received(self, seq: int, *, awaited_only: bool = False) -> bool:
         """Return whether every consumer has received every message before `seq`.
 
-        A consumer with a backlog only needs the messages for which its window has room. The backlog
-        keeps the other ones.
+        A consumer with a backlog only needs the messages for which its window has room. The other
+        messages stay in the backlog.
 
         Args:
             seq: Offset of the next message.
@@ -102,13 +110,14 @@ class Consumers:
         return {name: seq - c.handled for name, c in self._known.items() if not c.is_awaited}
 
     def next_seq_by_consumer(self) -> dict[str, int]:
-        """Return the offset of the next message for each consumer, by name."""
+        """Return the offset of the first message to send to each consumer, by name."""
         return {name: consumer.handled for name, consumer in self._known.items()}
 
     def join(self, name: str, seq: int, *, has_backlog: bool = False) -> None:
         """Connect a consumer that sent a hello.
 
-        A new consumer starts at `seq`. A known one receives again what it has not handled.
+        A new consumer starts at message `seq`. A known consumer receives all messages again that it
+        has not handled. With `has_backlog`, the producer does not wait for the consumer.
         """
         self._evicted.pop(name, None)
         consumer = self._known.setdefault(name, Consumer(handled=seq))
@@ -117,16 +126,20 @@ class Consumers:
         consumer.is_awaited = not (has_backlog or name in self.with_backlog)
 
     def note_sent(self, seq: int, now_s: float) -> None:
-        """Note that message `seq` was published.
+        """Note that message `seq` was published to all consumers at event-loop time `now_s`.
 
-        A consumer with a backlog accepts it only if it has received everything before it.
+        For a consumer with a backlog, the message counts as sent only if all earlier messages were
+        sent to it and its window has room. Otherwise the consumer rejects the message, and the
+        producer sends it from the backlog later.
         """
         for consumer in self._known.values():
             if not consumer.is_awaited and consumer.pushed == seq < consumer.limit:
                 consumer.pushed, consumer.pushed_at_s = seq + 1, now_s
 
     def next_of_backlog(self, name: str, seq: int, now_s: float, repeat_after_s: float) -> range:
-        """Return the messages that a consumer with a backlog should receive now.
+        """Return the offsets of the messages to send now to a consumer with a backlog.
+
+        These messages then count as sent.
 
         Args:
             name: Name of the consumer.
@@ -144,14 +157,15 @@ class Consumers:
         return messages
 
     def skip(self, first: int, since: int = 0) -> bool:
-        """Skip the messages before `first`, which the producer no longer has.
+        """Let consumers continue after messages that the producer no longer has.
 
         Args:
-            first: Offset of the first message that the producer has.
-            since: Only for consumers that have handled every message before this offset.
+            first: Offset of the first message that the producer still has.
+            since: Leave a consumer unchanged if it has not handled every message before this
+                offset.
 
         Returns:
-            Whether a consumer has missed some of them.
+            True if some consumer misses messages and now continues at `first`.
         """
         late = [c for c in self._known.values() if since <= c.handled < first]
         for consumer in late:
@@ -159,7 +173,7 @@ class Consumers:
         return bool(late)
 
     def grant(self, grant: Credit) -> Consumer:
-        """Update a known consumer from its credit message."""
+        """Update a known consumer from its credit message, and return the consumer."""
         self._evicted.pop(grant.consumer, None)
         consumer = self._known[grant.consumer]
         consumer.alive = True
@@ -176,7 +190,7 @@ class Consumers:
         blocks the producer until it connects again.
 
         Returns:
-            Whether the producer waits for it.
+            True if the producer now waits until the consumer connects again.
         """
         consumer = self._known[name]
         consumer.alive, consumer.shut_since_s = False, None
@@ -185,7 +199,10 @@ class Consumers:
         return name in self.expected and consumer.is_awaited
 
     def stalled(self, now_s: float, patience_s: float, seq: int) -> list[str]:
-        """Return the connected consumers whose window has been full for over `patience_s`."""
+        """Return the names of the consumers whose window has been full for over `patience_s`.
+
+        Only connected consumers without a backlog count.
+        """
         names: list[str] = []
         for name, consumer in self._known.items():
             if consumer.alive and consumer.is_awaited and consumer.limit <= seq:
@@ -201,7 +218,7 @@ class Consumers:
         self.leave(name)
 
     def is_still_stuck(self, grant: Credit) -> bool:
-        """Return whether the consumer was evicted and has handled no message since.
+        """Return whether the sender of a credit message was evicted and handled no message since.
 
         Credit messages alone are no progress, because a consumer repeats them with each heartbeat.
         """

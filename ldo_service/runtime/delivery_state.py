@@ -4,12 +4,12 @@ The stage saves these parts in one write with the actor's state:
 
 - `stage.offsets`: Offset of the next message on each lossless topic.
 - `stage.outbox T N`: Message N of topic T, which a required consumer has not handled.
-- `stage.wal N`: Input N (write-ahead log). An actor with `Actor.lags` has handled it after the step
-  of its saved state.
+- `stage.wal N`: Entry N of the write-ahead log, only for an actor with `Actor.lags`. Such an actor
+  saves the state of an earlier step. The log has the inputs that it has handled since that step.
 
 A restored stage therefore continues after the last saved step. It does not take the input of that
 step again. It sends the outputs of that step again until all required consumers have handled them.
-Outputs of an unsaved step were never sent to them.
+Outputs of an unsaved step were never sent to required consumers.
 """
 
 import logging
@@ -35,8 +35,8 @@ MAX_WAL_ENTRIES = 64
 class LoggedInput(NamedTuple):
     """Handled message and the flow status of its step, with counts by topic name."""
 
-    topic: str  # Empty for work while no message arrived.
-    body: bytes
+    topic: str  # Name of the topic; empty for idle work, which has no message.
+    body: bytes  # Encoded message.
     credits: Mapping[str, int]
     backlog: Mapping[str, int]
 
@@ -94,7 +94,7 @@ class RestoredState:
 
 
 class DeliveryState:
-    """Builder of the parts to save.
+    """Builder of the state that a stage saves, as named parts.
 
     An unchanged part stays the same object, so that the store does not write it again.
     """
@@ -155,8 +155,8 @@ def restore_actor(actor: Actor, past: RestoredState, make: Callable[[], Actor]) 
     """Restore a new actor to the end of the last saved step.
 
     The actor handles the logged inputs again to rebuild its state. The resulting outputs are
-    discarded, because the outbox has them already. If an input fails now, the function starts again
-    with another new actor and without this input.
+    discarded, because the outbox has them already. If an input raises an exception, the function
+    starts again with another new actor and without this input.
 
     Args:
         actor: A new actor.
@@ -175,7 +175,7 @@ def restore_actor(actor: Actor, past: RestoredState, make: Callable[[], Actor]) 
 
 
 def _handled_again(actor: Actor, taken: Iterable[LoggedInput]) -> int | None:
-    """Handle logged inputs again; return the index of the first that fails, or None."""
+    """Handle logged inputs again; return the index of the first failure, None without failure."""
     kinds = {port.topic.name: port.topic.message for port in actor.inputs}
     for number, one in enumerate(taken):
         actor.situation = one.situation(actor)
@@ -202,7 +202,7 @@ def _messages(
 
 
 def counts_by_topic(counts: Mapping[str, int], topics: Iterable[Topic]) -> dict[Topic, int]:
-    """Return counts by topic from counts by topic name."""
+    """Replace the topic names in `counts` by the topics; leave out topics without a count."""
     return {topic: counts[topic.name] for topic in topics if topic.name in counts}
 
 

@@ -27,7 +27,7 @@ class Delivery:
 
 @dataclass
 class Inlet:
-    """Input with policy Latest; its counters are those of `InputCount`."""
+    """Input with policy Latest; its counters become the fields of `InputCount`."""
 
     port: In
     waiting: deque[Delivery] = field(default_factory=deque)
@@ -40,7 +40,7 @@ class Inlet:
     numbers: SequenceTracker = field(default_factory=SequenceTracker)
 
     def number(self, header: Header) -> None:
-        """Count the messages that were lost before this one."""
+        """Count the messages that were lost before the one with this header."""
         if header is not EXTERNAL_HEADER:
             self.numbers.observe(header)
 
@@ -124,7 +124,7 @@ class LosslessInlet(Inlet):
             start: Offset of the first message that the producer can send.
 
         Returns:
-            Number of lost messages. The producer has sent them, and its outbox no longer has them.
+            Number of messages that this input has not received and that the producer no longer has.
         """
         known, is_connecting = epoch == self.epoch, not self.is_connected
         self.is_connected = True
@@ -133,7 +133,7 @@ class LosslessInlet(Inlet):
             return 0
         lost = start - self.arrived if known else 0
         self.numbers.lost += lost
-        if not (known and self.waiting):  # `done` follows when the queue is handled.
+        if not (known and self.waiting):  # Otherwise `done` advances it with the queue.
             self.handled = start
         self.epoch, self.arrived = epoch, start
         self.gap = True  # Request the messages that were sent before the hello.
@@ -142,13 +142,13 @@ class LosslessInlet(Inlet):
     def accept(self, header: Header) -> bool:
         """Return whether the message is the next one and fits into the window.
 
-        The producer retransmits skipped messages.
+        The producer retransmits a message that is not accepted.
         """
         if header.epoch != self.epoch or header.seq < self.arrived:
             return False
         self.gap = header.seq > self.arrived or len(self.waiting) >= self.window
         if self.gap:
-            # The producer of a backlog publishes while the window is full: that is no gap.
+            # A producer with a backlog also publishes while the window is full. This is no gap.
             self.gaps += not isinstance(self.port.policy, Backlog)
             return False
         self.arrived += 1
@@ -190,7 +190,12 @@ class LosslessInlet(Inlet):
         return InletPosition(self.epoch, handled)
 
     def grant(self, consumer: str, *, waits_for_disk: bool = False) -> ConsumerHello | Credit:
-        """Return the message to the producer: a hello until it is connected, then credit."""
+        """Return the message for the producer: a hello until the producer is connected, then credit.
+
+        Args:
+            consumer: Name of this actor.
+            waits_for_disk: The stage takes no messages while its disk is full.
+        """
         if not self.is_connected:
             return ConsumerHello(consumer, isinstance(self.port.policy, Backlog))
         limit = self.handled + self.window

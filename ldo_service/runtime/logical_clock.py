@@ -1,9 +1,9 @@
 """Offline run of the whole actor graph, on a logical clock that ticks once per frame.
 
-Odometry priors up to a frame are delivered in the tick of that frame, before the frame.
+Odometry priors with stamps up to that of a frame are delivered in the tick of the frame, before it.
 
-Each actor has a configured latency in ticks. Consumers receive the outputs of a step that many
-ticks after its input, however long the step really takes. Actors compute in parallel, each in its
+Each actor has a configured latency in ticks. With a latency of n, consumers receive the outputs of
+a step n ticks after its input, however long the step takes. Actors compute in parallel, each in its
 own thread. The clock waits for a thread only at the tick of its output. The result therefore
 depends only on the input and the latencies, not on the machine or its load. No message is dropped.
 """
@@ -39,7 +39,7 @@ class PendingOutput:
     are delivered in the order in which the steps started.
     """
 
-    tick: int  # Tick at which the outputs become visible.
+    tick: int  # Tick at which the outputs are delivered.
     rank: int  # Position of the actor in the graph.
     order: int  # Number of the step over all actors.
     answer: Future[StepOutput] = field(compare=False)
@@ -96,8 +96,9 @@ class LogicalClock:
 
         Args:
             actors: The actors, producers first.
-            latency_ticks: Latency of each actor by name; 0 where absent.
-            observe: Called for each output when it becomes visible.
+            latency_ticks: Latency of each actor in ticks, by name; 0 where absent.
+            observe: Called for each output when it is delivered, with the name of the actor, the
+                message and the duration of the step in ms.
         """
         check_graph(type(actor) for actor in actors)
         self._threads = [
@@ -145,7 +146,7 @@ class LogicalClock:
     def finish(self) -> None:
         """Deliver the final messages of each actor, in the order of `finish_order`.
 
-        `run` may be called again.
+        `run` may be called again afterwards.
         """
         threads = {thread.actor.name: thread for thread in self._threads}
         for actor in finish_order([type(thread.actor) for thread in self._threads]):

@@ -37,7 +37,8 @@ class Mailbox:
     """Queue of all inputs of an actor.
 
     Any thread may add messages; only the event loop takes them. A delivery counts as handled when
-    `done` is called. If the actor is killed before, it receives a lossless message again.
+    `done` is called. If the actor's process is killed before that, the restored actor receives the
+    message again, unless the input has policy Latest.
     """
 
     def __init__(
@@ -56,16 +57,17 @@ class Mailbox:
             transport: The network.
             max_bytes: Maximum size of a message of a Latest input, bytes. Lossless inputs have no
                 limit, because their messages come from actors of the service.
-            past: Position of the previous process on each lossless topic.
+            past: Position of the previous process on each lossless topic, by topic name.
         """
         self._consumer, self._max_bytes = consumer, max_bytes
         self._loop = asyncio.get_running_loop()
-        self._lock = Lock()  # Guards all state below that both sides use.
+        self._lock = Lock()  # Guards all state below that network threads and event loop share.
         self._order: deque[Delivery] = deque()
         self._ready = asyncio.Event()
         self._wake_pending = self._grant_pending = False
         self._closed = self._held = False
-        # The stage takes no messages because its state cannot be saved; it must not be evicted.
+        # True while the stage takes no messages because its state cannot be saved. Producers then
+        # do not evict this actor.
         self.waits_for_disk = False
         self._orders: deque[StageCommand] = deque()
         self._grants: dict[str, Publisher] = {}
@@ -166,12 +168,15 @@ class Mailbox:
     async def take(self, timeout_s: float | None = None) -> Delivery | StageCommand | None:
         """Wait for the next command or delivery and take it.
 
+        Args:
+            timeout_s: Maximum time to wait, seconds; None: no limit.
+
         Returns:
             A command if there is one, else the oldest delivery of an input with priority, else the
             oldest delivery. None if the mailbox is closed and empty.
 
         Raises:
-            TimeoutError: None came in time.
+            TimeoutError: Neither a command nor a delivery arrived within `timeout_s`.
         """
         # `asyncio.wait_for` of Python 3.11 may swallow the cancellation of a stage.
         async with asyncio.timeout(timeout_s):
@@ -202,7 +207,7 @@ class Mailbox:
             self._send_grant(inlet)
 
     def past(self, being_handled: Delivery | None = None) -> dict[str, InletPosition]:
-        """Return the position to save for each lossless topic.
+        """Return the position to save for each lossless topic, by topic name.
 
         Args:
             being_handled: The delivery of the current step, which counts as handled.
@@ -224,7 +229,7 @@ class Mailbox:
     def pause(self) -> None:
         """Let `take` return only commands until `resume`.
 
-        Latest inputs drop their messages and count them. Lossless inputs keep theirs.
+        Latest inputs drop their messages and count them. Lossless inputs keep their messages.
         """
         with self._lock:
             self._held = True

@@ -7,8 +7,8 @@ from threading import Lock
 from ldo_service.storage.message_log import LoggedMessage, MessageLog
 from ldo_service.transport.flow_control import UnackedMessage
 
-# Newest messages that stay in memory although the log has them: consumers that are not behind take
-# retransmissions from here.
+# Number of newest messages that stay in memory although the log on disk has them. Therefore
+# retransmissions to consumers that are not behind do not read the disk.
 MESSAGES_IN_MEMORY = 8
 
 
@@ -29,9 +29,9 @@ class Outbox:
 
         Args:
             unhandled: Messages that the previous process saved with its state.
-            log: Log on disk, which bounds its size itself.
-            max_bytes: Maximum size of the messages in memory, bytes, if there is no log; the
-                oldest are dropped beyond it. None: the consumers' windows bound the outbox.
+            log: Log on disk, which has its own maximum size; None: all messages are in memory.
+            max_bytes: Maximum size of an outbox in memory, bytes; beyond it, the oldest messages
+                are dropped. None: a log or the consumers' windows bound the outbox.
         """
         self._lock = Lock()
         self._memory = deque(unhandled)
@@ -51,7 +51,7 @@ class Outbox:
 
     @property
     def dropped(self) -> int:
-        """Messages dropped because of the maximum size."""
+        """Number of messages dropped because of the maximum size."""
         return self._dropped + (self._log.dropped if self._log else 0)
 
     @property
@@ -95,7 +95,7 @@ class Outbox:
                 self._bytes -= len(self._memory.popleft().body)
 
     def read(self, seq: int) -> UnackedMessage | None:
-        """Return a message, None if it is lost; reads the disk, so call it in a thread."""
+        """Return message `seq`, None if it is lost; may read the disk, so call it in a thread."""
         with self._lock:
             if self._memory and self._memory[0].seq <= seq <= self._memory[-1].seq:
                 return self._memory[seq - self._memory[0].seq]
@@ -103,7 +103,7 @@ class Outbox:
         return UnackedMessage(*found) if found else None
 
     def after(self, seq: int, end: int) -> int:
-        """Return the number of the next message that may be readable after a lost one.
+        """Return the number of the first message after a lost one that may be readable.
 
         Args:
             seq: Number of the lost message.
@@ -115,7 +115,7 @@ class Outbox:
         return min(in_memory, self._log.after(seq, end) if self._log else end)
 
     def forget(self, before: int) -> None:
-        """Delete the messages before a number, which all consumers have handled."""
+        """Delete the messages with numbers below `before`; all consumers have handled them."""
         with self._lock:
             while self._memory and self._memory[0].seq < before:
                 self._bytes -= len(self._memory.popleft().body)
@@ -123,7 +123,7 @@ class Outbox:
             self._log.forget(before)
 
     def truncate(self, end: int) -> None:
-        """Delete the messages from a number on, which were not sent."""
+        """Delete the messages with numbers of at least `end`, which were never sent."""
         with self._lock:
             while self._memory and self._memory[-1].seq >= end:
                 self._bytes -= len(self._memory.pop().body)

@@ -46,9 +46,10 @@ class Outlet:
     outbox on disk, and sends them as the consumer grants credit.
     """
 
-    # Half a credit period; a shorter time would retransmit messages that are still on their way.
+    # Time after which a message counts as lost, seconds: half a credit period. A shorter time would
+    # retransmit messages that are still on their way.
     REPEAT_AFTER_S = 0.25
-    # Maximum time to wait at the end for consumers with a backlog: two credit periods.
+    # Maximum time to wait at the end for consumers with a backlog, seconds: two credit periods.
     FLUSH_BACKLOG_S = 1.0
 
     def __init__(
@@ -70,14 +71,15 @@ class Outlet:
         Args:
             port: The output of the actor.
             source: Name of the actor.
-            epoch: Number of this run of the actor; a restored outlet continues the epoch of `past`.
+            epoch: Random number that identifies the numbering of the messages. A restored outlet
+                continues the epoch of `past` instead.
             transport: The network.
             expected: Names of the required consumers.
             evict_after_s: Time after which a consumer with a full window is evicted, seconds.
             on_evicted: Called with the name of an evicted consumer.
             past: Position of the previous process. The outlet continues its numbering, and sends
                 again the messages that a required consumer has not handled.
-            with_backlog: Names of the required consumers for which it does not wait.
+            with_backlog: Names of the required consumers for which the outlet does not wait.
             outbox: Storage of unhandled messages; by default in memory.
         """
         self.port, self.topic = port, port.topic
@@ -91,9 +93,9 @@ class Outlet:
         self._outbox = outbox or Outbox(past.unhandled)
         self._unsent = deque(past.unhandled)
         self._changed = asyncio.Event()  # The state of a consumer changed.
-        self._ahead: set[str] = set()  # Consumers that received messages unknown to this outlet.
+        self._ahead: set[str] = set()  # Consumers that report messages this outlet never sent.
         self._repeating: asyncio.Task[None] | None = None
-        # Publisher of the backlog and its running task, by consumer.
+        # Publisher of each consumer's backlog, and the task that is sending on it, by consumer.
         self._backlogs: dict[str, Publisher] = {}
         self._pushing: dict[str, asyncio.Task[None]] = {}
         self._closed = False
@@ -117,7 +119,9 @@ class Outlet:
     def credits(self) -> int:
         """Return how many messages may be sent now; 0 while staged messages are not sent.
 
-        If no consumer is awaited, it is the room in their windows, so that no backlog fills.
+        A nonblocking port whose required consumers all have a backlog gets the room in their
+        windows as credit. The actor then produces no more than they can queue, so that their
+        backlogs do not grow.
         """
         if self._unsent:
             return 0
@@ -277,11 +281,11 @@ class Outlet:
 
     # --- retransmission ---------------------------------------------------------------------
     def _push_backlog(self, name: str) -> None:
-        """Send a consumer with a backlog the messages for which it has room."""
+        """Send to a consumer the messages of its backlog for which its window has room."""
         if name in self._pushing:
             return
         if self._consumers.skip(self._outbox.first(self._seq)):
-            self._post_hellos()  # They say where the backlog begins now.
+            self._post_hellos()  # The hello has the new first message of the backlog.
             return
         messages = self._consumers.next_of_backlog(
             name, self._next, self._loop.time(), self.REPEAT_AFTER_S
@@ -308,7 +312,8 @@ class Outlet:
     def _retransmit(self, consumer: Consumer, gap: bool) -> None:
         """Retransmit the messages that a consumer has not received.
 
-        Without a gap they may be on their way, so the outlet first waits for `REPEAT_AFTER_S`.
+        If the consumer reports no gap, these messages may still be on their way. The outlet then
+        first waits for `REPEAT_AFTER_S`.
         """
         now = self._loop.time()
         recently = now - consumer.repeated_at_s < self.REPEAT_AFTER_S
@@ -336,7 +341,7 @@ class Outlet:
                 self._repeating = None
 
     def _skip_lost(self, seq: int) -> None:
-        """Let the consumers skip a message that the disk has lost, once they have come to it."""
+        """Let the consumers that have handled all messages before a lost one continue after it."""
         if self._consumers.skip(self._outbox.after(seq, self._seq), since=seq):
             self._post_hellos()
 
@@ -345,7 +350,7 @@ class Outlet:
             if task is not None:
                 task.cancel()
         self._repeating = None
-        self._pushing.clear()  # A task that has not started does not do so itself.
+        self._pushing.clear()  # A task cancelled before its start does not remove its entry.
 
     def _presence(self, name: str, alive: bool) -> None:
         if not alive and not self._closed and name in self._consumers:
@@ -356,9 +361,9 @@ class Outlet:
             self._changed.set()
 
     def evict_stalled(self) -> None:
-        """Evict connected consumers whose window has been full for too long.
+        """Evict connected consumers whose window has been full for over `evict_after_s`.
 
-        The stage calls it with every heartbeat.
+        The stage calls this method with every heartbeat.
         """
         overdue = self._consumers.stalled(self._loop.time(), self._evict_after_s, self._next)
         for name in overdue:

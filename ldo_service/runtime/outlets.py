@@ -24,9 +24,10 @@ class OutletOpener:
     Attributes:
         transport: The network.
         config: Limits of supervision.
-        store: Storage of the state. A backlog is on disk if the state is.
+        store: Storage of the state. Backlogs are on disk if the state is on disk, else in memory.
         expected: Names of the required consumers, by topic name.
-        with_backlog: Names of those for which the stage does not wait, by topic name.
+        with_backlog: Names of the required consumers with a backlog, for which the stage does not
+            wait, by topic name.
         on_evicted: Called with the name of an evicted consumer.
     """
 
@@ -44,7 +45,7 @@ class OutletOpener:
 
         Args:
             port: The output of the actor.
-            source: Name of the actor, and number of this run of it.
+            source: Name of the actor, and epoch of its messages if `past` has no position.
             past: Saved position of the previous process, by topic name.
         """
         name, epoch = source
@@ -83,8 +84,8 @@ class OutletOpener:
 class Outlets:
     """Set of all outlets of an actor.
 
-    They stage the outputs of a step. They send these outputs after the step is saved, and discard
-    them if the step fails.
+    `stage_outputs` takes the outputs of a step. `release` sends them after the step is saved, and
+    `discard` deletes them if the step fails.
     """
 
     def __init__(self, outlets: Iterable[Outlet] = ()) -> None:
@@ -112,7 +113,7 @@ class Outlets:
         }
 
     def past(self) -> dict[str, OutletPosition | None]:
-        """Return the position to save for each topic; None without required consumers."""
+        """Return the position to save, by topic name; None if a topic has no required consumer."""
         return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
 
     def stage_outputs(self, produced: Sequence[Produced]) -> None:
@@ -123,7 +124,10 @@ class Outlets:
     async def release(self, *, is_saved: bool = True) -> None:
         """Send the staged outputs of a step.
 
-        If the step is not saved, topics with required consumers keep theirs staged.
+        If the step is not saved, outputs on topics with required consumers stay staged.
+
+        Args:
+            is_saved: Whether the step is saved.
         """
         for outlet in self._all.values():
             if is_saved or outlet.position() is None:

@@ -22,7 +22,8 @@ from .supervision_policy import RestartBudget
 
 log = logging.getLogger(__name__)
 
-# The parent process repeats the last health message if none arrived for this time: three periods.
+# Time without a health message after which the parent process repeats the last one, seconds: three
+# heartbeat periods.
 REPEAT_HEALTH_AFTER_S = 1.5
 PARENT_VARIABLE = "LDO_PARENT_PID"  # A child ends when its parent process has ended.
 
@@ -39,8 +40,9 @@ def resident_mb() -> float:
 def trim_memory() -> None:
     """Return freed memory to the operating system.
 
-    Otherwise glibc keeps free memory between blocks in use. This was 280 MB after a camera walk of
-    three laps through the synthetic flat. On other systems than Linux the function does nothing.
+    Otherwise glibc keeps the free memory that lies between blocks in use. These were 280 MB after a
+    camera walk of three laps through the synthetic flat. On systems other than Linux the function
+    does nothing.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
@@ -95,8 +97,8 @@ class ChildProcess:
                 window.
             silent_after_s: Maximum time between heartbeats, seconds; then the process is killed.
             start_within_s: Maximum time from the start to the first heartbeat, seconds.
-            step_timeout_s: Maximum duration of a step, seconds. A suspended process (SIGSTOP, a
-                debugger) sends no heartbeats, and is killed only after this time too.
+            step_timeout_s: Maximum duration of a step, seconds. It is also the time after which a
+                suspended process (SIGSTOP, a debugger), which sends no heartbeats, is killed.
         """
         self.name = name
         self._command, self._transport = command, transport
@@ -194,10 +196,14 @@ class ChildProcess:
             self._heard_until_s = self._health_at_s + self._silent_after_s
 
     def _on_beat(self, step_age_s: float) -> None:
-        """Extend the deadline during a step that holds the GIL.
+        """Extend the deadline of the next heartbeat during a step, which may hold the GIL.
 
-        The stage cannot send its health then, so this process repeats the last one with the age of
-        the step. Between steps the health messages must come from the stage itself.
+        The stage cannot send health messages while a step holds the GIL. The parent process then
+        repeats the last one with the age of the step. Between steps, the health messages must come
+        from the stage itself.
+
+        Args:
+            step_age_s: Time since the start of the current step, seconds; 0 between steps.
         """
         if not 0.0 < step_age_s <= self._step_timeout_s:
             return
@@ -212,8 +218,8 @@ class ChildProcess:
     async def _kill_when_silent(self) -> None:
         """Kill the process when its heartbeat timeout expires.
 
-        A process that the user suspended (SIGSTOP, a debugger) is not killed before its step
-        timeout has expired too.
+        A process that the user suspended (SIGSTOP, a debugger) is killed only when its step timeout
+        has expired too.
         """
         while True:
             await asyncio.sleep(self._silent_after_s / 10)

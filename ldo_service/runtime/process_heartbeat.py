@@ -1,8 +1,8 @@
 """Heartbeat between a child process and its parent, over a pipe.
 
 The health message of a stage comes from its event loop. A step that holds the GIL, such as a solve
-of gtsam, stops it for as long as the step lasts. This heartbeat comes from a thread in C++ that
-needs no GIL, and carries the age of the current step.
+of gtsam, stops the event loop for as long as the step lasts. This heartbeat comes from a thread in
+C++ that does not need the GIL. It contains the age of the current step.
 """
 
 import asyncio

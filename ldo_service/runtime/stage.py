@@ -32,7 +32,8 @@ from .supervision_policy import RestartBudget, SupervisionConfig
 
 log = logging.getLogger(__name__)
 
-# Time between two checks for idle work, which may wait for credit, or for an unsaved state.
+# Time between two checks while no message arrives, seconds. The checks are for an unsaved state, and
+# for idle work, which may wait for credit.
 CHECK_S = 0.5
 
 
@@ -67,11 +68,13 @@ class Stage:
             transport: The network.
             config: Limits of supervision.
             store: Storage of the state; in memory by default.
-            expected: Names of the consumers that must not miss a message, by output topic.
-            with_backlog: Those of them for which the stage does not wait, by output topic.
+            expected: Names of the required consumers, which must not miss a message, by output
+                topic.
+            with_backlog: Names of the required consumers for which the stage does not wait, by
+                output topic.
             on_evicted: Called with the name of an evicted consumer.
             journal: Receiver of the journal entries.
-            heartbeat: Heartbeat of this process, if a parent process reads it.
+            heartbeat: Heartbeat of this process; None if no parent process reads it.
         """
         self._make, self._transport = make, transport
         self._config = config = config or SupervisionConfig()
@@ -98,7 +101,7 @@ class Stage:
 
         Raises:
             RestartsExhausted: The actor failed more often than its restart budget allows.
-            StageStalled: A step took longer than `stall_after_s`.
+            StageStalled: A step took longer than `SupervisionConfig.step_limit` allows.
         """
         nice = 0 if self._actor.is_prompt else self._config.nice
         self._worker = Worker(self.name, nice=nice)
@@ -181,10 +184,10 @@ class Stage:
                       self.name)  # fmt: skip
 
     async def _next(self, mailbox: Mailbox) -> Delivery | StageCommand | None:
-        """Take the next delivery or command; save an unsaved state or work idly meanwhile.
+        """Take the next delivery or command; None if the mailbox is closed and empty.
 
-        Idle work starts after `Actor.idle_after_s` without a message. Its further steps follow at
-        once until a message arrives.
+        While none arrives, save an unsaved state, or do idle work of the actor. Idle work starts
+        after `Actor.idle_after_s` without a message. Its further steps follow at once.
         """
         is_idle = False
         while True:
@@ -237,11 +240,11 @@ class Stage:
     def _has_idle_work(self, mailbox: Mailbox) -> bool:
         if self._is_idle_failed or self._drain_requested or mailbox.is_held:
             return False
-        self._update_flow_status()  # Work may wait for credit.
+        self._update_flow_status()  # Idle work may need credit.
         return self._actor.has_idle_work()
 
     async def _work_idly(self) -> None:
-        """Do idle work of the actor; after a failure, none until the next message."""
+        """Do one part of the actor's idle work; after a failure, wait for the next message."""
         produced = await self._attempt(
             lambda: self._actor.on_idle(), ("idle", "idle_failed"), "idle work"
         )
@@ -258,9 +261,9 @@ class Stage:
 
         Args:
             work: Handler that yields the messages of the step.
-            kinds: Kinds of its journal entry after a success and after a failure.
-            what: Description for the log.
-            delivery: Its input.
+            kinds: Kind of the step's journal entry after a success, and after a failure.
+            what: Description of the step for the log.
+            delivery: Input of the step; None for idle work.
 
         Returns:
             The outputs; None if the step failed. The actor is then restored.
@@ -283,7 +286,7 @@ class Stage:
         return produced
 
     def _logged(self, delivery: Delivery | None) -> LoggedInput | None:
-        """Return the write-ahead log entry of a step if the actor lags."""
+        """Return the write-ahead log entry of a step; None unless `Actor.lags`."""
         if not self._actor.lags:
             return None
         topic, body = (delivery.port.topic.name, delivery.body) if delivery else ("", b"")
@@ -353,7 +356,7 @@ class Stage:
 
     # --- in the actor's thread ------------------------------------------------------------------
     def _restored_actor(self) -> Actor:
-        self._journal.record_files()  # The new actor changes them.
+        self._journal.record_files()  # First, because the new actor changes these files.
         actor = self._checkpointer.restore_actor(self._make)
         self._journal.record_start(self._checkpointer.past.of_actor or None)
         return actor

@@ -16,8 +16,9 @@ Commands:
 
 `Control` replies once for the whole service, when all its actors have replied. `reset` first pauses
 every actor, producers first, so that no message of the old run is in flight when they restart.
-Otherwise a late correction after 50 keyframes could arrive in the new run. Its higher version would
-supersede the first correction of the new run.
+Otherwise a late graph correction of the old run could arrive in the new run. After 50 keyframes,
+for example, its graph version would be higher than that of the new run's first correction, and
+would supersede it.
 """
 
 import asyncio
@@ -37,11 +38,12 @@ from ldo_service.transport.interface import Transport, call_soon
 log = logging.getLogger(__name__)
 
 COMMAND_KEY, REPLY_KEY = "link/command", "link/reply"
-# A command without a reply after this time may be lost and is sent again. A stage that is still
-# executing it ignores the repetition.
+# A command without a reply after this time, in seconds, may be lost and is sent again. A stage that
+# is still executing the command ignores the repetition.
 REPEAT_AFTER_S = 0.25
 
-MIN_S = 2.0  # Minimum time for each actor: 3x the slowest step measured.
+# Minimum time that each actor has to reply to a command, seconds: 3x the slowest step measured.
+MIN_S = 2.0
 
 
 What = Literal["pause", "resume", "reset", "save"]
@@ -66,8 +68,8 @@ class StageReply(msgspec.Struct, frozen=True, array_like=True):
 class CommandReceiver:
     """Receiver of commands in a stage.
 
-    It passes each command to the stage once. If a finished command arrives again, it repeats the
-    reply, which was lost.
+    It passes each command to the stage once. If a finished command arrives again, its reply was
+    lost, and the receiver repeats the reply.
     """
 
     def __init__(
@@ -117,7 +119,8 @@ class CommandSender:
         """Send a command to a stage and wait for its reply.
 
         Returns:
-            Empty on success, else the error of the stage or of the timeout.
+            Empty text on success, else the error of the stage, or that it did not reply within
+            `timeout_s` seconds.
         """
         order = StageCommand(1 + secrets.randbits(62), what, stage)
         report = self._reports[order.number] = self._loop.create_future()
@@ -169,7 +172,7 @@ class Control:
             actors: Names of all actors, producers first.
             sources: Names of the actors with inputs from outside the service.
             saved_where: Description of the state folder, for replies.
-            timeout_s: Time limit of a command for all actors together.
+            timeout_s: Time limit of a command for all actors together, seconds.
         """
         self._commander = CommandSender(transport)
         self._actors, self._sources = tuple(actors), tuple(sources)
@@ -237,8 +240,9 @@ class Control:
         """Send a command to the actors, one after the other, and wait for each reply.
 
         The order matters for `pause`: a producer that waits for credit can finish its step only
-        while its consumer is not paused. All actors together have `timeout_s`. Each one has at
-        least `MIN_S`, even if an earlier actor does not reply.
+        while its consumer is not paused. All actors together have `timeout_s` seconds. Each actor
+        has at least `MIN_S`, or `timeout_s` if that is shorter, even if an earlier actor does not
+        reply.
 
         Raises:
             ControlError: Some actors did not execute the command. It is raised after the command

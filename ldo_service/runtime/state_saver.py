@@ -15,7 +15,8 @@ from .mailbox import Mailbox
 from .outlets import Outlets
 from .stage_metrics import StageMetrics
 
-# Time between two attempts to save: short for a user who frees disk space, and cheap.
+# Time between two attempts to save, seconds. A user who frees disk space hardly waits, and the
+# attempts take little time.
 SAVE_AGAIN_S = 0.5
 
 
@@ -67,8 +68,8 @@ class StateSaver:
     def save_initial(self, actor: Actor) -> None:
         """Save the initial state before other actors connect.
 
-        The initial state is small, so this blocks the event loop only briefly. If saving fails, the
-        stage retries before the first step.
+        The initial state is small, so this call blocks the event loop only briefly. If saving
+        fails, the stage retries before the first step.
         """
         try:
             self._write(
@@ -94,7 +95,8 @@ class StateSaver:
             whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`.
 
         Returns:
-            False if the state is not saved and the stage need not wait for the disk.
+            True if the state is saved. False if it is not saved and the stage need not wait for the
+            disk.
 
         Raises:
             UnsavedStateError: The stage is about to end and the state cannot be written.
@@ -143,7 +145,7 @@ class StateSaver:
 
     # --- in the actor's thread ------------------------------------------------------------------
     def _write(self, actor: Actor, state: State) -> None:
-        self._outlets.store()  # First: the state refers to the messages of a backlog.
+        self._outlets.store()  # First, because the state refers to the messages in backlogs.
         self._checkpointer.write(actor, state)
         self._metrics.facts = {
             **actor.metrics(),

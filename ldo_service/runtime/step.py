@@ -60,9 +60,9 @@ def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
 
 
 class MessageDecoder:
-    """Decoder of inputs.
+    """Decoder of an actor's inputs.
 
-    Of consecutive malformed messages of a topic, it logs only the first one.
+    It logs only the first of several consecutive malformed messages of a topic.
     """
 
     def __init__(self, actor: str) -> None:

@@ -1,8 +1,9 @@
 """Supervision of all stages of a process in one task group, and the watchdog of systemd.
 
 An error that a stage cannot recover from ends all stages. The watchdog uses the protocol of
-sd_notify(3): it sends datagrams with one word to the socket in NOTIFY_SOCKET. If a unit sets
-`WatchdogSec=`, systemd restarts it when the event loop is blocked for that time.
+sd_notify(3): it sends datagrams with one word to the socket in NOTIFY_SOCKET. If the unit of the
+service sets `WatchdogSec=`, systemd restarts the service when its event loop is blocked for that
+time.
 """
 
 import asyncio
@@ -17,10 +18,12 @@ from ldo_service.schemas import Health
 
 log = logging.getLogger(__name__)
 
-# Time without work after which the actors are quiet: two heartbeats of a child process.
+# Time without work after which the actors count as quiet, seconds: two heartbeat periods of a child
+# process.
 QUIET_S = 1.0
 
-# sd_watchdog_enabled(3) recommends two; one may be late on a busy machine.
+# Notifications per watchdog period. sd_watchdog_enabled(3) recommends two. With three, one may be
+# late on a busy machine.
 PINGS_PER_PERIOD = 3
 
 
@@ -66,7 +69,7 @@ class StopRequest:
 async def wait_until_quiet(runners: Sequence[Runner], timeout_s: float) -> None:
     """Wait until no runner has had a queued message or a step for `QUIET_S`, at most `timeout_s`.
 
-    The messages that the last input leads to have then reached all actors.
+    By then, all messages that result from the last input have reached their actors.
     """
     loop = asyncio.get_running_loop()
     until_s, quiet_since_s = loop.time() + timeout_s, loop.time()
@@ -85,13 +88,14 @@ async def supervise(
     Args:
         runners: Stages and child processes, producers first.
         stop: The stop request.
-        sources: Number of runners at the start that take inputs from outside. After these have
-            ended, the others have `drain_s` to handle what follows from their last outputs.
+        sources: Number of runners at the start of `runners` that get inputs from outside the
+            service. After these have ended, the others have `drain_s` seconds to handle all
+            messages that result from their last outputs.
         drain_s: Time that each runner has for a soft stop before it is cancelled, seconds.
 
     Raises:
         RestartsExhausted: An actor has used up its restart budget.
-        StageStalled: A step took longer than `SupervisionConfig.stall_after_s`.
+        StageStalled: A step took longer than `SupervisionConfig.step_limit` allows.
     """
     try:
         async with asyncio.TaskGroup() as group:
@@ -149,7 +153,7 @@ class Watchdog:
             notify.sendto(word.encode(), self._address)
 
     async def ping(self) -> None:
-        """Notify the watchdog periodically on the event loop; return at once without one."""
+        """Notify the watchdog periodically; return at once if systemd has set no watchdog."""
         while self.period_s > 0:
             self.notify("WATCHDOG=1")
             await asyncio.sleep(self.period_s / PINGS_PER_PERIOD)

@@ -21,7 +21,7 @@ class RestartBudget:
 
     @staticmethod
     def of(name: str, config: "SupervisionConfig") -> "RestartBudget":
-        """Return the restart budget of an actor by the limits of supervision."""
+        """Return the restart budget of an actor with the limits of `config`."""
         return RestartBudget(
             name,
             config.max_restarts,
@@ -54,10 +54,10 @@ class SupervisionConfig:
     restart_window_s: float = 60.0
     restart_delay_s: float = 0.05  # Doubled with each failure in the window.
     restart_delay_max_s: float = 5.0
-    heartbeat_s: float = 0.5  # Heartbeat period; a stopped process shows within two periods.
-    # Maximum duration of a step: 100x the slowest step measured (mapper, 1.5 M Gaussians).
+    heartbeat_s: float = 0.5  # Heartbeat period; a stopped process is noticed within two periods.
+    # Maximum duration of a step, seconds: 100x the slowest one measured (mapper, 1.5 M Gaussians).
     stall_after_s: float = 60.0
-    # The same for actors for which no other waits: one optimization may take minutes.
+    # The same limit for actors that no other actor waits for: one optimization may take minutes.
     backend_stall_after_s: float = 600.0
     # Maximum size on disk of the unhandled messages of one topic, MB: 11 minutes of keyframes of
     # 640x480 at 2 Hz.
