@@ -38,7 +38,9 @@ from .endpoint import require_robot
 from .keys import ACCESS, CA, CERTIFICATE, KEY
 
 CA_KEY = "ca.key"
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,54}")  # 64 with its number, the limit of X.509.
+# Valid name, at most 55 characters. With the random number, a common name then has at most 64, the
+# limit of X.509.
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,54}")
 HERE = ("localhost", "127.0.0.1", "::1")  # Addresses that the actors of a service connect to.
 HEAD = "# Who may do what. `ldo keys` writes this; routers read it when they start.\n"
 
@@ -149,7 +151,9 @@ class CertificateAuthority:
         return self.folder / name
 
     def remove(self, name: str) -> None:
-        """Remove keys from the access list; routers with the new list deny them.
+        """Remove keys from the access list and delete their folder.
+
+        Routers that start with the new list deny the keys.
 
         Raises:
             ConfigError: No keys have this name.
@@ -159,7 +163,7 @@ class CertificateAuthority:
             known = ", ".join(entry.name for entry in self.entries) or "none"
             raise ConfigError(f"{self.folder} has no keys named {name!r}; it has: {known}.")
         self._grant(kept)
-        shutil.rmtree(self.folder / name, ignore_errors=True)  # The user may have moved it.
+        shutil.rmtree(self.folder / name, ignore_errors=True)  # The user may have moved the folder.
 
     def _make(
         self, name: str, common_name: str, days: int, hosts: Sequence[str], now: datetime

@@ -17,7 +17,7 @@ except ImportError as error:
         f"creating keys needs the extra `keys`. Install it by {install_command('keys')}."
     ) from error
 
-MAX_DAYS = 36500
+MAX_DAYS = 36500  # Maximum validity of a certificate.
 # Maximum difference between the clocks of machines. The validity of a certificate begins this
 # long before its creation.
 CLOCKS_DIFFER = timedelta(hours=1)

@@ -8,11 +8,13 @@ from ldo_service.schemas.topics import ROBOT_PREFIX
 
 from .keys import TlsKeys
 
-# Default address of HTTP servers without keys: their clients can see where the robot works.
+# Default address of HTTP servers, which have no keys. On another address, every machine on the
+# network could see where the robot works.
 LOOPBACK = "127.0.0.1"
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-MAX_MESSAGE_MB = 128  # A 4K frame with depth in floats has 58 MB; Zenoh's default is 1074.
+# Maximum size of a message. A 4K frame with depth in floats has 58 MB; Zenoh's default is 1074 MB.
+MAX_MESSAGE_MB = 128
 CLOSED = {  # Zenoh settings, by path, that would open the network by default.
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,

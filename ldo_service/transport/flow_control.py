@@ -4,14 +4,16 @@
   sends its hello.
 - `ProducerHello` (producer to consumers): Epoch of the producer and offset of the first message for
   each known consumer. Each consumer replies at once with a hello or its credit.
-- `Credit` (consumer to producer): Offsets of the first message that is not handled, that has not
-  arrived, and that may not be sent yet. It is sent after each step and twice a second.
+- `Credit` (consumer to producer): Three offsets: `handled` of the first message that is not
+  handled, `arrived` of the first message that has not arrived, and `limit` of the first message
+  that may not be sent yet. It is sent after each step and twice a second.
 
-Each of the three has the complete state of its sender, not a change. It may therefore be lost,
+Each of these messages has the complete state of its sender, not a change. It may therefore be lost,
 repeated or replaced by a newer one.
 
-The producer keeps the messages that are not handled, at most one window. It retransmits them from
-`arrived` when a credit message reports a gap. A restarted consumer receives the messages that it
+The producer keeps the messages that are not handled: at most one window, or a backlog on disk for
+consumers that it does not wait for. It retransmits them from `arrived` when a credit message
+reports a gap. A restarted consumer receives the messages that it
 had not handled. Producer and consumer each save their position in one write with the actor's state
 (`runtime.delivery_state`). Each message therefore takes effect exactly once, even if either process
 is killed at any time. `SequenceTracker` counts lost messages by their sequence numbers.
@@ -27,7 +29,7 @@ from ldo_service.schemas import decode
 MAX_SEQ = 1 << 62
 ALIVE = "link/alive"  # Key of the liveliness tokens of running actors.
 
-# Maximum number of missing messages that may still arrive late: half a minute of a camera.
+# Maximum number of missing messages that may still arrive late: half a minute of camera frames.
 MAX_MISSING = 1024
 
 
@@ -58,7 +60,7 @@ class ConsumerHello(msgspec.Struct, frozen=True, tag="join", array_like=True):
     """Handshake of a consumer."""
 
     consumer: str
-    has_backlog: bool = False  # The producer does not wait for its credit.
+    has_backlog: bool = False  # The producer does not wait for the consumer's credit.
 
 
 class Credit(msgspec.Struct, frozen=True, tag="grant", array_like=True):
@@ -69,8 +71,8 @@ class Credit(msgspec.Struct, frozen=True, tag="grant", array_like=True):
     handled: int  # Offset of the first message that is not handled.
     arrived: int  # Offset of the first message that has not arrived.
     limit: int  # Offset of the first message that may not be sent yet.
-    gap: bool = False  # Message `arrived` was sent and lost.
-    # The consumer takes no messages while its disk is full, and must not be evicted.
+    gap: bool = False  # The producer should retransmit from message `arrived` on.
+    # The consumer takes no messages because its disk is full. The producer must not evict it.
     waits_for_disk: bool = False
 
     def __post_init__(self) -> None:
@@ -107,7 +109,7 @@ class OutletPosition(NamedTuple):
 
     @property
     def handled(self) -> int:
-        """Offset of the first message that some consumer has not handled."""
+        """Offset of the first message that some consumer has not handled; at most `seq`."""
         if self.logged_from is not None:
             return self.logged_from
         return self.unhandled[0].seq if self.unhandled else self.seq
@@ -141,8 +143,12 @@ def data_key(topic: str) -> str:
 def retransmit_key(topic: str, consumer: str = "") -> str:
     """Return the key of retransmitted messages.
 
-    Only lossless consumers subscribe to it; other consumers receive each message once. A consumer
-    with a backlog has a key of its own, so that no other consumer receives its backlog.
+    Only lossless consumers subscribe to it; other consumers receive each message once.
+
+    Args:
+        topic: Name of the topic.
+        consumer: Name of a consumer with a backlog. It has a key of its own, so that no other
+            consumer receives its backlog. Empty for the key of all other lossless consumers.
     """
     return f"link/again/{topic}/{consumer}" if consumer else f"link/again/{topic}"
 

@@ -17,14 +17,14 @@ class Publisher(Protocol):
     def send(self, header: bytes, body: bytes) -> Awaitable[None]:
         """Send a message.
 
-        The result is done when the message was sent, or was dropped because of congestion.
+        The returned awaitable is done when the message was sent or dropped because of congestion.
         """
         ...
 
     def post(self, header: bytes, body: bytes) -> None:
         """Send a message without waiting.
 
-        It replaces an earlier posted message that was not sent yet.
+        The message replaces an earlier posted message that was not sent yet.
         """
         ...
 
@@ -34,7 +34,7 @@ class Publisher(Protocol):
 
 
 class Transport(Protocol):
-    """Network between actors; keys are relative to the robot.
+    """Network between actors; keys are relative to the key prefix of the robot.
 
     Messages may be lost. Messages of one publisher stay in order.
     `ldo_service.transport.flow_control` adds lossless delivery: it numbers, acknowledges and
@@ -82,7 +82,7 @@ class MemoryTransport:
         """Initialize without subscribers.
 
         Args:
-            lose: Returns whether a message with a key is lost; tests use it.
+            lose: Function from the key of a message to True if the message is lost; for tests.
         """
         self._subscribers: dict[str, list[OnMessage]] = {}
         self._watchers: list[OnPresence] = []

@@ -20,7 +20,9 @@ from .access_control import Access, access_control, read_access
 
 CA, CERTIFICATE, KEY, ACCESS = "ca.crt", "tls.crt", "tls.key", "access.yaml"
 OTHERS = 0o007  # Bits of a file mode that give access to all users of the machine.
-ALERT_WITHIN_S = 1.0  # TLS rejects a client in the handshake or one round trip later.
+# Time limit for the TLS error of a server. TLS rejects a client in the handshake or one round trip
+# later.
+ALERT_WITHIN_S = 1.0
 
 
 def router_settings(folder: Path, access: Access) -> dict[str, Any]:
@@ -67,7 +69,11 @@ class TlsKeys:
         self.context()
 
     def settings(self, router: bool) -> dict[str, Any]:
-        """Return the Zenoh settings, by path, of a router with `access.yaml` or of a client."""
+        """Return the Zenoh settings, by path, of a router or a client with these keys.
+
+        Args:
+            router: True for a router, whose settings include the roles in `access.yaml`.
+        """
         if router:
             return router_settings(self.folder, read_access(self.folder / ACCESS))
         return {"transport/link/tls": _tls(self.folder, "connect")}

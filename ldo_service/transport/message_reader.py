@@ -42,7 +42,13 @@ class MessageReader:
 
     @contextmanager
     def poller(self, key: str, kind: type[M], keep: int) -> Iterator[Callable[[], list[M]]]:
-        """Yield a function that returns the messages since its last call, without waiting."""
+        """Yield a function that returns the messages since its last call, without waiting.
+
+        Args:
+            key: Key of the messages, relative to the robot; it may contain `*`.
+            kind: Type of the messages; malformed ones are logged and skipped.
+            keep: Number of buffered messages; older ones are dropped.
+        """
         with self._subscriber(key, keep) as subscriber:
 
             def inbox() -> list[M]:
@@ -62,7 +68,7 @@ class MessageReader:
     def request(
         self, topic: Topic, message: Message, answer: type[M], timeout_s: float
     ) -> M | None:
-        """Send a request and return the answer, or None if the service does not reply."""
+        """Send a request; return the answer, or None without a reply within `timeout_s`."""
         replies = self._session.get(
             self._network.expression(topic.name),
             payload=msgspec.msgpack.encode(message),

@@ -236,11 +236,11 @@ class ZenohPublisher:
         self._posted: tuple[bytes, bytes] | None = None
 
     def send(self, header: bytes, body: bytes) -> Awaitable[None]:
-        """Send a message; the result is done when it was sent or dropped by congestion."""
+        """Send a message; the returned awaitable is done when it was sent or dropped."""
         return self._thread.run(self._put, header, body)
 
     def post(self, header: bytes, body: bytes) -> None:
-        """Send a message without waiting; it replaces a posted one that was not sent yet."""
+        """Send a message without waiting; it replaces an earlier posted one not sent yet."""
         with self._lock:
             is_under_way, self._posted = self._posted is not None, (header, body)
         if not is_under_way:
