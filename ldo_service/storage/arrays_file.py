@@ -20,7 +20,7 @@ def read_arrays(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
 
     Args:
         path: The .npz file.
-        max_bytes: Maximum size of all arrays, checked before any memory is allocated.
+        max_bytes: Maximum total size of the arrays, bytes, checked before memory is allocated.
 
     Raises:
         Exception: The file is damaged, too large or not readable; the type is one of UNREADABLE.

@@ -1,7 +1,7 @@
 """Files and folders that appear whole or not at all.
 
-The content is first written to a temporary file or folder next to the target. This is renamed when
-it is complete, so a reader sees the old content or the new content, never an incomplete one. A
+The content is first written to a temporary file or folder next to the target. A rename moves the
+complete one to the target, so a reader sees the old or the new content, never an incomplete one. A
 failed write removes the temporary file. A killed process may leave a temporary file, whose name
 ends in `UNFINISHED`.
 """

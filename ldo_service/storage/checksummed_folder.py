@@ -39,7 +39,7 @@ class ChecksummedFolder:
         Args:
             folder: The folder; None for a temporary one that is deleted with this object.
             suffix: Suffix of the files.
-            consequence: Sentence that the log adds to a failed write, about its consequence.
+            consequence: Sentence about the consequence of a failed write, for its log message.
 
         Raises:
             ConfigError: The folder cannot be used.
@@ -105,7 +105,7 @@ class ChecksummedFolder:
         return body
 
     def remove(self, number: int) -> None:
-        """Remove a file; a failure only costs disk space and is logged."""
+        """Remove a file; a failure is logged, and the file then only takes disk space."""
         self._sizes.pop(number, None)
         try:
             self._path(number).unlink(missing_ok=True)

@@ -15,8 +15,8 @@ from .atomic_write import sync
 
 log = logging.getLogger(__name__)
 
-# Size at which a segment ends, bytes. A segment is deleted as a whole, so that this is also the
-# disk space that handled messages may still occupy.
+# Size at which a segment, one file of the log, ends, bytes. A segment is deleted only as a whole, so
+# handled messages may still occupy this much disk space.
 SEGMENT_BYTES = 32_000_000
 # Record before each message: its number, the sizes of its header and body in bytes, and the CRC-32
 # of both.
@@ -37,7 +37,7 @@ class _Segment:
 
     path: Path
     first: int  # Number of its first message.
-    # Position after each message, bytes. Message `first + i` ends at `ends[i]`.
+    # File position after each message, bytes. Message `first + i` ends at `ends[i]`.
     ends: list[int] = field(default_factory=list)
 
     @property
@@ -52,7 +52,8 @@ class _Segment:
 class MessageLog:
     """Log of messages in a folder; any thread may call its methods.
 
-    The numbers ascend. They have a hole only where the disk lost messages, as in a power cut.
+    The numbers of the messages are consecutive, except where the disk lost messages, as in a power
+    cut.
 
     The oldest messages are deleted when the log exceeds its maximum size. The numbers of the log
     belong to one epoch of their producer. Files of other epochs are deleted.
@@ -124,7 +125,7 @@ class MessageLog:
                 self._open = None
 
     def _segment_for(self, seq: int) -> _Segment:
-        """Return the segment to append a number to: a new one after a hole or a full one."""
+        """Return the segment for message `seq`: a new one after lost messages or a full segment."""
         last = self._segments[-1] if self._segments else None
         if last is not None and seq == last.next and last.size < SEGMENT_BYTES:
             return last
@@ -186,10 +187,10 @@ class MessageLog:
         return LoggedMessage(seq, header, body)
 
     def after(self, seq: int, end: int) -> int:
-        """Return the next number that the log may have after one that cannot be read.
+        """Return the number of the first message after an unreadable one that may be readable.
 
         Args:
-            seq: The number that cannot be read.
+            seq: Number of the message that cannot be read.
             end: Number after the last message; returned if the log has none after `seq`.
         """
         with self._lock:
@@ -199,7 +200,7 @@ class MessageLog:
         return min(later, default=end)
 
     def forget(self, before: int) -> None:
-        """Delete the segments that only hold messages before a number."""
+        """Delete the segments that only hold messages with numbers below `before`."""
         with self._lock:
             self._first = max(self._first, before)
             while (
@@ -210,7 +211,7 @@ class MessageLog:
                 _remove(self._segments.pop(0).path)
 
     def truncate(self, end: int) -> None:
-        """Delete the messages from a number on."""
+        """Delete the messages with numbers of at least `end`."""
         with self._lock:
             while self._segments and self._segments[-1].first >= end:
                 _remove(self._segments.pop().path)
@@ -240,7 +241,7 @@ class MessageLog:
         return self._folder / f"{self._epoch}-{first:012d}.log"
 
     def _scan(self, end: int) -> None:
-        """Index the files of this epoch, and delete those of others."""
+        """Index the files of this epoch up to message `end`, and delete those of other epochs."""
         for path in sorted(self._folder.glob("*.log")):
             epoch, _, number = path.stem.partition("-")
             first = int(number) if number.isdecimal() else -1
