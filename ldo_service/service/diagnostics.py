@@ -12,11 +12,12 @@ from ldo_service.actors.topology import GRAPH
 from ldo_service.schemas import Health
 from ldo_service.schemas.map import MAX_ITERATIONS
 
-# Messages behind which a slow consumer is mentioned: five seconds of keyframes at 2 Hz.
+# Number of unhandled messages above which a note names the slow consumer: five seconds of keyframes
+# at 2 Hz.
 BEHIND = 10
 SLOW_STEP_S = 5.0  # 8x the slowest step measured (mapper, 1.5 M Gaussians).
-# Maximum idle time with queued messages or a running camera. An actor takes a queued message after
-# each step, and a camera sends many frames a second.
+# Maximum time between steps, in seconds, with queued messages or a running camera. An actor takes a
+# queued message after each step, and a camera sends many frames a second.
 IDLE_S = 5.0
 
 
@@ -28,14 +29,14 @@ class ActorStatus:
     has_token: bool  # The liveliness token is present.
     health: Health | None  # The last heartbeat; None: no heartbeat was received.
     listened_s: float  # Duration of the observation.
-    heartbeat_age_s: float = 0.0
+    heartbeat_age_s: float = 0.0  # Time since the last heartbeat arrived.
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
     """Problem of an actor that needs an action."""
 
-    what: str  # The problem and its consequence; the subject is the actor.
+    what: str  # Problem and consequence, as a sentence without its subject, the actor.
     advice: str  # Action of the user.
 
     def __str__(self) -> str:
@@ -85,7 +86,7 @@ def _of_steps(health: Health) -> Iterator[Problem]:
         if _waits_for_server(health):
             return
         if _is_backend(health.actor):
-            return  # `notes` mentions it: no other actor waits.
+            return  # Only a note (`notes`), because no other actor waits.
         yield Problem(
             f"has been busy with one message for {health.current_step_s:.0f} s",
             "reduce its work per message; after supervision.step_timeout_s the service stops it",

@@ -6,7 +6,7 @@ It listens on loopback by default.
   process of their actor, as Prometheus expects. A silent actor keeps only its counters and the age
   of its last heartbeat.
 - `/healthz`: 200 while every actor sends heartbeats, else 503 with the names of the silent actors.
-  It shows the current state only.
+  The reply describes only the current state.
 """
 
 import socket
@@ -185,7 +185,8 @@ def _table(
         labels: Names of the labels.
         known: Health of all known actors, for counters.
         now: Health of the actors with a recent heartbeat, for gauges.
-        items_of: Function from a health message to label values and items.
+        items_of: Function from a health message to pairs: label values, and the item from which
+            the functions of `rows` read.
     """
     for (family, name, help_text), value in rows.items():
         metric = family(f"ldo_{name}", help_text, labels=labels)

@@ -53,7 +53,7 @@ from .state_folder import claim_state
 
 log = logging.getLogger(__name__)
 
-LEAVE_WITHIN_S = 1.0  # Time for a running step after everything else has ended.
+LEAVE_WITHIN_S = 1.0  # Time that a running step has to finish after all else has ended.
 
 
 def open_recorder(
@@ -98,11 +98,13 @@ class Service:
     config: Config
     network: Endpoint
     state: Path  # State folder.
-    only: tuple[str, ...] = ()  # Actors of this process; empty: all actors.
+    # Actors of this process, a child of the main process or on another machine. Empty: this is the
+    # main process, which runs or starts all other actors.
+    only: tuple[str, ...] = ()
     is_router: bool = True  # Open a router; False: the network has one.
     is_state_kept: bool = True  # The state folder remains after the service ends.
-    metrics_port: int | None = None  # Port for Prometheus.
-    recording: Path | None = None  # Folder of the recording.
+    metrics_port: int | None = None  # Port for Prometheus; None: no metrics server.
+    recording: Path | None = None  # Folder of the recording; None: no recording.
 
     def run(self) -> None:
         """Serve until SIGINT or SIGTERM; a second signal stops at once.

@@ -11,7 +11,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.runtime.delivery_state import RestoredState
 from ldo_service.storage.state_store import FolderStore
 
-# Actors that have state before the first keyframe.
+# Actors whose states refer to each other. Each one has a state before the first keyframe.
 INTERDEPENDENT_ACTORS = ("tracker", "mapper", "optimizer")
 
 
