@@ -190,7 +190,7 @@ class LosslessInlet(Inlet):
         return InletPosition(self.epoch, handled)
 
     def grant(self, consumer: str, *, waits_for_disk: bool = False) -> ConsumerHello | Credit:
-        """Return the message for the producer: a hello until the producer is connected, then credit.
+        """Return the message for the producer: a hello until it is connected, then credit.
 
         Args:
             consumer: Name of this actor.

@@ -32,7 +32,7 @@ from .supervision_policy import RestartBudget, SupervisionConfig
 
 log = logging.getLogger(__name__)
 
-# Time between two checks while no message arrives, seconds. The checks are for an unsaved state, and
+# Time between two checks while no message arrives, seconds. The checks are for an unsaved state and
 # for idle work, which may wait for credit.
 CHECK_S = 0.5
 
