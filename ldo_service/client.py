@@ -103,7 +103,7 @@ class Client:
     def publish_color(
         self, color: np.ndarray, camera: CameraModel, stamp_ns: int | None = None
     ) -> None:
-        """Send a color image of a camera whose depth images `publish_depth` sends.
+        """Send a color image of a camera that has separate depth images; see `publish_depth`.
 
         The arguments are those of `publish`.
         """
@@ -122,7 +122,7 @@ class Client:
     ) -> None:
         """Send a depth image of a separate depth camera.
 
-        The service pairs it with the color image of the nearest stamp.
+        The service pairs the depth image with the color image of the nearest stamp.
 
         Args:
             depth: Depth image, [H, W], uint16 or float32; 0 or NaN where unknown.
