@@ -35,7 +35,7 @@ class DetectorConfig:
 class Detector(Actor):
     """Actor that detects objects in keyframes.
 
-    It has no state, so it finds the same boxes if a keyframe is sent again.
+    It has no state, so a keyframe that is sent again gets the same boxes.
     """
 
     name = "detector"
@@ -58,7 +58,8 @@ class Detector(Actor):
     def handle(self, message: Keyframe) -> Iterator[DetectionBoxes]:
         """Yield the detections of the keyframe in one message.
 
-        If no network could be used, the field `network` of the message is empty.
+        If no network is configured or the network cannot be loaded, the message has no boxes and
+        its field `network` is empty.
         """
         if self._network is None:
             yield detections_to_message(message, None, (), "")
@@ -67,7 +68,7 @@ class Detector(Actor):
         yield detections_to_message(message, found, self._network.labels, self._network.identity)
 
     def _find(self, image: np.ndarray) -> Detections | None:
-        """Return the detections in an image [H, W, 3], or None if the network fails.
+        """Return the detections in an RGB image [H, W, 3], uint8, or None if the network fails.
 
         The first failure is logged; further ones are logged only after a success.
         """

@@ -32,7 +32,8 @@ from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD, 
 log = logging.getLogger(__name__)
 
 Input = CameraRgbd | CameraColor | CameraDepth
-# Unpaired images before the warning: a second of frames, more than a start-up effect.
+# Number of unpaired images before the warning: a second of frames, too many for an effect of the
+# start.
 UNPAIRED_WARNING_COUNT = 30
 
 
@@ -40,13 +41,14 @@ UNPAIRED_WARNING_COUNT = 30
 class FrameSourceConfig:
     """Limits for pairing, restarts and image sizes of a camera."""
 
-    # Maximum time between the color and depth image of a pair. Below half a period at 30
-    # Hz, so that the first depth image within it is the nearest. At 1 rad/s it is 0.9
-    # deg of rotation.
+    # Maximum time between the color and depth image of a pair. It is below half a frame period at
+    # 30 Hz, so that the first depth image within this time is the nearest one. A camera that turns
+    # at 1 rad/s rotates by 0.9 deg in this time.
     max_skew_s: float = 0.015
-    # Images per stream that wait for their partner: 0.27 s at 30 Hz, 7 MB for VGA.
+    # Maximum number of images per stream that wait for their partner: 0.27 s at 30 Hz, 7 MB at
+    # 640x480.
     pair_buffer: int = 8
-    # Stamps that go back by more than this mean that the camera restarted; jitter is smaller.
+    # If stamps go back by more than this time, the camera has restarted; jitter is smaller.
     restart_after_s: float = 1.0
     # Minimum image side. Smaller images lack detail for tracking; usually their header is wrong.
     min_side_px: int = 32
@@ -85,7 +87,7 @@ class FrameSource(Actor):
         self._rectify = Rectifier()
         self._pairing = self._new_pairing()
         self._last_stamp_ns = -1
-        self._sessions = 1  # Camera starts seen so far.
+        self._sessions = 1  # Number of camera starts so far.
         self._rejected = 0
         self._is_rejecting = False
         self._has_warned_of_skew = False

@@ -7,7 +7,7 @@ out  loop/closure       LoopClosure                    each accepted candidate
 out  loop/candidate     LoopCandidate                  each candidate; the reason if it is rejected
 
 The actor processes a keyframe when its detections have arrived. The detector publishes a message
-for every keyframe. If it has no network, the field `network` of the message is empty.
+for every keyframe. If the detector has no network, the field `network` of the message is empty.
 """
 
 import logging
@@ -47,13 +47,11 @@ from ldo_service.tracking.keyframe_database import KeyframeRecord, make_keyframe
 
 log = logging.getLogger(__name__)
 
-# Maximum keyframes that wait for detections: two windows of the input. If more wait, their
-# detections were lost.
-# Maximum keyframes that wait for a slow detector: two minutes at 2 Hz, 33 MB at 640x480. If more
-# wait, the oldest is compared without its detections.
+# Maximum number of keyframes that wait for a slow detector: two minutes at 2 Hz, 33 MB at 640x480.
+# If more wait, the oldest is compared without its detections.
 MAX_PENDING_KEYFRAMES = 256
-# Number of newest keyframes for which the optimizer may not have published a pose yet; the tracker
-# keeps as many.
+# Number of newest keyframes for which the optimizer may not have published a pose yet. The tracker
+# keeps the poses of as many.
 RECENT_KEYFRAMES = 32
 
 
@@ -95,7 +93,8 @@ class LoopCloser(Actor):
     )
     outputs = (Out(LOOP_CLOSURE, is_final=True), Out(LOOP_CANDIDATE, is_final=True))
     is_backend = True
-    # A camera that makes no keyframe for this time stands still.
+    # Time without messages after which the unfinished subgraph is compared, seconds. A camera that
+    # makes no keyframe for this time stands still.
     idle_after_s = 5.0
 
     def __init__(self, config: LoopCloserConfig | None = None) -> None:
@@ -104,10 +103,10 @@ class LoopCloser(Actor):
         self.recognizer = LoopDetector(self.config.loops)
         self._vocabulary = Vocabulary()
         self.poses = KeyframePoses()  # Poses of the stored keyframes and the newest ones.
-        # Merged submaps, each with the older one that it is merged into.
+        # Merged submaps: id of the older submap that each one is merged into, by id.
         self._merged_submaps: dict[int, int] = {}
         self._waiting: dict[int, PendingKeyframe] = {}  # Pending keyframes by id.
-        # Detections by keyframe that came before their keyframe or wait with it.
+        # Detections that arrived before their keyframe or wait together with it, by keyframe id.
         self._boxes: dict[int, DetectionBoxes] = {}
         self._newest = -1  # Id of the newest received keyframe.
         self._accepted = self._refused = self._without_boxes = self._repeated = 0
@@ -120,7 +119,7 @@ class LoopCloser(Actor):
     ) -> Iterator[LoopClosure | LoopCandidate]:
         """Yield the loop candidates and closures of keyframes that can be processed now.
 
-        A keyframe can be processed when its detections have arrived or were lost.
+        A keyframe can be processed when its detections have arrived or can no longer arrive.
         """
         if not self.config.is_on:
             return
@@ -161,11 +160,11 @@ class LoopCloser(Actor):
         )
 
     def _ready(self) -> list[int]:
-        """Return the pending keyframes whose detections have arrived or were lost.
+        """Return the ids of the pending keyframes that can be processed now, in order.
 
         Detections arrive in the order of the keyframes. If a keyframe has detections, those of
         earlier pending keyframes can no longer arrive. If more than `MAX_PENDING_KEYFRAMES` wait,
-        the detections of the oldest ones were lost.
+        the oldest ones are processed without detections.
         """
         newest = max(self._boxes.keys() & self._waiting.keys(), default=-1)
         ready = [k for k in self._waiting if k <= newest]
@@ -189,9 +188,10 @@ class LoopCloser(Actor):
     def _masked_keyframe(
         self, waiting: PendingKeyframe, boxes: DetectionBoxes | None
     ) -> tuple[KeyframeRecord, DetectionPoints | None]:
-        """Return the keyframe record without dynamic objects, and its detections as 3D points.
+        """Return the keyframe's record without dynamic objects, and its detections as 3D points.
 
-        The points are those of static classes; None if no network ran.
+        Only detections of static classes become points. If no network ran, the record is returned
+        unchanged, with None instead of points.
         """
         if boxes is None or not boxes.network:
             return waiting.place, None
@@ -234,19 +234,19 @@ class LoopCloser(Actor):
         return self.config.is_on and not self._waiting and self.recognizer.can_flush
 
     def on_idle(self) -> Iterator[LoopClosure | LoopCandidate]:
-        """Compare the last keyframes of a camera that stands still."""
+        """Compare the unfinished subgraph with earlier subgraphs while the camera stands still."""
         self._parts = None
         yield from self._to_messages(self.recognizer.flush(self.poses, self._merged_submaps))
 
     def on_stop(self) -> Iterator[LoopClosure | LoopCandidate]:
-        """Search loops for the pending keyframes and for the unfinished subgraph."""
+        """Search for loop closures of the pending keyframes and of the unfinished subgraph."""
         self._parts = None
         for keyframe in list(self._waiting):
             yield from self._recognize(keyframe)
         yield from self._to_messages(self.recognizer.flush(self.poses, self._merged_submaps))
 
     def _needed(self) -> list[int]:
-        """Return the keyframes whose poses must be kept.
+        """Return the ids of the keyframes whose poses must be kept.
 
         These are the keyframes stored as views of subgraphs, and the newest ones, for which the
         optimizer may not have published a pose yet.

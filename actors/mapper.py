@@ -87,7 +87,7 @@ class Mapper(Actor):
     """
 
     name = "mapper"
-    lags = True  # It writes the whole map only every few keyframes.
+    lags = True  # The mapper saves the whole map only every few keyframes.
     inputs = (
         In(KEYFRAME_NEW, Lossless(8)),
         In(DETECTION_BOXES, Lossless(8)),
@@ -106,7 +106,7 @@ class Mapper(Actor):
     )
 
     def __init__(self, config: MapperConfig | None = None, *, has_labeller: bool = False) -> None:
-        """Prepare an empty map; `has_labeller` enables label requests."""
+        """Start with an empty map; `has_labeller` enables label requests."""
         super().__init__()
         self.config = config or MapperConfig()
         folder = Path(self.config.folder) if self.config.folder else None
@@ -122,7 +122,7 @@ class Mapper(Actor):
         self._newest: tuple[int, int] = (0, -1)  # Stamp in ns and id of the newest keyframe.
         self._refit = LoopRefit(self._map, self.config.refit)
         self._label_queue = LabelRequestQueue()
-        self._idle_steps = 0  # Since the last published changes.
+        self._idle_steps = 0  # Idle steps since the last published changes.
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
 
@@ -170,9 +170,9 @@ class Mapper(Actor):
     def _iterations(self) -> int:
         """Return the number of optimization iterations for the next keyframe.
 
-        The more keyframes wait, the fewer iterations each one gets. Later keyframes optimize its
-        Gaussians again, because they include it as a neighbor. The iterations of a pending
-        deduplication are subtracted.
+        The more keyframes wait, the fewer iterations each one gets. The Gaussians of a keyframe are
+        optimized again with later keyframes, which use it as a neighboring view. The iterations of
+        a pending deduplication are subtracted.
         """
         config = self.config
         return max(
@@ -186,7 +186,9 @@ class Mapper(Actor):
     def _refine(self, message: RefineMap) -> Iterator[Output]:
         self._refit.refine(message.iterations, (message.initial_rate, message.final_rate))
         self._semantics.refresh()
-        self._checkpoint = {}  # Saves the work, up to half a minute; no keyframe may follow.
+        # The next snapshot is a new checkpoint. Otherwise up to half a minute of work stays unsaved
+        # if no keyframe follows.
+        self._checkpoint = {}
         yield from self._refinement()
         yield from self._publisher.deltas(self._message_context(), with_changed=True)
         yield from self._objects()
@@ -262,10 +264,10 @@ class Mapper(Actor):
             yield from self._objects()
 
     def _moved_keyframes(self) -> list[int]:
-        """Return the keyframes whose Gaussians must move.
+        """Return the ids of the keyframes whose Gaussians must move.
 
-        Their pose differs visibly from the pose to which their Gaussians were last moved. Smaller
-        differences accumulate until they are visible.
+        The pose of such a keyframe differs visibly from the pose to which its Gaussians were last
+        moved. Smaller differences accumulate until they are visible.
         """
         config, placed = self.config, self._map.views.poses
         T_now, T_gaussians = self._poses.of(placed), placed.of(placed)
@@ -275,7 +277,10 @@ class Mapper(Actor):
         return np.array(list(placed), np.int64)[shows].tolist()
 
     def _motion(self, keyframe: int) -> AnchorMotion:
-        """Return the motion from the pose that the Gaussians were moved to, to the current pose."""
+        """Return the motion that moves a keyframe's Gaussians to its current pose.
+
+        It starts at the pose to which these Gaussians were last moved.
+        """
         T_map_gaussians = self._map.views.poses[keyframe]
         T_new_old = pose_to_message(self._poses[keyframe] @ se3.inverse(T_map_gaussians))
         return AnchorMotion(keyframe=keyframe, T_new_old=T_new_old)
@@ -328,7 +333,8 @@ class Mapper(Actor):
     def snapshot(self) -> dict[str, Any]:
         """Return the last checkpoint of the map.
 
-        It stays the same object until the next one, `checkpoint_keyframes` keyframes later.
+        The checkpoint stays the same object until the next one is due, `checkpoint_keyframes`
+        keyframes later.
         """
         newest = self._newest[1]
         saved = self._checkpoint["newest"][1] if self._checkpoint else None

@@ -16,17 +16,24 @@ class MapperConfig:
 
     builder: MapBuilderConfig = field(default_factory=MapBuilderConfig)
     semantics: SemanticMapConfig = field(default_factory=SemanticMapConfig)
-    # Iterations per keyframe, fewer where the map is dense: 12 FPS on two cores at 640x480.
+    # Optimization iterations per keyframe. Fewer run where the map is dense or keyframes wait. With
+    # this value, the service reaches 12 FPS on two cores at 640x480.
     iterations: int = 12
-    min_iterations: int = 3  # Minimum, however many keyframes wait: new Gaussians need some.
-    folder: str = ""  # Keyframe images; empty: a temporary folder, or one within the state.
+    # Minimum iterations per keyframe, however many keyframes wait: new Gaussians need some.
+    min_iterations: int = 3
+    # Folder of the keyframe images; empty: a temporary folder, or one in the state folder.
+    folder: str = ""
     threads: int = 0  # Threads of the renderer; 0: all cores but one, which the tracker needs.
     publish: PublishConfig = field(default_factory=PublishConfig)
-    # Newest keyframes for which every relative measurement is updated when the renderer moves them.
-    # The pose graph has condensed older ones; for those only the one to the reference is updated.
+    # Number of newest keyframes for which every relative-pose measurement is updated when the
+    # renderer refines their poses. The pose graph has condensed older keyframes. For these, only
+    # the measurement relative to the reference keyframe is updated.
     measured_keyframes: int = 64
-    checkpoint_keyframes: int = 5  # Keyframes between saved maps; a crash repeats at most so many.
-    motion_min_m: float = 2e-4  # A smaller motion by a correction is not visible: 0.1 px.
+    # Keyframes between two saved maps. After a crash, at most so many are mapped again.
+    checkpoint_keyframes: int = 5
+    # Minimum motion of a keyframe by a correction that moves its Gaussians. A smaller motion is not
+    # visible: 0.1 px.
+    motion_min_m: float = 2e-4
     motion_min_rad: float = 2e-4  # Equal to MapBuilderConfig.refined_rad.
     refit: LoopRefitConfig = field(default_factory=LoopRefitConfig)
 

@@ -1,6 +1,6 @@
 """Optimization of the pose graph of keyframes and objects.
 
-in   keyframe/measurements  KeyframeMeasurements  Backlog(64)   each one links to the one before
+in   keyframe/measurements  KeyframeMeasurements  Backlog(64)   relative to earlier keyframes
 in   keyframe/refinement    KeyframeRefinement    Backlog(64)   better relative-pose measurements
 in   loop/closure           LoopClosure           Backlog(64)   rare, and costly to detect
 in   object/observation     ObjectObservation     Backlog(64)   every observation adds information
@@ -55,7 +55,8 @@ from ldo_service.schemas.topics import (
 
 log = logging.getLogger(__name__)
 
-# Messages of an input in memory. They are small, so that a backlog is read in few pieces.
+# Maximum number of messages of each input in memory. Messages are small, so the value is large, and
+# few reads take a backlog from the disk.
 WINDOW = 64
 
 
@@ -66,9 +67,9 @@ class OptimizerConfig:
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     landmarks: ObjectLandmarkConfig = field(default_factory=ObjectLandmarkConfig)
     uses_objects: bool = True  # False optimizes poses alone, to measure the benefit of landmarks.
-    # Maximum closures and observations that wait for a keyframe that has not arrived yet.
+    # Maximum number of closures, and of observations, that wait for keyframes not received yet.
     max_early: int = 512
-    # Newest keyframes for which intrinsics are kept; observations come a few keyframes late.
+    # Number of newest keyframes whose intrinsics are kept; observations come a few keyframes late.
     cameras: int = 64
 
     def __post_init__(self) -> None:
@@ -79,7 +80,7 @@ class OptimizerConfig:
 class Optimizer(Actor):
     """Actor that optimizes the pose graph.
 
-    It alone decides the poses of keyframes in the map, and which submaps are merged.
+    No other actor decides the poses of keyframes in the map, or which submaps are merged.
     """
 
     name = "optimizer"
@@ -104,12 +105,12 @@ class Optimizer(Actor):
         # Id and T_odom_keyframe of the newest keyframe, by submap.
         self._newest: dict[int, tuple[int, np.ndarray]] = {}
         self._first: dict[int, int] = {}  # First keyframe of each submap.
-        # Measurements that came before their keyframe.
+        # Measurements that arrived before their keyframe, by ids of their two keyframes.
         self._early: dict[tuple[int, int], MeasuredPose] = {}
         self._early_closures: list[LoopClosure] = []
         self._early_observations: list[ObjectObservation] = []
         self._waiting_number = 0  # Number of the last received refinement.
-        self._refinements = 0  # Number of the last refinement that all poses include.
+        self._refinements = 0  # Number of the last refinement that the poses fully include.
         self._repeated = self._bridged = self._refined = self._too_early = self._too_late = 0
 
     def handle(
@@ -283,7 +284,7 @@ class Optimizer(Actor):
     def _observe(self) -> None:
         """Pass the stored observations in known keyframes on to the landmarks.
 
-        A later keyframe adds them to the pose graph.
+        They enter the pose graph when a later keyframe is added.
         """
         later = []
         for seen in self._early_observations:
@@ -299,7 +300,7 @@ class Optimizer(Actor):
         self._early_observations = self._keep_newest(later)
 
     def _class(self, name: str) -> int:
-        """Return the index of a class; 0 (`other`) beyond the maximum number of classes."""
+        """Return the index of a class; 0 (`other`) for a new one if there are `MAX_CLASSES`."""
         if name not in self._classes and len(self._classes) < MAX_CLASSES:
             self._classes.append(name)
         return self._classes.index(name) if name in self._classes else 0
@@ -382,7 +383,7 @@ class Optimizer(Actor):
             "keyframes_odometry_fallback": self._bridged,
             "keyframes_refined": self._refined,
             "early_messages_discarded": self._too_early,
-            # Intrinsics of their keyframe were no longer kept.
+            # Observations in keyframes whose intrinsics were no longer kept.
             "late_observations_discarded": self._too_late,
             "submaps_unmerged": len(self._first) - len(self._merged_submaps()),
         }

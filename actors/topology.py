@@ -38,7 +38,7 @@ class ActorSpec:
     """Name, purpose, ports and factory of an actor."""
 
     name: str
-    does: str
+    does: str  # Purpose of the actor, in the imperative.
     inputs: tuple[In, ...]
     outputs: tuple[Out, ...]
     is_backend: bool  # True if no other actor waits for its outputs.
@@ -146,7 +146,7 @@ def topics_table() -> str:
 
 
 def mermaid_diagram(boxes: Iterable[ActorSpec] = GRAPH) -> str:
-    """Return the graph in Mermaid: solid arrows for lossless inputs, dashed ones for the latest."""
+    """Return the graph in Mermaid, with dashed arrows for inputs with policy Latest."""
     lines = ["flowchart LR", "    camera([camera])", "    odometry([other odometry])"]
     boxes = tuple(boxes)
     lines.extend(f"    {box.name}" for box in boxes)

@@ -6,13 +6,13 @@ in   odometry/prior   OdometryPrior    Latest(64)   0.3 s at 200 Hz: the time to
                                                     older poses may be dropped
 in   detection/boxes  DetectionBoxes   Latest(1)    dynamic objects are masked for tracking
 out  pose/tracked     TrackedPose                   one for every tracked frame
-out  keyframe/new     Keyframe                      made only when the mapper has credit
-out  keyframe/measurements  KeyframeMeasurements    the same without images
+out  keyframe/new     Keyframe                      made only if the mapper has granted credit
+out  keyframe/measurements  KeyframeMeasurements    each keyframe without its images
 
-The actor converts messages, buffers the odometry prior and counts. `Odometry.process` tracks a
-frame in one call. If `TrackerConfig.localize` names a finished run, a
-`Localizer` replaces the odometry. It makes no keyframes, so the mapper and the optimizer are idle
-and the map does not change. Subscribers of poses see no difference.
+The actor converts messages, buffers the odometry prior and counts results. `Odometry.process`
+tracks a frame in one call. If `TrackerConfig.localize` names a finished run, a `Localizer` replaces
+the odometry. The localizer makes no keyframes, so the mapper and the optimizer are idle and the map
+does not change. Subscribers receive poses as from the odometry.
 """
 
 import logging
@@ -66,9 +66,11 @@ from ldo_service.tracking.tracking_result import TrackingResult
 
 log = logging.getLogger(__name__)
 
-# Tolerance of a quaternion's norm. Configured values often have four digits; they are normalized.
+# Maximum difference of a configured quaternion's norm from 1. Configured values often have only
+# four digits; they are normalized.
 UNIT_WITHIN = 1e-3
-# Consecutive frames without a prior; a second of frames is no short gap.
+# Number of consecutive frames without a prior before the warning: a second of frames, longer than a
+# short gap.
 MISSED_PRIOR_WARNING_COUNT = 30
 # Entries of the odometry's state that are saved as separate parts.
 OWN_PARTS = "keyframe", "supporting"
@@ -112,7 +114,8 @@ class TrackerConfig:
     T_base_camera: CameraExtrinsics = field(default_factory=CameraExtrinsics)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
-    # Folder of a finished run: track in its map, which does not change; empty: map.
+    # Folder of a finished run. The tracker localizes in the map of this run, which does not change.
+    # Empty: the tracker makes keyframes for a new map.
     localize: str = ""
     hold_out: int = 0  # Every n-th frame is tracked but not mapped, to evaluate the map; 0: none.
 
@@ -124,7 +127,7 @@ class TrackerConfig:
 class Tracker(Actor):
     """Actor that tracks frames against the reference keyframe.
 
-    Graph corrections update the poses of its keyframes in the map.
+    Graph corrections update the map poses of the keyframes that it knows.
     """
 
     name = "tracker"
@@ -149,19 +152,20 @@ class Tracker(Actor):
         self._calibration = _make_calibration(self.config)
         self._correction = b""  # The last correction, encoded.
         self._prior = OdometryPriorBuffer()
-        self._made = self._without_room = self._reused = 0  # Numbers of keyframes.
+        # Numbers of keyframes that were made, not made for lack of credit, and reused.
+        self._made = self._without_room = self._reused = 0
         # Numbers of prior poses by outcome of their check.
         self._prior_checks: Counter[PriorCheck] = Counter()
-        # Numbers of frames since the first pose of the prior.
+        # Numbers of frames with and without a prior, since the first pose of the prior.
         self._with_prior = self._without_prior = 0
         self._missed = 0  # Consecutive frames without a prior.
-        # Cached parts of the state except the prior, which also changes between frames.
+        # Cached parts of the state; `snapshot` adds the prior, which also changes between frames.
         self._parts: dict[str, Any] | None = None
 
     def handle(
         self, message: FrameRgbd | GraphCorrection | OdometryPrior | DetectionBoxes
     ) -> Iterator[TrackedPose | Keyframe | KeyframeMeasurements]:
-        """Yield the pose of a frame, after its keyframe if the frame becomes one."""
+        """Yield the pose of a frame; if it becomes a keyframe, yield the keyframe first."""
         if isinstance(message, OdometryPrior):
             self._take_prior(message)
             return
@@ -179,7 +183,8 @@ class Tracker(Actor):
 
         The keyframe has the color and the depth that the self-calibration has corrected.
         """
-        frame = self._calibration.correction.applied(raw)
+        correction = self._calibration.correction
+        frame = correction.applied(raw)
         hold_out = self.config.hold_out
         is_held_out = hold_out > 0 and frame.index % hold_out == hold_out - 1
         may_map = not is_held_out and self.has_credit(KEYFRAME_NEW)
@@ -189,9 +194,8 @@ class Tracker(Actor):
         if change is not None:
             self._odometry.recorrect(change)
         if result.awaits_mapping:
-            return  # Odometry starts with a later frame, when all consumers have credit.
+            return  # Odometry starts with a later frame, when all consumers have granted credit.
         if result.keyframe is not None:
-            correction = self._calibration.correction
             keyframe = keyframe_message(frame, result, result.keyframe, correction)
             yield keyframe
             yield keyframe_measurements_message(keyframe)
@@ -244,7 +248,7 @@ class Tracker(Actor):
         """Return all parts of the tracker's state after the last frame, correction or detection."""
         state = self._odometry.snapshot()
         records = {record["id"]: record for record in state.pop("places")}
-        state["order"] = [*records]  # The keyframe used last is the last one.
+        state["order"] = [*records]  # The most recently used keyframe comes last.
         own = {name: state.pop(name) for name in OWN_PARTS}
         fix = {"fix": state.pop("fix")} if "fix" in state else {}
         poses, localize = state.pop("poses"), self.config.localize
@@ -324,6 +328,6 @@ def _make_calibration(config: TrackerConfig) -> SelfCalibration:
 
 
 def _box(detection: Detection) -> Box:
-    """Convert a box from pixel centers at integer coordinates to pixel edges."""
+    """Convert a detection to a box whose coordinates are integers at pixel edges, not centers."""
     x0, y0, x1, y1 = (edge + 0.5 for edge in detection.box_px)
     return Box(detection.label, x0, y0, x1, y1)

@@ -1,6 +1,6 @@
 """Labelling of regions that the detector does not know.
 
-in   label/request   LabelRequest   Backlog(2)             one waits while another is labelled
+in   label/request   LabelRequest   Backlog(2)             one waits while one is labelled
 in   label/add       AddLabel       Latest(32)             has priority, because a user waits
 out  label/result    LabelResult                           one for every request, with delay
 out  label/names     LabelNames                            one for every label/add
@@ -41,8 +41,8 @@ class VlmLabellerConfig:
 
     model: str = ""  # Dual encoder: a name of `ldo models list`, or a folder; empty: none.
     url: str = ""  # OpenAI-compatible server, such as http://127.0.0.1:8000/v1; empty: none.
-    # File with one name per line to choose from. Empty: the names of the dual encoder, or the 80
-    # classes of COCO; a server may return any name.
+    # File with the names to choose from, one per line. Empty: a dual encoder uses its own names, or
+    # the 80 classes of COCO if it has none; a server may return any name.
     names: str = ""
     dual_encoder: DualEncoderConfig = field(default_factory=DualEncoderConfig)
     http: HttpConfig = field(default_factory=HttpConfig)
@@ -74,12 +74,13 @@ class VlmLabeller(Actor):
     def __init__(
         self, config: VlmLabellerConfig | None = None, labeller: Labeller | None = None
     ) -> None:
-        """Open the configured labeller, or use `labeller` instead."""
+        """Open the configured labeller, or use `labeller` instead if it is not None."""
         super().__init__()
         self.config = config or VlmLabellerConfig()
         self.talks_outside = bool(self.config.url)
         self._labeller = labeller
-        self._state: State = {"added": ()}  # Added names; the same object until the next one.
+        # Added names; the same object until the next name is added.
+        self._state: State = {"added": ()}
         self._is_failing = False
         self._named = self._unnamed = self._failures = self._refusals = 0
         try:
