@@ -15,8 +15,8 @@ from .atomic_write import sync
 
 log = logging.getLogger(__name__)
 
-# Size at which a segment, one file of the log, ends, bytes. A segment is deleted only as a whole, so
-# handled messages may still occupy this much disk space.
+# Size at which a segment, which is one file of the log, ends, bytes. A segment is deleted only as a
+# whole, so handled messages may still occupy this much disk space.
 SEGMENT_BYTES = 32_000_000
 # Record before each message: its number, the sizes of its header and body in bytes, and the CRC-32
 # of both.
