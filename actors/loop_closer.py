@@ -258,8 +258,8 @@ class LoopCloser(Actor):
     def snapshot(self) -> dict[str, Any]:
         """Return the state in parts that are written only when they change.
 
-        There is one part for each subgraph and each pending keyframe, one for the visual words, one
-        for the poses, and one for the rest.
+        Each subgraph, each keyframe of the unfinished subgraph and each pending keyframe is a part.
+        Three more parts are the visual words, the keyframe poses, and the rest.
         """
         if self._parts is None:
             self._parts = self._all_parts()
@@ -284,8 +284,8 @@ class LoopCloser(Actor):
     def _poses_part(self) -> dict[str, Any]:
         """Return the part of the state with the keyframe poses.
 
-        It is the largest part, 0.4 kB for each stored view. It is cached, because detections do not
-        change it.
+        This part is the largest one: 0.4 kB for each stored view. It is cached, because detections
+        do not change the poses.
         """
         if self._saved_poses is None:
             self._saved_poses = self.poses.snapshot()

@@ -1,8 +1,8 @@
 """Mapping with labelled 3D Gaussians and objects.
 
-in   keyframe/new          Keyframe             Lossless(8)        a lost keyframe leaves a hole
+in   keyframe/new          Keyframe             Lossless(8)        the map lacks a lost keyframe
 in   detection/boxes       DetectionBoxes       Lossless(8)        labels come from detections
-in   label/result          LabelResult          Lossless(8)         newest label of each region
+in   label/result          LabelResult          Lossless(8)        one result for each request
 in   graph/correction      GraphCorrection      Latest(1)          the newest has all poses
 in   map/refine            RefineMap            Latest(1)          only the newest request counts
 out  map/view              MapRendering         the map rendered at the newest keyframe

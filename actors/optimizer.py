@@ -7,7 +7,8 @@ in   object/observation     ObjectObservation     Backlog(64)   every observatio
 out  graph/correction       GraphCorrection                     all keyframe poses and landmarks
 
 gtsam holds the GIL during every call, so this actor runs in a process of its own by default. No
-other actor waits for it: while it optimizes, its producers keep its messages on disk.
+other actor waits for the optimizer. While it is busy, the producers of its inputs keep the messages
+on disk.
 """
 
 import logging
@@ -207,7 +208,8 @@ class Optimizer(Actor):
     ) -> None:
         """Connect a keyframe to its submap by odometry.
 
-        This replaces its measurements, because none of its reference keyframes was received.
+        The keyframe's own measurements cannot be used, because none of their reference keyframes
+        was received.
 
         Args:
             newest: Id and T_odom_keyframe of the newest keyframe of the submap.

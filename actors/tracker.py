@@ -127,7 +127,7 @@ class TrackerConfig:
 class Tracker(Actor):
     """Actor that tracks frames against the reference keyframe.
 
-    Graph corrections update the map poses of the keyframes that it knows.
+    Graph corrections update the map poses of the tracker's keyframes.
     """
 
     name = "tracker"
@@ -179,7 +179,7 @@ class Tracker(Actor):
             yield from self._track(frame_from_message(message))
 
     def _track(self, raw: RgbdFrame) -> Iterator[TrackedPose | Keyframe | KeyframeMeasurements]:
-        """Track a frame; yield its keyframe if it becomes one, then its pose.
+        """Track a frame; if it becomes a keyframe, yield the keyframe first, then the pose.
 
         The keyframe has the color and the depth that the self-calibration has corrected.
         """

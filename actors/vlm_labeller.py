@@ -1,6 +1,6 @@
 """Labelling of regions that the detector does not know.
 
-in   label/request   LabelRequest   Backlog(2)             one waits while one is labelled
+in   label/request   LabelRequest   Backlog(2)             one request waits, one is labelled
 in   label/add       AddLabel       Latest(32)             has priority, because a user waits
 out  label/result    LabelResult                           one for every request, with delay
 out  label/names     LabelNames                            one for every label/add
@@ -42,7 +42,7 @@ class VlmLabellerConfig:
     model: str = ""  # Dual encoder: a name of `ldo models list`, or a folder; empty: none.
     url: str = ""  # OpenAI-compatible server, such as http://127.0.0.1:8000/v1; empty: none.
     # File with the names to choose from, one per line. Empty: a dual encoder uses its own names, or
-    # the 80 classes of COCO if it has none; a server may return any name.
+    # without own names the 80 classes of COCO. A server may then return any name.
     names: str = ""
     dual_encoder: DualEncoderConfig = field(default_factory=DualEncoderConfig)
     http: HttpConfig = field(default_factory=HttpConfig)
