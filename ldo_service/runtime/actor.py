@@ -185,8 +185,9 @@ class Actor:
     def checkpoint(self) -> State:
         """Return the complete state, including changes that `snapshot` may omit.
 
-        The call may take seconds. The stage makes it for the command `save`, after `on_restored`
-        and `on_stop`, and when its write-ahead log (the inputs since the last new state) is full.
+        The call may take seconds. The stage calls this method for the command `save`, after
+        `on_restored` and `on_stop`, and when its write-ahead log is full. This log has the inputs
+        since the last changed state.
         """
         return self.snapshot()
 

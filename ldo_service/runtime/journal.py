@@ -144,7 +144,14 @@ class Journal:
         produced: Iterable[Produced] = (),
         error: str = "",
     ) -> None:
-        """Record a finished step; the stage calls it before it sends the outputs."""
+        """Record a finished step; the stage calls this method before it sends the outputs.
+
+        Args:
+            kind: Outcome of the step.
+            situation: Credits and backlogs before the step.
+            produced: Outputs of the step.
+            error: Exception of a failed step; empty on success.
+        """
 
     def close(self) -> "Future[None]":
         """Stop recording; the future is done when all recorded entries are written."""

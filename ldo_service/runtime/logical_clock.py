@@ -1,6 +1,7 @@
 """Offline run of the whole actor graph, on a logical clock that ticks once per frame.
 
-Odometry priors with stamps up to that of a frame are delivered in the tick of the frame, before it.
+A frame is delivered together with poses of the odometry prior: these are delivered in the tick of
+the frame, before the frame.
 
 Each actor has a configured latency in ticks. With a latency of n, consumers receive the outputs of
 a step n ticks after its input, however long the step takes. Actors compute in parallel, each in its

@@ -341,7 +341,10 @@ class Outlet:
                 self._repeating = None
 
     def _skip_lost(self, seq: int) -> None:
-        """Let the consumers that have handled all messages before a lost one continue after it."""
+        """Let consumers skip message `seq`, which the disk has lost.
+
+        Only consumers that have handled all earlier messages skip it.
+        """
         if self._consumers.skip(self._outbox.after(seq, self._seq), since=seq):
             self._post_hellos()
 

@@ -64,7 +64,7 @@ async def exit_with_parent(period_s: float = 0.5) -> None:
 
 
 class ChildProcess:
-    """Process of one actor; it is restarted when it exits or sends no heartbeat in time.
+    """Child process of one actor, restarted when it exits or sends no heartbeat in time.
 
     The process has a process group of its own. Ctrl-C at a terminal therefore reaches only the
     parent, which ends its children in order.

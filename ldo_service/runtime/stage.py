@@ -222,8 +222,8 @@ class Stage:
         self._journal.record_step("dead_lettered", FlowStatus())
         await self._saver.save(self._actor, delivery)
         log.error(
-            "%s: message %s (stamp %d ns) failed twice and becomes a dead letter. Its traceback is "
-            "above; please report it with the recording.",
+            "%s: message %s (stamp %d ns) failed twice and is discarded as a dead letter. The "
+            "traceback is above; please report it with the recording.",
             self.name, type(message).__name__, message.stamp_ns,
         )  # fmt: skip
 
@@ -344,7 +344,7 @@ class Stage:
     async def _reset(self, mailbox: Mailbox) -> None:
         """Replace the actor by a new one with an empty state, under a new epoch.
 
-        Other actors connect to it again, as after a restart of its process.
+        Other actors connect to the new actor again, as after a restart of the process.
         """
         self._checkpointer.forget(self.name)
         self._actor = await self._worker.run(self._restored_actor)

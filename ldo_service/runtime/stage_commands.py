@@ -17,8 +17,8 @@ Commands:
 `Control` replies once for the whole service, when all its actors have replied. `reset` first pauses
 every actor, producers first, so that no message of the old run is in flight when they restart.
 Otherwise a late graph correction of the old run could arrive in the new run. After 50 keyframes,
-for example, its graph version would be higher than that of the new run's first correction, and
-would supersede it.
+for example, it would have a higher graph version than the first correction of the new run, and
+would supersede that correction.
 """
 
 import asyncio

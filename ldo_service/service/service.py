@@ -1,7 +1,8 @@
 """Live service: every actor as a stage in this process or in a child process.
 
-The main process opens the router that all other processes connect to. It starts a child process as
-`ldo serve --actor ACTOR`, with the same configuration and state folder, and supervises it.
+The main process opens the router that all other processes connect to. It starts and supervises the
+child processes. Each one runs `ldo serve --actor ACTOR` with the same configuration and state
+folder.
 """
 
 import asyncio
@@ -66,7 +67,7 @@ def open_recorder(
         actor: Name of the actor.
         robot: Name of the robot.
         config: Configuration of the service.
-        map_folder: Folder with the mapper's files; None if it is a temporary one.
+        map_folder: Folder with the mapper's files; None if this folder is temporary.
 
     Raises:
         ConfigError: The folder cannot be written.

@@ -4,16 +4,16 @@
   sends its hello.
 - `ProducerHello` (producer to consumers): Epoch of the producer and offset of the first message for
   each known consumer. Each consumer replies at once with a hello or its credit.
-- `Credit` (consumer to producer): Three offsets: `handled` of the first message that is not
-  handled, `arrived` of the first message that has not arrived, and `limit` of the first message
-  that may not be sent yet. It is sent after each step and twice a second.
+- `Credit` (consumer to producer): Three offsets, sent after each step and twice a second. `handled`
+  is that of the first message that is not handled. `arrived` is that of the first message that has
+  not arrived. `limit` is that of the first message that may not be sent yet.
 
 Each of these messages has the complete state of its sender, not a change. It may therefore be lost,
 repeated or replaced by a newer one.
 
-The producer keeps the messages that are not handled: at most one window, or a backlog on disk for
-consumers that it does not wait for. It retransmits them from `arrived` when a credit message
-reports a gap. A restarted consumer receives the messages that it
+The producer keeps the messages that are not handled, at most one window. For consumers that it does
+not wait for, the kept messages are a backlog on disk. The producer retransmits messages from
+`arrived` on when a credit message reports a gap. A restarted consumer receives the messages that it
 had not handled. Producer and consumer each save their position in one write with the actor's state
 (`runtime.delivery_state`). Each message therefore takes effect exactly once, even if either process
 is killed at any time. `SequenceTracker` counts lost messages by their sequence numbers.

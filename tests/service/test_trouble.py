@@ -78,7 +78,7 @@ def test_failing_message_becomes_a_dead_letter_and_tracking_continues(
         assert (tracker.failures, tracker.restarts) == (2, 2)
         poses = tracked(service, room, range(21, 30))
         assert [(pose.frame, pose.status) for pose in poses] == [(i, "OK") for i in range(21, 30)]
-        assert "failed twice and becomes a dead letter" in service.log
+        assert "failed twice and is discarded as a dead letter" in service.log
         assert service.stop() == 0
 
 
