@@ -58,8 +58,8 @@ class Detector(Actor):
     def handle(self, message: Keyframe) -> Iterator[DetectionBoxes]:
         """Yield the detections of the keyframe in one message.
 
-        If no network is configured or the network cannot be loaded, the message has no boxes and
-        its field `network` is empty.
+        If the detector has no network or inference fails, the message has no boxes and its field
+        `network` is empty.
         """
         if self._network is None:
             yield detections_to_message(message, None, (), "")

@@ -32,8 +32,7 @@ from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD, 
 log = logging.getLogger(__name__)
 
 Input = CameraRgbd | CameraColor | CameraDepth
-# Number of unpaired images before the warning: a second of frames, too many for an effect of the
-# start.
+# Number of unpaired images before the warning: a second of frames, longer than a start-up effect.
 UNPAIRED_WARNING_COUNT = 30
 
 
@@ -159,7 +158,7 @@ class FrameSource(Actor):
     def _notice_restart(self, message: Input) -> None:
         """Forget the last stamp and all unpaired images if the camera has restarted.
 
-        A restart shows in stamps that go back by more than `restart_after_s`.
+        The camera has restarted if the stamps go back by more than `restart_after_s`.
         """
         back_s = (self._last_stamp_ns - message.stamp_ns) * 1e-9
         if back_s > self.config.restart_after_s:

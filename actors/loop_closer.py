@@ -7,7 +7,8 @@ out  loop/closure       LoopClosure                    each accepted candidate
 out  loop/candidate     LoopCandidate                  each candidate; the reason if it is rejected
 
 The actor processes a keyframe when its detections have arrived. The detector publishes a message
-for every keyframe. If the detector has no network, the field `network` of the message is empty.
+for every keyframe. The field `network` of this message is empty if the detector has no network or
+inference failed.
 """
 
 import logging
@@ -103,7 +104,7 @@ class LoopCloser(Actor):
         self.recognizer = LoopDetector(self.config.loops)
         self._vocabulary = Vocabulary()
         self.poses = KeyframePoses()  # Poses of the stored keyframes and the newest ones.
-        # Merged submaps: id of the older submap that each one is merged into, by id.
+        # Id of the older submap that a submap was merged into, by id of the merged submap.
         self._merged_submaps: dict[int, int] = {}
         self._waiting: dict[int, PendingKeyframe] = {}  # Pending keyframes by id.
         # Detections that arrived before their keyframe or wait together with it, by keyframe id.

@@ -34,7 +34,7 @@ class MapperConfig:
     # Minimum motion of a keyframe by a correction that moves its Gaussians. A smaller motion is not
     # visible: 0.1 px.
     motion_min_m: float = 2e-4
-    motion_min_rad: float = 2e-4  # Equal to MapBuilderConfig.refined_rad.
+    motion_min_rad: float = 2e-4  # The same for rotations; equal to MapBuilderConfig.refined_rad.
     refit: LoopRefitConfig = field(default_factory=LoopRefitConfig)
 
     def __post_init__(self) -> None:

@@ -302,7 +302,7 @@ class Optimizer(Actor):
         self._early_observations = self._keep_newest(later)
 
     def _class(self, name: str) -> int:
-        """Return the index of a class; 0 (`other`) for a new one if there are `MAX_CLASSES`."""
+        """Return the index of a class; 0 (`other`) for a new class beyond `MAX_CLASSES`."""
         if name not in self._classes and len(self._classes) < MAX_CLASSES:
             self._classes.append(name)
         return self._classes.index(name) if name in self._classes else 0

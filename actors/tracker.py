@@ -194,7 +194,7 @@ class Tracker(Actor):
         if change is not None:
             self._odometry.recorrect(change)
         if result.awaits_mapping:
-            return  # Odometry starts with a later frame, when all consumers have granted credit.
+            return  # Odometry starts with a later frame that may be mapped.
         if result.keyframe is not None:
             keyframe = keyframe_message(frame, result, result.keyframe, correction)
             yield keyframe
@@ -238,7 +238,7 @@ class Tracker(Actor):
     def snapshot(self) -> dict[str, Any]:
         """Return the state in parts, of which only changed ones are written.
 
-        Each known keyframe has a part that never changes.
+        Each stored keyframe is a part of its own, which never changes.
         """
         if self._parts is None:
             self._parts = self._tracked_parts()
@@ -328,6 +328,6 @@ def _make_calibration(config: TrackerConfig) -> SelfCalibration:
 
 
 def _box(detection: Detection) -> Box:
-    """Convert a detection to a box whose coordinates are integers at pixel edges, not centers."""
+    """Convert a detection to a box with integer coordinates at pixel edges instead of centers."""
     x0, y0, x1, y1 = (edge + 0.5 for edge in detection.box_px)
     return Box(detection.label, x0, y0, x1, y1)
