@@ -76,7 +76,7 @@ class In:
 
     topic: Topic
     policy: Policy
-    has_priority: bool = False  # Take its messages before those queued at other inputs.
+    has_priority: bool = False  # Take messages of this input before those of other inputs.
 
     def __post_init__(self) -> None:
         if isinstance(self.policy, Latest) and self.policy.per_key and self.topic.key is None:
@@ -139,7 +139,10 @@ class Actor:
         self.situation = FlowStatus()
 
     def has_credit(self, topic: Topic) -> bool:
-        """Return whether a message of the topic may be sent without waiting."""
+        """Return whether a message of the topic may be sent without waiting.
+
+        The result is always True for an output that is not nonblocking.
+        """
         return self.situation.credits.get(topic, UNLIMITED) > 0
 
     def handle(self, message: Any) -> Iterator[Message]:

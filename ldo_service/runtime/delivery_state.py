@@ -33,7 +33,10 @@ MAX_WAL_ENTRIES = 64
 
 
 class LoggedInput(NamedTuple):
-    """Handled message and the flow status of its step, with counts by topic name."""
+    """Entry of the write-ahead log: a handled message and the flow status of its step.
+
+    The credits and backlogs of the flow status are counts by topic name.
+    """
 
     topic: str  # Name of the topic; empty for idle work, which has no message.
     body: bytes  # Encoded message.
@@ -62,7 +65,7 @@ class RestoredState:
     own: State = field(default_factory=dict)  # State of the actor.
     inputs: Mapping[str, InletPosition] = field(default_factory=dict)  # Position by topic name.
     outputs: Mapping[str, OutletPosition] = field(default_factory=dict)  # Position by topic name.
-    taken: tuple[LoggedInput, ...] = ()  # Write-ahead log: inputs after `own`.
+    taken: tuple[LoggedInput, ...] = ()  # Write-ahead log: inputs handled after `own`.
     is_none: bool = False  # The store had no state.
 
     @classmethod
@@ -70,7 +73,7 @@ class RestoredState:
         """Split a state that the store has loaded; None or an empty state: nothing was saved."""
         if not state:
             return cls(is_none=True)
-        links = state.get(OFFSETS, {"in": {}, "out": {}})  # Absent without lossless neighbors.
+        links = state.get(OFFSETS, {"in": {}, "out": {}})  # Absent without lossless links.
         return cls(
             own={part: value for part, value in state.items() if not part.startswith("stage.")},
             inputs={topic: InletPosition(*past) for topic, past in links["in"].items()},
@@ -132,7 +135,7 @@ class DeliveryState:
     def links(
         self, inputs: Mapping[str, InletPosition], outputs: Mapping[str, OutletPosition]
     ) -> dict[str, Any]:
-        """Return the offsets and the outbox; empty for an actor without lossless neighbors."""
+        """Return the offsets and the outbox as parts to save; empty without lossless links."""
         if not inputs and not outputs:
             return {}
         places = {
@@ -162,6 +165,9 @@ def restore_actor(actor: Actor, past: RestoredState, make: Callable[[], Actor]) 
         actor: A new actor.
         past: The saved state.
         make: Function that creates another new actor.
+
+    Returns:
+        The restored actor: `actor`, or the one that was created last.
     """
     taken = list(past.taken)
     while True:

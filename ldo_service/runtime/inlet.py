@@ -194,7 +194,7 @@ class LosslessInlet(Inlet):
 
         Args:
             consumer: Name of this actor.
-            waits_for_disk: The stage takes no messages while its disk is full.
+            waits_for_disk: True if the stage takes no messages because its disk is full.
         """
         if not self.is_connected:
             return ConsumerHello(consumer, isinstance(self.port.policy, Backlog))

@@ -1,7 +1,7 @@
 """Offline run of the whole actor graph, on a logical clock that ticks once per frame.
 
-A frame is delivered together with poses of the odometry prior: these are delivered in the tick of
-the frame, before the frame.
+The poses of an odometry prior are delivered in the ticks of the frames. Before each frame come all
+poses up to the first one that is not older than the frame.
 
 Each actor has a configured latency in ticks. With a latency of n, consumers receive the outputs of
 a step n ticks after its input, however long the step takes. Actors compute in parallel, each in its
@@ -36,7 +36,7 @@ class StepOutput:
 class PendingOutput:
     """Outputs of a step that is still running.
 
-    Outputs of one tick are delivered in the order of the actors in the graph. Those of one actor
+    Outputs of one tick are delivered in the order of the actors in the graph. Outputs of one actor
     are delivered in the order in which the steps started.
     """
 

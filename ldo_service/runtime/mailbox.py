@@ -265,7 +265,7 @@ class Mailbox:
         """Send the current credit of every lossless input to its producer.
 
         The stage repeats this with each heartbeat, because a credit message may be lost. Before a
-        producer has sent its hello, this sends the hello of the consumer instead.
+        producer has sent its hello, the mailbox sends it a hello instead of a credit.
         """
         with self._lock:
             self._grant_pending = False

@@ -184,7 +184,8 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until every lossless consumer has received all messages.
 
-        A consumer with a backlog may have stopped already, so the outlet waits only briefly for it.
+        A consumer with a backlog may have stopped already. The outlet therefore waits for it only
+        for `FLUSH_BACKLOG_S`.
         """
         self._post_hellos()  # Each consumer replies with its credit at once.
         while not self._consumers.all_received(self._seq, awaited_only=True):

@@ -158,7 +158,7 @@ class Outlets:
             outlet.reset(epoch)
 
     def check_windows(self) -> None:
-        """Evict stalled consumers of all topics."""
+        """Evict the consumers of all topics whose window has been full for too long."""
         for outlet in self._all.values():
             outlet.evict_stalled()
 

@@ -40,8 +40,8 @@ def resident_mb() -> float:
 def trim_memory() -> None:
     """Return freed memory to the operating system.
 
-    Otherwise glibc keeps the free memory that lies between blocks in use. These were 280 MB after a
-    camera walk of three laps through the synthetic flat. On systems other than Linux the function
+    Otherwise glibc keeps free memory that lies between blocks in use. It kept 280 MB after a camera
+    walk of three laps through the synthetic flat. On systems other than Linux the function
     does nothing.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
@@ -189,7 +189,10 @@ class ChildProcess:
             call_soon(self._loop, self._take_health, decode(body, Health))
 
     def _take_health(self, health: Health) -> None:
-        """Extend the deadline, unless this process sent the message itself."""
+        """Store a health message, and extend the deadline of the next heartbeat.
+
+        Messages that the parent process has repeated itself are ignored; see `_on_beat`.
+        """
         is_repeated = self._health is not None and health.step_age_s == self._health.step_age_s
         if health.pid == self.pid and not is_repeated:
             self._health, self._health_at_s = health, self._loop.time()

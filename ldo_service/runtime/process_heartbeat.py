@@ -24,7 +24,7 @@ def start_heartbeat(environment: Mapping[str, str] = os.environ) -> Heartbeat | 
 
 
 class HeartbeatPipe:
-    """Parent end of the pipe for one child process; the event loop reads it."""
+    """Heartbeat pipe of one child process, read by the parent on its event loop."""
 
     def __init__(self, on_beat: Callable[[float], None]) -> None:
         """Open the pipe.

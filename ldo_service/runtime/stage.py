@@ -41,7 +41,7 @@ class Stage:
     """Runtime around one actor; `run` lasts until `drain` or cancellation.
 
     Failures: The stage restores the actor and repeats a failed step once. A message that fails
-    twice becomes a dead letter. The `journal` receives everything that a step depends on.
+    twice is discarded as a dead letter. The `journal` receives everything that a step depends on.
 
     Saving: A step is complete when it is saved. Only then does the stage send its outputs to
     required consumers and acknowledge its input. While the disk is full, most stages take no more

@@ -189,7 +189,10 @@ class Control:
         transport.watch_liveliness(self._presence)
 
     async def answer(self, body: bytes) -> bytes:
-        """Execute the request of a query and return the encoded reply; accepts any bytes."""
+        """Execute an encoded `ControlRequest` and return the encoded `ControlAnswer`.
+
+        If the bytes are malformed, the answer has the error.
+        """
         try:
             request = decode(body, ControlRequest)
         except msgspec.DecodeError as error:

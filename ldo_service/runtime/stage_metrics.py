@@ -71,7 +71,7 @@ class StageMetrics:
         return 0.0 if started_s is None else time.monotonic() - started_s
 
     def health(self, **of_the_stage: Any) -> Health:
-        """Return the health message; `of_the_stage` has its fields that are not stored here."""
+        """Return the health message; `of_the_stage` contains the fields not stored here."""
         step_ms = np.array(self.step_ms or [0.0])
         is_busy = self.started_at_s is not None and self.state == "ready"
         return Health(

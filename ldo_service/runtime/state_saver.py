@@ -29,9 +29,9 @@ class StateSaver:
 
     While the disk is full, the saver retries and the stage takes no messages, with two exceptions:
 
-    - A stage with nonblocking outputs and without lossless inputs continues. Its credit is 0 until
-      the staged outputs are saved and sent.
-    - A stage without lossless inputs and without required consumers continues too.
+    - A stage with nonblocking outputs and without lossless inputs continues to take messages. The
+      credit of an output is 0 until its staged messages are saved and sent.
+    - A stage without lossless inputs and without required consumers also continues.
 
     A stage that is about to end does not wait for the disk.
     """
@@ -53,7 +53,7 @@ class StateSaver:
             outlets: Outputs of the stage, whose positions are saved.
             metrics: Counters of the stage; every write updates the actor's metrics in it.
             journal: Journal of the stage, for its metrics.
-            is_draining: Returns whether the stage is about to end.
+            is_draining: Function that returns True if the stage is about to end.
         """
         self._checkpointer, self._worker, self._outlets = checkpointer, worker, outlets
         self._metrics, self._journal = metrics, journal

@@ -40,7 +40,7 @@ class Runner(Protocol):
 
 
 class StopRequest:
-    """Stop request: soft after the first call, hard after the second.
+    """Stop request: soft after the first call of `request`, hard after the second.
 
     On a soft stop each stage handles its queued messages. A hard stop cancels the stages.
     """
@@ -67,9 +67,10 @@ class StopRequest:
 
 
 async def wait_until_quiet(runners: Sequence[Runner], timeout_s: float) -> None:
-    """Wait until no runner has had a queued message or a step for `QUIET_S`, at most `timeout_s`.
+    """Wait until no runner has had a queued message or a running step for `QUIET_S`.
 
-    By then, all messages that result from the last input have reached their actors.
+    By then, all messages that result from the last input have reached their actors. The function
+    waits for at most `timeout_s` seconds.
     """
     loop = asyncio.get_running_loop()
     until_s, quiet_since_s = loop.time() + timeout_s, loop.time()
