@@ -99,7 +99,7 @@ class UnackedMessage(NamedTuple):
 
 
 class OutletPosition(NamedTuple):
-    """Saved position of a producer, with the messages that some consumer has not handled."""
+    """Saved position of a producer on a topic, with the messages that are not handled."""
 
     epoch: int
     seq: int  # Offset of the next message.
@@ -116,7 +116,7 @@ class OutletPosition(NamedTuple):
 
 
 class InletPosition(NamedTuple):
-    """Saved position of a consumer."""
+    """Saved position of a consumer on a topic."""
 
     epoch: int  # Epoch of the producer; 0: no producer was connected.
     handled: int  # Offset of the first message that is not handled.
