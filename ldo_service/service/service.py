@@ -102,7 +102,7 @@ class Service:
     # Actors of this process, a child of the main process or on another machine. Empty: this is the
     # main process, which runs or starts all other actors.
     only: tuple[str, ...] = ()
-    is_router: bool = True  # Open a router; False: the network has one.
+    is_router: bool = True  # Open a router; False: connect to the network's router.
     is_state_kept: bool = True  # The state folder remains after the service ends.
     metrics_port: int | None = None  # Port for Prometheus; None: no metrics server.
     recording: Path | None = None  # Folder of the recording; None: no recording.

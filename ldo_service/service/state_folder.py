@@ -61,7 +61,7 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
 
     Args:
         folder: The state folder.
-        stack: Closed when the service ends.
+        stack: Exit stack that releases the lock when the service ends.
         remote_actors: Actors that another machine runs; their states are not in the folder.
 
     Raises:
