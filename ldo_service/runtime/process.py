@@ -231,8 +231,8 @@ class ChildProcess:
                 if self._suspended_at_s is None:
                     self._suspended_at_s = now_s
                     log.warning(
-                        "%s: its process %d is suspended; waiting at most %.0f s "
-                        "(supervision.backend_step_timeout_s). Resume it with `kill -CONT %d`.",
+                        "%s: its process %d is suspended and is killed after %.0f s, its step "
+                        "timeout. Resume it with `kill -CONT %d`.",
                         self.name, self.pid, self._step_timeout_s, self.pid,
                     )  # fmt: skip
                 if now_s - self._suspended_at_s < self._step_timeout_s:

@@ -173,16 +173,19 @@ class MessageLog:
                 file.seek(start)
                 raw = file.read(size)
         except OSError as error:
-            log.error("%s cannot be read (%s); message %d is lost.", segment.path, error, seq)
+            log.error(
+                "%s cannot be read (%s); message %d is lost. Check the disk.",
+                segment.path, error, seq,
+            )  # fmt: skip
             return None
         if len(raw) < size:
-            log.error("%s is truncated; message %d is lost.", segment.path, seq)
+            log.error("%s is truncated; message %d is lost. Check the disk.", segment.path, seq)
             return None
         _, header_bytes, _, checksum = _RECORD.unpack_from(raw)
         end = _RECORD.size + header_bytes
         header, body = raw[_RECORD.size : end], raw[end:]
         if _checksum(header, body) != checksum:
-            log.error("%s is damaged; message %d is lost.", segment.path, seq)
+            log.error("%s is damaged; message %d is lost. Check the disk.", segment.path, seq)
             return None
         return LoggedMessage(seq, header, body)
 
