@@ -20,10 +20,10 @@ from ldo_service.schemas.frames import (
 from ldo_service.schemas.graph import GraphCorrection, GraphLandmark
 from ldo_service.schemas.health import Health, InputCount, OutputCount
 from ldo_service.schemas.keyframe import (
+    CameraCorrection,
     Keyframe,
     KeyframeMeasurements,
     KeyframeRefinement,
-    CameraCorrection,
     MeasuredPose,
 )
 from ldo_service.schemas.labels import AddLabel, LabelNames, LabelRequest, LabelResult
@@ -46,6 +46,7 @@ __all__ = [
     "AnchorMotion",
     "Array",
     "CameraColor",
+    "CameraCorrection",
     "CameraDepth",
     "CameraModel",
     "CameraRgbd",
@@ -73,7 +74,6 @@ __all__ = [
     "MapObjects",
     "MapRendering",
     "MapSnapshot",
-    "CameraCorrection",
     "MeasuredPose",
     "Message",
     "ObjectObservation",
