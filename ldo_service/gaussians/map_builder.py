@@ -94,8 +94,7 @@ class MapBuilder:
             keyframe: Id of the keyframe, larger than all ids before.
             iterations: Number of iterations if `usual_reach` Gaussians are visible in each. If more
                 are visible, fewer iterations run, so that the time stays the same.
-            dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool. None if there
-                are none.
+            dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool; None if none.
         """
         self._load_visible(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
         self._renderer.forget()
@@ -174,14 +173,11 @@ class MapBuilder:
         """Remove the Gaussians that a keyframe added at pixels which show moving objects.
 
         Gaussians are removed if they are anchored to the keyframe and project into these pixels.
-        The pixels are excluded from later fitting.
+        The pixels are excluded from later fitting. The number of removed Gaussians is returned.
 
         Args:
             keyframe: Id of the keyframe.
             pixels: Mask, [H, W] bool.
-
-        Returns:
-            Number of removed Gaussians.
 
         Raises:
             KeyError: The images of the keyframe are dropped or unreadable.
@@ -245,14 +241,11 @@ class MapBuilder:
         """Remove Gaussians of a keyframe that duplicate older ones, after a loop closure.
 
         The map is then fitted to this keyframe. One call takes a short time, so that the caller can
-        map new keyframes between two calls.
+        map new keyframes between two calls. The number of removed Gaussians is returned.
 
         Args:
             keyframe: Id of the keyframe. If its images were dropped, nothing is done.
             iterations: Number of iterations of the fit.
-
-        Returns:
-            Number of removed Gaussians.
         """
         if keyframe not in self.views.cameras:
             return 0
@@ -343,12 +336,9 @@ class MapBuilder:
         return self._log.drain(self.gaussians, with_changed=with_changed)
 
     def refined(self) -> dict[int, np.ndarray]:
-        """Return the keyframe poses to publish, because the Gaussian optimizer has moved them.
+        """Return T_map_keyframe [4, 4] of the keyframes that the optimizer has moved, by id.
 
         The caller must publish them: the next call returns only poses that have moved again.
-
-        Returns:
-            T_map_keyframe [4, 4] by id of the keyframe.
         """
         return self._published.drain(self.views.poses)
 
@@ -379,10 +369,7 @@ class MapBuilder:
         }
 
     def saved(self) -> None:
-        """Remove the files that the last snapshot does not need.
-
-        Call this method once that snapshot is saved to disk.
-        """
+        """Remove the files that the last snapshot does not need; call it once that is on disk."""
         self.offloaded.saved()
 
     def restore(self, state: Mapping[str, Any]) -> None:

@@ -106,44 +106,26 @@ class VerificationConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoopHypothesis:
-    """Pose between two keyframes that is not yet verified.
+    """Pose between two keyframes that is not yet verified."""
 
-    Attributes:
-        old: Keyframe of the old subgraph.
-        new: Keyframe of the new subgraph.
-        T_old_new: Pose of the new keyframe in the old one, [4, 4].
-        evidence: Source of the pose; "" if no pose was found.
-        inliers: Number of features or landmarks that agree with the pose.
-        semantics: Agreement of the landmarks at this pose.
-        rejected_reason: Reason of the rejection; "" if the hypothesis is not rejected.
-    """
-
-    old: SubgraphKeyframe
-    new: SubgraphKeyframe
-    T_old_new: np.ndarray
-    evidence: Evidence = ""
-    inliers: int = 0
-    semantics: LandmarkAgreement = NOTHING
-    rejected_reason: str = ""
+    old: SubgraphKeyframe  # Keyframe of the old subgraph.
+    new: SubgraphKeyframe  # Keyframe of the new subgraph.
+    T_old_new: np.ndarray  # Pose of the new keyframe in the old one, [4, 4].
+    evidence: Evidence = ""  # Source of the pose; "" if no pose was found.
+    inliers: int = 0  # Number of features or landmarks that agree with the pose.
+    semantics: LandmarkAgreement = NOTHING  # Agreement of the landmarks at this pose.
+    rejected_reason: str = ""  # Reason of the rejection; "" if the hypothesis is not rejected.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class VerificationResult:
-    """Result of verifying a hypothesis.
+    """Result of verifying a hypothesis."""
 
-    Attributes:
-        proposal: The hypothesis.
-        overlap: Fraction of the new surface that the old keyframe also sees, 0..1.
-        rmse_m: Root mean square distance of both surfaces along the normals, meters.
-        rejected_reason: Reason of the rejection; "" if the hypothesis is accepted.
-        closure: Loop closure with the refined pose; None if the hypothesis was rejected.
-    """
-
-    proposal: LoopHypothesis
-    overlap: float = 0.0
-    rmse_m: float = 0.0
-    rejected_reason: str = ""
-    closure: RelativePose | None = None
+    proposal: LoopHypothesis  # The hypothesis.
+    overlap: float = 0.0  # Fraction of the new surface that the old keyframe also sees, 0..1.
+    rmse_m: float = 0.0  # Root mean square distance of both surfaces along the normals, meters.
+    rejected_reason: str = ""  # Reason of the rejection; "" if the hypothesis is accepted.
+    closure: RelativePose | None = None  # Loop closure with the refined pose; None if rejected.
 
 
 class Verifier:
@@ -188,15 +170,10 @@ class Verifier:
     def _from_single_keyframe(
         self, found: list[LoopHypothesis], old: Subgraph, new: Subgraph
     ) -> LoopHypothesis:
-        """Return the pose with the most inliers, rejected if it is not confirmed.
+        """Return the pose with the most inliers among `found`, rejected if it is not confirmed.
 
         The pose is confirmed by at least `confirming_landmarks` matching landmarks, or by another
         keyframe of `new` whose images pass the verification at this pose.
-
-        Args:
-            found: Poses from feature matches.
-            old: Old subgraph.
-            new: New subgraph.
         """
         best = max(found, key=lambda proposal: proposal.inliers, default=None)
         if best is None:
@@ -259,12 +236,8 @@ class Verifier:
 
         Images of a place from different viewpoints have few features in common. Therefore the pose
         in the map is the initial guess of the refinement. This finds loop closures between nearby
-        keyframes before they drift apart, but finds none after a large drift.
-
-        Args:
-            old: Old subgraph.
-            new: New subgraph.
-            T_old_new: Function that returns the relative pose of two keyframes in the map.
+        keyframes before they drift apart, but finds none after a large drift. The function
+        `T_old_new` returns the relative pose of two keyframes in the map.
         """
         found: list[LoopHypothesis] = []
         for a, b, T in islice(_nearest_pairs(old, new, T_old_new), self._config.map_pairs):
@@ -278,10 +251,7 @@ class Verifier:
         return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=refused)
 
     def _check_overlap(self, proposal: LoopHypothesis) -> VerificationResult | None:
-        """Verify a hypothesis if the overlap of the surfaces is large enough in both directions.
-
-        If the overlap is too small, return None without an alignment.
-        """
+        """Verify a hypothesis; if an overlap is too small, return None without an alignment."""
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         T_old_new, least = proposal.T_old_new, self._config.blind_overlap
         if self._fit(old, new, T_old_new).overlap < least:

@@ -77,14 +77,11 @@ class FactorStore:
         """Replace a measurement and return the name of the factor that changed.
 
         If the measured keyframe b is condensed, its pose relative to its head and tail changes, but
-        no factor changes.
+        no factor changes, and None is returned.
 
         Args:
             m: New measurement.
             pose: Function that returns the current T_map_keyframe [4, 4] of a keyframe.
-
-        Returns:
-            Name of the changed factor, or None if keyframe b is condensed.
         """
         row = self.rows.get(m.b)
         if row is not None:
@@ -169,10 +166,6 @@ class FactorStore:
 
         Each of the two poses is the pose of the head or tail times the measured relative pose.
 
-        Args:
-            keyframe: Id of the keyframe.
-            variables: Values of all variables.
-
         Returns:
             The largest of the six differences, in standard deviations of a loop closure, times the
             fraction of the way to the nearer of head and tail, 0..0.5. It is 0 if the keyframe is a
@@ -192,11 +185,7 @@ class FactorStore:
         return min(share, 1 - share) * float((off / sigmas).max())
 
     def relative(self, without: Pair | None = None) -> Iterable[RelativePose]:
-        """Yield all measurements between variables except loop closures.
-
-        Args:
-            without: Keyframes of a bridge edge that is omitted too; None omits no bridge edge.
-        """
+        """Yield all measurements between variables except closures and the bridge `without`."""
         yield from self.odometry.values()
         yield from self.condensed.values()
         bridges = (m for pair, m in self.bridges.items() if pair != without)
@@ -341,9 +330,7 @@ class FactorStore:
     def move_component(
         self, younger: int, older: int, T_new_old: np.ndarray, variables: Variables
     ) -> Variables:
-        """Merge the younger of two components into the older one.
-
-        All keyframes of the younger component and their landmarks move.
+        """Merge the younger of two components into the older one; its keyframes and landmarks move.
 
         Args:
             younger: First keyframe of the younger component.

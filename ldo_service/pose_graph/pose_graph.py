@@ -177,12 +177,9 @@ class PoseGraph:
         The limit is `max_interpolation_sigmas`, in standard deviations of a loop closure. A
         keyframe stays condensed if there are too many groups (`keyframes_each`).
 
-        Args:
-            closure: Accepted loop closure.
-            variables: Variables of the solution with this closure.
-
         Returns:
-            The variables, including the keyframes that are variables again.
+            The given `variables` of the solution with this closure, including the keyframes that
+            are variables again.
         """
         known, config = self._known, self._config
         for keyframe in (closure.a, closure.b):
@@ -195,10 +192,7 @@ class PoseGraph:
         return variables
 
     def _merge_components(self, measured: RelativePose) -> None:
-        """Merge the components of the two measured keyframes, and solve the graph again.
-
-        The younger component moves into the coordinate frame of the older one.
-        """
+        """Merge the components of both keyframes in the frame of the older one, and solve again."""
         first_a, first_b = self.component_root(measured.a), self.component_root(measured.b)
         moves = T_new_old(measured, self.pose, moves_b=first_a < first_b)
         younger, older = max(first_a, first_b), min(first_a, first_b)

@@ -37,10 +37,9 @@ class Outlet:
     """Sending half of a topic, with credit-based flow control for lossless consumers.
 
     The outlet numbers messages, waits for credit from every lossless consumer, and retransmits lost
-    messages. The consumers in `expected` are required: they must not miss a message. The outlet has
-    no credit while one of them is disconnected. Other consumers limit the credit only while they
-    are connected. A nonblocking port sends without waiting, because its actor has checked the
-    credits before.
+    messages. The required consumers (`expected`) must not miss a message, so there is no credit
+    while one of them is disconnected. Other consumers limit the credit only while they are
+    connected. A nonblocking port does not wait, because its actor has checked the credits before.
 
     The outlet never waits for a consumer with a backlog. It keeps the unhandled messages in its
     outbox on disk, and sends them as the consumer grants credit.
@@ -71,8 +70,7 @@ class Outlet:
         Args:
             port: The output of the actor.
             source: Name of the actor.
-            epoch: Random number that identifies the numbering of the messages. A restored outlet
-                continues the epoch of `past` instead.
+            epoch: Random number that identifies the numbering; unused if `past` is given.
             transport: The network.
             expected: Names of the required consumers.
             evict_after_s: Time after which a consumer with a full window is evicted, seconds.
@@ -120,8 +118,7 @@ class Outlet:
         """Return how many messages may be sent now; 0 while staged messages are not sent.
 
         A nonblocking port whose required consumers all have a backlog gets the room in their
-        windows as credit. The actor then produces no more than they can queue, so that their
-        backlogs do not grow.
+        windows as credit: the actor then sends no more than they can queue, so no backlog grows.
         """
         if self._unsent:
             return 0
@@ -184,8 +181,7 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until every lossless consumer has received all messages.
 
-        A consumer with a backlog may have stopped already. The outlet therefore waits for it only
-        for `FLUSH_BACKLOG_S`.
+        For consumers with a backlog, which may have stopped, it waits at most `FLUSH_BACKLOG_S`.
         """
         self._post_hellos()  # Each consumer replies with its credit at once.
         while not self._consumers.all_received(self._seq, awaited_only=True):
@@ -313,8 +309,7 @@ class Outlet:
     def _retransmit(self, consumer: Consumer, gap: bool) -> None:
         """Retransmit the messages that a consumer has not received.
 
-        If the consumer reports no gap, these messages may still be on their way. The outlet then
-        first waits for `REPEAT_AFTER_S`.
+        Without a reported gap, they may be on their way, so it first waits `REPEAT_AFTER_S`.
         """
         now = self._loop.time()
         recently = now - consumer.repeated_at_s < self.REPEAT_AFTER_S
@@ -342,10 +337,7 @@ class Outlet:
                 self._repeating = None
 
     def _skip_lost(self, seq: int) -> None:
-        """Let consumers skip message `seq`, which the disk has lost.
-
-        Only consumers that have handled all earlier messages skip it.
-        """
+        """Let consumers that handled all earlier messages skip `seq`, which the disk has lost."""
         if self._consumers.skip(self._outbox.after(seq, self._seq), since=seq):
             self._post_hellos()
 

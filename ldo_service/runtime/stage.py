@@ -32,8 +32,7 @@ from .supervision_policy import RestartBudget, SupervisionConfig
 
 log = logging.getLogger(__name__)
 
-# Time between two checks while no message arrives, seconds. The checks are for an unsaved state and
-# for idle work, which may wait for credit.
+# Time between two checks for unsaved state and for idle work while no message arrives, seconds.
 CHECK_S = 0.5
 
 
@@ -43,9 +42,8 @@ class Stage:
     Failures: The stage restores the actor and repeats a failed step once. A message that fails
     twice is discarded as a dead letter. The `journal` receives everything that a step depends on.
 
-    Saving: A step is complete when it is saved. Only then does the stage send its outputs to
-    required consumers and acknowledge its input. While the disk is full, most stages take no more
-    messages; see `StateSaver`.
+    Saving: Only after a step is saved does the stage send its outputs to required consumers and
+    acknowledge its input. While the disk is full, most stages take no messages; see `StateSaver`.
     """
 
     def __init__(
@@ -68,10 +66,8 @@ class Stage:
             transport: The network.
             config: Limits of supervision.
             store: Storage of the state; in memory by default.
-            expected: Names of the required consumers, which must not miss a message, by output
-                topic.
-            with_backlog: Names of the required consumers for which the stage does not wait, by
-                output topic.
+            expected: Required consumers, which must not miss a message, by output topic.
+            with_backlog: Required consumers for which the stage does not wait, by output topic.
             on_evicted: Called with the name of an evicted consumer.
             journal: Receiver of the journal entries.
             heartbeat: Heartbeat of this process; None if no parent process reads it.
@@ -342,10 +338,7 @@ class Stage:
             self._orders.report(order, "")
 
     async def _reset(self, mailbox: Mailbox) -> None:
-        """Replace the actor by a new one with an empty state, under a new epoch.
-
-        Other actors connect to the new actor again, as after a restart of the process.
-        """
+        """Replace the actor by a new, empty one under a new epoch; other actors connect again."""
         self._checkpointer.forget(self.name)
         self._actor = await self._worker.run(self._restored_actor)
         self._epoch = new_epoch()
@@ -362,10 +355,7 @@ class Stage:
         return actor
 
     async def _restart(self) -> None:
-        """Restore the actor from its last saved state, after a delay.
-
-        The delay doubles with each failure.
-        """
+        """Restore the actor's last saved state, after a delay that doubles with each failure."""
         while True:
             self._metrics.failures += 1
             await asyncio.sleep(self._budget.record_failure(asyncio.get_running_loop().time()))

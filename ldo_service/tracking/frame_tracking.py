@@ -120,12 +120,7 @@ class FrameTracker:
         )
 
     def restart_at(self, frame: RgbdFrame, T_odom_camera: np.ndarray) -> None:
-        """Reset the tracking state, and start a submap with the frame just tracked.
-
-        Args:
-            frame: The frame.
-            T_odom_camera: Pose of the frame in odometry, [4, 4].
-        """
+        """Reset tracking and start a submap with the frame just tracked at T_odom_camera [4, 4]."""
         self.state = replace(
             self.state,
             motion=ConstantVelocity(T_odom_camera, stamp_ns=frame.stamp_ns),
@@ -353,8 +348,7 @@ class FrameTracker:
     ) -> np.ndarray | None:
         """Return the dynamic mask of a frame, [H, W] bool; None if motion segmentation is off.
 
-        If much of the keyframe's surface has moved away, the ignore mask of the keyframe is
-        renewed.
+        If much of the keyframe's surface has moved away, its ignore mask is renewed.
         """
         config = self.config.moving
         if not config.is_on:

@@ -106,13 +106,9 @@ class KeyframeRecord:
         return self.__dict__["_across_scales"]
 
     def history(self, otherwise: ResidualHistory) -> ResidualHistory:
-        """Return the residual noise that is usual near this keyframe, as a history.
+        """Return the residual noise that is usual near this keyframe; if unknown, `otherwise`.
 
-        Alignments to this keyframe are compared with this noise, because noise differs between
-        scenes.
-
-        Args:
-            otherwise: The history to return if the noise of this record is unknown.
+        Alignments to this keyframe are compared with it, because noise differs between scenes.
         """
         if not self.intensity_sigma:
             return otherwise
@@ -145,10 +141,7 @@ class KeyframeRecord:
         return sum(array.nbytes for array in arrays) + len(self.gray) + len(self.depth)
 
     def keyframe(self, config: PyramidConfig) -> ReferenceKeyframe:
-        """Rebuild the keyframe, so that frames can be aligned to it.
-
-        Every call returns bitwise the same result.
-        """
+        """Rebuild the keyframe to align frames to it; each result is bitwise the same."""
         view = build_pyramid(self._gray, self.depth_m, self.camera, config)
         return ReferenceKeyframe(
             view, self.T_odom_keyframe, self.id, self.submap, stored_features=self.features
@@ -284,10 +277,6 @@ class KeyframeDatabase:
         The new record replaces the nearest older record if their poses differ by less than
         `config.same`. If the database then exceeds `config.count` records, one record is removed:
         the one whose previous and next record are closest to each other.
-
-        Args:
-            record: The new record.
-            config: Settings.
         """
         kept = (*self._others(record, config), record)
         if len(kept) > config.count:
@@ -303,12 +292,7 @@ class KeyframeDatabase:
         return KeyframeDatabase((*(other for other in self.all if other.id != record.id), record))
 
     def without(self, ignore_mask: np.ndarray, keyframe: int) -> "KeyframeDatabase":
-        """Return the database with pixels of one record masked; see `KeyframeRecord.without`.
-
-        Args:
-            ignore_mask: Pixels to exclude, [H, W] bool.
-            keyframe: Id of the record.
-        """
+        """Return the database with `KeyframeRecord.without` applied to the record `keyframe`."""
         records = (p.without(ignore_mask) if p.id == keyframe else p for p in self.all)
         return KeyframeDatabase(tuple(records))
 

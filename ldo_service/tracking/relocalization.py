@@ -171,12 +171,7 @@ class Relocalizer:
         return sure[1]
 
     def resembles_last_trusted(self, view: Pyramid, trusted: np.ndarray) -> bool:
-        """Return whether a frame looks similar to the last OK frame.
-
-        Args:
-            view: Pyramid of the frame.
-            trusted: Thumbnail of the last OK frame, [300] int8.
-        """
+        """Return whether a frame looks like the last OK frame, whose thumbnail is `trusted`."""
         seen, trusted = make_thumbnail(view).astype(float), trusted.astype(float)
         scale = np.linalg.norm(seen) * np.linalg.norm(trusted)
         return bool(seen @ trusted >= self.config.familiar * scale > 0)
@@ -192,10 +187,9 @@ class Relocalizer:
         return likely
 
     def _poses(self, view: Pyramid, records: Iterable[KeyframeRecord]) -> list[PosedRecord]:
-        """Match a frame with records by ORB features.
+        """Return the records whose ORB features yield a pose of the frame, with that pose.
 
-        Returns:
-            The records that yield a pose of the frame, with that pose; most inliers first.
+        The record with the most inliers comes first.
         """
         seen = detect(view, self.features)
         return self._posed(view, seen, ((record, record.features) for record in records))
@@ -203,12 +197,10 @@ class Relocalizer:
     def _poses_across_scales(
         self, view: Pyramid, records: Iterable[KeyframeRecord]
     ) -> list[PosedRecord]:
-        """Match a frame with records by SIFT features.
+        """Return the records whose SIFT features yield a pose of the frame, with that pose.
 
-        SIFT also matches if the camera is at half or twice the distance to the surface.
-
-        Returns:
-            The records that yield a pose of the frame, with that pose; most inliers first.
+        The record with the most inliers comes first. SIFT also matches if the camera is at half or
+        twice the distance to the surface.
         """
         config = self.features
         image = view.gray, view.depth_m, view.camera
@@ -264,13 +256,7 @@ class Relocalizer:
 
 
 def _due(database: KeyframeDatabase, turn: int, count: int) -> list[KeyframeRecord]:
-    """Return the records of one search in rotation; successive turns visit all records in order.
-
-    Args:
-        database: The database.
-        turn: Number of searches before this one.
-        count: Number of records per search.
-    """
+    """Return the next `count` records after `turn` searches, in rotation over all records."""
     numbers = range(turn * count, (turn + 1) * count)
     return [database.all[number % len(database)] for number in numbers]
 
@@ -330,11 +316,7 @@ class ReusedKeyframe:
     candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
     def measures(self, keyframe: int) -> RelativePose:
-        """Return the measured pose of a new keyframe relative to this known keyframe.
-
-        Args:
-            keyframe: Id of the new keyframe, which is made of the aligned frame.
-        """
+        """Return the measured pose of a new keyframe, made of the aligned frame, in this one."""
         seen = self.candidate.alignment
         return RelativePose(self.record.id, keyframe, seen.T_reference_camera, seen.information)
 
