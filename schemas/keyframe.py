@@ -37,13 +37,10 @@ NO_TERMS: Terms = (0.0, 0.0, 0.0)
 class CameraCorrection(msgspec.Struct, frozen=True, kw_only=True):
     """Correction of the camera that the self-calibration applied to color and depth.
 
-    With x = (u - cu) / (w/2) and y = (v - cv) / (w/2) around the image center, and r = 1 in the
-    corners:
-
-        1 / z = 1 / z_measured + b1 x^2 + b2 x y + b3 y^2
-        color_measured = V(r) color,  log V = a1 r^2 + a2 r^4 + a3 r^6 per channel
-
-    The colors are scaled by the smallest V, so that none of them is clipped.
+    x = (u - cu) / (w/2) and y = (v - cv) / (w/2) are coordinates around the image center, and r is
+    the distance from it, 1 in the corners. The corrected depth z has 1/z = 1/z_measured + b1 x^2 +
+    b2 x y + b3 y^2. A measured color is V(r) times the corrected one, with log V = a1 r^2 +
+    a2 r^4 + a3 r^6 per channel. All colors are scaled by the smallest V, so that none is clipped.
     """
 
     depth_bias: Terms = NO_TERMS  # b1, b2, b3 in 1/m.

@@ -15,7 +15,7 @@ LAYERS = (
     ("errors", "ldo_service"),
     ("schemas", "kernels", "demo_networks"),
     ("geometry", "storage"),
-    ("detection", "gaussians", "pose_graph", "synthetic", "cameras", "transport"),
+    ("calibration", "detection", "gaussians", "pose_graph", "synthetic", "cameras", "transport"),
     ("datasets", "volumes", "regions", "tracking", "runtime", "client"),
     ("semantics", "recordings"),
     ("loop_closing", "evaluation"),
@@ -32,7 +32,7 @@ LAYER = {package: number for number, packages in enumerate(LAYERS) for package i
 # Pairs of file and imported package. Add none.
 EXCEPTIONS: frozenset[tuple[str, str]] = frozenset()
 NUMERICS = (
-    *("datasets", "detection", "evaluation", "gaussians", "geometry", "kernels", "loop_closing"),
+    *("calibration", "datasets", "detection", "evaluation", "gaussians", "geometry", "kernels", "loop_closing"),
     *("pose_graph", "regions", "semantics", "synthetic", "tracking", "volumes"),
 )
 MAX_LINES = 400  # Maximum length of a file outside the kernels.
