@@ -62,6 +62,7 @@ from ldo_service.tracking.localizer import Localizer
 from ldo_service.tracking.odometry import Odometry
 from ldo_service.tracking.odometry_config import OdometryConfig
 from ldo_service.tracking.odometry_prior import OdometryPriorBuffer, PriorCheck
+from ldo_service.tracking.tracking_quality import TrackingStatus
 from ldo_service.tracking.tracking_result import TrackingResult
 
 log = logging.getLogger(__name__)
@@ -190,7 +191,8 @@ class Tracker(Actor):
         may_map = not is_held_out and self.has_credit(KEYFRAME_NEW)
         result = self._odometry.process(frame, self._prior, may_map=may_map)
         self._count(frame, result, is_held_out)
-        change = self._calibration.observe(raw, self._odometry.motion)
+        is_lost = result.status is TrackingStatus.LOST
+        change = self._calibration.observe(raw, None if is_lost else result.T_odom_camera)
         if change is not None:
             self._odometry.recorrect(change)
         if result.awaits_mapping:

@@ -32,7 +32,16 @@ LAYER = {package: number for number, packages in enumerate(LAYERS) for package i
 # Pairs of file and imported package. Add none.
 EXCEPTIONS: frozenset[tuple[str, str]] = frozenset()
 NUMERICS = (
-    *("calibration", "datasets", "detection", "evaluation", "gaussians", "geometry", "kernels", "loop_closing"),
+    *(
+        "calibration",
+        "datasets",
+        "detection",
+        "evaluation",
+        "gaussians",
+        "geometry",
+        "kernels",
+        "loop_closing",
+    ),
     *("pose_graph", "regions", "semantics", "synthetic", "tracking", "volumes"),
 )
 MAX_LINES = 400  # Maximum length of a file outside the kernels.

@@ -4,7 +4,7 @@
     for raw in frames:
         frame = calibration.correction.applied(raw)
         ...  # Track the frame.
-        change = calibration.observe(raw, motion)
+        change = calibration.observe(raw, T_odom_camera)
 
 Each frame does a bounded part of the work. An estimate is used only where evidence that it was not
 fitted to confirms it: stretches of time that are left out agree better with the correction than
@@ -14,6 +14,7 @@ without. When enough views are taken, the calibration is finished and costs noth
 import logging
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from .views import CalibrationView, ViewMaker, ViewPair, pair_of
 
 log = logging.getLogger(__name__)
 
+DEPTH_STRIDE = 8  # Pixels of which one is used for the median depth.
 PAIR_DISTANCES = (1, 2, 3, 5, 8)  # Numbers of views from one view of a pair to the other.
 
 
@@ -63,18 +65,10 @@ class SelfCalibrationConfig:
             )
 
 
-@dataclass(frozen=True, slots=True)
-class CameraMotion:
-    """Motion of the camera as the tracker knows it, which decides when a view is taken."""
-
-    T_odom_camera: np.ndarray | None  # [4, 4]; None while tracking is LOST.
-    median_depth_m: float  # Median depth of the scene.
-
-
 class SelfCalibration:
     """Self-calibration of one camera.
 
-    Equal frames and motions give bitwise equal results, also after `restore`.
+    Equal frames and poses give bitwise equal results, also after `restore`.
     """
 
     def __init__(self, config: SelfCalibrationConfig | None = None) -> None:
@@ -105,12 +99,13 @@ class SelfCalibration:
         calibration.correction = correction
         return calibration
 
-    def observe(self, raw: RgbdFrame, motion: CameraMotion) -> CorrectionChange | None:
+    def observe(self, raw: RgbdFrame, T_odom_camera: np.ndarray | None) -> CorrectionChange | None:
         """Take a view of a frame if the camera has moved, and do a part of a running estimate.
 
         Args:
             raw: The frame without correction.
-            motion: Motion of the camera up to this frame.
+            T_odom_camera: Pose of the frame, [4, 4], which decides when a view is taken; None while
+                tracking is LOST.
 
         Returns:
             The change of the correction, which applies from the next frame on; None without one.
@@ -118,30 +113,30 @@ class SelfCalibration:
         if self.is_finished:
             return None
         self._frames_since_view += 1
-        if self._is_view_due(raw, motion):
-            self._take_view(raw, motion)
+        if self._is_view_due(raw, T_odom_camera):
+            self._take_view(raw, T_odom_camera)
         if self._running is None and len(self._views) >= self.config.views[self._stage]:
             self._start(len(self._views))
         return None if self._running is None else self._continue()
 
-    def _is_view_due(self, raw: RgbdFrame, motion: CameraMotion) -> bool:
+    def _is_view_due(self, raw: RgbdFrame, T_odom_camera: np.ndarray | None) -> bool:
         if len(self._views) >= self.config.views[-1]:
             return False
-        if motion.T_odom_camera is None or self._T_last_view is None:
+        if T_odom_camera is None or self._T_last_view is None:
             return not self._views or self._frames_since_view >= self.config.lost_frames
-        T_last_now = se3.inverse(self._T_last_view) @ motion.T_odom_camera
+        T_last_now = se3.inverse(self._T_last_view) @ T_odom_camera
         turned_rad = se3.rotation_angle(T_last_now)
-        parallax_rad = float(se3.distances(T_last_now)) / max(motion.median_depth_m, 1e-3)
+        parallax_rad = float(se3.distances(T_last_now)) / _median_depth_m(raw)
         moved = (turned_rad + parallax_rad) * raw.camera.fx / raw.camera.width
         return moved >= self.config.view_motion
 
-    def _take_view(self, raw: RgbdFrame, motion: CameraMotion) -> None:
+    def _take_view(self, raw: RgbdFrame, T_odom_camera: np.ndarray | None) -> None:
         if self._views and next(iter(self._views.values())).camera != raw.camera:
             self._forget()  # Another camera or resolution.
         view = self._maker.make(raw)
         self._views[view.number] = view
         self._packed |= {"maker": self._maker.pack(), f"view_{view.number}": view.pack()}
-        self._T_last_view, self._frames_since_view = motion.T_odom_camera, 0
+        self._T_last_view, self._frames_since_view = T_odom_camera, 0
         for distance in PAIR_DISTANCES:
             earlier = self._views.get(view.number - distance)
             pair = None if earlier is None else pair_of(earlier, view)
@@ -268,3 +263,10 @@ class SelfCalibration:
             "depth_bias_corrected": float(self.correction.has_depth_bias),
             "vignetting_corrected": float(self.correction.has_vignetting),
         }
+
+
+def _median_depth_m(frame: RgbdFrame) -> float:
+    """Return the median depth of a frame in meters; infinity if it has no depth."""
+    measured_m = frame.depth_m[::DEPTH_STRIDE, ::DEPTH_STRIDE]
+    measured_m = measured_m[measured_m > 0]
+    return float(np.median(measured_m)) if measured_m.size else inf

@@ -29,7 +29,6 @@ from typing import Any
 import numpy as np
 
 from ldo_service.calibration.correction import CorrectionChange
-from ldo_service.calibration.self_calibration import CameraMotion
 from ldo_service.detection.dynamic_classes import Box
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
@@ -159,15 +158,6 @@ class Odometry:
         """
         state = self._frames.state
         self._frames.restore(state.recorrected(change, self.config.pyramid))
-
-    @property
-    def motion(self) -> CameraMotion:
-        """Motion of the camera up to the last frame."""
-        state = self._frames.state
-        if state.keyframe is None or state.status is TrackingStatus.LOST:
-            return CameraMotion(None, 0.0)
-        depth_m = state.keyframe.reference.median_depth_m
-        return CameraMotion(state.motion.T_odom_camera, depth_m)
 
     def mask_dynamic_objects(self, keyframe: int, boxes: Sequence[Box]) -> None:
         """Mask objects of dynamic classes in the reference keyframe and in its record.

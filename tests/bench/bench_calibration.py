@@ -46,7 +46,8 @@ def tracked(sequence: Sequence, count: int, config: SelfCalibrationConfig) -> Re
         start_s = time.process_time()
         tracked = odometry.process(result.calibration.correction.applied(raw))
         middle_s = time.process_time()
-        change = result.calibration.observe(raw, odometry.motion)
+        T_odom_camera = None if tracked.status == "LOST" else tracked.T_odom_camera
+        change = result.calibration.observe(raw, T_odom_camera)
         if change is not None:
             odometry.recorrect(change)
         step_s = time.process_time() - middle_s

@@ -11,7 +11,6 @@ from ldo_service.calibration.correction import (
     unbiased_depth,
 )
 from ldo_service.calibration.self_calibration import (
-    CameraMotion,
     SelfCalibration,
     SelfCalibrationConfig,
 )
@@ -42,14 +41,14 @@ def frames(room: Sequence) -> list[RgbdFrame]:
     return [room[index] for index in range(COUNT)]
 
 
-def motions(room: Sequence) -> list[CameraMotion]:
+def poses(room: Sequence) -> list[np.ndarray]:
     truth = room.truth()
     assert truth is not None
-    return [CameraMotion(T, 2.0) for T in truth.T_world_camera[:COUNT]]
+    return list(truth.T_world_camera[:COUNT])
 
 
 def changes_of(
-    calibration: SelfCalibration, frames: list[RgbdFrame], moved: list[CameraMotion]
+    calibration: SelfCalibration, frames: list[RgbdFrame], moved: list[np.ndarray]
 ) -> list[CorrectionChange]:
     made = [calibration.observe(*both) for both in zip(frames, moved, strict=True)]
     return [change for change in made if change is not None]
@@ -57,7 +56,7 @@ def changes_of(
 
 def test_known_bias_and_vignetting_are_found(room: Sequence, frames: list[RgbdFrame]) -> None:
     calibration = SelfCalibration()
-    changes = changes_of(calibration, [measured(f, TRUE) for f in frames], motions(room))
+    changes = changes_of(calibration, [measured(f, TRUE) for f in frames], poses(room))
     found, camera = calibration.correction, frames[0].camera
     assert changes[-1].new == found
     # The rows are less certain than the columns, because the camera mostly yaws.
@@ -68,14 +67,14 @@ def test_known_bias_and_vignetting_are_found(room: Sequence, frames: list[RgbdFr
 
 def test_exact_camera_gets_no_correction(room: Sequence, frames: list[RgbdFrame]) -> None:
     calibration = SelfCalibration()
-    assert changes_of(calibration, frames, motions(room)) == []
+    assert changes_of(calibration, frames, poses(room)) == []
     assert calibration.correction == CameraCorrection()
     assert calibration.metrics()["depth_bias_corrected"] == 0
 
 
 def test_finished_calibration_drops_its_views(room: Sequence, frames: list[RgbdFrame]) -> None:
     calibration = SelfCalibration(CONFIG)
-    changes_of(calibration, [measured(f, TRUE) for f in frames], motions(room))
+    changes_of(calibration, [measured(f, TRUE) for f in frames], poses(room))
     assert calibration.is_finished
     assert set(calibration.snapshot()) == {"now", "maker"}
     assert calibration.correction.has_vignetting
@@ -83,7 +82,7 @@ def test_finished_calibration_drops_its_views(room: Sequence, frames: list[RgbdF
 
 def test_camera_that_stands_still_is_not_calibrated(frames: list[RgbdFrame]) -> None:
     calibration = SelfCalibration()
-    still = CameraMotion(np.eye(4), 2.0)
+    still = np.eye(4)
     assert changes_of(calibration, [measured(frames[0], TRUE)] * 20, [still] * 20) == []
     assert calibration.metrics()["calibration_views"] == 1
 
@@ -92,7 +91,7 @@ def test_camera_that_stands_still_is_not_calibrated(frames: list[RgbdFrame]) -> 
 def test_restored_calibration_continues_bitwise_equal(
     room: Sequence, frames: list[RgbdFrame], split: int
 ) -> None:
-    biased, moved = [measured(f, TRUE) for f in frames], motions(room)
+    biased, moved = [measured(f, TRUE) for f in frames], poses(room)
     first, second = SelfCalibration(CONFIG), SelfCalibration(CONFIG)
     changes_of(first, biased[:split], moved[:split])
     second.restore(decode_state(encode_state(first.snapshot())))

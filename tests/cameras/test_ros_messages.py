@@ -116,7 +116,7 @@ def test_zero_coefficients_mean_no_distortion_in_any_model() -> None:
         (camera_info(k=np.zeros(9)), "focal lengths are 0"),
         (camera_info(k=np.full(9, np.nan)), "NaN"),
         (camera_info(d=np.ones(3)), "distortion has 3 coefficients"),
-        (camera_info(width=0), "image size 0x6"),
+        (camera_info(width=0), "image size is 0x6"),
     ],
 )
 def test_invalid_camera_info_is_rejected(info, expected: str) -> None:

@@ -30,7 +30,13 @@ def test_protocol_is_printed_above_the_scores(capsys, run: Path, room_folder: Pa
     code, out, _ = ldo(capsys, "eval", run, room_folder)
     assert code == 0
     parts = (
-        *("Umeyama", "ATE RMSE", "A: held-out frames", "B: as in the literature", "A: 3 of 3 frames"),
+        *(
+            "Umeyama",
+            "ATE RMSE",
+            "A: held-out frames",
+            "B: as in the literature",
+            "A: 3 of 3 frames",
+        ),
         *(
             "LPIPS is not computed",
             "PSNR dB",

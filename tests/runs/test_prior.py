@@ -87,5 +87,5 @@ def test_a_prior_of_another_clock_is_refused(
     fast_camera: Sequence, prior: Trajectory, tmp_path: Path
 ) -> None:
     later = Trajectory(prior.stamps_s + 1e6, prior.T_world_camera)
-    with pytest.raises(DataError, match="must be of the same clock"):
+    with pytest.raises(DataError, match="must come from the same clock"):
         job(fast_camera, tmp_path / "out", frames=FRAMES, prior=later)

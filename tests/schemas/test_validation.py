@@ -446,7 +446,11 @@ def test_invalid_object_is_rejected(fields: dict, error: str) -> None:
         ("loop_candidate", {"similarity": -0.5}, "similarity is -0.5"),
         ("loop_candidate", {"inliers": -1}, "inliers is -1"),
         ("loop_candidate", {"rejected_reason": "x" * 101}, "has 101 characters"),
-        ("loop_candidate", {"rejected_reason": "", "evidence": ""}, "a candidate without a pose must have a rejected_reason"),
+        (
+            "loop_candidate",
+            {"rejected_reason": "", "evidence": ""},
+            "a candidate without a pose must have a rejected_reason",
+        ),
     ],
 )
 def test_invalid_loop_closure_or_candidate_is_rejected(
