@@ -29,9 +29,9 @@ def test_psnr_is_infinite_for_equal_images_and_nan_without_pixels() -> None:
 
 
 def test_images_of_different_size_or_type_are_rejected() -> None:
-    with pytest.raises(ValueError, match="differ"):
+    with pytest.raises(ValueError, match="shapes must be equal"):
         psnr(A, B[:10])
-    with pytest.raises(ValueError, match="differ"):
+    with pytest.raises(ValueError, match="shapes must be equal"):
         psnr(A, B / 255)
 
 
@@ -59,7 +59,7 @@ def test_ssim_of_an_image_with_itself_is_one_and_of_a_negative_is_negative() -> 
 
 
 def test_images_without_an_ssim_window_or_of_unequal_size_are_rejected() -> None:
-    with pytest.raises(ValueError, match="11x11"):
+    with pytest.raises(ValueError, match="H and W at least 11"):
         ssim(A[:10] / 255, A[:10] / 255)
     with pytest.raises(ValueError, match="alike"):
         ssim(A / 255, B[:, 1:] / 255)
