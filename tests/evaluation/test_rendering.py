@@ -61,7 +61,7 @@ def test_ssim_of_an_image_with_itself_is_one_and_of_a_negative_is_negative() -> 
 def test_images_without_an_ssim_window_or_of_unequal_size_are_rejected() -> None:
     with pytest.raises(ValueError, match="H and W at least 11"):
         ssim(A[:10] / 255, A[:10] / 255)
-    with pytest.raises(ValueError, match="alike"):
+    with pytest.raises(ValueError, match="the shapes must be equal"):
         ssim(A / 255, B[:, 1:] / 255)
 
 
