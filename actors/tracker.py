@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.calibration.correction import read_correction
+from ldo_service.calibration.correction import read_corrections
 from ldo_service.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
 from ldo_service.conversions.frames import (
     frame_from_message,
@@ -198,7 +198,8 @@ class Tracker(Actor):
         if result.awaits_mapping:
             return  # Odometry starts with a later frame that may be mapped.
         if result.keyframe is not None:
-            keyframe = keyframe_message(frame, result, result.keyframe, correction)
+            mapped = correction.applied(raw, keeps_clipped=False)
+            keyframe = keyframe_message(mapped, result, result.keyframe, correction)
             yield keyframe
             yield keyframe_measurements_message(keyframe)
         yield tracked_pose_message(frame, result, self._T_base_camera)
@@ -326,7 +327,7 @@ def _make_calibration(config: TrackerConfig) -> SelfCalibration:
     """
     if not config.localize:
         return SelfCalibration(config.calibration)
-    return SelfCalibration.finished(read_correction(Path(config.localize)))
+    return SelfCalibration.finished(read_corrections(Path(config.localize)).last)
 
 
 def _box(detection: Detection) -> Box:

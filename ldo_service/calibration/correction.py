@@ -1,6 +1,7 @@
 """Correction of a frame for vignetting and for the smooth bias of the depth sensor."""
 
 import json
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -60,7 +61,7 @@ class CameraCorrection:
     def has_vignetting(self) -> bool:
         return any(any(channel) for channel in self.vignetting)
 
-    def applied(self, frame: RgbdFrame) -> RgbdFrame:
+    def applied(self, frame: RgbdFrame, *, keeps_clipped: bool = True) -> RgbdFrame:
         """Return the frame that a camera without vignetting and depth bias would have delivered.
 
         Without a correction, this is the frame itself.
@@ -70,13 +71,15 @@ class CameraCorrection:
 
         Args:
             frame: Rectified frame, which is not changed.
+            keeps_clipped: Leave pixels as they are that may be clipped, so that the tracker still
+                recognizes them. A map needs them in the brightness of their surroundings.
         """
         color, depth_m = frame.color, self.corrected_depth(frame.depth_m, frame.camera)
         if self.has_vignetting:
             gain = _gain_image(self.vignetting, frame.camera)
             even = (color * gain + np.float32(0.5)).astype(np.uint8)
-            is_clipped = color.max(axis=2, keepdims=True) >= CLIPPED_GRAY
-            color = np.where(is_clipped, color, even)
+            is_kept = color.max(axis=2, keepdims=True) >= CLIPPED_GRAY if keeps_clipped else False
+            color = np.where(is_kept, color, even)
         if color is frame.color and depth_m is frame.depth_m:
             return frame
         return replace(frame, color=color, depth_m=depth_m)
@@ -94,16 +97,40 @@ class CameraCorrection:
         return _bias_image(self.depth_bias, camera)
 
 
-def read_correction(folder: Path) -> CameraCorrection:
-    """Return the correction of the newest keyframe of a finished run.
+@dataclass(frozen=True, slots=True)
+class CorrectionHistory:
+    """Corrections of the keyframes of a run, in the order of time."""
+
+    stamps_ns: tuple[int, ...] = ()
+    corrections: tuple[CameraCorrection, ...] = ()
+
+    def at(self, stamp_ns: int) -> CameraCorrection:
+        """Return the correction of the last keyframe up to a stamp; none before the first one."""
+        count = bisect_right(self.stamps_ns, stamp_ns)
+        return self.corrections[count - 1] if count else CameraCorrection()
+
+    @property
+    def last(self) -> CameraCorrection:
+        """Correction of the last keyframe; no correction without keyframes."""
+        return self.corrections[-1] if self.corrections else CameraCorrection()
+
+
+def read_corrections(folder: Path) -> CorrectionHistory:
+    """Return the corrections of the keyframes of a finished run; older versions wrote none.
 
     Raises:
         DataError: keyframes.json of the folder cannot be read, or its content is invalid.
     """
     path = folder / "keyframes.json"
     try:
-        kept = json.loads(path.read_text()) or [{}]
-        return CameraCorrection.of(kept[-1].get("camera_correction", NO_CORRECTION))
+        keyframes = sorted(json.loads(path.read_text()), key=lambda keyframe: keyframe["stamp_ns"])
+        return CorrectionHistory(
+            tuple(int(keyframe["stamp_ns"]) for keyframe in keyframes),
+            tuple(
+                CameraCorrection.of(keyframe.get("camera_correction", NO_CORRECTION))
+                for keyframe in keyframes
+            ),
+        )
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:

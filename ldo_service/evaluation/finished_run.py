@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ldo_service.calibration.correction import CameraCorrection
+from ldo_service.calibration.correction import CorrectionHistory
 from ldo_service.errors import DataError
 from ldo_service.gaussians.exposure import Exposure
 from ldo_service.geometry import Trajectory
@@ -91,7 +91,7 @@ class PosedMap:
         trajectory: T_map_camera of the frames that are not LOST.
         exposures: Exposures of the keyframes.
         semantics: Labels of the Gaussians; None without a detector.
-        correction: Correction of the camera, to whose images the map was fitted.
+        corrections: Corrections of the camera that were applied to the keyframes.
     """
 
     name: str
@@ -99,7 +99,7 @@ class PosedMap:
     trajectory: Trajectory
     exposures: Exposures
     semantics: SavedSemantics | None = None
-    correction: CameraCorrection = field(default_factory=CameraCorrection)
+    corrections: CorrectionHistory = field(default_factory=CorrectionHistory)
 
     def T_map_camera(self, frame: RunFrame) -> np.ndarray:
         """Return T_map_camera of a frame, [4, 4].

@@ -150,7 +150,7 @@ class RenderedView:
     exposure: Exposure = field(default_factory=Exposure)
     # Pixels that show the camera image, not the rim of rectification, [H, W] bool; None for all.
     valid: np.ndarray | None = None
-    # Correction of the camera, to whose images the map was fitted. Renderings get its vignetting.
+    # Correction of the camera at the time of the frame. The rendering gets its vignetting.
     correction: CameraCorrection = field(default_factory=CameraCorrection)
 
     @property
@@ -310,7 +310,7 @@ def view_of(
     """
     T_camera_map = se3.inverse(posed.T_map_camera(frame))
     rendering = render(posed.rows, image.camera, T_camera_map, threads=threads)
-    correction = posed.correction
+    correction = posed.corrections.at(frame.stamp_ns)
     depth_m = correction.corrected_depth(image.depth_m, image.camera)
     exposure = posed.exposures.at(frame.stamp_ns)
     return RenderedView(replace(image, depth_m=depth_m), rendering, exposure, valid, correction)

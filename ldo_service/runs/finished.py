@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.calibration.correction import read_correction
+from ldo_service.calibration.correction import read_corrections
 from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap, RunFrame
 from ldo_service.gaussians.file_formats import read_ply
@@ -143,8 +143,8 @@ class MapFolder:
         """
         rows = self.gaussians()
         labels = self._semantics(len(rows))
-        correction = read_correction(self.folder)
-        return PosedMap(name, rows, self.trajectory(), self.exposures(), labels, correction)
+        corrections = read_corrections(self.folder)
+        return PosedMap(name, rows, self.trajectory(), self.exposures(), labels, corrections)
 
 
 def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:

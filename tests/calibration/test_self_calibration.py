@@ -1,6 +1,8 @@
 """Self-calibration on exact frames to which a known vignetting and depth bias are added."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import pytest
 from ldo_service.calibration.correction import (
     CameraCorrection,
     CorrectionChange,
+    read_corrections,
     unbiased_depth,
 )
 from ldo_service.calibration.self_calibration import (
@@ -15,6 +18,7 @@ from ldo_service.calibration.self_calibration import (
     SelfCalibrationConfig,
 )
 from ldo_service.datasets import Sequence
+from ldo_service.errors import DataError
 from ldo_service.geometry import RgbdFrame
 from ldo_service.storage.state_codec import decode_state, encode_state
 
@@ -126,3 +130,32 @@ def test_changed_correction_equals_a_new_one(frames: list[RgbdFrame]) -> None:
     z_old, z_new = old.depth_m[[30, 100], [20, 100]], new.depth_m[[30, 100], [20, 100]]
     points = change.points(camera.points_at(u, v, z_old), camera)
     np.testing.assert_allclose(points, camera.points_at(u, v, z_new), rtol=1e-5)
+
+
+def test_clipped_pixels_are_kept_for_tracking_and_darkened_for_the_map(
+    frames: list[RgbdFrame],
+) -> None:
+    color = frames[0].color.copy()
+    color[100:110, 100:110] = 255
+    frame = replace(frames[0], color=color)
+    assert (TRUE.applied(frame).color[100:110, 100:110] == 255).all()
+    mapped = TRUE.applied(frame, keeps_clipped=False).color[100:110, 100:110]
+    expected = 255 * TRUE.gain(frame.camera)[100:110, 100:110]
+    np.testing.assert_allclose(mapped, expected, atol=1)
+
+
+def test_each_frame_has_the_correction_of_the_last_keyframe_before_it(tmp_path: Path) -> None:
+    keyframes = [
+        {"stamp_ns": 10},
+        {"stamp_ns": 20, "camera_correction": TRUE.pack()},
+    ]
+    (tmp_path / "keyframes.json").write_text(json.dumps(keyframes))
+    history = read_corrections(tmp_path)
+    assert history.at(5) == history.at(19) == CameraCorrection()
+    assert history.at(20) == history.last == TRUE
+
+
+def test_damaged_keyframes_are_an_error_of_the_file(tmp_path: Path) -> None:
+    (tmp_path / "keyframes.json").write_text('[{"stamp_ns": 1, "camera_correction": 3}]')
+    with pytest.raises(DataError, match=r"keyframes\.json is not what"):
+        read_corrections(tmp_path)
