@@ -27,10 +27,11 @@ FEATURE_SIGMA_PX = 1.0
 MAX_STEP_RATIO = 0.08  # Depth difference beyond which two points are different surfaces.
 # Inverse variances of the coefficients around 0. Residuals share errors, so that many small ones
 # would outweigh any reasonable prior.
-DEPTH_PRIOR, VIGNETTING_PRIOR = 1e5, 1e2
+DEPTH_PRIOR, VIGNETTING_PRIOR = 4e4, 5e1
 # Gauss-Newton steps of each estimate; the next one starts from its result.
 DEPTH_ROUNDS, COLOR_ROUNDS = 3, 3
 PAIRS_PER_PART = 16  # Pairs that one part of the work evaluates, about 40 ms.
+BLOCK_STRIDE = 3  # Blocks of which one is compared, along each axis; neighbors are alike.
 COLOR_STRIDE = 2  # Every second point of a pair is used; neighbors have the same color.
 MIN_COMMON = 200  # Points; two views with fewer show no common surface.
 CELLS = 8  # Cells of the image along its width.
@@ -166,9 +167,8 @@ def _depth_block(
     rays = view.camera.rays_at(u, v).reshape(-1, 3)
     basis = bias_basis(u, v, view.camera).reshape(rays.shape)
     R, t = pair.T_second_first[:3, :3], pair.T_second_first[:3, 3]
-    # Every second block along each axis of the first view.
     chosen = np.zeros(there.depth_m.shape, bool)
-    chosen[::2, ::2] = there.is_surface[::2, ::2]
+    chosen[::BLOCK_STRIDE, ::BLOCK_STRIDE] = there.is_surface[::BLOCK_STRIDE, ::BLOCK_STRIDE]
     a = np.flatnonzero(chosen)
     directions = rays[a] @ R.T
     points = directions * there.depth_m.reshape(-1)[a, None] + t

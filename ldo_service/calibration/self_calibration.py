@@ -37,19 +37,19 @@ class SelfCalibrationConfig:
     """Settings of the self-calibration.
 
     The thresholds of the held-out residual were chosen on seven recordings and simulations. With a
-    strong bias or vignetting it falls to 0.84 or less and to 0.23 or less; otherwise it stays above
-    0.89 and 0.56.
+    strong bias or vignetting it falls to 0.85 or less and to 0.15 or less; otherwise it stays above
+    0.94 and 0.45.
     """
 
     # Numbers of views after which an estimate starts; the last one ends the calibration. Empty:
     # no calibration.
-    views: tuple[int, ...] = (6, 8, 11, 15, 20, 25, 30)
+    views: tuple[int, ...] = (6, 9, 15, 30)
     # Image motion from one view to the next, fraction of the image width: 12 px of 640.
     view_motion: float = 12 / 640
     lost_frames: int = 3  # Frames from one view to the next while tracking is LOST.
     min_pairs: int = 8
     max_depth_ratio: float = 0.86  # Largest held-out residual with a depth bias, over that without.
-    max_color_ratio: float = 0.5  # Largest held-out residual with vignetting, over that without.
+    max_color_ratio: float = 0.3  # Largest held-out residual with vignetting, over that without.
 
     def __post_init__(self) -> None:
         if any(n < 2 for n in self.views) or list(self.views) != sorted(set(self.views)):

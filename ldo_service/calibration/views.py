@@ -19,8 +19,8 @@ MIN_GRAY, MAX_GRAY, CLIPPED_BLOCKS = 12, 248, 2
 MIN_POINTS = 40  # Inliers of a pair.
 MIN_MOTION_RATIO = 15 / 640  # Median motion of the points of a pair, fraction of the width.
 # Corners that are tracked, and their least distance, fraction of the width.
-CORNERS, CORNER_QUALITY, CORNER_DISTANCE_RATIO = 600, 0.005, 10 / 640
-FLOW_WINDOW_PX, FLOW_LEVELS = 15, 4
+CORNERS, CORNER_QUALITY, CORNER_DISTANCE_RATIO = 300, 0.005, 15 / 640
+FLOW_WINDOW_PX, FLOW_LEVELS = 13, 3
 MAX_RETURN_PX = 0.5  # A corner tracked there and back that ends farther away is lost.
 LOCAL_MEAN_RATIO = 8 / 640  # Standard deviation of the brightness that is subtracted, of the width.
 RANSAC_ITERATIONS, RANSAC_PX = 100, 2.0
