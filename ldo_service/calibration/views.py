@@ -7,7 +7,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.geometry import Camera, RgbdFrame
+from ldo_service.geometry.pnp import solve_pnp
 
 VIEW_WIDTH = 160  # Pixels; the smooth errors need no finer images.
 MAX_DEPTH_M = 6.0  # Structured light and time of flight are mostly noise beyond it.
@@ -190,24 +191,18 @@ def pair_of(first: CalibrationView, second: CalibrationView) -> ViewPair | None:
     moved_px = float(np.median(np.linalg.norm(there - here, axis=1)))
     if moved_px < MIN_MOTION_RATIO * first.camera.width:
         return None
-    cv2.setRNGSeed(0)
-    found, rotation_vector, translation, inliers = cv2.solvePnPRansac(
+    found = solve_pnp(
         first.camera.points_at(there[:, 0], there[:, 1], z),
         here,
-        first.camera.matrix,
-        None,
-        iterationsCount=RANSAC_ITERATIONS,
-        reprojectionError=RANSAC_PX * max(first.camera.width, 160) / 640.0,
-        flags=cv2.SOLVEPNP_ITERATIVE,
+        first.camera,
+        reprojection_px=RANSAC_PX,
+        iterations=RANSAC_ITERATIONS,
+        min_inliers=MIN_POINTS,
     )
-    if not found or inliers is None or len(inliers) < MIN_POINTS:
+    if found is None:
         return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation_vector)[0], translation[:, 0]
-    if not np.isfinite(T).all():
-        return None
-    k = np.asarray(inliers[:, 0], np.int64)
-    return ViewPair(first.number, second.number, se3.orthonormalize(T), there[k], z[k], here[k])
+    T_second_first, k = found
+    return ViewPair(first.number, second.number, T_second_first, there[k], z[k], here[k])
 
 
 def _blocks(image: np.ndarray, block: int) -> np.ndarray:

@@ -19,6 +19,7 @@ import small_gicp
 
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
+from ldo_service.geometry.pnp import solve_pnp
 
 from .pyramid import Level, Pyramid, ReferencePoints
 
@@ -198,23 +199,15 @@ def estimate_pose(
     """
     pairs = match(reference, frame, config)
     pairs = pairs[reference.points_camera[pairs[:, 0], 2] > 0]
-    if len(pairs) < config.min_inliers:
-        return None
-    cv2.setRNGSeed(0)
-    found, rotation_vector, translation, inliers = cv2.solvePnPRansac(
+    found = solve_pnp(
         reference.points_camera[pairs[:, 0]],
         frame.pixels[pairs[:, 1]],
-        camera.matrix,
-        None,
-        iterationsCount=config.ransac_iterations,
-        reprojectionError=config.reprojection_px * max(camera.width, 160) / 640.0,
-        flags=cv2.SOLVEPNP_ITERATIVE,
+        camera,
+        reprojection_px=config.reprojection_px,
+        iterations=config.ransac_iterations,
+        min_inliers=config.min_inliers,
     )
-    if not found or inliers is None or len(inliers) < config.min_inliers:
-        return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation_vector)[0], translation[:, 0]
-    return FeaturePose(se3.orthonormalize(T), len(inliers)) if np.isfinite(T).all() else None
+    return None if found is None else FeaturePose(found[0], len(found[1]))
 
 
 @dataclass(frozen=True, slots=True)
