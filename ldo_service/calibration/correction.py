@@ -76,8 +76,7 @@ class CameraCorrection:
         """
         color, depth_m = frame.color, self.corrected_depth(frame.depth_m, frame.camera)
         if self.has_vignetting:
-            gain = _gain_image(self.vignetting, frame.camera)
-            even = (color * gain + np.float32(0.5)).astype(np.uint8)
+            even = (color * self.gain(frame.camera) + np.float32(0.5)).astype(np.uint8)
             is_kept = color.max(axis=2, keepdims=True) >= CLIPPED_GRAY if keeps_clipped else False
             color = np.where(is_kept, color, even)
         if color is frame.color and depth_m is frame.depth_m:
@@ -181,9 +180,10 @@ def unbiased_depth(depth_m: np.ndarray, bias: np.ndarray) -> np.ndarray:
     Returns:
         Depth in meters, [...] in the type of `depth_m`.
     """
-    inverse = 1.0 / np.maximum(depth_m, 0.1) + bias
+    is_known = depth_m > 0
+    inverse = 1.0 / np.where(is_known, depth_m, 1.0) + bias
     corrected = 1.0 / np.maximum(inverse, MIN_INVERSE_DEPTH)
-    return np.where(depth_m > 0, corrected, 0.0).astype(depth_m.dtype)
+    return np.where(is_known, corrected, 0.0).astype(depth_m.dtype)
 
 
 def bias_basis(u: np.ndarray, v: np.ndarray, camera: Camera) -> np.ndarray:

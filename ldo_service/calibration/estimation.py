@@ -21,7 +21,7 @@ from .views import SURFACE_STEP_M, SURFACE_STEP_RATIO, CalibrationView, ViewPair
 
 # Depth noise of structured light, meters (Nguyen et al., 2012): s0 + s1 (z - z0)^2.
 DEPTH_SIGMA = (0.0012, 0.0019, 0.4)
-# Weight of a depth residual, with 1 for a feature; the errors of neighboring points are equal.
+# Weight of a depth residual, with 1 for a feature: neighboring points share their errors.
 DEPTH_WEIGHT = 0.03
 FEATURE_SIGMA_PX = 1.0
 MAX_STEP_RATIO = 0.08  # Depth difference beyond which two points are different surfaces.
@@ -63,8 +63,13 @@ class Estimate:
     depth_bias: np.ndarray  # [3] 1/m
     vignetting: np.ndarray  # [3, 3] channel by term
     pairs: list[ViewPair]  # T_second_first is that of the joint solution.
-    depth_check: Solution  # Of the dense depth alone, without features.
+    depth_check: Solution  # Solution from the dense depth alone, without features.
     color_checks: list[Solution]  # One per channel; empty if too few colors were compared.
+
+    @property
+    def is_finite(self) -> bool:
+        """True if the steps have converged to numbers; degenerate pairs may prevent it."""
+        return bool(np.isfinite(self.depth_bias).all() and np.isfinite(self.vignetting).all())
 
     @property
     def depth_ratio(self) -> float:
@@ -86,8 +91,8 @@ def estimate(
 ) -> Generator[None, None, Estimate]:
     """Estimate depth bias, relative poses and vignetting by Gauss-Newton steps.
 
-    The generator yields after each part of the work, a few milliseconds, so that the caller can
-    spread the work over frames.
+    The generator yields after each part of the work, some 40 ms, so that the caller can spread the
+    work over frames.
 
     Args:
         views: Views by number.
@@ -189,9 +194,7 @@ def _depth_block(
     own = np.c_[np.cross(points, n), n]
     weight = DEPTH_WEIGHT * student_weight(residual, sigma_m * spread)
     features = _feature_rows(view.camera, pair, coefficients)
-    width = here.depth_m.shape[1]
-    row, column = np.divmod(b, width)
-    cells = (row * CELLS // width) * CELLS + column * CELLS // width
+    cells = _cells(b, here.depth_m.shape[1])
     block = Block(
         np.r_[shared, features.shared],
         np.r_[own, features.own],
@@ -210,6 +213,12 @@ def _indices(points: np.ndarray, view: CalibrationView) -> np.ndarray:
     column, row = np.floor((view.camera.project(safe) + 0.5) / view.block).astype(int).T
     inside = is_ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return np.where(inside, row * width + column, -1)
+
+
+def _cells(blocks: np.ndarray, width: int) -> np.ndarray:
+    """Return the number of the cell of each block, given as a flat index into rows of `width`."""
+    row, column = np.divmod(blocks, width)
+    return (row * CELLS // width) * CELLS + column * CELLS // width
 
 
 def _feature_rows(camera: Camera, pair: ViewPair, coefficients: np.ndarray) -> Block:
@@ -279,7 +288,5 @@ def _brightness(
     here = second.color.reshape(-1, 3)[b, channel].astype(np.float64)
     u, v = first.pixels()
     basis = vignetting_basis(u, v, first.camera).reshape(-1, 3)
-    width = first.depth_m.shape[1]
-    row, column = np.divmod(b, width)
-    cells = (row * CELLS // width) * CELLS + column * CELLS // width
+    cells = _cells(b, first.depth_m.shape[1])
     return (there + here) / 2.0, np.log(here / there), basis[b] - basis[a], cells

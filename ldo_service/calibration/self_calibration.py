@@ -170,6 +170,9 @@ class SelfCalibration:
         except StopIteration as done:
             found: Estimate = done.value
         self._running, self._parts_done = None, 0
+        if not found.is_finite:
+            self._end_stage()
+            return None
         self._depth_bias, self._vignetting = found.depth_bias, found.vignetting
         self.ratios = found.depth_ratio, found.color_ratio
         poses = {(pair.first, pair.second): pair for pair in found.pairs}
@@ -236,7 +239,8 @@ class SelfCalibration:
         now = state["now"]
         self.correction = CameraCorrection.of(now)
         self.ratios = (float(now["ratios"][0]), float(now["ratios"][1]))
-        self.is_finished = bool(now["is_finished"])
+        # If the calibration was switched off since, the correction of the saved map stays.
+        self.is_finished = bool(now["is_finished"]) or not self.config.views
         self._depth_bias, self._vignetting = now["last_depth_bias"], now["last_vignetting"]
         self._T_last_view = now["T_last_view"]
         self._frames_since_view = int(now["frames_since_view"])

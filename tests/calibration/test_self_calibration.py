@@ -159,3 +159,19 @@ def test_damaged_keyframes_are_an_error_of_the_file(tmp_path: Path) -> None:
     (tmp_path / "keyframes.json").write_text('[{"stamp_ns": 1, "camera_correction": 3}]')
     with pytest.raises(DataError, match=r"keyframes\.json is not what"):
         read_corrections(tmp_path)
+
+
+def test_calibration_switched_off_keeps_the_correction_of_a_saved_state(
+    room: Sequence, frames: list[RgbdFrame]
+) -> None:
+    first, off = SelfCalibration(CONFIG), SelfCalibration(SelfCalibrationConfig(views=()))
+    biased, moved = [measured(f, TRUE) for f in frames[:25]], poses(room)[:25]
+    assert changes_of(first, biased, moved)
+    off.restore(first.snapshot())
+    assert off.observe(biased[0], moved[0]) is None
+    assert off.correction == first.correction
+
+
+def test_depth_near_the_camera_and_far_away_is_unchanged_without_a_bias() -> None:
+    depth_m = np.array([[0.0, 0.05, 1.0, 20.0]], np.float32)
+    np.testing.assert_allclose(unbiased_depth(depth_m, np.zeros((1, 4))), depth_m, rtol=1e-6)
