@@ -44,8 +44,7 @@ class OpenVocabularyConfig:
     min_sure: float = 0.3
     # Labels that are no objects; a region with such a label result stays background.
     structure: tuple[str, ...] = ("background", "wall", "floor", "ceiling")
-    # Maximum pending label requests, some 10 kB each. The labeller queues 32 regions, and each may
-    # be requested three times.
+    # Maximum pending label requests, some 10 kB each; as many as `maps.label_queue` holds.
     max_open: int = 96
 
     def __post_init__(self) -> None:

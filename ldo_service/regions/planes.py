@@ -43,7 +43,7 @@ class PlaneConfig:
     # Maximum difference, 1 / m, between the inverse depth of a plane and of its pixels.
     tolerance: float = 0.006
     # Maximum fraction of a structural plane's outline past which a farther surface is visible.
-    # Where the border of the image cuts the plane, no farther surface is counted.
+    # No farther surface is counted where the border of the image cuts the plane.
     behind: float = 0.3
     # Range of the distances outside of the outline at which farther surfaces are counted.
     gap_px: tuple[int, int] = (3, 8)

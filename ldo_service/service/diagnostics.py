@@ -187,9 +187,9 @@ def notes(seen: ActorStatus) -> Iterator[str]:
         yield "has no model and detects nothing: set detector.model to one of `ldo models`"
     if due := health.metrics.get("iterations_pending"):
         yield (
-            f"has {due:.0f} refit iterations pending after a loop closure: new keyframes run some; "
-            f"run `ldo control refine --iterations {min(int(due), MAX_ITERATIONS)}` while the "
-            "robot stands still"
+            f"has {due:.0f} refit iterations pending after a loop closure: they run while no "
+            "keyframe arrives; let the robot stand still, or run "
+            f"`ldo control refine --iterations {min(int(due), MAX_ITERATIONS)}`"
         )
     for output in health.outputs:
         for consumer, behind in output.behind.items():
