@@ -15,7 +15,7 @@ from ldo_service.geometry import Camera, RgbdFrame
 
 BIAS_TERMS = 3  # x^2, x y, y^2.
 VIGNETTING_TERMS = 3  # r^2, r^4, r^6.
-# Gray level from which a pixel may be clipped. Its brightness is unknown, so it is not corrected.
+# Gray level from which a pixel may be clipped. The true brightness of such a pixel is unknown.
 CLIPPED_GRAY = 250
 MIN_INVERSE_DEPTH = 0.02  # 1/m. A bias cannot move a surface beyond 50 m.
 MIN_TRANSMISSION = 0.3  # Darker corners would be amplified together with their noise.
@@ -64,15 +64,16 @@ class CameraCorrection:
     def applied(self, frame: RgbdFrame, *, keeps_clipped: bool = True) -> RgbdFrame:
         """Return the frame that a camera without vignetting and depth bias would have delivered.
 
-        Without a correction, this is the frame itself.
+        If this correction changes nothing, the frame itself is returned.
 
-        The colors are darkened to the level of the darkest pixel rather than brightened to the
-        level of the center, so that no pixel is clipped.
+        The colors are darkened to the level of the strongest vignetting rather than brightened to
+        the level of the center, so that the correction clips no pixel.
 
         Args:
             frame: Rectified frame, which is not changed.
-            keeps_clipped: Leave pixels as they are that may be clipped, so that the tracker still
-                recognizes them. A map needs them in the brightness of their surroundings.
+            keeps_clipped: True leaves pixels that may be clipped unchanged, so that the tracker
+                still recognizes them as clipped. False corrects them too, so that they match their
+                surroundings in the map.
         """
         color, depth_m = frame.color, self.corrected_depth(frame.depth_m, frame.camera)
         if self.has_vignetting:
@@ -84,7 +85,7 @@ class CameraCorrection:
         return replace(frame, color=color, depth_m=depth_m)
 
     def corrected_depth(self, depth_m: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return measured depth [H, W] in meters without the bias; 0 stays 0."""
+        """Remove the bias from measured depth [H, W] in meters; 0 stays 0."""
         return unbiased_depth(depth_m, self.bias(camera)) if self.has_depth_bias else depth_m
 
     def gain(self, camera: Camera) -> np.ndarray:
@@ -92,30 +93,35 @@ class CameraCorrection:
         return _gain_image(self.vignetting, camera)
 
     def bias(self, camera: Camera) -> np.ndarray:
-        """Return the bias of the inverse depth of each pixel, [H, W] float32, in 1/m."""
+        """Return the bias that is added to the inverse depth, [H, W] float32, in 1/m."""
         return _bias_image(self.depth_bias, camera)
 
 
 @dataclass(frozen=True, slots=True)
 class CorrectionHistory:
-    """Corrections of the keyframes of a run, in the order of time."""
+    """Camera corrections that the keyframes of a run were made with, in the order of time."""
 
     stamps_ns: tuple[int, ...] = ()
     corrections: tuple[CameraCorrection, ...] = ()
 
     def at(self, stamp_ns: int) -> CameraCorrection:
-        """Return the correction of the last keyframe up to a stamp; none before the first one."""
+        """Return the correction of the last keyframe up to a stamp.
+
+        Before the first keyframe, the result is a correction that changes nothing.
+        """
         count = bisect_right(self.stamps_ns, stamp_ns)
         return self.corrections[count - 1] if count else CameraCorrection()
 
     @property
     def last(self) -> CameraCorrection:
-        """Correction of the last keyframe; no correction without keyframes."""
+        """Correction of the last keyframe; one that changes nothing if there are no keyframes."""
         return self.corrections[-1] if self.corrections else CameraCorrection()
 
 
 def read_corrections(folder: Path) -> CorrectionHistory:
-    """Return the corrections of the keyframes of a finished run; older versions wrote none.
+    """Return the corrections of the keyframes of a finished run.
+
+    A keyframe from an older version has no correction and counts as not corrected.
 
     Raises:
         DataError: keyframes.json of the folder cannot be read, or its content is invalid.
@@ -133,7 +139,9 @@ def read_corrections(folder: Path) -> CorrectionHistory:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
+        raise DataError(
+            f"{path} is not what `ldo run` writes: {error!r}. Give the folder of a finished run."
+        ) from error
 
 
 NO_CORRECTION = CameraCorrection().pack()
@@ -141,19 +149,19 @@ NO_CORRECTION = CameraCorrection().pack()
 
 @dataclass(frozen=True, slots=True)
 class CorrectionChange:
-    """Replacement of a correction by another one, for images that the old one was applied to."""
+    """Replacement of an old correction by a new one, for images corrected by the old one."""
 
     old: CameraCorrection
     new: CameraCorrection
 
     def depth_m(self, depth_m: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return depth [H, W] in meters as the new correction would have made it."""
+        """Convert depth [H, W] in meters from the old correction to the new one."""
         return unbiased_depth(depth_m, self.new.bias(camera) - self.old.bias(camera))
 
     def gray(self, gray: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return a gray image [H, W] uint8 as the new correction would have made it.
+        """Convert a gray image [H, W] uint8 from the old correction to the new one.
 
-        Pixels that may be clipped, and black ones, which are invalid, stay.
+        Pixels that may be clipped do not change, nor do black pixels, which are invalid.
         """
         if self.old.vignetting == self.new.vignetting:
             return gray
@@ -162,7 +170,10 @@ class CorrectionChange:
         return np.where((gray >= CLIPPED_GRAY) | (gray == 0), gray, changed)
 
     def points(self, points_camera: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return camera points [N, 3] in meters, measured at their pixels, with the new depth."""
+        """Convert measured points [N, 3] from the old correction to the new one.
+
+        Points are in meters in the camera frame. Each one stays on the viewing ray of its pixel.
+        """
         u, v = camera.project(points_camera).T
         bias = np.subtract(self.new.depth_bias, self.old.depth_bias)
         z = points_camera[:, 2]

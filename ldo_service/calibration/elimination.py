@@ -1,7 +1,7 @@
 """Least squares of shared coefficients, with the unknowns of each block eliminated.
 
-A block is the measurements of one pair of views. Its own unknowns, such as the relative pose, occur
-in no other block.
+A block contains the measurements of one pair of views. The unknowns of a block, such as the
+relative pose, occur in no other block. The coefficients are shared by all blocks.
 """
 
 from collections.abc import Sequence
@@ -10,17 +10,20 @@ from dataclasses import dataclass
 import numpy as np
 
 STUDENT_FREEDOM = 5.0  # Degrees of freedom of the t-distribution of residuals.
-GROUPS = 8  # Stretches of time; each is left out once.
-MIN_CELL_COUNT = 20  # Residuals; the mean of fewer is noise.
+GROUPS = 8  # Maximum number of groups of successive blocks; each group is held out once.
+MIN_CELL_COUNT = 20  # Cells with at most this many residuals are skipped; their mean is noise.
 CELL_QUANTILES = (5, 95)  # Percentiles to which residuals are clipped before they are averaged.
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Linearized measurements of one pair: residual + shared dc + own dx."""
+    """Linearized measurements of one pair of views: residual + shared dc + own dx.
 
-    shared: np.ndarray  # [N, K] derivative by the shared coefficients.
-    own: np.ndarray  # [N, M] derivative by the unknowns of this block.
+    dc is the step of the shared coefficients, dx that of the unknowns of this block.
+    """
+
+    shared: np.ndarray  # [N, K] derivative with respect to the shared coefficients.
+    own: np.ndarray  # [N, M] derivative with respect to the unknowns of this block.
     residual: np.ndarray  # [N]
     weight: np.ndarray  # [N]
     cells: np.ndarray  # [C] int: cell of the image for each of the first C residuals, C <= N.
@@ -28,19 +31,20 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Step of the coefficients, with what the data that were left out say about it."""
+    """Step of the shared coefficients, with its evaluation on held-out blocks."""
 
     step: np.ndarray  # [K]
     own_steps: list[np.ndarray]  # [M] for each block.
-    sigma: np.ndarray  # [K] standard deviation by jackknife over stretches of time.
-    # Root mean square of the cells' mean residuals in the blocks left out, without the shared
-    # coefficients and with those estimated from the other blocks. Noise averages out in a cell.
+    sigma: np.ndarray  # [K] standard deviation by jackknife over the groups of blocks.
+    # Root mean square of the cells' mean residuals in held-out blocks. `rms_without` has all shared
+    # coefficients at 0; `rms_with` uses the coefficients estimated from the other groups. Within a
+    # cell, noise averages out.
     rms_without: float
     rms_with: float
 
     @property
     def residual_ratio(self) -> float:
-        """Held-out residual with the coefficients over that without; 1 if nothing was compared."""
+        """Ratio rms_with / rms_without of the held-out residuals; 1 if rms_without is 0."""
         return self.rms_with / self.rms_without if self.rms_without > 0 else 1.0
 
 
@@ -51,7 +55,7 @@ def student_weight(residual: np.ndarray, sigma: np.ndarray | float) -> np.ndarra
 
 
 def solve(blocks: Sequence[Block], prior: float, now: np.ndarray) -> Solution:
-    """Minimize sum of weight (residual + shared dc + own dx)^2 + prior |now + dc|^2.
+    """Minimize the sum of weight (residual + shared dc + own dx)^2, plus prior |now + dc|^2.
 
     Args:
         blocks: Measurements in the order of time.
@@ -84,10 +88,11 @@ def solve(blocks: Sequence[Block], prior: float, now: np.ndarray) -> Solution:
 
 
 def _reduced(block: Block) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the normal equations without the block's own unknowns, and how those follow.
+    """Eliminate the block's own unknowns from its normal equations.
 
     Returns:
-        H [K, K], g [K], and G [M, K + 1], with own step = -G [dc; 1].
+        H [K, K] and g [K] of the shared coefficients, and G [M, K + 1]. The step of the block's own
+        unknowns is -G [dc; 1].
     """
     shared, own = block.shared * block.weight[:, None], block.own * block.weight[:, None]
     H_shared, H_mixed, H_own = block.shared.T @ shared, shared.T @ block.own, block.own.T @ own
@@ -98,7 +103,10 @@ def _reduced(block: Block) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _cell_means(block: Block, step: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """Return the mean residual of each cell of the image, after a step and the own step with it."""
+    """Return the mean residual of each cell of the image after a step of the coefficients.
+
+    The block's own unknowns take the step that follows from it by G (see `_reduced`).
+    """
     if not len(block.cells):
         return np.zeros(0)
     own_step = -(G @ np.r_[step, 1.0])

@@ -1,11 +1,13 @@
 """Estimation of depth bias and vignetting from pairs of views, by least squares.
 
-Depth. The surface of one view, moved into another, lies on the planes of that one. The unknowns are
-the coefficients of the bias and the relative pose of each pair, which the reprojection of features
-holds too: their directions have no bias.
+Depth. The surface points of the first view of a pair, transformed into the second view, must lie on
+the tangent planes of its surface. The unknowns are the bias coefficients and the relative pose of
+each pair. The reprojection errors of features constrain the poses too, because the image positions
+of features have no bias.
 
-Color. The log ratio of the brightness of one surface point in two views is the difference of log V,
-besides gain and offset of the exposure, which are unknowns of each pair.
+Color. The log ratio of the brightness of one surface point in two views equals the difference of
+log V at its two pixels, apart from a change of the exposure. The gain and the offset of this change
+are unknowns of each pair.
 """
 
 from collections.abc import Generator, Mapping, Sequence
@@ -21,36 +23,37 @@ from .views import SURFACE_STEP_M, SURFACE_STEP_RATIO, CalibrationView, ViewPair
 
 # Depth noise of structured light, meters (Nguyen et al., 2012): s0 + s1 (z - z0)^2.
 DEPTH_SIGMA = (0.0012, 0.0019, 0.4)
-# Weight of a depth residual, with 1 for a feature: neighboring points share their errors.
+# Weight of a depth residual relative to a feature; low, because neighboring points share errors.
 DEPTH_WEIGHT = 0.03
 FEATURE_SIGMA_PX = 1.0
-MAX_STEP_RATIO = 0.08  # Depth difference beyond which two points are different surfaces.
-# Inverse variances of the coefficients around 0. Residuals share errors, so that many small ones
-# would outweigh any reasonable prior.
+# Depth difference, as a fraction of depth, beyond which two points are on different surfaces.
+MAX_STEP_RATIO = 0.08
+# Inverse variances of the coefficients' prior around 0. The residuals are correlated but count as
+# independent, so that they would outweigh a weaker prior.
 DEPTH_PRIOR, VIGNETTING_PRIOR = 4e4, 5e1
-# Gauss-Newton steps of each estimate; the next one starts from its result.
+# Gauss-Newton steps of each estimate. The next estimate starts from the result of this one.
 DEPTH_ROUNDS, COLOR_ROUNDS = 3, 3
 PAIRS_PER_PART = 16  # Pairs that one part of the work evaluates, about 40 ms.
-BLOCK_STRIDE = 3  # Blocks of which one is compared, along each axis; neighbors are alike.
-COLOR_STRIDE = 2  # Every second point of a pair is used; neighbors have the same color.
-MIN_COMMON = 200  # Points; two views with fewer show no common surface.
+BLOCK_STRIDE = 3  # Every third block along each axis is compared; neighbors are alike.
+COLOR_STRIDE = 2  # Colors are compared at every second of these; neighbors have the same color.
+MIN_COMMON = 200  # Minimum number of compared colors; a pair with fewer is skipped for vignetting.
 CELLS = 8  # Cells of the image along its width.
 GRAY_SIGMA = 1.0  # Minimum noise of a blurred color, gray levels.
 
 
 @dataclass(frozen=True, slots=True)
 class _Cloud:
-    """Surface of a view with a given bias."""
+    """Surface of a view after its depth is corrected by a given bias."""
 
     depth_m: np.ndarray  # [h, w]
-    slope: np.ndarray  # [h, w] derivative of the depth by the bias.
+    slope: np.ndarray  # [h, w] derivative of the depth with respect to the bias.
     normals: np.ndarray  # [h, w, 3] unit length.
     is_surface: np.ndarray  # [h, w] bool
 
 
 @dataclass(frozen=True, slots=True)
 class _Common:
-    """Points that two views have in common, as flat indices into their blocks."""
+    """Surface points that both views of a pair show, as flat indices into their blocks."""
 
     there: np.ndarray  # [N] in the first view.
     here: np.ndarray  # [N] in the second one.
@@ -62,23 +65,23 @@ class Estimate:
 
     depth_bias: np.ndarray  # [3] 1/m
     vignetting: np.ndarray  # [3, 3] channel by term
-    pairs: list[ViewPair]  # T_second_first is that of the joint solution.
+    pairs: list[ViewPair]  # Pairs with the relative poses that were estimated jointly with the bias.
     depth_check: Solution  # Solution from the dense depth alone, without features.
     color_checks: list[Solution]  # One per channel; empty if too few colors were compared.
 
     @property
     def is_finite(self) -> bool:
-        """True if the steps have converged to numbers; degenerate pairs may prevent it."""
+        """True if no coefficient is NaN or infinite, as degenerate pairs can make it."""
         return bool(np.isfinite(self.depth_bias).all() and np.isfinite(self.vignetting).all())
 
     @property
     def depth_ratio(self) -> float:
-        """Held-out depth residual with the bias removed, over that without."""
+        """Held-out depth residual with the bias removed, divided by the one of the raw depth."""
         return self.depth_check.residual_ratio
 
     @property
     def color_ratio(self) -> float:
-        """Held-out color residual with the vignetting removed, over that without."""
+        """Held-out color residual with vignetting removed, divided by the one of the raw color."""
         without = sum(check.rms_without for check in self.color_checks)
         return sum(check.rms_with for check in self.color_checks) / without if without else 1.0
 
@@ -91,14 +94,14 @@ def estimate(
 ) -> Generator[None, None, Estimate]:
     """Estimate depth bias, relative poses and vignetting by Gauss-Newton steps.
 
-    The generator yields after each part of the work, some 40 ms, so that the caller can spread the
+    The generator yields after each part of the work, about 40 ms, so that the caller can spread the
     work over frames.
 
     Args:
         views: Views by number.
-        pairs: Pairs of them, in the order of time.
-        depth_bias: Coefficients to start from, [3].
-        vignetting: Coefficients to start from, [3, 3].
+        pairs: Pairs of these views, in the order of time.
+        depth_bias: Initial coefficients of the depth bias, [3].
+        vignetting: Initial coefficients of the vignetting, [3, 3].
     """
     pairs = list(pairs)
     for _ in range(DEPTH_ROUNDS):
@@ -222,7 +225,7 @@ def _cells(blocks: np.ndarray, width: int) -> np.ndarray:
 
 
 def _feature_rows(camera: Camera, pair: ViewPair, coefficients: np.ndarray) -> Block:
-    """Return the reprojection errors of the features in pixels; u and v alternate."""
+    """Return the linearized reprojection errors of the features in pixels; u and v alternate."""
     u, v = pair.pixels_first.T
     basis = bias_basis(u, v, camera)
     z = unbiased_depth(pair.depth_first_m, basis @ coefficients)
@@ -230,12 +233,13 @@ def _feature_rows(camera: Camera, pair: ViewPair, coefficients: np.ndarray) -> B
     directions = camera.rays_at(u, v) @ R.T
     points = directions * z[:, None] + t
     count = len(points)
-    P = np.zeros((count, 2, 3))  # Derivative of the projection by the point.
+    P = np.zeros((count, 2, 3))  # Derivative of the projection with respect to the point.
     P[:, 0, 0], P[:, 1, 1] = camera.fx / points[:, 2], camera.fy / points[:, 2]
     P[:, 0, 2] = -camera.fx * points[:, 0] / points[:, 2] ** 2
     P[:, 1, 2] = -camera.fy * points[:, 1] / points[:, 2] ** 2
     residual = (camera.project(points) - pair.pixels_second).reshape(-1)
-    turned = np.cross(np.eye(3), points[:, None])  # Derivative of the point by each rotation.
+    # Derivative of the point with respect to each rotation.
+    turned = np.cross(np.eye(3), points[:, None])
     own = np.concatenate([P @ turned.transpose(0, 2, 1), P], axis=2).reshape(2 * count, 6)
     by_depth = (P @ directions[..., None])[..., 0] * -(z**2)[:, None]
     shared = (by_depth[..., None] * basis[:, None]).reshape(2 * count, -1)
@@ -278,7 +282,12 @@ def _channel(
 def _brightness(
     first: CalibrationView, second: CalibrationView, points: _Common, channel: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return mean level, log ratio, difference of basis functions, and cell of common points."""
+    """Compare one color channel of two views at their common points.
+
+    Returns:
+        Mean level [N], log ratio [N], difference of the basis functions [N, 3] and cell [N] of each
+        point; None if there are fewer than MIN_COMMON points.
+    """
     is_exposed = first.is_exposed.reshape(-1)[points.there]
     is_exposed &= second.is_exposed.reshape(-1)[points.here]
     a, b = points.there[is_exposed][::COLOR_STRIDE], points.here[is_exposed][::COLOR_STRIDE]

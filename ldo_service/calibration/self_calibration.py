@@ -6,9 +6,9 @@
         ...  # Track the frame.
         change = calibration.observe(raw, T_odom_camera)
 
-Each frame does a bounded part of the work. An estimate is used only where evidence that it was not
-fitted to confirms it: stretches of time that are left out agree better with the correction than
-without. When enough views are taken, the calibration is finished and costs nothing more.
+Each call of `observe` does a bounded part of the work. An estimate is used only if held-out pairs
+of views confirm it: the correction must reduce their residuals clearly. After the estimate from the
+largest number of views, the calibration is finished and costs nothing more.
 """
 
 import logging
@@ -28,32 +28,33 @@ from .views import CalibrationView, ViewMaker, ViewPair, pair_of
 
 log = logging.getLogger(__name__)
 
-DEPTH_STRIDE = 8  # Pixels of which one is used for the median depth.
-PAIR_DISTANCES = (1, 2, 3, 5, 8)  # Numbers of views from one view of a pair to the other.
+DEPTH_STRIDE = 8  # The median depth uses every eighth pixel along each axis.
+PAIR_DISTANCES = (1, 2, 3, 5, 8)  # A new view is paired with the views this many views before it.
 
 
 @dataclass(frozen=True, slots=True)
 class SelfCalibrationConfig:
     """Settings of the self-calibration.
 
-    The thresholds of the held-out residual were chosen on seven recordings and simulations. With a
-    strong bias or vignetting it falls to 0.85 or less and to 0.15 or less; otherwise it stays above
-    0.94 and 0.45.
+    The two maximum ratios were chosen on seven recordings and simulations. The depth ratio was at
+    most 0.85 with a strong bias, and above 0.94 otherwise. The color ratio was at most 0.15 with
+    strong vignetting, and above 0.45 otherwise.
     """
 
-    # Numbers of views after which an estimate starts; the last one ends the calibration. Empty:
-    # no calibration.
+    # Numbers of views at which an estimate starts. The estimate at the last number ends the
+    # calibration. Empty: no calibration.
     views: tuple[int, ...] = (6, 9, 15, 30)
-    # Image motion from one view to the next, fraction of the image width: 12 px of 640.
+    # Minimum image motion from one view to the next, fraction of the image width: 12 px of 640.
     view_motion: float = 12 / 640
     lost_frames: int = 3  # Frames from one view to the next while tracking is LOST.
-    min_pairs: int = 8
-    max_depth_ratio: float = 0.86  # Largest held-out residual with a depth bias, over that without.
-    max_color_ratio: float = 0.3  # Largest held-out residual with vignetting, over that without.
+    min_pairs: int = 8  # An estimate from fewer pairs of views is skipped.
+    # A correction is used if it reduces the residual of held-out pairs to at most this fraction.
+    max_depth_ratio: float = 0.86
+    max_color_ratio: float = 0.3
 
     def __post_init__(self) -> None:
         if any(n < 2 for n in self.views) or list(self.views) != sorted(set(self.views)):
-            raise ConfigError(named(self, "views") + " must ascend and be at least 2.")
+            raise ConfigError(named(self, "views") + " must be ascending numbers of at least 2.")
         if not self.view_motion > 0 or min(self.lost_frames, self.min_pairs) < 1:
             raise ConfigError(
                 named(self, "view_motion", "lost_frames", "min_pairs")
@@ -82,7 +83,7 @@ class SelfCalibration:
         self._pairs: list[ViewPair] = []
         self._T_last_view: np.ndarray | None = None
         self._frames_since_view = 0
-        # Start of the next estimate: the coefficients of the last one, used or not.
+        # Initial coefficients of the next estimate: the result of the last one, even if rejected.
         self._depth_bias = np.zeros(BIAS_TERMS)
         self._vignetting = np.zeros((3, VIGNETTING_TERMS))
         # Packed parts of the state; a part that has not changed stays the same object.
@@ -94,21 +95,22 @@ class SelfCalibration:
 
     @staticmethod
     def finished(correction: CameraCorrection) -> "SelfCalibration":
-        """Return a calibration that keeps a known correction."""
+        """Return a finished calibration, whose correction is known and never changes."""
         calibration = SelfCalibration(SelfCalibrationConfig(views=()))
         calibration.correction = correction
         return calibration
 
     def observe(self, raw: RgbdFrame, T_odom_camera: np.ndarray | None) -> CorrectionChange | None:
-        """Take a view of a frame if the camera has moved, and do a part of a running estimate.
+        """Make a view from a frame if the camera has moved, and do one part of a running estimate.
 
         Args:
             raw: The frame without correction.
-            T_odom_camera: Pose of the frame, [4, 4], which decides when a view is taken; None while
-                tracking is LOST.
+            T_odom_camera: Pose of the frame, [4, 4], which shows how far the camera has moved since
+                the last view; None while tracking is LOST.
 
         Returns:
-            The change of the correction, which applies from the next frame on; None without one.
+            The change of the correction, which applies from the next frame on; None if the
+            correction does not change.
         """
         if self.is_finished:
             return None
@@ -151,7 +153,7 @@ class SelfCalibration:
 
     # --- estimates --------------------------------------------------------------------------------
     def _start(self, count: int) -> None:
-        """Start an estimate from the first `count` views; skip it if too few of them are pairs."""
+        """Start an estimate from the first `count` views; skip it if they form too few pairs."""
         self._views_used = count
         pairs = [pair for pair in self._pairs if pair.second < count]
         if len(pairs) < self.config.min_pairs:
@@ -184,7 +186,10 @@ class SelfCalibration:
         return None if change.old == new else change
 
     def _confirmed(self, found: Estimate) -> CameraCorrection:
-        """Return the correction by the parts of an estimate that held-out data confirm."""
+        """Return the correction that has only the confirmed parts of an estimate.
+
+        Held-out pairs confirm the depth bias and the vignetting separately.
+        """
         nothing = CameraCorrection()
         has_bias = found.depth_ratio <= self.config.max_depth_ratio
         has_vignetting = found.color_ratio <= self.config.max_color_ratio
@@ -194,7 +199,7 @@ class SelfCalibration:
         )
 
     def _end_stage(self) -> None:
-        """Go on to the next number of views that is not reached yet, or finish."""
+        """Select the next entry of `config.views` that is not reached yet, or finish."""
         limits = self.config.views
         is_last = len(self._views) >= limits[-1] and self._views_used >= limits[-1]
         while self._stage < len(limits) - 1 and limits[self._stage] <= self._views_used:
@@ -204,8 +209,8 @@ class SelfCalibration:
         self.is_finished = True
         self._forget()
         log.info(
-            "tracker: self-calibration finished: depth bias %s (held-out residual %.2f of that "
-            "without), vignetting %s (%.2f).",
+            "tracker: self-calibration finished: depth bias %s (held-out residual with / without "
+            "correction: %.2f), vignetting %s (%.2f).",
             "corrected" if self.correction.has_depth_bias else "not corrected",
             self.ratios[0],
             "corrected" if self.correction.has_vignetting else "not corrected",
@@ -214,7 +219,7 @@ class SelfCalibration:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, dict[str, Any]]:
-        """Return the state in parts; the part of a view never changes."""
+        """Return the state as named parts; the part of a view never changes."""
         now = {
             **self.correction.pack(),
             "ratios": list(self.ratios),
@@ -239,7 +244,7 @@ class SelfCalibration:
         now = state["now"]
         self.correction = CameraCorrection.of(now)
         self.ratios = (float(now["ratios"][0]), float(now["ratios"][1]))
-        # If the calibration was switched off since, the correction of the saved map stays.
+        # If `config.views` is empty, the calibration is off: the restored correction stays.
         self.is_finished = bool(now["is_finished"]) or not self.config.views
         self._depth_bias, self._vignetting = now["last_depth_bias"], now["last_vignetting"]
         self._T_last_view = now["T_last_view"]
@@ -262,7 +267,7 @@ class SelfCalibration:
     def metrics(self) -> dict[str, float]:
         """Return the number of views, and whether each correction is in use, 0 or 1."""
         return {
-            # Views of the self-calibration that are not evaluated yet; 0 when it is finished.
+            # Views that the self-calibration has made so far; 0 when it is finished.
             "calibration_views": float(len(self._views)),
             "depth_bias_corrected": float(self.correction.has_depth_bias),
             "vignetting_corrected": float(self.correction.has_vignetting),

@@ -1,4 +1,4 @@
-"""Views of a camera from which its vignetting and depth bias are estimated, and pairs of them."""
+"""Calibration views, from which vignetting and depth bias are estimated, and pairs of views."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
@@ -11,19 +11,25 @@ from ldo_service.geometry import Camera, RgbdFrame
 from ldo_service.geometry.pnp import solve_pnp
 
 VIEW_WIDTH = 160  # Pixels; the smooth errors need no finer images.
-MAX_DEPTH_M = 6.0  # Structured light and time of flight are mostly noise beyond it.
-# A block of pixels, and neighboring blocks, belong to one surface if their depths differ by less.
+MAX_DEPTH_M = 6.0  # Structured light and time of flight measure mostly noise beyond this depth.
+# The pixels of a block, and neighboring blocks, belong to one surface if their depths differ by
+# less than this fraction of the depth plus this length.
 SURFACE_STEP_RATIO, SURFACE_STEP_M = 0.03, 0.01
-BLUR_BLOCKS = 0.75  # Standard deviation; the error of a pixel's place then does not matter.
-# Gray levels that may be clipped, and their surroundings in blocks, are not compared.
+# Standard deviation of the blur of colors, in blocks; it hides errors of the pixel positions.
+BLUR_BLOCKS = 0.75
+# Pixels with a channel outside MIN_GRAY..MAX_GRAY may be clipped. Their blocks are not compared,
+# nor are the blocks up to CLIPPED_BLOCKS away.
 MIN_GRAY, MAX_GRAY, CLIPPED_BLOCKS = 12, 248, 2
-MIN_POINTS = 40  # Inliers of a pair.
-MIN_MOTION_RATIO = 15 / 640  # Median motion of the points of a pair, fraction of the width.
-# Corners that are tracked, and their least distance, fraction of the width.
+MIN_POINTS = 40  # Minimum number of PnP inliers of a pair.
+MIN_MOTION_RATIO = 15 / 640  # Minimum median motion of a pair's corners, fraction of the width.
+# Maximum number of tracked corners, minimum quality (`cv2.goodFeaturesToTrack`) and minimum
+# distance of new corners, the distance as a fraction of the image width.
 CORNERS, CORNER_QUALITY, CORNER_DISTANCE_RATIO = 300, 0.005, 15 / 640
 FLOW_WINDOW_PX, FLOW_LEVELS = 13, 3
-MAX_RETURN_PX = 0.5  # A corner tracked there and back that ends farther away is lost.
-LOCAL_MEAN_RATIO = 8 / 640  # Standard deviation of the brightness that is subtracted, of the width.
+# A corner is tracked into the next image and back. It is dropped if it ends farther from its start.
+MAX_RETURN_PX = 0.5
+# Standard deviation of the local mean that is subtracted from the image, fraction of the width.
+LOCAL_MEAN_RATIO = 8 / 640
 RANSAC_ITERATIONS, RANSAC_PX = 100, 2.0
 
 
@@ -33,12 +39,12 @@ class CalibrationView:
 
     number: int  # Running number of the view.
     camera: Camera  # Camera of the full image.
-    block: int  # Side of the square of pixels that one block of the images below averages.
+    block: int  # Side of a block, pixels. One pixel of the images below averages one block.
     depth_m: np.ndarray  # [h, w] float32; 0 where unknown or not on one surface.
     color: np.ndarray  # [h, w, 3] float32, blurred.
     is_exposed: np.ndarray  # [h, w] bool: no pixel nearby is clipped.
-    tracks: np.ndarray  # [N] int64: numbers of the corners, ascending.
-    corners: np.ndarray  # [N, 2] pixels.
+    tracks: np.ndarray  # [N] int64: numbers of the corners, ascending; the same in all views.
+    corners: np.ndarray  # [N, 2] pixels of the full image.
     corner_depth_m: np.ndarray  # [N]; 0 where unknown.
 
     def pack(self) -> dict[str, Any]:
@@ -52,7 +58,7 @@ class CalibrationView:
         return CalibrationView(**{**kept, "camera": Camera.of(kept["camera"])})
 
     def pixels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the image coordinates u [1, w] and v [h, 1] of the centers of the blocks."""
+        """Return u [1, w] and v [h, 1] of the block centers, in pixels of the full image."""
         height, width = self.depth_m.shape
         offset = (self.block - 1) / 2.0
         u = self.block * np.arange(width)[None, :] + offset
@@ -60,7 +66,7 @@ class CalibrationView:
 
 
 class ViewMaker:
-    """Maker of views; it tracks corners from each view to the next."""
+    """Maker of calibration views, which tracks corners from each view to the next."""
 
     def __init__(self) -> None:
         self._flat: np.ndarray | None = None  # Last image without its local mean.
@@ -86,7 +92,7 @@ class ViewMaker:
         return maker
 
     def make(self, frame: RgbdFrame) -> CalibrationView:
-        """Reduce an uncorrected frame to a view."""
+        """Reduce an uncorrected frame to a calibration view."""
         camera = frame.camera
         block = max(1, camera.width // VIEW_WIDTH)
         height, width = camera.height // block, camera.width // block
@@ -113,10 +119,10 @@ class ViewMaker:
         return view
 
     def _track(self, gray: np.ndarray, width: int) -> None:
-        """Move the corners to this image, and add new ones where there are none.
+        """Track the corners into this image, and add new corners where there are none.
 
-        Vignetting and exposure change the brightness from view to view. The local mean is therefore
-        subtracted.
+        The local mean is subtracted first, because vignetting and exposure change the brightness of
+        a corner from view to view.
         """
         mean = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), LOCAL_MEAN_RATIO * width)
         flat = np.clip(gray - mean + 128.0, 0, 255).astype(np.uint8)
@@ -146,7 +152,8 @@ def _follow(
     """Track corners by pyramidal optical flow, there and back (Lucas and Kanade; Bouguet, 2000).
 
     Returns:
-        Which corners were found again [N] bool, and their new pixels [N, 2] float32.
+        Mask of the corners that were tracked, [N] bool, and the new pixels of all corners,
+        [N, 2] float32.
     """
     options = {"winSize": (FLOW_WINDOW_PX, FLOW_WINDOW_PX), "maxLevel": FLOW_LEVELS}
     place = np.empty_like(corners)
@@ -180,7 +187,8 @@ def pair_of(first: CalibrationView, second: CalibrationView) -> ViewPair | None:
     """Estimate the relative pose of two views by PnP RANSAC from the corners that both show.
 
     Returns:
-        The pair; None if both show too few corners, or if the corners did not move.
+        The pair. None if the views have too few corners in common, if the corners hardly moved, or
+        if PnP finds too few inliers.
     """
     _, i, j = np.intersect1d(first.tracks, second.tracks, assume_unique=True, return_indices=True)
     has_depth = first.corner_depth_m[i] > 0

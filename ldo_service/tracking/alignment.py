@@ -41,8 +41,8 @@ class ResidualConfig:
     noise: DepthNoise = field(default_factory=DepthNoise)
     # Largest depth difference between a point and its measured point q, as a fraction of depth.
     gate: float = 0.1
-    # A point farther than this behind the surface measured by the frame is hidden; fraction of
-    # depth.
+    # A point is hidden if it lies farther than this behind the surface that the frame measures;
+    # fraction of depth.
     occlusion: float = 0.08
 
     def __post_init__(self) -> None:
@@ -153,8 +153,8 @@ class AlignConfig:
     damping: float = 1e-6
     # Lower bound of the photometric noise, gray levels: the noise of rounding and interpolation.
     min_intensity_sigma: float = 1.0
-    # Lower bound of the geometric noise as a multiple of `DepthNoise`: 0.24 mm at its floor of
-    # 1.2 mm, for depth that is rounded to millimeters.
+    # Lower bound of the geometric noise as a multiple of `DepthNoise`: 0.24 mm at short range,
+    # where `DepthNoise` is 1.2 mm. It covers depth that is rounded to millimeters.
     min_depth_noise_scale: float = 0.2
     # Fraction of the residuals that count as independent, because the errors of neighboring
     # residuals are correlated. Pose errors measured on exact renders fit a fraction of 0.1. Pose
@@ -189,7 +189,7 @@ class Alignment:
     # [6, 6] for T_reference_camera * exp(xi), xi = (rotation rad, translation m).
     information: np.ndarray
     photometric_inliers: float  # Fraction of the visible points within 3 sigma.
-    # Fraction of the points paired with a measured depth whose residual is within 3 sigma.
+    # Fraction within 3 sigma of the points that are paired with a measured depth.
     geometric_inliers: float
     intensity_sigma: float  # Photometric noise, gray levels.
     depth_noise_scale: float  # Geometric noise as a multiple of `DepthNoise`.

@@ -71,7 +71,7 @@ class FrameTracker:
             frame: The frame; it may have neither texture nor depth.
             prior: Camera pose from another odometry, such as wheels; None if unknown. It yields an
                 additional initial guess and the start pose of a new submap after a loss. A frame is
-                OK only if its images confirm the pose.
+                OK only if its images confirm the resulting pose.
         """
         view, keyframe = self.view(frame), self.state.keyframe
         self._prior = prior
@@ -90,8 +90,8 @@ class FrameTracker:
             if found is None:
                 return self._lost_result(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, TrackingStatus.OK
-            # Reset the noise history, since noise differs between scenes. Reset the motion
-            # evidence, which is valid for one keyframe only.
+            # Reset the noise history, since noise differs between scenes, and the motion evidence,
+            # which is valid for one keyframe only.
             origin = KeyframeOrigin.KNOWN if self.can_reuse_keyframes else KeyframeOrigin.NEW
             self.state = replace(
                 self.state, history=ResidualHistory(), motion_evidence=None, origin=origin

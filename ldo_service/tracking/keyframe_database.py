@@ -28,7 +28,7 @@ from .motion_segmentation import resized
 from .pyramid import Pyramid, PyramidConfig, build_pyramid
 from .tracking_quality import ResidualHistory
 
-# Columns and rows of a thumbnail; so coarse that a camera motion of 10 cm changes it little.
+# Columns and rows of a thumbnail. It is so coarse that a camera motion of 10 cm changes it little.
 THUMBNAIL = 20, 15
 # Thumbnail values per standard deviation of the gray level. The correlation of two thumbnails, a
 # sum of 300 products of int8, is exact in float32.
@@ -45,11 +45,11 @@ OLD_DATABASE_FILE = "places.msgpack"  # File name up to version 0.1; read for on
 class KeyframeDatabaseConfig:
     """Settings of the keyframe database."""
 
-    # Maximum number of records, 0.13 MB each at 640x480 (sequence kitchen). Beyond it, the record
-    # with the closest neighbors on the path is removed.
+    # Maximum number of records, 0.13 MB each at 640x480 (sequence kitchen). Beyond this number, the
+    # record whose two neighbors on the path are closest to each other is removed.
     count: int = 1000
-    # Maximum number of ORB features of a record: half of those of a frame, to halve the time of
-    # matching.
+    # Maximum number of ORB features of a record: half of the number of a frame, to halve the time
+    # of matching.
     features: int = 500
     # A new record replaces an older one within this distance, rad as in `motion.image_motion_rad`,
     # because the new one shows the current state of the scene. The value is half the distance
@@ -108,7 +108,8 @@ class KeyframeRecord:
     def history(self, otherwise: ResidualHistory) -> ResidualHistory:
         """Return the residual noise that is usual near this keyframe; if unknown, `otherwise`.
 
-        Alignments to this keyframe are compared with it, because noise differs between scenes.
+        Alignments to this keyframe are compared with this noise, because noise differs between
+        scenes.
         """
         if not self.intensity_sigma:
             return otherwise
@@ -165,7 +166,7 @@ class KeyframeRecord:
         )
 
     def recorrected(self, change: CorrectionChange) -> "KeyframeRecord":
-        """Return a copy of the record as a changed correction of the camera would have made it."""
+        """Return a copy of the record, converted to a new camera correction."""
         gray, depth_m = change.gray(self._gray, self.camera), self.depth_m
         nothing = np.zeros(gray.shape, bool)
         points = change.points(self.points_camera.astype(np.float64), self.camera)
@@ -297,7 +298,7 @@ class KeyframeDatabase:
         return KeyframeDatabase(tuple(records))
 
     def recorrected(self, change: CorrectionChange) -> "KeyframeDatabase":
-        """Return the database with all records as a changed correction would have made them."""
+        """Return the database with all records converted to a new camera correction."""
         return replace(self, all=tuple(record.recorrected(change) for record in self.all))
 
     def in_submap(self, submap: int, without: Set[int] = frozenset()) -> tuple[KeyframeRecord, ...]:
@@ -335,11 +336,14 @@ class KeyframeDatabase:
 
 
 def neighbor_distances(path: Sequence[KeyframeRecord]) -> np.ndarray:
-    """Return the distance between the previous and the next record of each inner record of a path.
+    """Return the distance between the two neighbors of each record, except the first and the last.
+
+    Args:
+        path: N records in the order of the path.
 
     Returns:
-        [N-2], rad, as `motion.image_motion_rad` defines it; infinite if the previous and the next
-        record are in different submaps.
+        [N-2], rad, as `motion.image_motion_rad` defines it; infinite if the two neighbors are in
+        different submaps.
     """
     median_depth_m = np.array([record.median_depth_m for record in path[1:-1]])
     apart = image_motions_rad(se3.inverse(_poses(path[:-2])) @ _poses(path[2:]), median_depth_m)
@@ -373,7 +377,8 @@ def load_keyframe_database(folder: Path) -> KeyframeDatabase:
     if path is None:
         raise DataError(
             f"{folder} has no {DATABASE_FILE}, which localization needs. Give a folder that "
-            "`ldo run SOURCE --out DIR` wrote. If an older version wrote it, repeat the run."
+            "`ldo run SOURCE --out DIR` wrote. If an older version wrote the folder, repeat the "
+            "run."
         )
     try:
         kept = decode_state(path.read_bytes())

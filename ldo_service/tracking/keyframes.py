@@ -30,19 +30,21 @@ class KeyframeConfig:
     min_frames: int = 1
     # Maximum number of frames between reference keyframes while the camera moves.
     max_frames: int = 30
-    # A frame can become a reference for tracking alone (`Relay`) while the caller allows no
-    # keyframe. It does if its motion exceeds this multiple of max_rotation_rad or max_translation,
-    # or if its overlap is below min_overlap divided by this ratio. With 1, each held-out frame that
-    # needs a keyframe would become a relay and add a link to the chain of relative poses.
+    # A frame can become a relay while the caller allows no keyframe: a reference for tracking
+    # alone (`Relay`). It does so if its motion exceeds this multiple of max_rotation_rad or
+    # max_translation, or if its overlap is below min_overlap divided by this ratio. With a ratio of
+    # 1, each held-out frame that needs a keyframe would become a relay and add a link to the chain
+    # of relative poses.
     relay_ratio: float = 1.5
     # The camera stands still if the overlap is above still_overlap, and rotation (rad) and
     # translation (fraction of the median depth) are below still_motion.
     still_overlap: float = 0.97
     still_motion: float = 0.01
-    # A frame becomes a mapping keyframe beyond this fraction of max_rotation_rad and
-    # max_translation; the reference keyframe stays. More views improve the map, and fewer
-    # references improve tracking. At equal iterations on the sequence kitchen, held-out views gain
-    # 0.4 dB, and the worst of them 2 dB. With a value above 1, there are no mapping keyframes.
+    # A frame becomes a mapping keyframe if its motion since the last mapped frame exceeds this
+    # fraction of max_rotation_rad or max_translation; the reference keyframe stays. More views
+    # improve the map, and fewer references improve tracking. On the sequence kitchen, at equal
+    # iterations, mapping keyframes improve held-out views by 0.4 dB, and the worst one by 2 dB.
+    # With a value above 1, there are no mapping keyframes.
     mapping_only_ratio: float = 0.33
 
     def __post_init__(self) -> None:
@@ -129,7 +131,7 @@ class ReferenceKeyframe:
 
     @cached_property
     def reference(self) -> ReferencePoints:
-        """Surface points that frames are aligned to; masked pixels have none."""
+        """Surface points that frames are aligned to; masked pixels yield no points."""
         masks = [mask for mask in (self.ignore_mask, self.dynamic_class_mask) if mask is not None]
         return build_reference(self.view, np.logical_or.reduce(masks) if masks else None)
 
@@ -146,7 +148,7 @@ class ReferenceKeyframe:
         return self.__dict__["_features"]
 
     def recorrected(self, change: CorrectionChange, config: PyramidConfig) -> "ReferenceKeyframe":
-        """Return the keyframe as a changed correction of the camera would have made it."""
+        """Return the keyframe with images and features converted to a new camera correction."""
         view, camera = self.view, self.view.camera
         gray, depth_m = change.gray(view.gray, camera), change.depth_m(view.depth_m, camera)
         features = self.stored_features
@@ -181,7 +183,7 @@ class ReferenceKeyframe:
 
     @staticmethod
     def unpack(kept: dict[str, Any], config: PyramidConfig) -> "ReferenceKeyframe":
-        """Return the keyframe from its packed form; `config` must equal that of the packed one."""
+        """Return the keyframe from its packed form; `config` must be unchanged since packing."""
         features = None if kept["features"] is None else Features(**kept["features"])
         view = build_pyramid(kept["gray"], kept["depth_m"], Camera.of(kept["camera"]), config)
         return ReferenceKeyframe(

@@ -17,7 +17,7 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 from .tracking_result import TrackedFrame
 
 # Number of newest keyframes whose poses are stored: four credit windows of the topic keyframe/new.
-# The pose-graph optimizer cannot lag behind by more keyframes.
+# Backpressure keeps the pose-graph optimizer from lagging behind by more keyframes.
 RECENT_KEYFRAMES = 32
 
 
@@ -27,8 +27,8 @@ class MapCorrection:
 
     version: int
     roots: Mapping[int, int]  # Oldest submap that a submap is merged with, by submap.
-    # Function that returns T_map_keyframe [4, 4] by id. Its argument is the ids of the keyframes to
-    # return besides the newest one; None returns all keyframes.
+    # Function that returns T_map_keyframe [4, 4] by id. Its argument lists the ids to return; the
+    # newest keyframe is always returned too. None returns all keyframes.
     read_poses: Callable[[Iterable[int] | None], Mapping[int, np.ndarray]]
 
 

@@ -14,7 +14,7 @@ class ConstantVelocity:
     """Constant-velocity motion model: the last accepted pose and the motion before it."""
 
     T_odom_camera: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4]
-    # Motion from the pose before to the last pose, [6]: rotation rad, then translation m.
+    # Motion from the second-last pose to the last pose, [6]: rotation rad, then translation m.
     twist: np.ndarray = field(default_factory=lambda: np.zeros(6))
     interval_ns: int = 0  # Time between these two poses; 0 if unknown.
     stamp_ns: int = 0  # Stamp of the last pose.

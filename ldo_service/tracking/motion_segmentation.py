@@ -1,7 +1,7 @@
 """Motion segmentation by depth differences between a keyframe and an aligned frame.
 
 Points of the frame are projected into the keyframe, and points of the keyframe into the frame. Each
-point is compared with the depth measured there:
+point is compared with the depth that the other image measures at its pixel:
 
 - A point of the frame lies in front of the keyframe's surface: it has appeared since the keyframe.
 - A point of the keyframe lies in front of the frame's surface: it has disappeared since the

@@ -147,14 +147,14 @@ class Odometry:
         """Apply corrected keyframe poses of the pose graph; poses in odometry do not change.
 
         Returns:
-            True if the correction is newer than the last one. An older one changes nothing.
+            True if the correction is newer than the last one. Otherwise it changes nothing.
         """
         return self._map.correct(correction)
 
     def recorrect(self, change: CorrectionChange) -> None:
-        """Continue with frames to which another correction of the camera is applied.
+        """Convert all keyframes to a new camera correction, which applies to the next frames.
 
-        The known keyframes are changed as if it had been applied to them. Their poses stay.
+        The poses of the keyframes do not change.
         """
         state = self._frames.state
         self._frames.restore(state.recorrected(change, self.config.pyramid))

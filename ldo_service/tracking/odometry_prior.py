@@ -17,7 +17,7 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
-# Number of poses kept: a third of a second at 200 Hz. A frame is tracked within that time.
+# Number of poses kept: a third of a second at 200 Hz. Tracking a frame takes less time.
 KEPT = 64
 
 

@@ -239,7 +239,7 @@ class InitialGuessAligner:
     def _independent_estimate(
         self, keyframe: ReferenceKeyframe, view: Pyramid, T_keyframe_previous: np.ndarray
     ) -> tuple[np.ndarray | None, str]:
-        """Estimate T_keyframe_camera [4, 4] from ORB features, or by GICP if that fails.
+        """Estimate T_keyframe_camera [4, 4] from ORB features, or by GICP if the features fail.
 
         Returns:
             The pose, or None if both fail; and the name of the method.

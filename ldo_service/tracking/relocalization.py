@@ -65,18 +65,18 @@ PosedRecord = tuple[KeyframeRecord, FeaturePose]
 class RelocalizationConfig:
     """Settings of relocalization."""
 
-    # Number of records with the most similar thumbnails that a frame is compared with, as in the
-    # prototype.
+    # A frame is compared with this number of records, those with the most similar thumbnails. The
+    # prototype has the same value.
     appearance_candidates: int = 5
-    # Number of further records that a frame is compared with, in rotation. 1000 records take 11 s
-    # at 30 Hz.
+    # A frame is also compared with this number of further records, which rotate from search to
+    # search. At 30 Hz, the rotation through 1000 records takes 11 s.
     in_turn: int = 3
-    # Number of further records that a lost frame is compared with by SIFT, in rotation. SIFT
-    # matches across scales. 0: none.
+    # A lost frame is compared by SIFT, which matches across scales, with this number of further
+    # records. They rotate from search to search. 0: no SIFT.
     across_scales: int = 8
     # Maximum number of direct alignments per search, from the feature poses with most inliers.
     attempts: int = 3
-    # Minimum inlier fraction of the points paired with a measured depth, as in the prototype.
+    # Minimum inlier fraction of the points paired with a measured depth; value of the prototype.
     min_geometric_inliers: float = 0.85
     # Maximum rotation plus parallax between the feature pose and the pose by alignment.
     agreement_rad: float = 0.06
@@ -220,7 +220,7 @@ class Relocalizer:
     ) -> tuple[PosedRecord, tuple[ReferenceKeyframe, PoseHypothesis]] | None:
         """Return the first record and feature pose that direct alignment verifies.
 
-        The second element is the keyframe of the record with the alignment.
+        The second element of the result is the keyframe of that record, with the alignment to it.
         """
         for record, pose in poses[: self.config.attempts]:
             keyframe = record.keyframe(self.pyramid)
@@ -284,8 +284,8 @@ Nearby = tuple[KeyframeRecord, np.ndarray]
 class KeyframeReuseConfig:
     """Settings of keyframe reuse."""
 
-    # Number of keyframes, mapping keyframes included, after which known keyframes are reused; 0:
-    # never. Before that, the gain of new views is worth their cost, a few kB each.
+    # Known keyframes are reused once this number of keyframes, mapping keyframes included, have
+    # been made; 0: never. Before that, new keyframes improve the map and cost a few kB each.
     after: int = 1500
     # Maximum number of records that a frame is aligned to, the nearest first; 8 ms each at 640x480.
     tries: int = 2
@@ -316,7 +316,11 @@ class ReusedKeyframe:
     candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
     def measures(self, keyframe: int) -> RelativePose:
-        """Return the measured pose of a new keyframe, made of the aligned frame, in this one."""
+        """Return the measured pose of a new keyframe relative to this one.
+
+        Args:
+            keyframe: Id of the new keyframe, which is made of the aligned frame.
+        """
         seen = self.candidate.alignment
         return RelativePose(self.record.id, keyframe, seen.T_reference_camera, seen.information)
 

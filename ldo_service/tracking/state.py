@@ -127,9 +127,9 @@ class OdometryState:
         return replace(self, keyframe=reference, motion_evidence=evidence)
 
     def recorrected(self, change: CorrectionChange, config: PyramidConfig) -> "OdometryState":
-        """Return the state as a changed correction of the camera would have made its images.
+        """Return the state with all keyframes and records converted to a new camera correction.
 
-        The residuals of the frames before say nothing about those after the change.
+        The residual history is cleared, because the noise may differ from now on.
         """
         keyframe, mapped = self.keyframe, self.mapping_keyframe
         return replace(
@@ -178,7 +178,7 @@ def pack(state: OdometryState) -> dict[str, Any]:
 
 
 def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
-    """Return the state from its packed form; `config` must equal that of the packed state."""
+    """Return the state from its packed form; `config` must be unchanged since packing."""
     keyframe, evidence, dynamic_mask = (
         values["keyframe"],
         values["suspicion"],

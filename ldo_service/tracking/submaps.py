@@ -36,7 +36,7 @@ class SubmapConfig:
     # default is the field of view of a depth camera. Lower values merge sooner and accept
     # perceptual aliases.
     confirm_apart_rad: float = 1.0
-    misses: int = 3  # Maximum searches in a row without a match before a pending match is dropped.
+    misses: int = 3  # Number of searches in a row without a match that a pending match survives.
 
     def __post_init__(self) -> None:
         if not self.begin_after_s >= 0 or min(self.search_interval_frames, self.confirm_after) < 1:
@@ -165,7 +165,7 @@ class Submaps:
     def is_search_due(self, config: SubmapConfig) -> bool:
         """Return whether to search the other submaps with the current frame.
 
-        A search is due if unmerged submaps exist and enough frames have passed since the last one.
+        A search is due if unmerged submaps exist and the last search was long enough ago.
         """
         wait = config.search_interval_frames if self.pending_match is None else config.confirm_after
         return len(set(self.roots)) > 1 and self.frames_since_search >= wait

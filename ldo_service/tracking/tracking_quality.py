@@ -45,21 +45,21 @@ class TrackingQualityConfig:
     min_paired: float = 0.05
     # Maximum condition number of the information, with translation in median depths.
     max_condition: float = 1e5
-    # Maximum gain, and inverse of the minimum gain: 1.5 stops, as of a camera that moves into
-    # light.
+    # Maximum gain, and inverse of the minimum gain. A camera that moves into light changes its
+    # exposure by about this factor, 1.5 stops.
     max_gain: float = 3.0
     # The limits named residual are ratios of the noise of an alignment to its running median.
     weak_residual: float = 2.5  # Maximum ratio of an OK frame.
     lost_residual: float = 5.0  # A frame with a larger ratio is LOST.
     lost_overlap: float = 0.08  # A frame with a smaller overlap is LOST.
-    # Residual limits of a pose within confirmed_rad of the pose by features. They replace smaller
-    # limits, except while tracking is LOST. They were chosen on the ScanNet parts and on
-    # freiburg1_rpy. Of the frames above weak_residual, those within 0.03 rad of the feature pose
-    # erred by at most 0.01 rad, and the others by up to 0.07 rad.
+    # Residual limits of a pose within confirmed_rad of the pose by features. They replace the
+    # limits above if those are smaller, except while tracking is LOST. They were chosen on the
+    # ScanNet parts and on freiburg1_rpy. Of the frames above weak_residual, those within 0.03 rad
+    # of the feature pose erred by at most 0.01 rad, and the others by up to 0.07 rad.
     confirmed_rad: float = 0.03
     confirmed_weak_residual: float = 6.0
     confirmed_lost_residual: float = 15.0
-    # Lower bounds of the running medians, which any camera reaches. Intensity in gray levels.
+    # Lower bounds of the running medians: noise that any camera has. Intensity in gray levels.
     min_intensity_sigma: float = 2.0
     min_depth_noise_scale: float = 0.5
     # Minimum overlap of the first OK frame after a loss, unless an independent estimate confirms

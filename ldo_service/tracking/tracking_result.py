@@ -100,7 +100,7 @@ class TrackedFrame:
         )
 
     def relay(self) -> Relay:
-        """Return the pose of the frame in its keyframe, to align later frames to the frame."""
+        """Return the frame's pose in its keyframe as a relay, which later frames are aligned to."""
         return Relay(self.T_reference_camera, covariance_of(self.information))
 
 
@@ -110,7 +110,7 @@ class NewKeyframe:
 
     id: int
     kind: KeyframeKind
-    submap: int  # Submap that the keyframe was made in, even if it is merged with an older one.
+    submap: int  # Submap that the keyframe was made in, even if merged with an older submap.
     # Measured poses relative to earlier keyframes other than the reference.
     window: tuple[RelativePose, ...] = ()
     # Measured pose relative to a keyframe of another submap, which merges the submaps.
