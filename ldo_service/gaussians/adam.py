@@ -19,9 +19,9 @@ from .rows import aligned_rows
 class AdamConfig:
     """Learning rates of Adam for each parameter of a Gaussian.
 
-    A rate is about the change of its parameter in one step. The rates are 5 to 10 times those of
-    3DGS, because a keyframe gets tens of iterations instead of thousands. On a CPU, the map reaches
-    in 0.35 s the quality that the rates of 3DGS reach in 4.5 s.
+    A rate approximates the change of its parameter in one step. The rates are 5 to 10 times as high
+    as in 3DGS, because a keyframe gets tens of iterations instead of thousands. On a CPU, the map
+    reaches in 0.35 s the quality that it reaches in 4.5 s with the rates of 3DGS.
     """
 
     mean_m: float = 5e-4
@@ -31,7 +31,8 @@ class AdamConfig:
     color: float = 0.01
     beta1: float = 0.9  # Kingma and Ba, 2015.
     beta2: float = 0.95  # The usual 0.999 averages over more iterations than a keyframe gets.
-    epsilon: float = 1e-15  # The value of 3DGS: gradients are means over pixels, about 1e-7.
+    # Value of 3DGS. It is this small because gradients are means over pixels, about 1e-7.
+    epsilon: float = 1e-15
 
     def __post_init__(self) -> None:
         rates = (self.mean_m, self.log_scale, self.quat, self.opacity_logit, self.color)
@@ -47,7 +48,7 @@ class AdamConfig:
             )
 
     def rates(self) -> np.ndarray:
-        """Return the learning rate of each field of a row, [16] float32."""
+        """Return the learning rate of each column of a row (`gaussians.rows`), [16] float32."""
         groups = ((self.mean_m, 3), (self.log_scale, 3), (self.quat, 4), (self.opacity_logit, 1))
         out = [rate for rate, n in (*groups, (self.color, 3), (0.0, 2)) for _ in range(n)]
         return np.array(out, np.float32)
@@ -119,8 +120,8 @@ class Adam:
     ) -> VisibleGaussians:
         """Compute the gradients of the last rendering and take a step of Adam, in one pass.
 
-        The result equals that of `Rasterizer.gradients` and `step`. One pass is faster, since no
-        gradients are written to memory.
+        The result equals that of `Rasterizer.gradients` followed by `step`. One pass is faster,
+        since no gradients are written to memory.
 
         Args:
             gaussians: The map; its rows change.
@@ -200,7 +201,10 @@ class Adam:
         self._ids = ids.copy()
 
     def _sort_out(self, ids: np.ndarray) -> None:
-        """Move moments and step counts of remaining Gaussians to their new rows; the rest is 0."""
+        """Move moments and step counts of the remaining Gaussians to their new rows.
+
+        All other rows become zero.
+        """
         n = len(self._ids)
         old_places = np.searchsorted(self._ids, ids)
         stays = np.append(self._ids, -1)[old_places] == ids

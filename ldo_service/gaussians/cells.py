@@ -66,21 +66,22 @@ def quadtree(
 ) -> QuadtreeCells:
     """Divide an image into square cells: cells that are not uniform are split into four.
 
-    A cell is uniform if three conditions hold:
+    A cell is uniform if three conditions hold; a cell of one pixel needs only the last one:
 
     - Within the cell and a rim of one pixel, the values of each channel differ by at most
       `max_contrast`.
-    - The depths in the cell differ by at most `max_depth_step` times the largest of them.
+    - The depths in the cell differ by at most `max_depth_step` times the largest depth in it.
     - All pixels of the cell are in `wanted`.
 
     Args:
         color: [H, W, 3] uint8.
         depth_m: [H, W] float32, meters.
-        wanted: Pixels to cover, [H, W] bool. Each of them is in exactly one cell; all other pixels
-            are in none.
+        wanted: Pixels to cover, [H, W] bool. Each of these pixels is in exactly one cell; all other
+            pixels are in no cell.
         coarsest_px: Edge of the largest cells, a power of 2.
         max_contrast: Largest contrast of a uniform cell, 0..1.
-        max_depth_step: Largest depth difference in a uniform cell, as a fraction of its depth.
+        max_depth_step: Largest depth difference in a uniform cell, as a fraction of the largest
+            depth in it.
 
     Returns:
         The cells, from the largest size to single pixels.
@@ -117,7 +118,7 @@ def _means(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def _greatest(image: np.ndarray, size: int, rim: int = 0) -> np.ndarray:
-    """Return the maximum over each block of size x size pixels, enlarged by `rim` on all sides."""
+    """Return the maximum over each block of size x size pixels and its rim of `rim` pixels."""
     window = np.ones((size + 2 * rim,) * 2, np.uint8)
     return cv2.dilate(image, window, anchor=(rim, rim))[::size, ::size]
 

@@ -18,7 +18,7 @@ class Changes:
     Attributes:
         removed: Ids of removed Gaussians, [R] int64, ascending.
         changed: Rows of published Gaussians whose parameters or labels have changed, [C] int64.
-            Empty if `drain` was called without changed rows.
+            Empty if `drain` was called with `with_changed=False`.
         added: Rows of Gaussians that were never published, [A] int64.
     """
 
@@ -90,7 +90,7 @@ class ChangeLog:
         return Changes(removed, changed, np.arange(first_new, len(gaussians)))
 
     def mark_all_published(self, gaussians: GaussianMap) -> None:
-        """Drop all records: the whole map, which may be a restored one, counts as published."""
+        """Drop all records, so that the whole map counts as published, as after a restore."""
         newest = int(gaussians.ids[-1]) if len(gaussians) else -1
         self._next_untold = max(self._next_untold, newest + 1)
         self._is_changed = np.zeros(len(gaussians), bool)
@@ -133,17 +133,17 @@ class PublishedPoses:
         return moved
 
     def move(self, T_map: Mapping[int, np.ndarray]) -> None:
-        """Record the poses of a correction as published, so that `drain` omits its motions.
+        """Record corrected poses as published, so that `drain` does not return them.
 
         Args:
-            T_map: Corrected poses T_map_keyframe [4, 4] by id of the keyframe.
+            T_map: Poses T_map_keyframe [4, 4] after a correction of the pose graph, by keyframe id.
         """
         self._poses.update({k: T for k, T in T_map.items() if k in self._poses})
 
     def snapshot(self) -> np.ndarray:
-        """Return the last published poses [K, 4, 4] in the order of their ids."""
+        """Return the last published poses [K, 4, 4] in the order of the keyframe ids."""
         return self._poses.of(self._poses)
 
     def restore(self, keyframes: Collection[int], T_map: np.ndarray) -> None:
-        """Replace all poses by the T_map_keyframe [K, 4, 4] of a snapshot."""
+        """Replace all poses by the poses `T_map` [K, 4, 4] of `keyframes` from a snapshot."""
         self._poses.become(keyframes, T_map)

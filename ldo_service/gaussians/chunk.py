@@ -12,7 +12,7 @@ from ldo_service.errors import DataError
 from .model import LABEL_BYTES, GaussianBatch
 from .rows import ROW, transform_rows
 
-_HEADER = struct.Struct("<qq")  # Anchor, number of Gaussians.
+_HEADER = struct.Struct("<qq")  # Id of the anchor keyframe, number of Gaussians.
 _LEVEL = 1  # Compression level of zstd.
 
 
@@ -58,9 +58,9 @@ class Chunk:
 def pack(chunk: Chunk) -> bytes:
     """Compress a chunk to bytes.
 
-    Ids are stored as differences. Rows and labels are stored byte by byte: the first byte of every
-    Gaussian, then the second byte of every Gaussian, and so on. This compresses better, because
-    neighboring Gaussians often agree in a byte.
+    Ids are stored as differences of consecutive ids. Rows and labels are stored byte by byte: the
+    first byte of every Gaussian, then the second byte of every Gaussian, and so on. This compresses
+    better, because neighboring Gaussians often have equal bytes.
     """
     steps = np.diff(chunk.ids, prepend=0).astype("<i8")
     planes = np.ascontiguousarray(chunk.rows, "<f4").view(np.uint8).T

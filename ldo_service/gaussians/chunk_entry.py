@@ -1,4 +1,4 @@
-"""Records that stay in memory for chunks of Gaussians that are on disk or lost."""
+"""Records in memory of chunks whose Gaussians are on disk or lost."""
 
 from dataclasses import dataclass, replace
 

@@ -10,7 +10,7 @@ from .pruning import PruningConfig
 
 
 class Confirmation:
-    """Search for Gaussians that others hide, among the Gaussians of two keyframes per call.
+    """Search for hidden Gaussians, among the Gaussians that are anchored to two keyframes per call.
 
     Args:
         store: Store of the keyframe images.
@@ -29,9 +29,10 @@ class Confirmation:
         """Return the mask of the hidden Gaussians that are anchored to either of two keyframes.
 
         The first keyframe is the newest one that has `confirm_keyframes` later keyframes. The
-        second is drawn at random from it and all earlier ones, since the map around old keyframes
-        also changes. The map is rendered at both and at the newest keyframe. A Gaussian is hidden
-        if, in each of these images, its blending weights sum to less than `min_weight_px`.
+        second one is drawn at random from the first one and all earlier keyframes, since the map
+        around old keyframes also changes. The map is rendered at these two keyframes and at the
+        newest one. A Gaussian is hidden if its blending weights sum to less than `min_weight_px` in
+        each of these images.
 
         Args:
             gaussians: The map.

@@ -19,8 +19,8 @@ from .renderer import Rendering, render
 from .rows import ROW
 
 # The renderer adds 0.3 px^2 to the variance of every splat. Densification subtracts this much of
-# it from the variance of a new Gaussian. A larger value gives sharper images, but the full 0.3
-# leaves cracks between Gaussians of one pixel when the camera comes nearer.
+# it from the variance of a new Gaussian. A larger value gives sharper images. With the full 0.3,
+# cracks appear between Gaussians from one-pixel cells when the camera comes nearer.
 LOW_PASS_COMPENSATION_PX2 = 0.2
 
 
@@ -40,8 +40,9 @@ def surfels(
 
     Seen from this camera, each Gaussian looks round. In the image, its standard deviation is
     `sigma_per_spacing` times the side of its cell. On a slanted surface, the standard deviation
-    down the slope is longer than across it, by the factor 1 / cos of the angle between normal and
-    viewing ray. Along the normal, it is `thickness` times as long as across the slope.
+    down the slope is `1 / cos(angle)` times the standard deviation across the slope; `angle` is
+    between the normal and the viewing ray. The standard deviation along the normal is `thickness`
+    times the standard deviation across the slope.
 
     Args:
         cells: The cells.
@@ -51,7 +52,7 @@ def surfels(
         T_map_camera: Camera pose, [4, 4].
         sigma_per_spacing: Standard deviation as a fraction of the cell's side.
         thickness: Standard deviation along the normal as a fraction of the one across the slope.
-        max_stretch: Largest factor along the slope.
+        max_stretch: Upper bound of `1 / cos(angle)`.
         opacity: Opacity of each Gaussian, 0..1.
 
     Returns:
@@ -158,18 +159,18 @@ class DensificationConfig:
     # fraction of the rendered depth.
     in_front: float = 0.05
     # A nearer surface is not new if the map shows it within this many pixels, because depth is
-    # noisy at edges. With 0, each lap of an apartment adds 5 % of the map again although the
-    # poses are exact, and kitchen views lose 0.7 dB.
+    # noisy at edges. With 0, each further lap through an apartment adds 5 % Gaussians although the
+    # poses are exact, and the sequence kitchen loses 0.7 dB.
     edge_px: int = 2
     # A pixel is unexplained if its color error, averaged over the channels, exceeds this, 0..1.
-    # The criterion is off, because colors are not yet optimized when a keyframe is inserted. 0.1
-    # gives +0.3 dB for +57 % Gaussians, and adds as many at every visit: inserting the same 5
-    # frames six times grows the map from 101 k to 369 k Gaussians. Without the criterion, the map
-    # stays at 79 k.
+    # The default turns this criterion off, because colors are not optimized yet when a keyframe is
+    # densified. 0.1 gives +0.3 dB for +57 % Gaussians, but adds Gaussians again at every visit:
+    # densifying the same 5 frames six times increases the map from 101 k to 369 k Gaussians. With
+    # the criterion off, the map stays at 79 k.
     max_color_error: float = inf
     overlap_px: int = 2  # Margin around unexplained pixels; it closes seams. 0: -1.2 dB.
-    # Pixels without depth get the depth found within this distance. Holes that stay black limit
-    # the PSNR.
+    # Pixels without depth get the farthest depth within this many pixels. Holes that stay black
+    # limit the PSNR.
     hole_px: int = 4
 
     # Placement of the Gaussians.
@@ -179,22 +180,23 @@ class DensificationConfig:
     # Largest contrast of one cell and its rim, 0..1. 0.2 gives 30 % more Gaussians, and no better
     # image once they are optimized.
     max_contrast: float = 0.3
-    # Largest depth difference in one cell as a fraction of its depth; more is not one surface.
+    # Largest depth difference in one cell, as a fraction of the largest depth in it. A larger
+    # difference means several surfaces.
     max_depth_step: float = 0.05
 
     # Shape and color of the Gaussians.
     # Standard deviation as a fraction of the cell's side. 0.5: cracks, -2.0 dB; 0.7: blur, -0.6 dB.
     sigma_per_spacing: float = 0.6
-    # Standard deviation along the normal as a fraction of the one across; 0.03 to 0.3 look the
-    # same.
+    # Standard deviation along the normal as a fraction of the one across the slope; values from
+    # 0.03 to 0.3 look the same.
     thickness: float = 0.1
-    # Largest stretch along a slope, 1 / cos of 75 deg. Normals of steeper slopes are unreliable.
+    # Largest stretch down a slope, about 1 / cos(75 deg). Normals of steeper slopes are unreliable.
     max_stretch: float = 4.0
-    opacity: float = 0.95  # 0.9: -0.2 dB, dark grids on walls when the camera comes nearer.
+    opacity: float = 0.95  # 0.9: -0.2 dB, and dark grids on walls when the camera comes nearer.
     # Number of color corrections by the difference of frame and rendering. 0: -1.1 dB; 3: -0.4 dB
     # (overfits).
     color_steps: int = 1
-    # Largest correction of a channel, 0..1. Older Gaussians cause any larger difference.
+    # Largest correction of a color channel, 0..1. Older Gaussians cause the larger differences.
     max_color_step: float = 0.1
 
     def __post_init__(self) -> None:
@@ -310,7 +312,9 @@ def densify(
 def densification_mask(
     frame: RgbdFrame, rendering: Rendering, config: DensificationConfig
 ) -> np.ndarray:
-    """Return the pixels that show surface missing in the map, with a margin of `overlap_px`.
+    """Return the pixels where a keyframe shows surface that the map lacks, with a margin.
+
+    The margin around these pixels is `overlap_px` wide.
 
     Args:
         frame: The keyframe, with color corrected to the exposure of the map.
@@ -333,7 +337,7 @@ def densification_mask(
 
 
 def _without(frame: RgbdFrame, ignore_mask: np.ndarray, before: Rendering) -> RgbdFrame:
-    """Return the frame with the color of the rendering `before` and depth 0 in masked pixels."""
+    """Return the frame with masked pixels replaced: color by the rendering `before`, depth by 0."""
     shown = (255 * before.color.clip(0, 1) + 0.5).astype(np.uint8)
     color = np.where(ignore_mask[..., None], shown, frame.color)
     return replace(frame, color=color, depth_m=frame.depth_m * ~ignore_mask)
@@ -365,9 +369,9 @@ def correct_colors(
     rendering: Rendering,
     max_step: float,
 ) -> None:
-    """Correct the colors of new Gaussians by the mean difference of frame and rendering per cell.
+    """Correct the color of each new Gaussian by the mean color error of its cell.
 
-    Each channel stays in 0..1.
+    The color error is the frame minus the rendering. Each channel stays in 0..1.
 
     Args:
         colors: Colors of the new Gaussians, [M, 3], 0..1; changed in place.

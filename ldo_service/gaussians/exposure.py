@@ -5,31 +5,32 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-# Least divisor when an exposure is removed from an image. An image of a smaller gain does not
-# determine the brightness of the map.
+# Minimum gain that colors are divided by when an exposure is removed from an image. An image with a
+# smaller gain does not determine the brightness of the map.
 MIN_GAIN = 0.1
 # Images are compared as averages over blocks, so that a misplaced edge does not count as a
 # change of brightness.
 MIN_BLOCK_PX = 8
-BLOCKS_ACROSS = 40  # Blocks per image row; more give no more information.
-SATURATED = 0.97  # Fraction of the range above which the sensor saturates.
-MIN_SHARE = 0.15  # Minimum fraction of the blocks that can be compared.
-MIN_BLOCKS = 16  # Minimum number of these blocks.
+BLOCKS_ACROSS = 40  # Blocks across the width of an image; more blocks add no information.
+SATURATED = 0.97  # Color in 0..1 above which a pixel counts as saturated.
+MIN_SHARE = 0.15  # Minimum fraction of blocks that must be comparable.
+MIN_BLOCKS = 16  # Minimum number of comparable blocks.
 OUTLIER_SIGMAS = 2.5
 MAX_GAIN = 3.0  # Largest plausible gain, a stop and a half; the smallest is its inverse.
-ROUNDS = 6  # Maximum number of rounds of outlier rejection.
-# Standard deviations of the prior: the gain of a camera changes, and its bias is nearly zero. Where
-# a wall fills the image, gain and bias are ambiguous. With a free bias, such an image gave a gain
-# of 1.7 and wrong colors in the map. The prior gains 0.4 dB on held-out frames of half an
-# apartment.
+ROUNDS = 6  # Maximum number of iterations of outlier rejection.
+# Standard deviations of the prior: the gain of a camera changes, and its bias is nearly zero. If a
+# wall fills the image, gain and bias are ambiguous. With a free bias, such an image gave a gain of
+# 1.7 and wrong colors in the map. The prior gains 0.4 dB on held-out frames of a run through half
+# an apartment.
 GAIN_SIGMA = 0.3
-BIAS_SIGMA = 0.02  # Fraction of the range.
-# Largest number of independent measurements that an image counts as. It is below the number of
-# blocks, because errors of neighboring blocks are correlated.
+BIAS_SIGMA = 0.02  # Colors are in 0..1.
+# Maximum number of independent measurements that the blocks of an image count as. It is below the
+# number of blocks, because errors of neighboring blocks are correlated.
 PATCHES = 50
-# Standard deviation of a block's color, fraction of the range: in the first round, and the minimum.
+# Standard deviation of a block's color from the fitted line, for colors in 0..1: the value in the
+# first iteration, and the minimum.
 FIRST_SIGMA, MIN_SIGMA = 0.05, 0.01
-MAX_SIGMA = 0.1  # Two images with a larger standard deviation show different surfaces.
+MAX_SIGMA = 0.1  # Maximum standard deviation; above it, the images show different surfaces.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -59,7 +60,7 @@ class Exposure:
         return (self.gain * color + self.bias).clip(0, 1)
 
     def removed(self, color: np.ndarray) -> np.ndarray:
-        """Convert an image [H, W, 3] from this exposure to that of the map, in 0..1."""
+        """Convert an image [H, W, 3] from this exposure to the exposure of the map, in 0..1."""
         return ((color - self.bias) / np.maximum(self.gain, MIN_GAIN)).clip(0, 1)
 
 
@@ -68,8 +69,8 @@ def fit_exposure(
 ) -> Exposure:
     """Fit gain and bias by least squares, such that `seen` = gain * `rendered` + bias.
 
-    Use it for evaluation only: the fit uses the same image that is compared with the rendering. A
-    channel without contrast gets a gain of one.
+    Use this function for evaluation only: it fits to the image that the rendering is then compared
+    with. A channel without contrast gets a gain of one.
 
     Args:
         rendered: [H, W, 3], 0..1.
@@ -90,8 +91,8 @@ def estimate_exposure(
     """Estimate gain and bias of an image relative to the rendering of the map at its pose.
 
     The estimate is a least-squares fit over mean colors of pixel blocks. Only opaque, unsaturated
-    pixels are used. Outliers, such as moved objects and new surface, are removed. A prior pulls the
-    gain towards 1 and, more strongly, the bias towards 0.
+    pixels are used. Outliers, such as moved objects and new surface, are excluded. A prior pulls
+    the gain towards 1 and, more strongly, the bias towards 0.
 
     Args:
         rendered: Rendered color, [3, H, W], 0..1.
@@ -119,7 +120,7 @@ def estimate_exposure(
 
 
 def _averaged(plane: np.ndarray) -> np.ndarray:
-    """Return the means over square blocks of an image [H, W], without incomplete blocks."""
+    """Return the mean of each square block of an image [H, W]; incomplete blocks are omitted."""
     block = max(MIN_BLOCK_PX, plane.shape[1] // BLOCKS_ACROSS)
     height, width = (n // block for n in plane.shape)
     plane = np.ascontiguousarray(plane[: height * block, : width * block], np.float32)
@@ -137,8 +138,8 @@ def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
         y: Colors of the same blocks in the camera image, [M], 0..1.
 
     Returns:
-        Slope a and offset b. Then the standard deviation of all M points from that line, estimated
-        from the median absolute deviation (MAD).
+        Slope a and offset b of the line. Then the standard deviation of all M points from the line,
+        estimated from the median absolute deviation (MAD).
     """
     gain_weight, bias_weight = GAIN_SIGMA**-2, BIAS_SIGMA**-2
     x, y = x.astype(float), y.astype(float)

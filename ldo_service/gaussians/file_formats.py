@@ -6,8 +6,8 @@
         A byte of the quaternion is 128 (1 + q), so a rotation is accurate to about half a degree.
         Axes are those of the map. Format: https://github.com/antimatter15/splat
 .spz    Quantized and compressed to about a tenth of the size of a PLY.
-        Means are fixed point (0.24 mm, up to 2 km), log scales have steps of 1/16, opacity and
-        color are bytes, and quaternions are accurate to about a tenth of a degree.
+        Means are fixed point with steps of 0.24 mm, up to 2 km. Log scales have steps of 1/16,
+        opacity and color are bytes, and quaternions are accurate to about a tenth of a degree.
         Format: https://github.com/nianticlabs/spz
 
 An .spz file has the axes of OpenGL: x right, y up, z back. `gsply.write_spz` does not convert
@@ -40,7 +40,7 @@ OF_A_ROW = (
     *("opacity", "f_dc_0", "f_dc_1", "f_dc_2"),  # The last three columns of a row hold RGB.
 )
 COLUMNS = {name: column for column, name in enumerate(OF_A_ROW)}
-# Byte order of NumPy by format name.
+# NumPy byte order of each PLY format; empty for text.
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 TYPES = {
     name: kind
@@ -56,14 +56,15 @@ TYPES = {
     )
     for name in names
 }
-MAX_LINE = 4096  # Bytes of the longest line that a header may have.
+MAX_LINE = 4096  # Maximum length of a header line, bytes.
 
 SPLAT = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)]
 )
 
 OPENGL = np.array([1, -1, -1], np.float32)  # Map axes to OpenGL axes, and back.
-OPENGL_QUAT = np.array([1, 1, -1, -1], np.float32)  # Rotation R to F R F, with F = diag(OPENGL).
+# Factors from the quaternion of a rotation R to the quaternion of F R F, with F = diag(OPENGL).
+OPENGL_QUAT = np.array([1, 1, -1, -1], np.float32)
 
 
 def write_ply(path: Path, rows: np.ndarray) -> None:
@@ -96,8 +97,8 @@ def read_ply(path: Path) -> np.ndarray:
         Gaussian rows [N, 16] float32 (see `gaussians.rows`).
 
     Raises:
-        DataError: The file is cut off or too long, lacks a property, or holds NaN, infinity or a
-            quaternion of length zero.
+        DataError: The file cannot be read, is cut off or too long, lacks a property, or holds NaN,
+            infinity or a quaternion of length zero.
     """
     try:
         with path.open("rb") as file:
@@ -142,31 +143,31 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
             case _:
                 raise DataError(f"{path}: its header has an unknown line {' '.join(words)!r}.")
     if byte_order is None:
-        raise DataError(f"{path}: its header names no format, so it is no PLY file.")
+        raise DataError(f"{path}: its header names no format, so it is not a PLY file.")
     if next(iter(elements), None) != "vertex":
-        raise DataError(f"{path}: its first element is not `vertex`, so it is no map of Gaussians.")
+        raise DataError(f"{path} is not a map of Gaussians: its first element is not `vertex`.")
     return _Header(byte_order, *elements["vertex"], is_last=len(elements) == 1)
 
 
 def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
     """Yield the words of each line between `ply` and `end_header`, without comments."""
     if file.readline(MAX_LINE).rstrip() != b"ply":
-        raise DataError(f"{path} is no PLY file: it does not start with `ply`.")
+        raise DataError(f"{path} is not a PLY file: it does not start with `ply`.")
     while line := file.readline(MAX_LINE):
         words = line.decode("ascii", "replace").split()
         if words == ["end_header"]:
             return
         if words and words[0] not in ("comment", "obj_info"):
             yield words
-    raise DataError(f"{path} is cut off: its header has no end.")
+    raise DataError(f"{path} is cut off: its header has no end, the line `end_header`.")
 
 
 def _read_vertices(path: Path, header: _Header, body: bytes) -> dict[str, np.ndarray]:
     missing = [name for name in COLUMNS if name not in header.properties]
     if missing:
         raise DataError(
-            f"{path} has no property {missing[0]}: it is no map of Gaussians in the format of 3D "
-            "Gaussian splatting."
+            f"{path} has no property {missing[0]}: it is not a map of Gaussians in the format "
+            "of 3D Gaussian splatting."
         )
     if header.byte_order:
         return _binary_vertices(path, header, body)
@@ -186,7 +187,7 @@ def _text_vertices(path: Path, header: _Header, body: bytes) -> dict[str, np.nda
     try:
         table = np.array(words[: header.count * width], float).reshape(header.count, width)
     except ValueError as error:
-        raise DataError(f"{path}: {error}.") from error
+        raise DataError(f"{path} holds text that is not a number: {error}.") from error
     return {name: table[:, list(header.properties).index(name)] for name in COLUMNS}
 
 
@@ -200,7 +201,7 @@ def _require_size(path: Path, header: _Header, found: int, each: int, unit: str)
     if found > expected and header.is_last:
         raise DataError(
             f"{path} holds {found - expected} {unit} beyond the {header.count} Gaussians of its "
-            "header: header and content do not match."
+            "header: header and content do not match. Write the file again."
         )
 
 
@@ -214,7 +215,7 @@ def _rows(path: Path, vertices: dict[str, np.ndarray]) -> np.ndarray:
     if bad.any():
         raise DataError(
             f"{path}: {bad.sum()} of {len(rows)} Gaussians hold NaN, infinity or a quaternion of "
-            f"length zero (first: number {np.argmax(bad)}). Write the file again without them."
+            f"length zero (first index: {np.argmax(bad)}). Write the file again without them."
         )
     return rows
 

@@ -15,8 +15,8 @@ from .model import GaussianMap
 from .optimizer import GaussianOptimizer, GaussianOptimizerConfig
 from .training_views import TrainingView, covisibility_ratio, sample_training_views, sampled_surface
 
-# Number of random draws per keyframe that is needed. The spare ones replace keyframes that are
-# skipped, because they see offloaded Gaussians.
+# Number of random draws per needed keyframe. The additional draws replace drawn keyframes that may
+# see offloaded Gaussians.
 TRIES_PER_DRAW = 4
 
 
@@ -24,17 +24,18 @@ TRIES_PER_DRAW = 4
 class ViewSamplingConfig:
     """Settings of the choice of keyframes to which the map is fitted after a new keyframe.
 
-    Without iterations on random keyframes, the map would get worse where the newest keyframe does
-    not look. In published ablations, these iterations gain 4.2 dB PSNR, and iterations on covisible
-    keyframes gain 1.1 dB.
+    Without iterations on random keyframes, the map would get worse in places that the newest
+    keyframe does not show. In published ablations, iterations on random keyframes gain 4.2 dB PSNR,
+    and iterations on covisible keyframes gain 1.1 dB.
     """
 
     newest_share: float = 0.3  # Fraction of the iterations that use the newest keyframe.
     # Fraction of the iterations that use a covisible keyframe; the rest use a random keyframe.
     covisible_share: float = 0.3
     min_shared: float = 0.3  # Least overlap of a covisible keyframe with the newest one, 0..1.
-    recent: int = 32  # Number of last keyframes that are checked for covisibility.
-    # Number of random earlier keyframes that are checked too. It is fixed, so that the cost does
+    # Number of keyframes just before the newest one that are checked for covisibility.
+    recent: int = 32
+    # Number of random earlier keyframes that are checked too. It is constant, so that the cost does
     # not grow with the length of the run.
     earlier: int = 32
 
@@ -60,8 +61,8 @@ class Fitting:
         window: Settings of the choice after a new keyframe.
         views: Keyframes to fit the map to.
         is_resident: Function that returns whether all Gaussians that may be visible in a keyframe
-            are in memory. Other keyframes are skipped: the Gaussians in memory would move to where
-            offloaded Gaussians are missing.
+            are in memory. Keyframes with the result False are skipped: the Gaussians in memory
+            would move to where offloaded Gaussians are missing.
         seed: Seed of the random choice of keyframes.
         threads: Threads of the renderer.
     """
@@ -84,7 +85,7 @@ class Fitting:
 
     @property
     def threads(self) -> int:
-        """Threads of the renderer and the optimizer; the results do not depend on them."""
+        """Number of threads of renderer and optimizer; the results do not depend on it."""
         return self._optimizer.threads
 
     @threads.setter
@@ -140,16 +141,16 @@ class Fitting:
     def plan_refinement(self, iterations: int, first: Sequence[int]) -> Iterable[int]:
         """Return keyframes of `first` and random keyframes alternately, `iterations` in total.
 
-        There are fewer if offloaded Gaussians may be visible in most keyframes.
+        The result is shorter if offloaded Gaussians may be visible in most keyframes.
         """
         drawn = self._sample_keyframes(iterations - len(first))
         return (k for pair in zip_longest(first, drawn) for k in pair if k is not None)
 
     def _sample_keyframes(self, count: int) -> list[int]:
-        """Return up to `count` random keyframes in which no offloaded Gaussians may be visible.
+        """Return up to `count` random keyframes that cannot see offloaded Gaussians.
 
-        A keyframe may occur several times. There are fewer than `count` if most keyframes may see
-        offloaded Gaussians.
+        A keyframe may occur several times. The result has fewer than `count` keyframes if most
+        keyframes may see offloaded Gaussians.
         """
         known = self._views.store.keyframes()
         if not known:
@@ -167,13 +168,13 @@ class Fitting:
     ) -> np.ndarray:
         """Run one iteration for each usable keyframe of the plan.
 
-        A keyframe is usable if its images are readable and no offloaded Gaussians may be visible in
-        it.
+        A keyframe is usable if its images are readable and all Gaussians that may be visible in it
+        are in memory.
 
         Args:
             gaussians: The map.
             plan: Keyframes, in the order of the iterations.
-            rates: Factor on the learning rates at the first and at the last iteration.
+            rates: Factors on the learning rates at the first and at the last iteration.
             effort: Limit of the computation; see `GaussianOptimizer.optimize`.
 
         Returns:

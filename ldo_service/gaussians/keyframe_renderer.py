@@ -13,7 +13,7 @@ class KeyframeRenderer:
     """Renderer of the Gaussians in memory; it caches the last rendering at a keyframe."""
 
     def __init__(self, views: KeyframeViews, threads: int) -> None:
-        """Initialize without a rendering.
+        """Create a renderer with an empty cache.
 
         Args:
             views: Cameras and poses of the keyframes.

@@ -21,8 +21,8 @@ from .visibility import BLOCKS, MaxDepthGrid, PlacedCamera
 log = logging.getLogger(__name__)
 
 _DISK_FULL = (
-    "The newest keyframes stay in memory (cache_mb), older ones will be missing; free some disk "
-    "space, or lower quota_mb."
+    "Images of new keyframes stay only in memory, up to cache_mb, and are then dropped. To keep "
+    "them, free some disk space or lower quota_mb."
 )
 
 
@@ -30,11 +30,11 @@ _DISK_FULL = (
 class KeyframeStoreConfig:
     """Limits of the keyframe store."""
 
-    cache_mb: float = 256.0  # Memory: 119 keyframes of 640x480 with 2.15 MB each.
-    quota_mb: float = 4096.0  # Disk: about 8,000 keyframes of 640x480 with 0.5 MB each.
+    cache_mb: float = 256.0  # Maximum memory: 119 keyframes of 640x480 with 2.15 MB each.
+    quota_mb: float = 4096.0  # Maximum disk space: 8,000 keyframes of 640x480 with 0.5 MB each.
     # Maximum number of keyframes on disk; the view of each also takes 3 kB of memory.
     max_keyframes: int = 20_000
-    # Number of newest keyframes that the quota never removes, because the map is fitted to them.
+    # Number of newest keyframes that are never dropped, because the map is fitted to them.
     newest_kept: int = 8
 
     def __post_init__(self) -> None:
@@ -51,7 +51,7 @@ class KeyframeStoreConfig:
 
 
 class KeyframeStore:
-    """Store of keyframe images in `folder`, including images that are there already.
+    """Store of keyframe images in `folder`, including images that the folder contains already.
 
     If `folder` is None, the store uses a temporary folder and removes it at the end. When the store
     exceeds its quota, it drops the most redundant keyframes (see `_most_redundant`). If the disk is
@@ -77,7 +77,7 @@ class KeyframeStore:
         self._make_room()
 
     def get(self, keyframe: int) -> KeyframeImages | None:
-        """Return the images of a keyframe, read-only and bitwise unchanged; None if not stored."""
+        """Return the images of a keyframe, read-only and bitwise unchanged; None if unavailable."""
         images = self._cache.get(keyframe)
         if images is not None:
             self._cache.move_to_end(keyframe)
@@ -159,12 +159,13 @@ class KeyframeStore:
             self._forgotten += 1
 
     def _most_redundant(self) -> int | None:
-        """Return the keyframe on disk whose previous and next stored ids are closest to each other.
+        """Return the keyframe on disk whose neighbors on disk have ids closest to each other.
 
-        These two keyframes probably show the same surface, and the remaining keyframes stay spread
-        over the whole run. Of several such keyframes, the oldest is returned. The first keyframe is
-        never returned, since it fixes the pose and the brightness of the map. The `newest_kept`
-        newest ones are never returned either.
+        The neighbors are the previous and the next keyframe on disk. They probably show the same
+        surface as the returned keyframe, and the remaining keyframes stay spread over the whole
+        run. Of several such keyframes, the oldest is returned. The first keyframe is never
+        returned, since it fixes the pose and the brightness of the map. The `newest_kept` newest
+        keyframes are never returned either.
 
         Returns:
             Id of the keyframe, or None if no keyframe may be dropped.
@@ -182,8 +183,8 @@ class KeyframeViews:
     Attributes:
         store: The images.
         cameras: Intrinsics of each keyframe with images.
-        poses: T_map_camera [4, 4] of every keyframe of the run, also without images, since
-            Gaussians are anchored to them. A pose takes 136 bytes.
+        poses: T_map_camera [4, 4] of every keyframe of the run. A pose remains when the images are
+            dropped, since Gaussians are anchored to the keyframe. A pose takes 136 bytes.
         exposures: Exposure of each keyframe with images.
         horizons: Grid of the farthest depths of each keyframe with images. `cameras`, `exposures`
             and `horizons` have the same order; together they take 1.5 kB per keyframe.

@@ -14,7 +14,7 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 
 from .map_builder import MapBuilder
 
-# Numbers cubes of space by one integer each; cubes within a million of the origin differ.
+# Factors that turn the three indices of a cube into one number, unique for indices up to a million.
 CUBE_STRIDES = np.array([1 << 42, 1 << 21, 1], np.int64)
 
 
@@ -22,27 +22,31 @@ CUBE_STRIDES = np.array([1 << 42, 1 << 21, 1], np.int64)
 class LoopRefitConfig:
     """Settings of the deduplication and the refit after pose corrections."""
 
-    # A keyframe that moves farther against its surroundings is deduplicated and refitted. Normal
-    # iterations correct smaller motions.
+    # A keyframe is deduplicated and refitted if it moves relative to its surroundings by more than
+    # this distance or angle. Normal iterations correct smaller motions.
     min_motion_m: float = 0.01
     min_motion_rad: float = 0.01
     # Edge of the cubes in which motions are compared, meters. A correction of less than 0.5 % of
-    # the path bends the map by less than `min_motion_m` within a cube.
+    # the path length bends the map by less than `min_motion_m` within a cube.
     cube_m: float = 2.0
-    # Keyframes deduplicated with each new keyframe; 100 moved ones take 50 keyframes.
+    # Number of keyframes that are deduplicated with each new keyframe. The deduplication of 100
+    # displaced keyframes thus ends after 50 new ones.
     deduplicated_per_keyframe: int = 2
-    deduplicated_at_end: int = 200  # Newest keyframes deduplicated at the end; takes some seconds.
-    # Iterations after the deduplication of each keyframe. A new keyframe gets as many while many
-    # others wait.
+    # Maximum number of keyframes that are deduplicated at the end, newest first; takes some
+    # seconds.
+    deduplicated_at_end: int = 200
+    # Iterations after the deduplication of each keyframe. A new keyframe gets at least as many
+    # (`MapperConfig.min_iterations`).
     deduplication_iterations: int = 3
-    # Refit iterations for a displaced keyframe, half of them on other keyframes; as many as for a
-    # new keyframe.
+    # Refit iterations for each displaced keyframe, half of them on other keyframes. A new keyframe
+    # gets as many iterations.
     iterations: int = 12
-    # Pending refit iterations that run with each new keyframe while no other waits; mapping then
-    # takes 50 % longer. The rest runs while no keyframe arrives, and at the end of offline runs.
+    # Number of pending refit iterations that run with each new keyframe if no further keyframe
+    # waits; mapping then takes 50 % longer. The other pending iterations run while no keyframe
+    # arrives, and at the end of offline runs.
     iterations_per_keyframe: int = 6
-    # Pending refit iterations that run without a break while no keyframe arrives. They delay the
-    # next keyframe by at most 0.8 s, measured on two cores at 640x480.
+    # Number of pending refit iterations that run in one go while no keyframe arrives. They delay
+    # the next keyframe by at most 0.8 s, measured on two cores at 640x480.
     iterations_while_idle: int = 12
 
     def __post_init__(self) -> None:
@@ -53,10 +57,10 @@ class LoopRefitConfig:
 
 
 def displaced_mask(T_now: np.ndarray, T_before: np.ndarray, config: LoopRefitConfig) -> np.ndarray:
-    """Return which keyframes moved far against the oldest keyframe within the same cube.
+    """Return which keyframes moved far relative to the oldest keyframe in the same cube of space.
 
     Two grids of cubes are used, shifted by half an edge along each axis, since a boundary of one
-    grid may separate two passes through the same place.
+    grid may lie between the keyframes of two passes through the same place.
 
     Args:
         T_now: Poses T_map_keyframe after the correction, [K, 4, 4], oldest first.
@@ -84,10 +88,10 @@ class LoopRefit:
     The Gaussians of a keyframe move with it. A part of the map that a correction moves as a whole
     stays as good as it was. Work is needed where keyframes that see the same surface move
     differently, such as on both sides of a loop closure. A keyframe counts as displaced if it
-    moves far against the oldest keyframe within the same cube of space.
+    moves far relative to the oldest keyframe in the same cube of space.
 
-    Deduplication. The surface of a displaced keyframe may lie on surface that the map contains
-    already. The keyframe is queued for deduplication.
+    Deduplication. After a correction, the Gaussians of a displaced keyframe may duplicate older
+    Gaussians of the same surface. The keyframe is queued for deduplication.
 
     Refit. A displaced keyframe gets pending refit iterations. Half of them optimize against this
     keyframe, the other half against random keyframes. Optimizing against displaced keyframes alone
@@ -156,8 +160,8 @@ class LoopRefit:
     def has_work(self) -> bool:
         """Return whether keyframes wait for deduplication or for refit iterations.
 
-        Refit iterations of keyframes that see offloaded Gaussians do not count. They wait until the
-        camera is near, and the Gaussians are loaded.
+        Refit iterations of keyframes that may see offloaded Gaussians do not count. They wait until
+        the camera comes near and these Gaussians are loaded.
         """
         return bool(self._to_deduplicate) or bool(self._resident_keyframes())
 
@@ -165,7 +169,8 @@ class LoopRefit:
         """Do a part of the pending deduplication and refit while no keyframe arrives.
 
         Args:
-            threads: Threads of the iterations. The tracker has little to do then.
+            threads: Threads during this call. There may be more than usual, since the tracker has
+                little to do meanwhile.
         """
         config, fitting = self.config, self._map.fitting
         usual, fitting.threads = fitting.threads, threads
@@ -209,9 +214,9 @@ class LoopRefit:
         self._forget()
 
     def _resident_keyframes(self) -> list[int]:
-        """Return the keyframes with pending iterations that see no offloaded Gaussians.
+        """Return the keyframes with pending iterations that cannot see offloaded Gaussians.
 
-        The map cannot be fitted to the other keyframes until these Gaussians are loaded.
+        The map cannot be fitted to the other keyframes until their offloaded Gaussians are loaded.
         """
         self._forget()
         return [k for k in self._pending if self._map.is_resident(k)]

@@ -59,8 +59,9 @@ def image_loss(
 
         L = l1 mean|x - y| + d_ssim (1 - mean SSIM(x, y)) + depth mean|D - d|,  x = gain C + bias
 
-    SSIM has an 11x11 Gaussian window of sigma 1.5 px and zeros beyond the image, as in 3DGS
-    (Wang et al., 2004; Kerbl et al., 2023). The result is bitwise equal for any number of threads.
+    SSIM has an 11x11 Gaussian window of sigma 1.5 px, and pixels beyond the image count as 0, as in
+    3DGS (Wang et al., 2004; Kerbl et al., 2023). The result is bitwise equal for any number of
+    threads.
 
     Args:
         planes: Rendering [5, H, W] float32: colors C, weighted depth D in meters, opacity (unused).
@@ -121,6 +122,6 @@ def tile_mask(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
     """
     shape = -(-height // TILE), -(-width // TILE)
     if tiles.shape != shape or not tiles.any():
-        raise ValueError(f"tiles {tiles.shape} must have shape {shape} and a value that is not 0.")
+        raise ValueError(f"tiles {tiles.shape}: they must have shape {shape} and not all be 0.")
     pixels = (tiles != 0).repeat(TILE, axis=0).repeat(TILE, axis=1)[:height, :width]
     return np.ascontiguousarray(pixels, np.uint8)

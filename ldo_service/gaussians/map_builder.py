@@ -25,10 +25,10 @@ from .renderer import Contributions, Rendering
 from .training_views import TrainingView, visible_in_mask
 from .visibility import BoundingSpheres, MaxDepthGrid, PlacedCamera, chunk_numbers, plan_offload
 
-# Most iterations per unit of effort (see `GaussianOptimizer.optimize`): an iteration in which
+# Maximum iterations per unit of effort (see `GaussianOptimizer.optimize`): an iteration in which
 # almost no Gaussians are visible counts as half a unit.
 MAX_ITERATIONS_PER_EFFORT = 2
-# Files in the folder of a map to which its snapshots refer: keyframe images, offloaded Gaussians.
+# Files in a map folder that snapshots of the map refer to: keyframe images, offloaded Gaussians.
 FILE_PATTERNS = ("images/*.keyframe", "gaussians/*.gaussians")
 
 
@@ -92,8 +92,8 @@ class MapBuilder:
             frame: Color and depth of the keyframe.
             T_map_camera: Pose of the keyframe, [4, 4].
             keyframe: Id of the keyframe, larger than all ids before.
-            iterations: Number of iterations if `usual_reach` Gaussians are visible in each. If more
-                are visible, fewer iterations run, so that the time stays the same.
+            iterations: Number of iterations if `usual_reach` Gaussians are visible in each. With
+                more visible Gaussians, fewer iterations run, so that the time stays the same.
             dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool; None if none.
         """
         self._load_visible(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
@@ -138,8 +138,8 @@ class MapBuilder:
     def _exposure(self, frame: RgbdFrame, before: Rendering, counts: np.ndarray | None) -> Exposure:
         """Estimate the exposure of a frame relative to the map.
 
-        If that fails, for example because the map covers too little of the image, the exposure of
-        the previous keyframe is returned. The first keyframe then gets gain 1 and bias 0.
+        If the estimate fails, for example because the map covers too little of the image, the
+        exposure of the previous keyframe is returned. The first keyframe then gets gain 1, bias 0.
         """
         rendered, seen = before.color.transpose(2, 0, 1), frame.color.transpose(2, 0, 1)
         estimated = estimate_exposure(rendered, before.opacity, seen, counts)
@@ -238,7 +238,7 @@ class MapBuilder:
 
     # --- after a correction -----------------------------------------------------------------------
     def deduplicate_keyframe(self, keyframe: int, iterations: int) -> int:
-        """Remove Gaussians of a keyframe that duplicate older ones, after a loop closure.
+        """Remove the Gaussians of a keyframe that duplicate older Gaussians, after a loop closure.
 
         The map is then fitted to this keyframe. One call takes a short time, so that the caller can
         map new keyframes between two calls. The number of removed Gaussians is returned.
@@ -369,7 +369,7 @@ class MapBuilder:
         }
 
     def saved(self) -> None:
-        """Remove the files that the last snapshot does not need; call it once that is on disk."""
+        """Remove files that the last snapshot does not need; call it after saving that snapshot."""
         self.offloaded.saved()
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -388,7 +388,7 @@ class MapBuilder:
             "gaussians": len(self.gaussians),
             "gaussians_pruned": self._pruned,
             "iterations": self.fitting.iterations,
-            # Keyframes chosen for fitting that see offloaded Gaussians or have no readable images.
+            # Chosen keyframes that may see offloaded Gaussians, or whose images are unreadable.
             "keyframes_skipped": self.fitting.unusable,
             # Gaussians in memory beyond the limit, because recent keyframes may see them.
             "gaussians_over_limit": self._excess,

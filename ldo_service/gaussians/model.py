@@ -14,7 +14,7 @@ from ldo_service.kernels._rasterize import Bounds
 
 from .rows import ROW, aligned_rows, move_rows
 
-# Bytes of a Gaussian's labels (see `semantics.gaussian_labels`); all are 0 before an observation.
+# Bytes of a Gaussian's labels (`semantics.gaussian_labels`); all are 0 before any observation.
 LABEL_BYTES = 32
 
 
@@ -244,11 +244,12 @@ class GaussianMap:
             labels: [M, 32]; None for Gaussians without observations.
 
         Raises:
-            ValueError: An array has another shape, or the rows hold NaN or infinity. It is also
-                raised for an id that is present, is given twice, or was never assigned here.
+            ValueError: An array has another shape, or the rows hold NaN or infinity. Or an id is
+                in the map already, is given twice, or was never assigned by this map.
         """
         returned = _piece(ids, rows, anchors, labels).at(np.argsort(ids, kind="stable"))
-        before = np.searchsorted(self.ids, returned.ids)  # Number of present rows before each.
+        # Number of rows of the map before each of these Gaussians.
+        before = np.searchsorted(self.ids, returned.ids)
         self._require_absent(returned.ids, before)
         if len(ids) == 0:
             return

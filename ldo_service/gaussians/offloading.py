@@ -22,8 +22,8 @@ from .visibility import BoundingSpheres, PlacedCamera
 
 log = logging.getLogger(__name__)
 
-_DISK_FULL = "Gaussians stay in memory, which may run out: free some disk space."
-MAX_MOTIONS = 32  # Pending motions of the anchor of a chunk; a chunk with more is rewritten.
+_DISK_FULL = "The Gaussians stay in memory, which may run out: free some disk space."
+MAX_MOTIONS = 32  # Maximum pending motions of a chunk; a chunk with more is rewritten.
 REWRITTEN_PER_CALL = 16  # Chunks rewritten per call of `move_anchors`: 2 ms each.
 
 
@@ -31,13 +31,14 @@ class OffloadedGaussians:
     """Store of offloaded chunks in `folder`.
 
     Loading restores Gaussians exactly: they are bitwise equal to Gaussians that stayed in memory
-    and moved with their anchor keyframes. A chunk on disk takes less than 1 kB of memory. If
-    `folder` is None, a temporary folder is used and removed at the end. Not thread-safe.
+    and moved with their anchor keyframes. A chunk on disk takes less than 1 kB of memory
+    beside its pending motions. If `folder` is None, a temporary folder is used and removed at the
+    end. Not thread-safe.
 
-    The folder contains the chunks of one state only. `restore` removes all other files; without
-    `restore`, the first `put` removes them. When a chunk is loaded, its file stays: a process
-    restored from the last snapshot would need it. The file is removed once a later snapshot, which
-    does not contain the chunk, has been saved (`saved`).
+    The folder contains the chunks of one map only. `restore` removes all files that are not in the
+    snapshot. Without `restore`, the first `put` removes all earlier files. When a chunk is loaded,
+    its file stays, since a process restored from the last snapshot would need the file. The file is
+    removed once a later snapshot, which does not contain the chunk, has been saved (`saved`).
 
     Raises:
         ConfigError: The folder cannot be used.
@@ -48,7 +49,7 @@ class OffloadedGaussians:
         self._entries: dict[int, ChunkEntry] = {}  # Key: file number, ascending.
         self._next_number = 0
         self._retired: list[int] = []  # Files that became unused after the last snapshot.
-        self._retired_before: list[int] = []  # Files that became unused before that snapshot.
+        self._retired_before: list[int] = []  # Files that the last snapshot does not need.
         self._spheres: BoundingSpheres | None = None  # Cache; None after a change of the entries.
         self._lost: list[LostIdRange] = []  # Ranges that `pop_lost_ids` will return.
         self._slept = self._awoken = self._damaged = 0
@@ -75,8 +76,8 @@ class OffloadedGaussians:
         ids, rows = chunk.ids, chunk.rows
         if len(ids) == 0 or len(ids) != len(rows) or np.any(np.diff(ids) <= 0):
             raise ValueError(
-                f"chunk of anchor {chunk.anchor}: its {len(ids)} ids must ascend, one per row, and "
-                "not be empty."
+                f"chunk of anchor keyframe {chunk.anchor}: its {len(ids)} ids must ascend. There "
+                "must be at least one row, and one id per row."
             )
         if self._next_number == 0:
             self._remove_unknown()

@@ -38,7 +38,7 @@ class PoseAdam:
             gradient: dL/dxi of the pose T exp(xi), [6]: rotation rad, translation m.
 
         Returns:
-            Direction, [6]. The step is the negative of it, times the learning rates.
+            Direction, [6]. The step is this direction times the negative learning rates.
         """
         mean, square, steps = self._moments.setdefault(keyframe, np.zeros((3, WIDTH)))
         steps += 1
@@ -70,16 +70,17 @@ class GaussianOptimizerConfig:
 
     adam: AdamConfig = field(default_factory=AdamConfig)
     loss: LossWeights = field(default_factory=LossWeights)
-    # Weight of the penalty on needles: the mean of log(longest / middle axis) above
-    # log(max_needle_ratio); see `Rasterizer.gradients`.
+    # Weight of the penalty on needle-shaped Gaussians: the mean excess of log(longest / middle
+    # axis) over log(max_needle_ratio); see `Rasterizer.gradients`.
     needle_weight: float = 0.01
-    # Densification gives this ratio to surfaces seen at a grazing angle.
+    # Ratio of the axes above which the penalty applies. Densification gives at most this ratio, on
+    # surfaces seen at a grazing angle.
     max_needle_ratio: float = 4.0
 
     # Longest standard deviation of a Gaussian after a step, in pixels of the view; densification
-    # gives at most 10. Without a limit, a single Gaussian grows over a whole wall and over what is
-    # observed there later. This costs 3 dB on held-out frames of the first 240 frames of an
-    # apartment. Limits of 14 and 10 cost 0.3 and 0.6 dB in the kitchen.
+    # gives at most 10. Without a limit, a single Gaussian grows over a whole wall and covers
+    # surface that is observed there later. This costs 3 dB on held-out frames among the first 240
+    # frames of an apartment. Limits of 14 and 10 cost 0.3 and 0.6 dB in the sequence kitchen.
     max_sigma_px: float = 20.0
 
     # Number of visible Gaussians at which an iteration spends half of its time on the pixels and
@@ -87,12 +88,13 @@ class GaussianOptimizerConfig:
     usual_reach: int = 60_000
 
     # Each iteration moves the exposure of its keyframe by this fraction of the way to the
-    # estimate. 0 keeps the exposures constant; 1 is as good. Gradient steps with a prior of gain 1
-    # would lag behind, which cost 2.3 dB in an apartment where gains vary by a fifth.
+    # estimate. 0 keeps the exposures constant; 1 gives the same quality as 0.3. Gradient steps with
+    # a prior of gain 1 would lag behind the camera's exposure, which cost 2.3 dB in an apartment
+    # where gains vary by a fifth.
     exposure_share: float = 0.3
-    # Learning rates of keyframe poses; 0 keeps the poses constant. 2e-4 gains 0.3 dB in that
-    # apartment. It adds 1 mm of noise to exact poses (90 frames of a Replica apartment: ATE 0.02 cm
-    # without, 0.13 cm with).
+    # Learning rates of keyframe poses; 0 keeps the poses constant. 2e-4 gains 0.3 dB in the same
+    # apartment. It adds 1 mm of noise to exact poses: on 90 frames of a Replica apartment, the ATE
+    # is 0.13 cm with 2e-4 and 0.02 cm with 0.
     rotation_rate_rad: float = 0.0
     translation_rate_m: float = 0.0
 
@@ -189,7 +191,7 @@ class GaussianOptimizer:
             rates: Factors on the learning rates at the first and at the last iteration; they change
                 geometrically in between. Use 1 while the map grows, less to converge at the end.
             fixed: Keyframe whose pose and exposure stay constant, to fix the pose and the
-                brightness of the map. None lets all of them change.
+                brightness of the map. With None, no keyframe stays constant.
             effort: Limit of the computing time, in iterations with `usual_reach` visible Gaussians.
                 An iteration with r times as many visible Gaussians counts as (1 + r) / 2. No
                 iteration starts once the sum has reached `effort`.

@@ -18,17 +18,17 @@ class PruningConfig:
     """Criteria of the pruning."""
 
     min_opacity: float = 0.005  # Kerbl et al., 2023, sec. 5.2.
-    # Largest length of a Gaussian's longest axis, relative to the mean of the other Gaussians in
-    # its neighborhood (paper, III.A).
+    # Largest length of a Gaussian's longest axis, relative to the mean longest axis of the other
+    # Gaussians in its neighborhood (paper, III.A).
     max_relative_scale: float = 10.0
     neighborhood_m: float = 0.25  # Edge of the cubes of space that are the neighborhoods.
     # A Gaussian must be visible in the image of its anchor keyframe or of the newest keyframe. This
     # is checked when this many keyframes have followed the anchor keyframe, and later at random.
-    # Hidden Gaussians are removed, because others have grown over them.
+    # Hidden Gaussians are removed, because other Gaussians have grown over them.
     confirm_keyframes: int = 5
     # Least sum of a visible Gaussian's blending weights over an image; 0 turns the check off. In
-    # the kitchen, the map has 430 k Gaussians without the check and 165 k with it; the PSNR of
-    # held-out views differs by 0.1 dB.
+    # the sequence kitchen, the map has 430 k Gaussians without the check and 165 k with the check;
+    # the PSNR of held-out views differs by 0.1 dB.
     min_weight_px: float = 0.25
 
     def __post_init__(self) -> None:
@@ -49,8 +49,8 @@ class PruningConfig:
 def prunable_mask(rows: np.ndarray, config: PruningConfig | None = None) -> np.ndarray:
     """Return the mask of Gaussians that are nearly transparent, oversized or not finite.
 
-    A Gaussian is oversized if its longest axis exceeds `max_relative_scale` times the mean of the
-    other Gaussians in its cube of edge `neighborhood_m`.
+    A Gaussian is oversized if its longest axis exceeds `max_relative_scale` times the mean longest
+    axis of the other Gaussians in its cube of edge `neighborhood_m`.
 
     Args:
         rows: [N, 16].
@@ -84,7 +84,7 @@ def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.nda
 
 
 def weights(rows: np.ndarray) -> np.ndarray:
-    """Return the approximate contribution of each Gaussian, rows [N, 16], to an image, [N].
+    """Return how much each Gaussian of `rows` [N, 16] approximately contributes to an image, [N].
 
     The contribution is the opacity times the product of the two larger standard deviations, m^2.
     """
@@ -111,15 +111,15 @@ class DeduplicationConfig:
     # Least difference between the ids of the two anchor keyframes. When a keyframe was mapped, the
     # Gaussians of the keyframes just before it were in view, so it added no duplicates of them.
     keyframes_apart: int = 30
-    # Largest distance along the normal. A loop closure is accurate to one or two centimeters, and
-    # the two sides of a door are 4 cm apart.
+    # Largest distance along the normal of the older Gaussian. A loop closure is accurate to one or
+    # two centimeters, and the two sides of a door are 4 cm apart.
     off_m: float = 0.03
     # Largest distance in the plane of the older Gaussian, relative to its longest standard
-    # deviation. The corners of a densification cell are at 1.18.
+    # deviation. The corners of a densification cell are 1.18 standard deviations from the center.
     reach_sigmas: float = 1.25
     min_cosine: float = 0.8  # Least |cos| of the angle between the normals: 37 deg.
-    # Largest difference in any channel, 0..1. It allows for different exposures, but keeps a
-    # picture on a wall.
+    # Largest difference in any color channel, 0..1. It allows for different exposures, but does not
+    # take a picture on a wall for a duplicate of the wall.
     max_color: float = 0.25
     neighbors: int = 4  # Number of nearest older Gaussians that each Gaussian is compared with.
 
@@ -171,7 +171,7 @@ def find_duplicates(
 
 
 def _within(rows: np.ndarray, among: np.ndarray, points: np.ndarray, reach_m: float) -> np.ndarray:
-    """Return the indices of the rows near some points, out of the mask `among` [N] bool.
+    """Return the indices of the rows near some points, where the mask `among` [N] is True.
 
     Near means inside the bounding box of the points [M, 3], enlarged by `reach_m` on all sides.
     """

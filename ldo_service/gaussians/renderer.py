@@ -53,7 +53,7 @@ class RowGradients:
 
     Attributes:
         indices: Rows that may touch the image, [V] uint32, ascending.
-        rows: dL/drow, [V, 16] float32. Column 14 is no derivative: it is the blending weight of the
+        rows: dL/drow, [V, 16] float32. Column 14 is not a derivative but the blending weight of the
             Gaussian summed over the pixels. Column 15 is zero. A hidden Gaussian has only zeros.
         xi: dL/dxi at xi = 0 of T_map_camera exp(xi), [6] float64: rotation rad, translation m.
     """
@@ -115,7 +115,8 @@ class Rasterizer:
             bounds: Bounds of these rows (`GaussianMap.bounds`), which save reading invisible rows.
                 None reads all rows.
             tiles: [ceil(H / 16), ceil(W / 16)] uint8. Tiles with value 0 are not rendered, and
-                their pixels are zero. Pass the same array to `image_loss`, which then ignores them.
+                their pixels are zero. Pass the same array to `image_loss`, so that it ignores these
+                tiles.
 
         Returns:
             Planes [5, H, W] float32: red, green, blue, weighted depth sum w_i z_i in meters, and

@@ -16,8 +16,8 @@ from ldo_service.geometry import Camera, RgbdFrame, se3
 from .exposure import Exposure
 
 _LEVEL = 1  # Compression level of zstd.
-# A depth image that compresses to less than this fraction counts as quantized: the sensor measures
-# in steps, so the same bytes repeat.
+# A depth image that compresses to less than this fraction of its size counts as quantized: the
+# sensor measures in steps, so the same bytes repeat.
 _QUANTIZED = 0.25
 
 
@@ -51,7 +51,7 @@ class TrainingView:
 
 
 def sampled_surface(view: TrainingView, *, step_px: int = 32) -> np.ndarray:
-    """Return the measured 3D points at every `step_px`-th row and column, [M, 3] in the map."""
+    """Return measured 3D points in the map frame, [M, 3], at every `step_px`-th row and column."""
     coarse = slice(step_px // 2, None, step_px)
     z = view.depth_m[coarse, coarse]
     points = view.camera.rays()[coarse, coarse][z > 0] * z[z > 0][:, None]
@@ -109,7 +109,7 @@ def sample_training_views(
 ) -> list[int]:
     """Choose the keyframe of each iteration at random.
 
-    If the list for an iteration is empty, the iteration uses the newest keyframe.
+    An iteration that would draw from an empty list uses the newest keyframe.
 
     Args:
         newest: The newest keyframe. The first iteration uses it unless `newest_share` is 0.
@@ -179,7 +179,7 @@ class KeyframeImages:
         return cls(view.keyframe, view.camera, view.color, view.depth_m, view.mask)
 
     def view(self, T_map_camera: np.ndarray, exposure: Exposure | None = None) -> TrainingView:
-        """Return the training view at a pose [4, 4] and with an exposure; None: gain 1, bias 0."""
+        """Return the training view with a pose [4, 4] and an exposure; None is gain 1, bias 0."""
         return TrainingView(
             self.keyframe,
             self.camera,
@@ -257,9 +257,10 @@ def unpack(body: bytes | memoryview) -> KeyframeImages:
 
 
 def _color_differences(color: np.ndarray) -> np.ndarray:
-    """Return color as small differences, which compress better; all are modulo 256.
+    """Return color as small differences, which compress better.
 
-    Green is subtracted from red and blue, then from each row the row above it.
+    Green is subtracted from red and blue. Then the row above is subtracted from each row. All
+    differences are modulo 256.
     """
     out = color.copy()
     out[0::2] -= color[1]
@@ -279,7 +280,7 @@ def _packed_depth(depth_m: np.ndarray) -> tuple[bytes, bool]:
     """Compress depth [H, W].
 
     Quantized depth is stored unchanged. Other depth is stored as differences between rows, with the
-    first bytes of all values first, then the second bytes and so on. This halves its size.
+    first bytes of all values first, then the second bytes and so on. This halves the size.
 
     Returns:
         The bytes, and whether they contain differences.

@@ -15,13 +15,14 @@ from ldo_service.geometry import Camera, se3
 from .densification import with_small_holes_filled
 
 BLOCKS = 12, 16  # Blocks of an image, vertically and horizontally; a grid takes 0.8 kB.
-# Fraction of the depth: a point that lies less than this behind the surface counts as visible,
+# A point counts as visible if it lies behind the surface by less than this fraction of the depth,
 # because depth is noisy.
 BEHIND = 0.1
-LOW_PASS_PX = 2.0  # 3.33 times the square root of the 0.3 px^2 that the renderer adds to a splat.
+# Margin for the 0.3 px^2 that the renderer adds to the variance of a splat: 3.33 sqrt(0.3) = 1.8.
+LOW_PASS_PX = 2.0
 _HOLE_PX = 4  # Equals the hole_px of densification; holes beside an object show the background.
 
-# `render` draws a Gaussian up to alpha = 1/255: sqrt(2 ln 255) = 3.33 standard deviations. The
+# `render` draws a Gaussian out to alpha = 1/255: sqrt(2 ln 255) = 3.33 standard deviations. The
 # affine approximation makes splats near the edge of the image up to 1.3 times as wide as the
 # projected ellipsoid. The Jacobian is evaluated over an area 1.3 times as wide as the image
 # (kernels/projection.hpp).
@@ -137,8 +138,8 @@ class PlacedCamera:
         """Return which spheres the camera may see.
 
         These are the spheres that touch the view frustum and do not lie behind `horizon`. The
-        result is conservative: never False for a visible sphere, but True for some spheres just
-        outside. It is True for spheres with NaN.
+        result is conservative: never False for a visible sphere, but True for some invisible
+        spheres. It is True for spheres with NaN.
 
         Args:
             centers_map: Centers in the map frame, [K, 3].
@@ -175,7 +176,7 @@ class PlacedCamera:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoundingSpheres:
-    """Bounding spheres of K chunks of Gaussians, at the extent to which Gaussians are rendered.
+    """Bounding spheres of K chunks; each contains the rendered extent of the Gaussians of a chunk.
 
     Attributes:
         anchors: Id of the anchor keyframe of each chunk, [K]; several chunks may have the same.
@@ -261,10 +262,10 @@ class OffloadConfig:
     # is checked every mapper.publish.update_interval_keyframes keyframes. Until then, new and
     # loaded Gaussians may exceed it.
     max_active: int = 1_500_000
-    # Fraction of max_active that remains after offloading, so each batch takes about 0.1 s.
+    # Fraction of max_active that remains in memory after offloading; this takes about 0.1 s.
     low_water: float = 0.9
-    # Largest distance at which Gaussians count as visible. Depth cameras measure less far, so
-    # densification adds nothing twice where Gaussians are offloaded. Within this distance, the
+    # Largest distance at which Gaussians count as visible. Depth cameras do not measure this far,
+    # so densification does not add surface whose Gaussians are offloaded. Within this distance, the
     # measured surface hides the Gaussians behind it.
     reach_m: float = 20.0
     # Edge of the cubes of space; the Gaussians of one keyframe in one cube form a chunk. In an

@@ -9,8 +9,8 @@ Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy, pixels.
 isa: str
 
 # Average the 2x2 blocks of an image [H, W] to [H // 2, W // 2]. Zeros are missing values. Only
-# values of at most (1 + `tolerance`) times the lowest value of a block are averaged. A block with
-# fewer than `least` such values gives 0.
+# values of at most (1 + `tolerance`) times the lowest value of a block are averaged. The result is
+# 0 for a block with fewer than `least` such values.
 def halve(values: Image, tolerance: float, least: int = 1) -> Image: ...
 
 # Combine gray levels [H, W] (0 where clipped) and depth [H, W] in meters (0 where missing) into
@@ -25,12 +25,12 @@ def normals(depth_m: Image, intrinsics: Intrinsics, radius: int) -> Image: ...
 def points(texels: Image, normals: Image, intrinsics: Intrinsics) -> Image: ...
 
 # Compute the Hessian [8, 8] and the gradient [8] of all residuals, and seven sums. The unknowns are
-# rotation, translation, gain and bias. The sums are the number of visible points, then the number,
-# the number of inliers and the sum of weighted squares of the photometric residuals, then the same
-# three of the geometric residuals.
+# rotation, translation, gain and bias. The first sum is the number of visible points. Three sums
+# follow for the photometric residuals: number, number of inliers and sum of weighted squares. The
+# last three are the same for the geometric residuals.
 # `noise` is (floor, growth, nearest) of the depth noise: sigma = floor + growth (z - nearest)^2, in
-# meters. `gate` is the largest depth difference of a pair of points, and `occlusion` the distance
-# behind the measured surface at which a point is hidden; both are fractions of the depth.
+# meters. `gate` is the largest depth difference between a point and the target surface. A point is
+# hidden if it lies more than `occlusion` behind that surface. Both are fractions of the depth.
 def normal_equations(
     points: Image,
     texels: Image,

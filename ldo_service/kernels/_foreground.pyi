@@ -27,7 +27,8 @@ def surfaces(
         cy: Principal point, pixels.
         max_step: Maximum step of depth within 3x3 pixels of one surface, fraction of depth.
         min_cosine: Minimum cosine of normals 4 px apart on one surface.
-        labels: Output, [H, W]: the piece of each pixel; 0 on edges and where depth is missing.
+        labels: Output, [H, W]: number of the piece that each pixel belongs to; 0 on edges and where
+            depth is missing.
 
     Returns:
         The number of pixels of each label, [S].
@@ -68,7 +69,7 @@ def foreground(
         depth_bin: Width of a bin of the depth mode, fraction of depth.
         near_mode: Maximum distance from the mode, fraction of depth.
         grow_px: Number of pixels by which the mask grows.
-        mask: Output, [h, w], a window within the image: 1 on the object, else 0.
+        mask: Output of the size of the window, [h, w]: 1 on the object, else 0.
 
     Raises:
         ValueError: An array has the wrong shape, type or strides, a number is out of range, or the

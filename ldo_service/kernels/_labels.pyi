@@ -41,15 +41,15 @@ def assign(
         boxes: Boxes x0 y0 x1 y1 of the regions, [M, 4], pixels.
         scores: Scores of the regions, [M], 0..1.
         rects: Column, row, width and height of the rectangle that each region's mask covers,
-            [M, 4]. A region of width 0 has no mask and is its whole box.
+            [M, 4]. A region whose rectangle has width 0 has no mask and covers its whole box.
         sums: Summed-area tables [height + 1, width + 1] of the masks, one after the other.
         by_iou: Whether the overlap is the IoU of region and splat. If False, it is the fraction of
             the splat that the region covers.
         min_overlap: Overlap that a region must exceed.
         max_depth_gap_m: Maximum distance between a Gaussian and the measured surface, meters.
-        region: Output, [V]: number of the region; -1 for no region, -2 for a Gaussian that is not
-            expected in the image.
-        overlap: Output, [V]: overlap with that region.
+        region: Output, [V]: number of the matched region; -1 for no region, -2 for a Gaussian that
+            is not expected in the image.
+        overlap: Output, [V]: overlap with the matched region.
         z: Output, [V]: depth of the Gaussian, meters.
         threads: Number of threads.
 
@@ -84,7 +84,8 @@ def update(
         confidence: Confidences of the labels, [V], 0..1.
         extent_m: Extent of the label's object, [V], meters; for a miss, the minimum extent of an
             object that counts as missed.
-        is_corrected: Whether the corrected moving average is used. If False, the paper's is used.
+        is_corrected: Whether the corrected moving average is used. If False, the moving average of
+            the paper is used.
         keep: Factor on earlier observations, in [0, 1).
         miss_weight: Weight of a miss as an observation of background, 0..1.
         miss_limit: Misses in a row that reset a row to background, for the paper's average.

@@ -132,7 +132,7 @@ def rasterize_planes(
         The number V of Gaussians that may touch the image.
 
     Raises:
-        ValueError: As for `rasterize`, or `tiles` does not fit.
+        ValueError: As for `rasterize`, or `tiles` has the wrong shape, type or strides.
     """
 
 def backpropagate(
@@ -146,7 +146,7 @@ def backpropagate(
     needle_log_ratio: float = 0.0,
     threads: int = 1,
 ) -> NDArray[np.float64]:
-    """Compute the derivatives of a loss L from those by the planes of the last rendering.
+    """Compute the derivatives of a loss L by rows and pose, from its derivatives by the planes.
 
     Args:
         forward: Pass of the last `rasterize_planes`, with V visible Gaussians.
@@ -157,8 +157,8 @@ def backpropagate(
         row_gradients: Output, [V, 16]: derivatives of L by these rows, with the sum of the
             Gaussian's weights in field 14.
         needle_weight: Weight of the penalty on needle-shaped Gaussians, which is added to L.
-        needle_log_ratio: Logarithm of the ratio of the longest to the middle axis from which the
-            penalty applies.
+        needle_log_ratio: Logarithm of the axis ratio, longest to middle, above which the penalty
+            applies.
         threads: Number of threads.
 
     Returns:
@@ -190,9 +190,9 @@ def descend(
 ) -> NDArray[np.float64]:
     """Run `backpropagate` and `adam_step` in one pass that never stores the row gradients.
 
-    `rows`, `mean`, `square` and `steps` change in place; the result is bitwise equal to that of
-    `adam_step`. Then the standard deviations of changed rows are limited to `max_sigma_px`. The
-    rendering in `forward` cannot be differentiated again.
+    `rows`, `mean`, `square` and `steps` change in place, bitwise as if both functions were called.
+    Then the standard deviations of changed rows are limited to `max_sigma_px`. The rendering in
+    `forward` cannot be differentiated again.
 
     Args:
         forward: Pass of the last `rasterize_planes`, with V visible Gaussians.

@@ -53,7 +53,7 @@ struct Equations {
 // Entry points, compiled once per instruction set.
 struct Kernels {
   // Average each 2x2 block over the values of at most (1 + `tolerance`) times its lowest value.
-  // Zeros are missing values. A block with fewer than `least` such values gives 0.
+  // Zeros are missing values. The result is 0 for a block with fewer than `least` such values.
   void (*halve)(const float* values, int width, int height, float tolerance, int least, float* out);
   // Combine an image and its depth into texels. Depth beyond `max_depth` becomes 0. Gradients are
   // central differences, 0 on the border and next to clipped pixels.

@@ -91,7 +91,8 @@ class BoxForeground {
         belongs_(window.width, window.height),
         mask_(window.width, window.height) {}
 
-  // Write `mask` [height, width] of the window, 0 or 1. Return false if a label has no size.
+  // Write `mask` [height, width] of the window, 0 or 1. Return false if a label has no entry in the
+  // sizes of the labels.
   bool write(uint8_t* mask) {
     std::fill_n(mask, static_cast<int64_t>(window_.height) * window_.width, uint8_t{0});
     if (!find_mode()) return true;
@@ -139,7 +140,7 @@ class BoxForeground {
   // Copy the depths of pixels that may belong to the object. Such a pixel lies on an edge (label 0)
   // or on a surface that is mostly inside the box. Its depth differs from the mode by less than the
   // longer side of the box in meters, or by less than near_mode times the mode if that is more.
-  // Return false if a label has no size.
+  // Return false if a label has no entry in the sizes of the labels.
   bool find_what_belongs() {
     const std::vector<Run> all = runs();
     std::vector<int64_t> inside(found_.count, 0);
@@ -211,8 +212,8 @@ class BoxForeground {
     return count;
   }
 
-  // Grow the mask by one pixel, over pixels of `belongs_` at about the depth of the farthest of the
-  // neighbors in the mask.
+  // Grow the mask by one pixel. A pixel of `belongs_` joins the mask if its depth is close to that
+  // of its farthest neighbor in the mask.
   void grow() {
     Plane grown(window_.width, window_.height);
     const float near = static_cast<float>(rule_.near_mode);

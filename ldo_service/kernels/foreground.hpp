@@ -43,7 +43,7 @@ struct ForegroundRule {
   namespace isa {                                                                       \
   std::vector<int64_t> surfaces(const DepthImage& image, const Pinhole& camera,         \
                                 const SurfaceRule& rule, int32_t* labels);              \
-  /* Return false if a label has no size. */                                            \
+  /* Return false if a label has no entry in `sizes`. */                                \
   bool foreground(const DepthImage& image, double focal_px, const SurfaceLabels& found, \
                   const Window& window, const ForegroundRule& rule, uint8_t* mask);     \
   }

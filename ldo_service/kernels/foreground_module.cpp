@@ -94,7 +94,7 @@ void foreground(const Array& depth_m, double focal_px, const Array& labels, cons
     nb::gil_scoped_release release;
     is_known = kernels.foreground(image, focal_px, found, window, rule, out);
   }
-  require(is_known, "labels must be those that sizes has.");
+  require(is_known, "each label must be at least 0 and below the length of sizes.");
 }
 
 }  // namespace

@@ -145,7 +145,7 @@ void require_observations(const Observations& seen, size_t v) {
     confident &= (label < 0) | ((c >= 0.0f) & (c <= 1.0f));
     sized &= seen.extent_m[i] >= 0.0f;
   }
-  require(labels, "labels that were observed must be below 256, -1 for a miss, or -2.");
+  require(labels, "observed must hold labels below 256, -1 for a miss or -2 for no observation.");
   require(confident, "confidences must lie in 0..1.");
   require(sized, "extents must not be negative.");
 }
@@ -181,7 +181,8 @@ nb::tuple agree(const Array& rows, const WritableArray& labels, const Array& ind
   LabelRow* label_rows = label_rows_of(labels);
   const uint32_t* which = indices_of(indices, labels.shape(0));
   const int64_t v = static_cast<int64_t>(indices.shape(0));
-  require(sigma_m > 0 && std::isfinite(sigma_m) && radius_m > 0, "lengths must be positive.");
+  require(sigma_m > 0 && std::isfinite(sigma_m) && radius_m > 0,
+          "sigma_m and radius_m must be positive, and sigma_m finite.");
   require(is_share(rate), "rate must lie in 0..1.");
   Disagreement out;
   {

@@ -55,7 +55,8 @@ Kernels kernels;  // Set together with `isa`.
 class Exclusive {
  public:
   explicit Exclusive(std::mutex& busy) : lock_(busy, std::try_to_lock) {
-    require(lock_.owns_lock(), "this pass is in use by another thread: give each its own.");
+    require(lock_.owns_lock(),
+            "this pass or these bounds are in use by another thread: give each thread its own.");
   }
 
  private:
@@ -132,7 +133,8 @@ class BoundsOfPython {
 template <class AnyArray>
 const float* rows_of(const AnyArray& rows, const std::string& name) {
   require(rows.ndim() == 2 && rows.shape(1) == kRowFloats, name + " must have shape [N, 16].");
-  require(rows.shape(0) <= static_cast<size_t>(kMaxGaussians), name + ": more than 2^27.");
+  require(rows.shape(0) <= static_cast<size_t>(kMaxGaussians),
+          name + " must hold at most 2^27 Gaussians.");
   return values_of<float>(rows, name);
 }
 
@@ -201,7 +203,8 @@ int64_t rasterize_planes(PassOfPython& held, const Array& rows, const Array& T_c
                          BoundsOfPython* bounds, const std::optional<Array>& tiles) {
   require_threads(threads);
   require(planes.ndim() == 3 && planes.shape(0) == kPlanes, "planes must have shape [5, H, W].");
-  require(planes.shape(1) <= kMaxSide && planes.shape(2) <= kMaxSide, "planes are too large.");
+  require(planes.shape(1) <= kMaxSide && planes.shape(2) <= kMaxSide,
+          "planes may have at most 32768 pixels a side.");
   const Seen seen(rows, bounds);
   float* images = values_of<float>(planes, "planes");
   const View view = view_of(T_camera_map, fx, fy, cx, cy, static_cast<int>(planes.shape(2)),
@@ -257,7 +260,7 @@ struct Backward {
     const size_t height = pass->view.height, width = pass->view.width;
     require(rows_of(rows, "rows") == pass->rows &&
                 static_cast<int64_t>(rows.shape(0)) == pass->gaussians,
-            "rows are not those that were rendered.");
+            "rows are not those that were rendered: give the rows of the last rendering.");
     require_shape(planes, "planes", {kPlanes, height, width});
     require_shape(gradients, "gradients", {kPlanes, height, width});
     images = values_of<float>(planes, "planes");
