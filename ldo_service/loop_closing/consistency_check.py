@@ -27,8 +27,8 @@ class ConsistencyCheckConfig:
     drift: float = 0.1  # Additional drift per meter of path; ten times the drift of depth cameras.
     turn_rad: float = 0.35  # Allowed rotation drift on any path.
     turn_rad_per_m: float = 0.02  # Additional rotation drift per meter of path; 1.1 degrees.
-    # Maximum pose difference of two cameras that see the same surfaces, to which the allowed drift
-    # is added: the rotation is at most the width of a view, the distance is in median depths.
+    # Maximum pose difference of two cameras that see the same surfaces: rotation (the width of a
+    # view), and distance in median depths. The allowed drift is added to these limits.
     view_rad: float = 1.5
     view_depths: float = 2.0
     # A hypothesis is ambiguous if another one has at least this fraction of its inliers, and if the
@@ -51,7 +51,7 @@ class ConsistencyCheckConfig:
 class ConsistencyChecker:
     """Check of loop hypotheses against the known keyframe poses.
 
-    Hypotheses between submaps that are not merged pass unchecked, because the relative pose of the
+    Hypotheses between submaps that are not merged are not checked, because the relative pose of the
     submaps is unknown.
     """
 
@@ -62,7 +62,7 @@ class ConsistencyChecker:
 
         Args:
             poses: Keyframe poses in the map.
-            merged: Merged submaps, each with the older one that it is merged into.
+            merged: For each merged submap, the older submap that it is merged into.
             config: Limits.
         """
         self._poses, self._merged_submaps, self._config = poses, merged, config
@@ -119,8 +119,8 @@ class ConsistencyChecker:
     def reject_aliased(self, proposals: Sequence[LoopHypothesis]) -> list[LoopHypothesis]:
         """Return all hypotheses of a new subgraph, with the ambiguous ones rejected.
 
-        A hypothesis is ambiguous if another one puts the new keyframe far away from where this one
-        puts it, and has nearly as many inliers (`ambiguous_rad`, `ambiguous_inlier_ratio`).
+        A hypothesis is ambiguous if another one has enough inliers (`ambiguous_inlier_ratio`) and
+        gives the new keyframe a pose that differs by more than `ambiguous_rad`.
         """
         return [
             replace(proposal, rejected_reason="ambiguous: another place fits as well")
@@ -164,7 +164,7 @@ class ConsistencyChecker:
     def _drift(
         self, old: SubgraphKeyframe, new: SubgraphKeyframe, T_old_new: np.ndarray
     ) -> tuple[float, float]:
-        """Return the difference between a measured relative pose and that in the map, m and rad."""
+        """Return the difference of a measured relative pose and the one in the map, m and rad."""
         T_map_new = self._poses[old.keyframe] @ T_old_new
         T_gap = se3.inverse(T_map_new) @ self._poses[new.keyframe]
         return float(np.linalg.norm(T_gap[:3, 3])), se3.rotation_angle(T_gap)

@@ -1,7 +1,7 @@
 """Loop detector: groups keyframes into subgraphs and finds earlier subgraphs of the same place.
 
-Visual words are ORB descriptors that represent all similar descriptors. They are learned during the
-run, from the first image on.
+A visual word is an ORB descriptor that stands for all similar descriptors. The words are learned
+during the run, from the first image on.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -46,7 +46,7 @@ class VisualWordsConfig:
     # Maximum number of words; the counts of 1024 words need 4 kB per subgraph. In the sequences
     # kitchen and flat, 512 words find 2 % fewer loops than 1024, and 2048 words find no more.
     count: int = 1024
-    # A feature that differs from every word in more of its 256 bits becomes a word.
+    # A descriptor becomes a word if it differs from every word in more than this many of 256 bits.
     apart_bits: int = 64
     # Maximum new words per image, so that many images contribute words.
     learned_at_once: int = 64
@@ -61,7 +61,7 @@ class VisualWordsConfig:
 
 
 class VisualWords:
-    """Vocabulary of ORB descriptors, called words; a feature is counted for the nearest word.
+    """Vocabulary of ORB descriptors, called words; a feature counts for its nearest word.
 
     Words never change and are never removed. The same images in the same order give the same words.
     """
@@ -113,9 +113,9 @@ def _matches(descriptors: np.ndarray, words: np.ndarray) -> tuple[cv2.DMatch, ..
 class LoopsConfig:
     """Parameters of loop detection."""
 
-    # Data that the coarse and the fine step use. two_stage: labels and images to find candidates,
-    # then features or landmarks, and surfaces, to verify them. The other values are for comparison.
-    # geometric: no labels; semantic: no images, only landmarks as in the paper (III.C).
+    # Data that the coarse and the fine step use. two_stage: labels and images find candidates, and
+    # surfaces verify poses from features, landmarks or the map. The other values are for
+    # comparison. geometric: no labels; semantic: no images, only landmarks as in the paper (III.C).
     stages: Stages = "two_stage"
     subgraphs: SubgraphConfig = field(default_factory=SubgraphConfig)
     words: VisualWordsConfig = field(default_factory=VisualWordsConfig)
@@ -198,7 +198,7 @@ class LoopDetector:
             sightings: Detections as points; None if no detector ran.
             poses: T_map_keyframe of the stored keyframes. Loops of keyframes without a pose are not
                 checked for plausible drift.
-            merged: Merged submaps, each with the older one that it is merged into.
+            merged: For each merged submap, the older submap that it is merged into.
         """
         results: list[LoopCandidateResult] = []
         if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
@@ -300,8 +300,8 @@ class LoopDetector:
         """Return the loop hypothesis of a candidate, marked as rejected if no method finds a pose.
 
         The methods are tried in the order features, landmarks, map. Poses from features are
-        accurate to centimeters, and those from landmarks to decimeters. Poses from the map come
-        last, because two images must also confirm them.
+        accurate to centimeters, and poses from landmarks to decimeters. Poses from the map come
+        last, because two new keyframes must confirm them.
         """
         verifier, stages = self._verifier, self._config.stages
         if stages == "semantic":

@@ -1,4 +1,4 @@
-"""Detections as labelled 3D points, and the landmarks of a subgraph that they form.
+"""Detections as labelled 3D points, and the landmarks that they form in a subgraph.
 
 Conventions: `ldo_service.geometry`.
 """
@@ -15,7 +15,7 @@ from ldo_service.regions.foreground import ForegroundConfig, foreground, surface
 from ldo_service.semantics.distributions import dense, divergence, entropy, sparse
 from ldo_service.semantics.gaussian_labels import MAX_LABELS, OTHER
 
-LAYOUT_WORDS = 512  # Bins that pairs of labels and their distances are hashed to.
+LAYOUT_WORDS = 512  # Number of bins to which pairs of labels with their distance are hashed.
 DISTANCE_BIN_M = 0.5  # Bin width of the distances; a distance counts in its two nearest bins.
 # Labels below this index, background and `other`, are ignored: they do not describe a place.
 HIDDEN_NAMES = OTHER + 1
@@ -26,8 +26,8 @@ class LandmarkConfig:
     """Parameters of the landmarks of a subgraph; III.C is a section of the paper."""
 
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
-    # Detections with the same label belong to one object if their distance is smaller than this,
-    # which is half a chair.
+    # Detections with the same label belong to one object if their distance is below this limit. It
+    # is half the width of a chair.
     same_m: float = 0.4
     # Maximum KL divergence of matching landmarks in both directions, nats (III.C).
     max_divergence: float = 0.3
@@ -287,6 +287,6 @@ def compare_landmarks_at(
 
 
 def _divergences(a: SubgraphLandmarks, b: SubgraphLandmarks) -> np.ndarray:
-    """Return the larger of both KL divergences for each pair of landmarks, [K, L], nats."""
+    """Return the larger KL divergence of both directions for each landmark pair, [K, L], nats."""
     p, q = a.distributions[:, None], b.distributions[None]
     return np.maximum(divergence(p, q), divergence(q, p))

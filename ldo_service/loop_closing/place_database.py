@@ -62,7 +62,10 @@ class Histograms:
         self._count -= 1
 
     def idf(self) -> np.ndarray:
-        """Return the weights of the words, [W] float32; words in no row weigh most."""
+        """Return the weight of each word, [W] float32.
+
+        A word in no row has the weight of a word in one row.
+        """
         return np.log1p(self._count / np.maximum(self._frequency, 1)).astype(np.float32)
 
     def cosines(self, row: np.ndarray) -> np.ndarray:
@@ -85,16 +88,17 @@ Stages = Literal["two_stage", "semantic", "geometric"]
 class RetrievalConfig:
     """Parameters of the search; III.C is a section of the paper."""
 
-    # Minimum distance of two subgraphs in camera frames, not keyframes; nearer subgraphs are no
-    # loop (III.C).
+    # Minimum distance of two subgraphs in camera frames, not keyframes; nearer subgraphs are not
+    # loop candidates (III.C).
     exclude_frames: int = 100
     candidates: int = 5  # K, the maximum number of candidates (III.C).
     min_similarity: float = 0.75  # theta_loop, the minimum cosine of the label histograms (III.C).
-    # Cosine of the visual words from which on similar labels are not required. If a detector misses
-    # two of five objects, the cosine of the labels is below theta_loop. With a value above 1,
-    # similar labels are always required, as in the paper.
+    # A subgraph with at least this cosine of the visual words needs no similar labels. If a
+    # detector misses two of five objects, the cosine of the labels is below theta_loop. With a
+    # value above 1, similar labels are always required, as in the paper.
     min_appearance: float = 0.35
-    count: int = 1000  # Maximum stored subgraphs; if there are more, the path is thinned.
+    # Maximum number of stored subgraphs; if there are more, `PlaceDatabase` removes some.
+    count: int = 1000
 
     def __post_init__(self) -> None:
         if self.exclude_frames < 0 or self.candidates < 1 or self.count < 3:
@@ -118,15 +122,15 @@ class RetrievalMatch:
     similarity: float  # Cosine of the label histograms.
     layout: float  # Cosine of the layout histograms.
     appearance: float  # Cosine of the visual-word histograms.
-    score: float  # Score that candidates are ranked by.
+    score: float  # Score by which candidates are ranked.
 
 
 class PlaceDatabase:
     """Stored subgraphs in the order of insertion, with tables of the histograms of the subgraphs.
 
     If there are more than `count` subgraphs, one is removed: the subgraph whose previous and next
-    subgraph along the camera path are nearest to each other. A long run in one building thus thins
-    the path evenly, and each part of the path keeps some subgraphs.
+    subgraph along the camera path are nearest to each other. In a long run, each part of the path
+    thus keeps some subgraphs.
     """
 
     def __init__(self, words: int, stages: Stages, config: RetrievalConfig) -> None:
@@ -195,9 +199,9 @@ class PlaceDatabase:
         """Return the scores of all stored subgraphs, [S]; 0 for those that are no candidates.
 
         A stored subgraph is a candidate if its labels or its visual words are similar to those of
-        the new subgraph. The score is the mean of two similarities: that of the visual words, and
-        the mean of labels and layout. If either of the two subgraphs has no detections, only the
-        visual words are used. The setting `stages` may also exclude labels or images.
+        the new subgraph. The score is (appearance + (similarity + layout) / 2) / 2. If either of
+        the two subgraphs has no detections, only the visual words are used. The setting `stages`
+        may also exclude labels or images.
 
         Args:
             new: New subgraph.

@@ -11,8 +11,8 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.se3 import fit_rigid_transform
 
-# Minimum height of a triangle of points over its longest side, meters. Three points that are closer
-# to a line do not determine the rotation about this line.
+# Minimum height of a triangle of points over its longest side, meters. Three points that are nearly
+# on a line do not determine the rotation about this line.
 SPREAD = 0.1
 
 
@@ -39,7 +39,7 @@ def ransac_rigid(
 ) -> RansacResult | None:
     """Return the rigid transform that most correspondences agree with, by RANSAC over triples.
 
-    The transform of the best triple is fitted again to its inliers.
+    The transform of the best triple is fitted again to all its inliers.
 
     Args:
         p_a: Points in frame a, [K, 3], meters.
@@ -105,7 +105,8 @@ class DepthConsistencyConfig:
 
     # Distance along the ray beyond which two depths belong to different surfaces.
     gate_m: float = 0.1
-    # Fraction of the depth that is added to gate_m: the noise of structured light at 5 m.
+    # Fraction of the depth that is added to gate_m. It allows for the noise of structured light at
+    # a depth of 5 m.
     gate_share: float = 0.02
     # Minimum fraction of the new surface that the old keyframe also sees.
     min_overlap: float = 0.2

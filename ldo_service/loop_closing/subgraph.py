@@ -151,7 +151,7 @@ def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfi
     """Return whether a keyframe belongs to the same subgraph as the previous keyframe.
 
     This is the case if both keyframes are in the same submap and at most `gap_rad` apart. Two
-    consecutive keyframes are far apart if the tracker used old keyframes between them.
+    consecutive keyframes are far apart if the tracker reused existing keyframes between them.
 
     Args:
         before: Record of the previous keyframe.

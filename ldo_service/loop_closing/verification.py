@@ -1,9 +1,9 @@
 """Verification of loop candidates: the pose between two keyframes of two subgraphs (fine step).
 
 A pose comes from ORB features, from landmarks or from the map. It must be confirmed by landmarks or
-by a second keyframe of the new subgraph. Direct alignment refines the pose on the images, and may
-change it only a little. At the refined pose, the surfaces must overlap without conflict, and the
-landmarks must not contradict each other. Conventions: `ldo_service.geometry`.
+by a second keyframe of the new subgraph, and the landmarks must not contradict the pose. Direct
+alignment refines the pose on the images, and may change it only a little. At the refined pose, the
+surfaces must overlap without conflict. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Callable, Iterator
@@ -42,7 +42,7 @@ NOTHING = LandmarkAgreement(0, 0, 0.0, 0.0)
 Evidence = Literal["", "landmarks", "features", "map"]
 # Function of an old and a new keyframe that returns T_old_new [4, 4], or None if it is unknown.
 KnownPose = Callable[[SubgraphKeyframe, SubgraphKeyframe], np.ndarray | None]
-# Decompressed keyframes in the cache, 3 MB each: those of a new subgraph and of some candidates.
+# Maximum decompressed keyframes in the cache, 3 MB each: of a new subgraph and some candidates.
 OPENED = 12
 FIT_LEVEL = 1  # Pyramid level of 160 pixels width: 19,200 points suffice for the overlap.
 
@@ -57,7 +57,7 @@ class VerificationConfig:
     # subgraph only needs `features.min_inliers`.
     min_inliers: int = 20
     # Minimum number of matching landmarks that confirm a pose from features, if no second keyframe
-    # does.
+    # gives the same pose.
     confirming_landmarks: int = 3
     # Maximum rotation plus parallax between two poses from features that confirm each other.
     confirmation_rad: float = 0.08
@@ -71,14 +71,14 @@ class VerificationConfig:
     # Maximum rotation plus parallax by which the refinement on the images may change a pose from
     # features or from the map.
     refined_rad: float = 0.1
-    # The same limit for a pose from landmarks. It is larger because their centers are inaccurate.
+    # The same limit for a pose from landmarks. It is larger because landmarks are inaccurate.
     refined_landmarks_rad: float = 0.4
     # Maximum condition number of the information matrix, with translations in median depths, as in
     # the tracker.
     max_condition: float = 1e5
     max_gain: float = 3.0  # Maximum ratio of the brightness of both images, in either direction.
-    # Maximum number of landmarks that contradict a pose. If more landmarks match, as many may
-    # contradict as match.
+    # Maximum number of landmarks that contradict a pose. If more landmarks than this match, the
+    # number of matching landmarks is the maximum.
     max_contradictions: int = 3
 
     def __post_init__(self) -> None:
@@ -148,10 +148,11 @@ class Verifier:
 
     # --- hypotheses -------------------------------------------------------------------------------
     def hypothesis_from_features(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
-        """Return the pose from feature matches that a second keyframe of `new` confirms.
+        """Return the pose with the most feature inliers, if a second keyframe of `new` confirms it.
 
-        If no two keyframes of `new` give the same pose, `_from_single_keyframe` tries to confirm
-        the best pose in another way.
+        Pairs of keyframes are matched until a second keyframe of `new` gives the same pose as the
+        best one so far. If none does, `_from_single_keyframe` tries to confirm the best pose in
+        another way, and rejects the hypothesis if this fails.
         """
         found: list[LoopHypothesis] = []
         for a, b in islice(_likely_pairs(old, new), self._config.pairs):
@@ -172,17 +173,18 @@ class Verifier:
     ) -> LoopHypothesis:
         """Return the pose with the most inliers among `found`, rejected if it is not confirmed.
 
-        The pose is confirmed by at least `confirming_landmarks` matching landmarks, or by another
-        keyframe of `new` whose images pass the verification at this pose.
+        A pose with fewer than `min_inliers` inliers is also rejected. The pose is confirmed by at
+        least `confirming_landmarks` matching landmarks, or by another keyframe of `new` whose
+        images pass the verification at this pose.
         """
         best = max(found, key=lambda proposal: proposal.inliers, default=None)
         if best is None:
             return LoopHypothesis(
-                old.views[0], new.views[0], np.eye(4), rejected_reason="no pose fits features"
+                old.views[0], new.views[0], np.eye(4), rejected_reason="no pose fits the features"
             )
         best = self._with_semantics(best, old, new)
         if best.inliers < self._config.min_inliers:
-            return replace(best, rejected_reason=f"{best.inliers} features agree")
+            return replace(best, rejected_reason=f"{best.inliers} features agree, too few")
         if best.semantics.count >= self._config.confirming_landmarks:
             return best
         if any(self._is_confirmed_by(best, view) for view in new.views if view is not best.new):
@@ -198,9 +200,10 @@ class Verifier:
     def _is_confirmed_by_any(
         self, best: LoopHypothesis, found: list[LoopHypothesis], within_rad: float
     ) -> bool:
-        """Return whether the hypothesis of another new keyframe gives the same pose as `best`.
+        """Return whether a hypothesis in `found` for another new keyframe confirms `best`.
 
-        The poses are the same if they differ by less than `within_rad`, rotation plus parallax.
+        It confirms `best` if the two poses differ by less than `within_rad`, rotation plus
+        parallax.
         """
         return any(
             image_motion_rad(se3.inverse(best.T_old_new) @ _as_seen_by(best, other), _depth(best))
@@ -212,8 +215,8 @@ class Verifier:
     def hypothesis_from_landmarks(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
         """Return the relative pose of the two subgraphs that most landmarks agree with.
 
-        It is returned as the pose between two keyframes: those that are nearest to each other at
-        this relative pose.
+        The pose is returned for the two keyframes that are nearest to each other at this relative
+        pose. The hypothesis is rejected if fewer than `min_inliers` landmarks agree.
         """
         config = self._config.landmarks
         pairs = possible_pairs(old.landmarks, new.landmarks, config)
@@ -222,7 +225,7 @@ class Verifier:
         motion = ransac_rigid(*points, pairs, config.reach_m, config.iterations, rng)
         count = 0 if motion is None else int(motion.inliers.sum())
         if motion is None or count < config.min_inliers:
-            reason = f"{count} landmarks agree"
+            reason = f"{count} landmarks agree, too few"
             return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=reason)
         semantics = compare_landmarks(old.landmarks, new.landmarks, pairs[motion.inliers])
         nearest = _nearest_pairs(old, new, lambda a, b: _between(a, b, motion.T_a_b))
@@ -232,12 +235,21 @@ class Verifier:
     def hypothesis_from_map(
         self, old: Subgraph, new: Subgraph, T_old_new: KnownPose
     ) -> LoopHypothesis:
-        """Return the pose in the map, refined on the images, if two new keyframes confirm it.
+        """Return a pose from the map, refined on images, if two new keyframes give the same pose.
 
-        Images of a place from different viewpoints have few features in common. Therefore the pose
-        in the map is the initial guess of the refinement. This finds loop closures between nearby
-        keyframes before they drift apart, but finds none after a large drift. The function
-        `T_old_new` returns the relative pose of two keyframes in the map.
+        Up to `map_pairs` pairs of keyframes are aligned, the nearest ones first. The alignment
+        starts at the relative pose of the pair in the map. A refined pose is returned as soon as it
+        differs by less than `map_confirmation_rad` from the refined pose of an earlier pair with
+        another new keyframe. Otherwise, a rejected hypothesis is returned.
+
+        Images of a place from different viewpoints have few features in common, and this method
+        needs none. It finds loop closures between nearby keyframes before they drift apart, but
+        finds none after a large drift.
+
+        Args:
+            old: Old subgraph.
+            new: New subgraph.
+            T_old_new: Function that returns the relative pose of two keyframes in the map, or None.
         """
         found: list[LoopHypothesis] = []
         for a, b, T in islice(_nearest_pairs(old, new, T_old_new), self._config.map_pairs):
@@ -247,11 +259,11 @@ class Verifier:
                 if self._is_confirmed_by_any(met, found, self._config.map_confirmation_rad):
                     return self._with_semantics(met, old, new)
                 found.append(met)
-        refused = "not confirmed by images" if found else "no overlap at the mapped pose"
+        refused = "not confirmed by images" if found else "images do not fit the pose in the map"
         return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=refused)
 
     def _check_overlap(self, proposal: LoopHypothesis) -> VerificationResult | None:
-        """Verify a hypothesis; if an overlap is too small, return None without an alignment."""
+        """Verify a hypothesis; return None, without aligning, if an overlap is too small."""
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         T_old_new, least = proposal.T_old_new, self._config.blind_overlap
         if self._fit(old, new, T_old_new).overlap < least:
@@ -270,7 +282,10 @@ class Verifier:
 
     # --- verification -----------------------------------------------------------------------------
     def verify(self, proposal: LoopHypothesis) -> VerificationResult:
-        """Refine a pose on the images, and check surfaces and landmarks at the refined pose."""
+        """Refine a pose on the images, and check the surfaces at the refined pose.
+
+        `proposal.semantics`, the agreement of the landmarks before the refinement, is checked too.
+        """
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         alignment = align(old.reference, new.view, se3.inverse(proposal.T_old_new), self._align)
         fit = self._fit(old, new, alignment.T_reference_camera)
@@ -325,17 +340,17 @@ class Verifier:
         if alignment.condition > config.max_condition:
             return "degenerate alignment"
         if abs(np.log(max(alignment.gain, 1e-6))) > np.log(config.max_gain):
-            return f"brightness differs {alignment.gain:.2f} times"
+            return f"brightness ratio {alignment.gain:.2f} is out of range"
         by_features = proposal.evidence == "features"
         if shared < (config.fit.min_overlap if by_features else config.blind_overlap):
-            return f"overlap {shared:.2f}"
+            return f"overlap of only {shared:.2f}"
         if fit.rmse_m > config.fit.max_rmse_m:
             return f"surfaces are {100 * fit.rmse_m:.1f} cm apart"
         if fit.conflict > config.fit.max_conflict:
-            return f"{fit.conflict:.0%} lies in free space"
+            return f"{fit.conflict:.0%} of the surface lies in free space"
         seen = proposal.semantics
         if seen.contradicted > max(config.max_contradictions, seen.count):
-            return f"{seen.contradicted} other things stand there"
+            return f"{seen.contradicted} landmarks contradict the pose"
         return ""
 
 

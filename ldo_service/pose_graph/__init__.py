@@ -13,10 +13,10 @@ costs:
     similarity    w_sem / 2 (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j],
                   landmarks i, j that a keyframe shows together
 
-Here lambda = 0.5 and w_sem = 0.1. rho is a robust kernel and pi the projection into the image. z_kl
-is the center of a detected box, and q_kl is the class distribution of the Gaussians in that box.
-The factor s = 1/320 accounts for errors common to all observations of an object
-(`factors.NoiseConfig`).
+Here lambda = 0.5 and w_sem = 0.1. |x|^2_Omega is x^T Omega x with the information matrix Omega of a
+measurement. rho is a robust kernel and pi the projection into the image. z_kl is the center of a
+detected box, and q_kl is the class distribution of the Gaussians in this box. The factor s = 1/320
+accounts for errors common to all observations of an object (`factors.NoiseConfig`).
 
 The weight w_kl reduces the effect of uncertain observations. It is exp(-2 H(q_kl)) if the entropy H
 is above 0.5 nats, else 1. The entropy of p_l is not used, since the weights would then change with
@@ -24,7 +24,7 @@ the solution. In the paper, the similarity has a direction from landmark i to la
 pair has no direction, so the cost contains both directions with half the weight each.
 
 No term contains both a p and a T or mu. Therefore the sum of all costs is minimal if these two
-parts are minimal:
+parts are minimal; projections is the first term of the observations:
 
     F(T, mu) = odometry + loops + projections      and
     G(p)     = lambda sum w KL(p_l || q_kl) + similarity
@@ -38,13 +38,13 @@ observations:
     d/dp_c [ sum_k w_k p_c log(p_c / q_kc) ] + nu = 0   =>   p_c ~ prod_k q_kc^(w_k / sum w)
 
 `condensation` limits the number of variables in a long run. Marginalization of old keyframes would
-leave a dense prior, linearized at their current poses. Later loop closures could not correct this
+leave a dense prior, linearized at the current poses. Later loop closures could not correct this
 prior, and no variables would remain to attach loop closures to. Instead, the first of every ten
 keyframes remains a variable, and the other nine are condensed. One relative measurement from this
-variable to the next one replaces all measurements of the ten keyframes. The relative measurement
-does not depend on poses in the map, so it remains valid after corrections of any size.
+variable to the next variable replaces all measurements of the ten keyframes. This measurement does
+not depend on poses in the map, so it remains valid after corrections of any size.
 
-The pose of a condensed keyframe is interpolated between the variables before and after it. The
-keyframe becomes a variable again if a loop closure would change its pose relative to these two
-variables.
+The pose of a condensed keyframe is interpolated between the variables before and after it. A
+condensed keyframe becomes a variable again if a loop closure would change its pose relative to
+these two variables.
 """

@@ -50,7 +50,7 @@ def check_against_bridge(
         known: The other measurements.
         closure: Loop closure between keyframes of one component.
         start: Values from which the batch solver starts.
-        initial: Values with which the variables were added to the solver.
+        initial: Values with which the variables were added to the incremental solver.
 
     Returns:
         The decision, and the variables of the resulting solution.
@@ -107,7 +107,10 @@ def best_bridge_removal(
     variables: Variables,
     initial: Variables,
 ) -> tuple[BridgeEdge, FactorStore, Variables] | None:
-    """Replace the bridge edge whose replacement by a rejected closure leaves the most closures.
+    """Replace one of several bridge edges by a rejected closure if more closures are then accepted.
+
+    Each edge is tried; see `replace_bridge_by_consensus`. The edge is chosen whose replacement
+    leaves the most accepted closures.
 
     Args:
         known: Store of all measurements, which is not changed.
@@ -115,7 +118,7 @@ def best_bridge_removal(
         closure: Rejected closure that would become the bridge edge.
         pose: Function that returns the current T_map_keyframe [4, 4].
         variables: Current values of the variables.
-        initial: Values with which the variables were added to the solver.
+        initial: Values with which the variables were added to the incremental solver.
 
     Returns:
         The replaced bridge edge, then the store and the variables after the replacement. None if no
@@ -140,7 +143,10 @@ def replace_bridge_by_consensus(
     variables: Variables,
     initial: Variables,
 ) -> tuple[FactorStore, Variables] | None:
-    """Replace a bridge edge by a rejected closure if more closures agree with the closure.
+    """Replace a bridge edge by a rejected closure if more closures are then accepted.
+
+    The accepted closures between the two sides of the edge are counted before and after the
+    replacement.
 
     Args:
         known: Store of all measurements, which is not changed.
@@ -148,11 +154,11 @@ def replace_bridge_by_consensus(
         closure: Rejected closure that would become the bridge edge.
         pose: Function that returns the current T_map_keyframe [4, 4].
         variables: Current values of the variables.
-        initial: Values with which the variables were added to the solver.
+        initial: Values with which the variables were added to the incremental solver.
 
     Returns:
-        The store and the variables after the replacement. None if the number of agreeing closures
-        is not larger than for the old bridge edge.
+        The store and the variables after the replacement. None if the number of accepted closures
+        does not increase.
     """
     across = [c for pair, c in known.closures.accepted.items() if bridge.is_across(pair)]
     contradicting = [c for pair, c in known.contradicting.items() if bridge.is_across(pair)]

@@ -108,14 +108,17 @@ class CondensedKeyframes:
         return keyframes[order], np.concatenate([T_map_variable, T_map])[order]
 
     def moved(self, row: int, T_head_keyframe: np.ndarray) -> "CondensedKeyframes":
-        """Return the condensed keyframes with a new T_head_keyframe [4, 4] in one row."""
+        """Return the condensed keyframes with a new T_head_keyframe [4, 4] in one row.
+
+        T_tail_keyframe of the row changes accordingly.
+        """
         T_tail_head = self.T_tail[row] @ np.linalg.inv(self.T_head[row])
         T_head, T_tail = self.T_head.copy(), self.T_tail.copy()
         T_head[row], T_tail[row] = T_head_keyframe, T_tail_head @ T_head_keyframe
         return replace(self, T_head=T_head, T_tail=T_tail)
 
     def without_split(self, row: int) -> "CondensedKeyframes":
-        """Return the condensed keyframes without the keyframe of a row, now a variable again.
+        """Return the condensed keyframes without one keyframe, which becomes a variable again.
 
         The new variable divides its group: it is the tail of the first part and the head of the
         second part.
@@ -196,14 +199,14 @@ def group_to_condense(
 ) -> list[int]:
     """Choose the next group to condense: the oldest chain of at least `size` + 1 keyframes.
 
-    Each keyframe of the chain has an odometry measurement from an earlier keyframe of the chain.
+    Each keyframe of the chain but the first has an odometry measurement from an earlier one.
     The tail of a group is the head of the next group. The head or tail of an existing group must
     stay a variable, so it can only be the head of a new group.
 
-    The keyframe that follows the tail should be measured from the tail. If it were measured only
-    from keyframes inside the group, its measurement would be transferred to one end of the group.
-    A correction would then move the following keyframe with that end alone. To avoid this, the
-    group grows to up to twice `size`.
+    The keyframe that follows the tail should have a measurement from the tail. If all its
+    measurements were from keyframes inside the group, they would be transferred to the head or the
+    tail. A correction would then move the following keyframe only with that variable. To avoid
+    this, the group may grow to twice `size`.
 
     Args:
         active: Keyframes that may still be condensed, ascending (`FactorStore.active`).

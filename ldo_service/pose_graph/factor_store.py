@@ -36,9 +36,10 @@ from .solver import Name, Variables, point_key
 class FactorStore:
     """Store of all measurements by kind, which builds their factors.
 
-    A factor connects variables, and a condensed keyframe is not a variable. Its measurements are
-    therefore transferred to its head or its tail, whichever is nearer: the last variable before it
-    or the first variable after it (see `condensation.CondensedKeyframes`).
+    A factor connects variables, and a condensed keyframe is not a variable. The measurements of a
+    condensed keyframe are therefore transferred to the nearer one of its head and its tail. The
+    head is the last variable before the keyframe, and the tail is the first variable after it (see
+    `condensation.CondensedKeyframes`).
     """
 
     def __init__(self, noise: NoiseConfig, closures: LoopClosureConfig) -> None:
@@ -47,7 +48,8 @@ class FactorStore:
         self.first_of: dict[int, int] = {}  # First keyframe of each keyframe's component.
         # Keyframes that may still be condensed, ascending: neither condensed nor head of a group.
         self.active: list[int] = []
-        self.odometry: dict[Pair, RelativePose] = {}  # Measurements between variables.
+        # Odometry measurements by pair of variables, transferred ones included.
+        self.odometry: dict[Pair, RelativePose] = {}
         # Measurements that replace groups, each from the head of a group to its tail.
         self.condensed: dict[Pair, RelativePose] = {}
         self.bridges: dict[Pair, RelativePose] = {}  # Bridge edges between merged components.
@@ -62,8 +64,9 @@ class FactorStore:
     def add_measurement(self, m: RelativePose) -> Name:
         """Store an odometry measurement and return the name of its factor.
 
-        A measurement between variables replaces an older one of the same pair. A measurement that
-        was transferred from condensed keyframes is stored only if its pair of variables has none.
+        If both keyframes are variables, the measurement replaces an older one of the same pair. If
+        a keyframe is condensed, the measurement is transferred to variables. It is then stored only
+        if this pair of variables has no odometry measurement.
         """
         between = self.between_variables(m)
         pair = between.a, between.b
@@ -101,7 +104,8 @@ class FactorStore:
     def _in_head_of_b(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> np.ndarray:
         """Return T_head_b [4, 4] according to a measurement of keyframe b from keyframe a.
 
-        If a is in another group than b, the pose between the groups is the current one in the map.
+        If a and b have different heads, the pose of a relative to the head of b is computed from
+        the current poses in the map.
         """
         (head_a, T_a), (head_b, _) = self.relative_to_start(m.a), self.relative_to_start(m.b)
         if head_a == head_b:
@@ -162,14 +166,16 @@ class FactorStore:
         self.rows = self.interpolated.index()
 
     def interpolation_error_sigmas(self, keyframe: int, variables: Variables) -> float:
-        """Return how far the poses of a condensed keyframe from its head and its tail differ.
+        """Return the difference between two estimates of the pose of a condensed keyframe.
 
-        Each of the two poses is the pose of the head or tail times the measured relative pose.
+        The first estimate is T_map_head T_head_keyframe, and the second one is T_map_tail
+        T_tail_keyframe, with the measured relative poses.
 
         Returns:
-            The largest of the six differences, in standard deviations of a loop closure, times the
-            fraction of the way to the nearer of head and tail, 0..0.5. It is 0 if the keyframe is a
-            variable.
+            The largest absolute value of the six components of the difference, in standard
+            deviations of a loop closure (`sigma_loop_rad`, `sigma_loop_m`). It is multiplied by the
+            distance to the nearer variable as a fraction of the way from head to tail, 0..0.5. The
+            result is 0 if the keyframe is a variable.
         """
         row = self.rows.get(keyframe)
         if row is None:
@@ -185,7 +191,10 @@ class FactorStore:
         return min(share, 1 - share) * float((off / sigmas).max())
 
     def relative(self, without: Pair | None = None) -> Iterable[RelativePose]:
-        """Yield all measurements between variables except closures and the bridge `without`."""
+        """Yield all measurements except loop closures and the bridge edge `without`.
+
+        Each measurement is between two variables; bridge edges are transferred to variables.
+        """
         yield from self.odometry.values()
         yield from self.condensed.values()
         bridges = (m for pair, m in self.bridges.items() if pair != without)
@@ -214,10 +223,11 @@ class FactorStore:
         return int(self.interpolated.end_variables[row]), self.interpolated.T_tail[row]
 
     def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
-        """Return the two variables that a measurement is transferred to, for its keyframes a and b.
+        """Return the two variables to which the keyframes a and b of a measurement are transferred.
 
-        For each keyframe this is the nearest variable. If it is the same for a and b, the heads of
-        both keyframes are used instead.
+        Each keyframe is transferred to the nearer one of its head and its tail. If this gives the
+        same variable for a and b, both keyframes are transferred to their heads instead. A keyframe
+        that is a variable is not transferred.
 
         Returns:
             For a, then for b: the id of the variable, and T_variable_keyframe [4, 4].
@@ -235,11 +245,12 @@ class FactorStore:
         return transfer_measurement(m, se3.inverse(T_a), se3.inverse(T_b), (a, b))
 
     def _ends_covariance(self, m: RelativePose) -> np.ndarray:
-        """Return the covariance [6, 6] that transferring a measurement to variables adds, at b.
+        """Return the covariance [6, 6] that the transfer of a measurement to variables adds.
 
         The pose of a condensed keyframe relative to its variable is uncertain. Each condensed
-        keyframe therefore adds the covariance of its group, times its distance from the variable as
-        a fraction of the way between head and tail. The result is zero if a and b are variables.
+        keyframe therefore adds the covariance of the measurement from its head to its tail, times
+        its distance from the variable as a fraction of the way from head to tail. The covariance is
+        for perturbations at keyframe b. It is zero if a and b are variables.
         """
         total = np.zeros((6, 6))
         T_b_end = se3.inverse(m.T_a_b), np.eye(4)
@@ -273,7 +284,7 @@ class FactorStore:
 
         Args:
             name: Name of the factor, as `names` yields it.
-            initial: Values with which the variables were added to the solver.
+            initial: Values with which the variables were added to the incremental solver.
         """
         kind, pair = name[0], name[1:]
         match kind:
@@ -330,7 +341,9 @@ class FactorStore:
     def move_component(
         self, younger: int, older: int, T_new_old: np.ndarray, variables: Variables
     ) -> Variables:
-        """Merge the younger of two components into the older one; its keyframes and landmarks move.
+        """Merge the younger of two components into the older one.
+
+        The keyframes and landmarks of the younger component move.
 
         Args:
             younger: First keyframe of the younger component.

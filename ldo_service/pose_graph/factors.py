@@ -39,18 +39,20 @@ class NoiseConfig:
     # also treats pixels as independent, and does not model errors of calibration and exposure.
     sigma_loop_rad: float = 0.01
     sigma_loop_m: float = 0.01
-    # Sigma of the center of a detected box, relative to the projected mean of the Gaussians of the
-    # object. The detector causes an error in pixels. Occlusion and the visible side of the object
-    # cause an error that is a fraction of the longer side of the box.
+    # Two sigmas of the center of a detected box, relative to the projected mean of the Gaussians of
+    # the object. Their squares are added. The detector causes the first one, in pixels. Occlusion
+    # and the visible side of the object cause the second one, a fraction of the longer side of the
+    # box.
     sigma_box_px: float = 4.0
     sigma_box_share: float = 0.15
-    # Observations of an object from one side share this error, so N observations contain less
-    # information than N independent ones. Each counts as this fraction of an independent one, so
-    # 32 observations (`landmarks.max_observations`) count as a tenth of one. When 32 observations
-    # counted as one, they moved poses by 3 mm although odometry was accurate to 2 mm
-    # (docs/decisions/0057-tenth-information.md).
+    # Observations of an object from one side have the same error, so N observations contain less
+    # information than N independent observations. Each observation counts as this fraction of an
+    # independent one, so 32 observations (`landmarks.max_observations`) count as a tenth of an
+    # independent one. With ten times this value, landmarks moved poses by 3 mm although odometry
+    # was accurate to 2 mm (docs/decisions/0057-tenth-information.md).
     independent_observations: float = 1 / 320
-    robust_sigmas: float = 2.385  # Cauchy kernel width: 95 % efficient on Gaussian noise.
+    # Width of the Cauchy kernel in sigmas: 95 % efficient on Gaussian noise.
+    robust_sigmas: float = 2.385
 
     def __post_init__(self) -> None:
         optional = ("drift_rad_per_sqrt_m", "drift_m_per_sqrt_m", "turn_m_per_rad")
@@ -64,7 +66,7 @@ class NoiseConfig:
 
     @property
     def floor(self) -> np.ndarray:
-        """Minimum information [6, 6] of every relative pose."""
+        """Information [6, 6] that is added to each relative-pose measurement."""
         return information(self.sigma_rotation_max_rad, self.sigma_translation_max_m)
 
     def drift(self, T: np.ndarray) -> np.ndarray:
@@ -98,7 +100,8 @@ def information(sigma_rad: float, sigma_m: float) -> np.ndarray:
 def odometry_information(measured: RelativePose, noise: NoiseConfig) -> np.ndarray:
     """Return the information [6, 6] of an odometry measurement.
 
-    `NoiseConfig.floor` is added to the information of `measured`, then the drift to the covariance.
+    The result is ((Omega + floor)^-1 + drift)^-1 with the information Omega of `measured`, and with
+    `NoiseConfig.floor` and `NoiseConfig.drift`. The drift thus increases the covariance.
     """
     own = 0.5 * (measured.information + measured.information.T) + noise.floor
     return np.linalg.inv(np.linalg.inv(own) + noise.drift(measured.T_a_b))
@@ -109,8 +112,8 @@ def closure_information(
 ) -> np.ndarray:
     """Return the information [6, 6] of a loop closure.
 
-    `NoiseConfig.floor` is added to the information of `measured`. Then two terms are added to the
-    covariance: that of `sigma_loop_rad` and `sigma_loop_m`, and the argument `covariance`.
+    The result is ((Omega + floor)^-1 + S + covariance)^-1 with the information Omega of `measured`
+    and `NoiseConfig.floor`. S is the diagonal covariance of `sigma_loop_rad` and `sigma_loop_m`.
 
     Args:
         measured: The closure.

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import wrightomega
 
-# Minimum probability of a class in an observation: a class that it does not name is improbable, but
-# not impossible.
+# Minimum probability of a class in an observation: a class that an observation does not contain is
+# improbable, but not impossible.
 FLOOR = 1e-6
 # Maximum number of Newton steps; 5 to 15 are usual. The iteration is monotone, so it cannot cycle.
 NEWTON_STEPS = 60

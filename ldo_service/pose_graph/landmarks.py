@@ -46,16 +46,17 @@ class ObjectLandmarkConfig:
     # Entropy H above which an observation has weight exp(-2 H), and above which a landmark is
     # uncertain, so that it is removed earlier (III.C).
     vague_nats: float = 0.5
-    min_observations: int = 3  # Minimum observations of a landmark in the graph (III.C).
-    # Minimum angle between two rays to a new landmark, 5 deg. At this angle, an error of 12 px
-    # changes a depth of 2 m by 0.5 m (focal length 525 px).
+    # Minimum number of observations at which a landmark is added to the graph (III.C).
+    min_observations: int = 3
+    # Minimum value of the largest angle between two rays to a new landmark, 5 deg. At this angle,
+    # an error of 12 px changes a depth of 2 m by 0.5 m (focal length 525 px).
     min_parallax_rad: float = 0.09
-    # Maximum observations of a landmark in the graph. If there are more, the first half of this
-    # number and the newest observations are kept.
+    # Maximum observations of a landmark in the graph. If there are more, the first and the newest
+    # observations are kept, half of this number each.
     max_observations: int = 32
     misses: int = 10  # Consecutive misses after which a landmark is removed (III.C).
     vague_misses: int = 5  # Consecutive misses after which an uncertain landmark is removed.
-    # Keyframes without an observation after which an uncertain landmark is removed.
+    # Number of keyframes without an observation after which an uncertain landmark is removed.
     vague_keyframes: int = 20
     # Maximum landmarks; if there are more, the least recently observed ones are removed.
     max_landmarks: int = 1000
@@ -288,9 +289,9 @@ class ObjectLandmarks:
     ) -> np.ndarray | None:
         """Triangulate the point [3] in the map where the rays through the box centers meet.
 
-        Return None if there are too few observations or too little parallax, or if the point lies
-        behind a camera or less than 0.1 m before it, or is projected more than 3 sigma from the
-        center of a box.
+        Return None if there are too few observations or too little parallax. Also return None if
+        the point is less than 0.1 m in front of a camera, or is projected more than 3 sigma from
+        the center of a box.
         """
         observations = list(observations)
         if len(observations) < self._config.min_observations:

@@ -28,21 +28,22 @@ class LoopClosureConfig:
     """Limits for the acceptance of loop closures."""
 
     # Maximum increase of the sum of squared residuals by a closure: the 99.73 % quantile (3 sigma)
-    # of chi^2 with six degrees of freedom. The residual of the closure alone is no criterion: a
-    # chain of 100 measurements moves by a meter, and the closure then has a residual of 2 sigma.
+    # of chi^2 with six degrees of freedom. The residual of the closure alone is not sufficient: a
+    # false closure can move a chain of 100 measurements by a meter, and its residual is then only
+    # 2 sigma.
     max_cost: float = 20.06
-    # Maximum residual of an accepted closure in any direction, in sigmas (RTAB-Map's guard).
+    # Maximum residual of an accepted closure in any direction, in sigmas (as in RTAB-Map).
     max_sigmas: float = 3.0
-    # Maximum number of earlier closures that are tested for removal instead of a new one; those
-    # with the largest residuals are tested.
+    # If a new closure does not fit, the earlier closures with the largest residuals are tested for
+    # removal. This is the maximum number of tests.
     max_removal_tests: int = 3
     # Maximum number of accepted closures; each needs 1 kB and one more factor in the solver. If
     # there are more, the older of the two most similar closures is removed.
     max_closures: int = 500
-    # Maximum number of stored closures that contradict a bridge edge. If two of them agree and no
-    # closure agrees with the edge, they replace it (see `component_merging`).
+    # Maximum number of stored closures that contradict a bridge edge. One of these closures
+    # replaces the edge if more closures agree with it than with the edge (`component_merging`).
     max_contradicting: int = 16
-    # Maximum number of rejected closures that are stored for publication, and of removed ones.
+    # Maximum number of rejected closures, and of removed closures, that are stored for publication.
     max_rejected: int = 256
 
     def __post_init__(self) -> None:
@@ -131,9 +132,10 @@ class LoopClosureSet:
         variables: Variables,
         sigmas: Sigmas,
     ) -> RelativePose | None:
-        """Return the earlier closure whose removal lets the new closure fit at the lowest cost.
+        """Return the earlier closure whose replacement by the new one gives the lowest cost.
 
-        Return None if the new closure fits after none of the tested removals.
+        This cost must be below `cost_before`, and the new closure must increase the cost without
+        the earlier one by at most `max_cost`. Return None if no tested closure meets both criteria.
         """
         fitting = sorted(before, key=lambda c: sigmas(variables, c), reverse=True)
         best, best_cost = None, cost_before

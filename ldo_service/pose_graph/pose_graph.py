@@ -127,7 +127,7 @@ class PoseGraph:
     def odometry_fallback(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
         """Return the odometry pose T_a_b [4, 4] between two keyframes as a measurement.
 
-        It connects keyframes `a` and `b` if the keyframes between them were missed. Its noise is
+        Use it to connect keyframes `a` and `b` if keyframes between them were missed. Its noise is
         larger than that of an alignment; see `NoiseConfig.sigma_odometry_m`.
         """
         noise = self._config.noise
@@ -157,11 +157,11 @@ class PoseGraph:
             self._merge_components(closure)
             return ClosureDecision(True)
         if pair_of(closure) in self._known.bridges:
-            # The bridge edge connects the same two images, which must not count twice.
+            # The bridge edge uses the same two images, which must not count twice.
             return ClosureDecision(True)
         start, known = self._solver.variables(), self._known
         if known.relative_to_start(closure.a)[0] == known.relative_to_start(closure.b)[0]:
-            # Both keyframes are condensed into one variable, so no factor can connect them.
+            # Both keyframes belong to the same condensed group, so no factor can connect them.
             return self._reject(closure)
         decision, variables = check_against_bridge(known, closure, start, self._initial)
         self.solved_times += 1
@@ -178,8 +178,8 @@ class PoseGraph:
         keyframe stays condensed if there are too many groups (`keyframes_each`).
 
         Returns:
-            The given `variables` of the solution with this closure, including the keyframes that
-            are variables again.
+            The given `variables` of the solution with this closure, and the poses of the keyframes
+            that are variables again.
         """
         known, config = self._known, self._config
         for keyframe in (closure.a, closure.b):
@@ -192,7 +192,7 @@ class PoseGraph:
         return variables
 
     def _merge_components(self, measured: RelativePose) -> None:
-        """Merge the components of both keyframes in the frame of the older one, and solve again."""
+        """Merge the components of both keyframes in the frame of the older one; solve again."""
         first_a, first_b = self.component_root(measured.a), self.component_root(measured.b)
         moves = T_new_old(measured, self.pose, moves_b=first_a < first_b)
         younger, older = max(first_a, first_b), min(first_a, first_b)

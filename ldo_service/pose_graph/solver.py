@@ -9,7 +9,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-Name = tuple[Any, ...]  # Name of a factor: its kind, then the ids of its ends.
+# Name of a factor: its kind, then the ids of its keyframes, or of its keyframe and landmark.
+Name = tuple[Any, ...]
 # Value of each variable by its gtsam key: T_map_keyframe [4, 4], or a point [3] in the map, meters.
 Variables = dict[int, np.ndarray]
 
@@ -17,7 +18,7 @@ Variables = dict[int, np.ndarray]
 class Solver:
     """Incremental minimization of a sum of named factors by iSAM2.
 
-    An update linearizes again at each variable that has moved by more than 0.01 rad or m.
+    An update linearizes again at the variables that have moved by more than 0.01 rad or m.
     """
 
     def __init__(self) -> None:
@@ -26,7 +27,7 @@ class Solver:
         solver.setWildfireThreshold(0.0)  # The default 0.001 does not propagate smaller changes.
         parameters = gtsam.ISAM2Params()
         parameters.setOptimizationParams(solver)
-        parameters.findUnusedFactorSlots = True  # Otherwise the list grows with every replacement.
+        parameters.findUnusedFactorSlots = True  # Otherwise each replacement grows the list.
         parameters.setRelinearizeThreshold(0.01)  # rad and m; gtsam's recommendation for poses.
         parameters.relinearizeSkip = 1
         self._isam = gtsam.ISAM2(parameters)
