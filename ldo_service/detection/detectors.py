@@ -20,14 +20,15 @@ class NetworkConfig:
 
     # Layout of the output: yolov5, yolox or yolov8; empty: determined by the shape of the output.
     layout: str = ""
-    # File with one class name per line; empty: the names that the network was registered with, or
-    # those in its metadata, or the 80 of COCO.
+    # File with one class name per line; empty: the registered names of the network, else the names
+    # in its metadata, else the 80 names of COCO.
     names: str = ""
     # Width and height of the input, used if the network takes any size.
     input_px: tuple[int, int] = (640, 480)
     score_min: float = 0.25  # Minimum score of a box; the default of YOLOv5 and YOLOX.
-    nms_iou: float = 0.45  # Maximum IoU of two objects of one class; the default of YOLOv5.
-    # Maximum boxes of an image, those with the highest scores; 100 as in COCO's own evaluation.
+    # Maximum IoU of two boxes of one class that are both kept; the default of YOLOv5.
+    nms_iou: float = 0.45
+    # Maximum boxes per image, the ones with the highest scores; COCO's own evaluation uses 100.
     max_boxes: int = 100
     # Maximum boxes before non-maximum suppression, to bound the time of the suppression.
     max_candidates: int = 1000
@@ -144,7 +145,7 @@ class OnnxDetector:
             ModelError: If the network fails.
         """
         config, layout = self.config, self._head.layout
-        # Fit the image into the input.
+        # Scale and pad the image to the size of the input.
         height, width = image.shape[:2]
         letterbox = Letterbox.fit((width, height), self.input_px, layout.is_centered)
         canvas = letterbox.canvas(image)
@@ -162,7 +163,10 @@ class OnnxDetector:
     def _output(self, planes: np.ndarray) -> np.ndarray:
         outputs = self._network.run(**{self._input: planes})
         if len(outputs) != 1:
-            raise ModelError(f"the network has {len(outputs)} outputs. Expected: one, {EXPECTED}.")
+            raise ModelError(
+                f"the network has {len(outputs)} outputs. Expected: one output {EXPECTED}. Export "
+                "the network with its boxes as the only output."
+            )
         return outputs[0]
 
 
@@ -183,7 +187,7 @@ def _image_input(network: Network, free_px: tuple[int, int]) -> tuple[str, tuple
     if not is_image or not (_allows(shape[0], 1) and _allows(shape[1], 3)):
         raise ModelError(
             f"the network's inputs are {shapes}. Expected: one image, float32 "
-            "[1, 3, height, width]."
+            "[1, 3, height, width]. Export the network with an image as its only input."
         )
     width, height = free_px
     return name, (_side(shape[3], width), _side(shape[2], height))

@@ -26,18 +26,21 @@ class DynamicClassConfig:
         *("person", "bird", "cat", "dog", "horse", "sheep", "cow", "elephant", "bear", "zebra"),
         *("giraffe", "bicycle", "car", "motorcycle", "bus", "train", "truck", "boat", "airplane"),
     )
-    # Maximum difference between the depth of a pixel and the median depth of the core. 0.4 m covers
-    # a stride or an outstretched arm.
+    # Maximum difference between the depth of a masked pixel and the median depth of the core. 0.4 m
+    # covers a stride or an outstretched arm.
     reach_m: float = 0.4
 
     def __post_init__(self) -> None:
         if not self.reach_m > 0:
-            raise ConfigError(f"reach_m={self.reach_m:g} must be positive.")
+            raise ConfigError(f"DynamicClassConfig.reach_m={self.reach_m:g} must be positive.")
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Detection of a class: its box has the pixels left <= u < right, top <= v < bottom."""
+    """Label and box of a detected object.
+
+    The box has the pixels left <= u < right and top <= v < bottom.
+    """
 
     label: str
     left: float
@@ -46,7 +49,7 @@ class Box:
     bottom: float
 
     def in_smaller(self, times: float) -> "Box":
-        """Return the box in an image whose width and height were divided by `times`."""
+        """Scale the box to the image after division of the image's width and height by `times`."""
         edges = (self.left, self.top, self.right, self.bottom)
         return Box(self.label, *(edge / times for edge in edges))
 

@@ -13,7 +13,7 @@ Precomputed text embeddings may replace these two files:
 
     <folder>/<name>/embeddings.npz or embeddings.safetensors
 
-The environment variable LDO_MODELS gives <folder>; by default, it is ldo/models in XDG_DATA_HOME.
+The environment variable LDO_MODELS gives <folder>, which is ldo/models in XDG_DATA_HOME by default.
 """
 
 import os
@@ -85,8 +85,8 @@ class Model:
             if not is_whole:
                 raise ModelError(
                     f"{self.folder / part} is not the file registered as {self.name}: it is "
-                    f"damaged or was replaced. Run `ldo models remove {self.name}` and add it "
-                    "again."
+                    f"missing, damaged or replaced. Run `ldo models remove {self.name}` and add "
+                    "the model again."
                 )
 
 
@@ -126,7 +126,7 @@ class Models:
             pair: Files of the pair.
             config: Settings of the trial run that checks the files.
             names: Labels that the labeller chooses from, stored with the pair; empty: the names in
-                its file of embeddings or, without such a file, the 80 of COCO.
+                the pair's file of embeddings or, without such a file, the 80 names of COCO.
             license: Text of the license of the pair; empty if unknown.
 
         Raises:
@@ -147,7 +147,7 @@ class Models:
             )
         for file in files:
             if not file.is_file():
-                raise ModelError(f"{file} is not a file: give the path of an ONNX file.")
+                raise ModelError(f"{file} is not a file: give the path of an existing file.")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             with folder_made_atomically(self.folder / name) as folder:
@@ -169,7 +169,7 @@ class Models:
             shutil.rmtree(self.folder / name)
         except OSError as error:
             raise ConfigError(
-                f"{self.folder / name} cannot be removed: {error}. Delete it yourself."
+                f"{self.folder / name} cannot be removed: {error}. Delete the folder yourself."
             ) from error
 
     def get(self, name: str) -> Model:
@@ -189,7 +189,7 @@ class Models:
         except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ModelError(
                 f"{folder / ABOUT} cannot be read ({error}): run `ldo models remove {name}` and "
-                "add it again."
+                "add the model again."
             ) from error
         return Model(name, folder, about)
 
@@ -246,7 +246,7 @@ def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
         if not path.is_file():
             raise ConfigError(
                 f"detector.model={model} is neither `demo`, which comes with the package, nor an "
-                f"ONNX file, nor registered in {models.folder}, where there are: "
+                f"ONNX file, nor registered in {models.folder}, which has the models: "
                 f"{', '.join(models.names) or 'none'}. `ldo models add NAME FILE` registers one."
             )
         return OnnxDetector(path, config)
@@ -267,8 +267,8 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
         model: `demo`, a registered name, or a folder with the files that the docstring of this
             module lists.
         config: Settings.
-        names: Labels that the labeller chooses from; empty: those that the pair was registered
-            with.
+        names: Labels that the labeller chooses from; empty: the labels registered with the pair, or
+            the default of `DualEncoder` for a folder.
 
     Raises:
         ConfigError: If there is no such model.
@@ -282,7 +282,7 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
         if not any((folder / file).is_file() for file in IMAGES):
             raise ConfigError(
                 f"vlm_labeller.model={model} is neither a folder with {' or '.join(IMAGES)} nor "
-                f"registered in {models.folder}, where there are: "
+                f"registered in {models.folder}, which has the models: "
                 f"{', '.join(models.names) or 'none'}. "
                 "`ldo models add NAME FILE --embeddings FILE` registers one."
             )
@@ -298,7 +298,7 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
 
 
 def _pair_in(folder: Path) -> EncoderFiles:
-    """Return the files of a pair that a folder has, by their usual names."""
+    """Return the files of the pair in a folder, found by their usual names."""
 
     def here(*parts: str) -> Path | None:
         return next((folder / part for part in parts if (folder / part).is_file()), None)
@@ -353,8 +353,8 @@ def _fill(folder: Path, file: Path, config: NetworkConfig, license: str) -> Mode
 def _require_name(name: str) -> None:
     if not NAME_PATTERN.fullmatch(name):
         raise ConfigError(
-            f"{name!r} is not a valid model name: use letters, digits, '.', '-' and '_', at most "
-            "64, beginning with a letter or digit."
+            f"{name!r} is not a valid model name: use at most 64 letters, digits, '.', '-' and "
+            "'_', and begin with a letter or digit."
         )
     if name == demo_networks.NAME:
         raise ConfigError(

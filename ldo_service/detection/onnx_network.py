@@ -29,7 +29,7 @@ class Network:
             path: The ONNX file.
             providers: Execution providers by preference, by onnxruntime's names or short names:
                 cpu, cuda, tensorrt, openvino. A provider that this machine lacks is ignored with a
-                warning. The CPU is always added as the last one.
+                warning. The CPU is added as the last provider unless it is given.
             threads: Threads of one inference; with 1, the CPU gives bitwise equal results in every
                 run.
 
@@ -43,7 +43,10 @@ class Network:
         try:
             self._session = _session(path, wanted, threads)
         except Exception as error:  # Errors of onnxruntime have no common base class.
-            raise ModelError(f"the file is no network in ONNX: {_first_line(error)}.") from error
+            raise ModelError(
+                f"the file is no network in ONNX: {_first_line(error)}. Export the network to ONNX "
+                "again."
+            ) from error
         if self.providers[0] != wanted[0]:
             log.warning(
                 "%s: execution provider %s cannot run this network, which now runs on %s; no "
@@ -73,7 +76,9 @@ class Network:
         try:
             return dict(self._session.get_modelmeta().custom_metadata_map)
         except UnicodeDecodeError as error:
-            raise ModelError(f"the network's metadata is not text: {error}.") from error
+            raise ModelError(
+                f"the network's metadata is not text: {error}. Export the network again."
+            ) from error
 
     def run(self, **inputs: np.ndarray) -> list[np.ndarray]:
         """Run an inference, and return all outputs in the order of the network.
@@ -88,7 +93,8 @@ class Network:
             outputs = [np.asarray(output) for output in self._session.run(None, inputs)]
         except Exception as error:
             raise ModelError(
-                f"the inference of the network fails: {_first_line(error)}."
+                f"the inference of the network fails: {_first_line(error)}. Export the network "
+                "again."
             ) from error
         if not all(np.isfinite(output).all() for output in outputs):
             raise ModelError(
@@ -110,7 +116,8 @@ def available(names: Sequence[str]) -> list[str]:
         names: Names of providers, by preference, as onnxruntime's or short names.
 
     Returns:
-        The names of onnxruntime, in the order of `names`, with the CPU last unless it was given.
+        Names of the providers in onnxruntime, in the order of `names`; the CPU is last unless it
+        was given.
 
     Raises:
         ConfigError: If onnxruntime has no provider of a given name.
@@ -122,8 +129,9 @@ def available(names: Sequence[str]) -> list[str]:
     for name in wanted:
         if name not in here:
             log.warning(
-                "execution provider %s is not in this onnxruntime, which has %s; continuing "
-                "without it. Install the onnxruntime package with it, such as onnxruntime-gpu.",
+                "execution provider %s is missing from the installed onnxruntime, which has %s; "
+                "networks run on the other providers. To use the missing one, install a package "
+                "such as onnxruntime-gpu.",
                 name,
                 ", ".join(here),
             )
@@ -151,7 +159,7 @@ def _session(path: Path, providers: Sequence[str], threads: int) -> Any:
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
-    options.log_severity_level = 4  # Fatal only: errors are raised.
+    options.log_severity_level = 4  # Log fatal errors only; other errors are raised.
     return onnxruntime.InferenceSession(str(path), options, providers=providers)
 
 

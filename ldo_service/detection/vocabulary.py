@@ -56,24 +56,25 @@ def class_names(
 
     Args:
         count: Number of classes.
-        given: Names from the user, which override those of the metadata; empty: none.
+        given: Names from the user, which override the names in the metadata; empty: none given.
         metadata: The metadata entry `names` of the network: a dictionary or list as Python source.
             None: the network has no such entry.
 
     Returns:
-        The given names, else those of the metadata, else those of COCO if `count` is 80.
+        The given names, else the names in the metadata, else the names of COCO if `count` is 80.
 
     Raises:
         ModelError: If the number of names is not `count`, or there are no names.
     """
     if given:
-        return _fitting(tuple(given), count, "the file of names has")
+        return _fitting(tuple(given), count, "the list of names has")
     if metadata is not None:
-        return _fitting(_of_metadata(metadata), count, "its metadata names")
+        return _fitting(_of_metadata(metadata), count, "the entry `names` of its metadata has")
     if count == len(COCO):
         return COCO
     raise ModelError(
-        f"the network has {count} classes without names: give a file with one name per line."
+        f"the network has {count} classes without names: give a file with one class name per line "
+        "(--names of `ldo models add`, or detector.class_names)."
     )
 
 
@@ -86,13 +87,16 @@ def read_names(path: Path) -> tuple[str, ...]:
     try:
         lines = path.read_text("utf-8").rstrip().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the names in {path} cannot be read: {error}.") from error
+        raise ConfigError(
+            f"the names in {path} cannot be read: {error}. Give a text file in UTF-8 with one name "
+            "per line."
+        ) from error
     names = tuple(line.strip() for line in lines)
     for number, name in enumerate(names, 1):
         if not is_name(name):
             raise ConfigError(
                 f"line {number} of {path} is not a valid name: write one name of 1 to {LONGEST} "
-                "characters per line, in the order of the network's classes."
+                "characters per line; for a detector, in the order of its classes."
             )
     return names
 
@@ -100,8 +104,8 @@ def read_names(path: Path) -> tuple[str, ...]:
 def _fitting(names: tuple[str, ...], count: int, who: str) -> tuple[str, ...]:
     if len(names) != count:
         raise ModelError(
-            f"the network has {count} classes and {who} {len(names)}: give the names that it was "
-            "trained with, one per line."
+            f"the network has {count} classes, but {who} {len(names)} names: give a file with the "
+            "names that the network was trained with, one per line."
         )
     return names
 
@@ -115,13 +119,14 @@ def _of_metadata(text: str) -> tuple[str, ...]:
         entry = [entry[number] for number in range(len(entry))]
     if not isinstance(entry, list | tuple):
         raise ModelError(
-            f"the network's metadata names no classes: {text[:60]!r}. Expected: a list, or a "
-            "dictionary with the keys 0, 1, ...; or give a file with one name per line."
+            f"the entry `names` of the network's metadata is {text[:60]!r}. Expected: a list of "
+            "class names, or a dictionary of them with the keys 0, 1, 2 and so on. Give a file "
+            "with one name per line instead."
         )
     if not all(map(is_name, entry)):
         raise ModelError(
-            f"the network's metadata has names that are not of 1 to {LONGEST} characters: "
-            f"{text[:60]!r}. Give a file with one name per line."
+            f"the network's metadata has class names that are not of 1 to {LONGEST} characters: "
+            f"{text[:60]!r}. Give a file with one name per line instead."
         )
     return tuple(entry)
 
@@ -143,10 +148,10 @@ def coco_class(name: str) -> str | None:
 
 
 def answers_to(query: str) -> tuple[str, ...]:
-    """Return the class names that match a text query, the nearest first.
+    """Return the class names that match a text query, the best match first.
 
     The first is the query's canonical name. Next is the COCO class that includes the query, if any:
-    a detector may only know that class. The last are the subclasses of the query.
+    a detector may know no narrower class. The last are the subclasses of the query.
 
     The answer to "chair" is "chair" and its subclasses such as "armchair"; the answer to "armchair"
     is "armchair" and "chair".
@@ -214,7 +219,8 @@ class Vocabulary:
     def index(self, name: str) -> int:
         """Return the index of a name, and add the name if it is unknown.
 
-        If the vocabulary is full or the name is empty, return the index of `other`.
+        An empty name gets the index of `other`, and so does an unknown name if the vocabulary is
+        full.
         """
         plain = canonical(name)
         if plain in self._indices:
@@ -237,18 +243,19 @@ class Vocabulary:
         All names keep their indices, even if a newer `synonyms.yaml` makes some of them synonyms.
 
         Raises:
-            ValueError: If the names do not start with the initial ones, repeat or exceed the cap.
+            ValueError: If the names do not start with the initial names, if a name is repeated, or
+                if there are more names than the cap.
         """
         names, vocabulary = packed["names"], Vocabulary(packed["cap"])
         start = len(FIRST_NAMES)
         if tuple(names[:start]) != FIRST_NAMES or not start <= len(names) <= vocabulary.cap:
             raise ValueError(
-                f"the {len(names)} names of the vocabulary must start with the {start} initial "
-                f"names of every vocabulary and be at most {vocabulary.cap}"
+                f"the stored vocabulary has {len(names)} names. Expected: first the {start} names "
+                f"of every new vocabulary, and at most {vocabulary.cap} names in total"
             )
         vocabulary._names = list(names)
         vocabulary._indices = {name: index for index, name in enumerate(names)}
         if len(vocabulary._indices) != len(names):
-            raise ValueError("a name of the vocabulary is repeated; each name must occur once")
+            raise ValueError("a name of the stored vocabulary is repeated; each must occur once")
         vocabulary.refused = packed["refused"]
         return vocabulary

@@ -11,8 +11,8 @@ lie near their cells.
 
 Here, `cells` is the number of cells of all grids, and C the number of classes. In yolox, the center
 of a box is an offset from its cell, and its size is a logarithm; networks exported with
-`--decode_in_inference` have pixels like the others. YOLOv7 has the layout of YOLOv5. YOLOv9 and
-YOLO11 have that of YOLOv8.
+`--decode_in_inference` output pixels, as the other layouts do. YOLOv7 has the layout of YOLOv5.
+YOLOv9 and YOLO11 have the layout of YOLOv8.
 
 An image is scaled to fit into the input of a network (letterbox), and the boxes are scaled back to
 the image. Of overlapping boxes of one class, non-maximum suppression keeps the one with the highest
@@ -27,19 +27,19 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, ModelError
 
-# Strides of known networks; each network has some consecutive ones of them.
+# Strides of known networks; each network has one or several consecutive strides of this list.
 STRIDES_PX = (4, 8, 16, 32, 64)
-# Maximum median distance of box centers from their cells, in cells. The networks place the sides of
-# a box at most 16 cells from its cell.
+# Maximum median distance of box centers from their cells, in cells. The networks place each side of
+# a box at most 16 cells from its cell, and therefore the center at most 8.
 CELLS_APART = 8
 SCORE_TOLERANCE = 1e-3  # Maximum excess of a score over 0..1, which rounding may cause.
 EXPECTED = (
-    "[1, N, 5 + C] with three boxes a cell (yolov5) or one (yolox), or [1, 4 + C, N] (yolov8), "
-    "over grids of strides 8, 16 and 32 pixels or the like, exported without suppression of "
-    "overlapping boxes"
+    "[1, N, 5 + C] with three boxes per grid cell (yolov5) or one box (yolox), or [1, 4 + C, N] "
+    "(yolov8), for N boxes and C classes, with consecutive grid strides such as 8, 16 and 32 "
+    "pixels, without non-maximum suppression"
 )
 
-PADDING = 114  # Gray value of the padding around images that YOLO networks are trained with.
+PADDING = 114  # Gray value that pads the images in the training of YOLO networks.
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +70,8 @@ class Grid:
     """Grid cells in which a network predicts its boxes.
 
     Attributes:
-        corners_px: Upper left corners of the cells, [N, 2], pixels of the input.
-        strides_px: Sides of the cells, [N, 1], pixels of the input.
+        corners_px: Upper left corner of the cell of each box, [N, 2], pixels of the input.
+        strides_px: Side of the cell of each box, [N, 1], pixels of the input.
         boxes_per_cell: Number of boxes per cell.
     """
 
@@ -110,7 +110,7 @@ class Head:
         objectness, it is the output of the class.
         """
         rows = _rows(output, self.layout)
-        scores = self._scores(rows)  # This cheap bound excludes most boxes.
+        scores = self._scores(rows)  # Cheap upper bounds, which exclude most boxes.
         chosen = np.flatnonzero(scores >= score_min)
         classes = rows[chosen, self._first_class :]
         class_ids = classes.argmax(axis=1)
@@ -131,14 +131,14 @@ class Head:
         low, high = float(scores.min()), float(scores.max())
         if low < -SCORE_TOLERANCE or high > 1 + SCORE_TOLERANCE:
             raise ModelError(
-                f"with the layout {self.layout.name}, scores of {low:.3g} to {high:.3g} are no "
-                "probabilities: export the network with its last sigmoid."
+                f"with the layout {self.layout.name}, the scores from {low:.3g} to {high:.3g} are "
+                "no probabilities in 0..1: export the network with its final sigmoid."
             )
         if self.cells_apart(output) > CELLS_APART:
             raise ModelError(
-                f"with the layout {self.layout.name}, boxes lie {self.cells_apart(output):.0f} "
-                f"grid cells from the cells that predict them, expected at most {CELLS_APART:g}: "
-                "export the network with boxes in pixels."
+                f"with the layout {self.layout.name}, the median distance of a box from the grid "
+                f"cell that predicts it is {self.cells_apart(output):.0f} cells, expected at most "
+                f"{CELLS_APART:g}: export the network with boxes in pixels."
             )
 
     def cells_apart(self, output: np.ndarray) -> float:
@@ -177,12 +177,13 @@ def detect_layout(output: np.ndarray, input_px: tuple[int, int], wanted: str = "
 
     Raises:
         ConfigError: If there is no layout of the name `wanted`.
-        ModelError: If the output has no known layout, or another one than wanted.
+        ModelError: If the output has no known layout or another layout than `wanted`, or fails
+            `Head.check`.
     """
     if output.ndim != 3 or output.shape[0] != 1 or output.dtype != np.float32:
         raise ModelError(
             f"the network's output is {output.dtype} {list(output.shape)}. Expected: float32 "
-            f"{EXPECTED}."
+            f"{EXPECTED}. Export the network in one of these layouts."
         )
     layout = layout_named(wanted) if wanted else _layout_of(output, input_px)
     boxes, channels = _rows(output, layout).shape
@@ -193,8 +194,8 @@ def detect_layout(output: np.ndarray, input_px: tuple[int, int], wanted: str = "
     if class_count < 1 or boxes_per_cell != layout.boxes_per_cell or is_without_cells:
         raise ModelError(
             f"the network's output {list(output.shape)} for an input of "
-            f"{input_px[0]}x{input_px[1]} pixels is not that of {layout.name}. "
-            f"Expected: {EXPECTED}."
+            f"{input_px[0]}x{input_px[1]} pixels does not have the layout {layout.name}. "
+            f"Expected: {EXPECTED}. Choose another layout, or export the network again."
         )
     heads = [Head(layout, class_count, grid, is_decoded=True)]
     if layout.name == "yolox":
@@ -211,15 +212,15 @@ def layout_named(name: str) -> Layout:
         ConfigError: If there is no such layout.
     """
     if name not in LAYOUTS:
-        raise ConfigError(f"there is no layout {name!r}. The layouts are {', '.join(LAYOUTS)}.")
+        raise ConfigError(f"there is no layout {name!r}. Choose from {', '.join(LAYOUTS)}.")
     return LAYOUTS[name]
 
 
 def find_grid(count: int, input_px: tuple[int, int]) -> Grid | None:
     """Return the grid for a network that predicts `count` boxes, or None if no grid fits.
 
-    A grid has some consecutive strides and one or three boxes per cell. No two grids for the same
-    input have the same number of boxes. The boxes are sorted by stride, the smallest first. With
+    A grid has consecutive strides and one or three boxes per cell. No two grids for the same input
+    have the same number of boxes. The boxes are sorted by stride, the smallest first. With
     three boxes per cell, the cells of each stride are repeated three times, one repetition after
     the other.
 
@@ -256,7 +257,8 @@ def _layout_of(output: np.ndarray, input_px: tuple[int, int]) -> Layout:
             return layout
     raise ModelError(
         f"the network's output {list(output.shape)} for an input of "
-        f"{input_px[0]}x{input_px[1]} pixels is of no known layout. Expected: {EXPECTED}."
+        f"{input_px[0]}x{input_px[1]} pixels is of no known layout. Expected: {EXPECTED}. Export "
+        "the network in one of these layouts."
     )
 
 
@@ -316,7 +318,7 @@ class Letterbox:
 
         Networks have the origin at the corner of the first pixel, this project has it at the
         pixel's center. So x_image = (x_input - offset) * W / w - 0.5, where W is the width of the
-        image and w that of the scaled image. The image covers -0.5 to W - 0.5.
+        image and w is the width of the scaled image. The image covers -0.5 to W - 0.5.
 
         Args:
             boxes: Boxes in the input, [M, 4], x0 y0 x1 y1, pixels.

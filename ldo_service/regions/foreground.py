@@ -22,8 +22,8 @@ class ForegroundConfig:
 
     max_step: float = 0.05  # Maximum relative depth step within 3x3 pixels of one surface.
     min_cosine: float = 0.9  # Minimum cosine of normals 4 px apart on one surface.
-    # Minimum fraction of a surface inside the box. It excludes floors and walls, which extend
-    # outside of the box.
+    # Minimum fraction of a surface inside the box. This limit excludes floors and walls, which
+    # extend outside of the box.
     min_inside: float = 0.5
     max_gap: float = 0.15  # Maximum relative depth step within 3x3 pixels of one object.
     # Bin width, relative to the depth, of the histogram whose mode is the object's depth.
@@ -80,7 +80,7 @@ class Foreground:
     mask: np.ndarray
 
     def image(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the mask in the whole image, which has this shape, [H, W] bool."""
+        """Return the mask for the whole image of this shape, [H, W] bool."""
         out = np.zeros(shape, bool)
         height, width = self.mask.shape
         out[self.row : self.row + height, self.column : self.column + width] = self.mask
@@ -134,7 +134,7 @@ def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> S
         ValueError: If depth_m does not have the size of the camera's images.
     """
     if depth_m.shape != (camera.height, camera.width):
-        raise ValueError(f"depth_m has shape {depth_m.shape}, must have that of {camera}.")
+        raise ValueError(f"depth_m has shape {depth_m.shape}, must have the size of {camera}.")
     labels = np.empty(depth_m.shape, np.int32)
     sizes = _foreground.surfaces(
         np.ascontiguousarray(depth_m, np.float32),
@@ -179,7 +179,7 @@ def foreground(
         wall.
 
     Raises:
-        ValueError: If the surfaces belong to another image.
+        ValueError: If the surfaces have another size than the depth image.
     """
     rows, columns = pixels_of(box, depth_m.shape)
     mask = np.zeros((rows.stop - rows.start, columns.stop - columns.start), bool)
@@ -221,7 +221,8 @@ class NestingConfig:
     """
 
     inside: float = 0.8  # Minimum fraction of the smaller region that lies in the larger region.
-    # Minimum ratio of the sizes of both regions; below it, both regions show the same object.
+    # Minimum size of the larger region divided by the size of the smaller one; below this ratio,
+    # both regions show the same object.
     times: float = 2.0
     # Minimum score of the smaller region; many boxes with lower scores are wrong.
     min_score: float = 0.5

@@ -137,7 +137,7 @@ def _joined(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndar
 
 
 def _on_planes(found: Planes, apart: np.ndarray) -> np.ndarray:
-    """Return the pixels on planes in `apart` and next to such planes, [h, w] bool.
+    """Return the pixels of `apart` that lie on planes, and the pixels next to them, [h, w] bool.
 
     Args:
         found: All planes of the keyframe.
@@ -184,7 +184,7 @@ def _divided(
 
 
 def _across(values: np.ndarray, r: int, axis: int) -> np.ndarray:
-    """Return the value `r` pixels after minus that `r` pixels before each pixel, along an axis.
+    """Return the difference of the values `r` pixels after and before each pixel along an axis.
 
     The result is shorter than `values` by 2 r along the axis.
     """

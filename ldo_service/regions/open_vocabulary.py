@@ -37,14 +37,17 @@ class OpenVocabularyConfig:
 
     trigger: RegionProposalConfig = field(default_factory=RegionProposalConfig)
     regions: RegionTrackerConfig = field(default_factory=RegionTrackerConfig)
-    reliable: float = 0.6  # Minimum probability of a label that needs no label request (III.B).
+    # Minimum probability of a reliable label in the map. Pixels with such a label need no label
+    # request (III.B).
+    reliable: float = 0.6
     # Minimum confidence of a label result. With 0.5, the recall on the synthetic flat is 7
-    # percentage points lower. Labellers that recognize regions without an object return few results
-    # with a confidence below 0.3.
+    # percentage points lower. Results below 0.3 are rare if the labeller recognizes that a region
+    # shows no object.
     min_sure: float = 0.3
     # Labels that are no objects; a region with such a label result stays background.
     structure: tuple[str, ...] = ("background", "wall", "floor", "ceiling")
-    # Maximum pending label requests, some 10 kB each; as many as `maps.label_queue` holds.
+    # Maximum pending label requests, about 10 kB each; equal to `MAX_WAITING` in
+    # `maps.label_queue`.
     max_open: int = 96
 
     def __post_init__(self) -> None:
@@ -195,7 +198,7 @@ class OpenVocabularyLabeling:
             np.array([label_ids]),
             np.array([confidence], np.float32),
             (pending.part,),
-            # The Gaussians of a standing object have the label of the surface below it until now.
+            # The Gaussians of a standing object still have the label of the surface below it.
             replaces_labels=pending.kind == "standing"
             and confidence >= self.config.regions.settled
             and before is not None
@@ -282,7 +285,7 @@ class OpenVocabularyLabeling:
             "regions_tracked": len(self._regions),
             "questions": self._requests,
             "label_requests_pending": len(self._open),
-            "label_requests_expired": self._overdue,  # Dropped for newer requests.
+            "label_requests_expired": self._overdue,  # Dropped for newer requests, or not sent.
             "answers_named": self._named,
             # Results without a label: no object, or no labeller available.
             "answers_unnamed": self._unnamed,

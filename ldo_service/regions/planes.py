@@ -25,9 +25,9 @@ _EPSILON = np.float32(1e-6)
 class PlaneConfig:
     """Settings of the planes.
 
-    The values are those with which regions covered the objects of the sequence `synthetic:flat`
-    best; no other data were tried. Lengths in pixels refer to the small image, which is the depth
-    image scaled down to a width of about `width_px`.
+    With these values, regions covered the objects of the sequence `synthetic:flat` best; no other
+    data were tried. Lengths in pixels refer to the small image, which is the depth image scaled
+    down to a width of about `width_px`.
     """
 
     # Width of the small image; at this width, normals over a few pixels are stable enough.
@@ -39,7 +39,7 @@ class PlaneConfig:
     # exceeds max_step.
     step_floor: float = 0.004
     min_share: float = 0.01  # Minimum plane size as a fraction of the image.
-    most: int = 24  # Maximum number of surfaces to which planes are fitted, the largest.
+    most: int = 24  # Planes are fitted to at most this number of surfaces, the largest ones.
     # Maximum difference, 1 / m, between the inverse depth of a plane and of its pixels.
     tolerance: float = 0.006
     # Maximum fraction of a structural plane's outline past which a farther surface is visible.
@@ -164,8 +164,8 @@ def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
 def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -> np.ndarray:
     """Return the number of the structural plane of each pixel, [h, w] int32; 0 without one.
 
-    A structural plane consists of its pixels in `found` and of pixels up to 15 px around them, as
-    far as their distance from the plane is within the depth noise.
+    A structural plane consists of its pixels in `found` and of pixels up to 15 px around them. A
+    pixel is excluded if its distance from the plane exceeds the depth noise.
     """
     out = np.zeros(found.number.shape, np.int32)
     for number, inverse in enumerate(found.inverses, 1):

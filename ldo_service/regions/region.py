@@ -23,8 +23,8 @@ def with_vote(votes: Votes, name: str, sure: float, weight: float = 1.0) -> Vote
     """Add a vote for the label `name`; with an empty name, nothing is added.
 
     The value of the vote is `weight` times the square of the confidence `sure`, 0..1. The square is
-    used because, in the demo, a third of the boxes with a score of 0.3 are right, and nearly all of
-    those with a score of 0.6.
+    used because, in the demo, a third of the boxes with a score of 0.3 are right, and nearly all
+    boxes with a score of 0.6.
 
     >>> votes = with_vote((("tv", 0.25, 0.5),), "tv", 0.6)
     >>> with_vote(votes, "oven", 0.5, weight=4)
@@ -156,7 +156,8 @@ class Region:
         votes: Votes for each label.
         questions: Number of label requests so far.
         quality: Summed quality of the views at the last label request; 0 before any request.
-        answer: Label result with the highest confidence, without alternatives; None without one.
+        answer: Label result with the highest confidence, without its alternative labels; None
+            before any label result.
         is_supported: True if the region stood on another object in any keyframe. The region is then
             a separate object and not a part of the other object.
     """
@@ -243,8 +244,8 @@ def observe_region(
 def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Select at most MAX_POINTS of a region's pixels, spread evenly over the region.
 
-    The selected pixels lie on a square grid. Only if the region is too thin for a grid, every n-th
-    pixel is selected; in a rectangle, every n-th pixel may lie on a few lines.
+    The selected pixels lie on a square grid. If the region is too thin for a grid, every n-th pixel
+    is selected instead. In other regions, every n-th pixel could lie on a few lines only.
 
     Args:
         rows: Rows of the region's pixels, [N].
@@ -271,8 +272,8 @@ def merge_observation(region: Region, seen: RegionObservation, max_boxes: float)
     Args:
         region: The region.
         seen: The observation.
-        max_boxes: Maximum sum of the votes for a label to which the vote of the detector's box may
-            be added.
+        max_boxes: Maximum sum of the votes for a label after a vote of a detector's box, see
+            `with_box`.
     """
     proposal = seen.candidate
     surer = max(region, proposal, key=lambda one: one.score)

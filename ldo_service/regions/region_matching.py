@@ -11,7 +11,7 @@ from ldo_service.geometry import Camera, se3
 from .foreground import Foreground
 from .region import Region, RegionObservation
 
-# Distance between sampled pixels, and side of the square of the mask that each of them stands for.
+# Distance between sampled pixels, and side of the square of the mask that each sample represents.
 STRIDE_PX = 4
 # Margin around a region's visible points in which pixels are sampled. The points are few and do not
 # reach the edges of the region.
@@ -170,8 +170,8 @@ def propagate_mask(
         camera: Intrinsics of both keyframes.
         T_seen_now: Transform from the current camera to the earlier one, [4, 4].
         max_gap_m: Maximum distance of a pixel's point from the nearest point of the earlier
-            observation. If 1.5 times the spacing of the observation's points is larger, it is used
-            instead.
+            observation. If 1.5 times the spacing of the observation's points is larger, that
+            distance is used instead.
 
     Returns:
         The mask in the current keyframe, or None if fewer than 12 sampled pixels belong to the
@@ -303,8 +303,8 @@ class RegionMatcher:
     def overlaps(self, shown: Sequence[tuple[int, Foreground]]) -> np.ndarray:
         """Estimate the IoU of each pair of M regions' masks in the keyframe.
 
-        The IoU of regions a and b is estimated from two fractions: that of a's points in the mask
-        of b, and that of b's points in the mask of a.
+        The IoU of regions a and b is estimated from two fractions: the fraction of a's points in
+        the mask of b, and the fraction of b's points in the mask of a.
 
         Args:
             shown: Ids of M regions, each once, and their masks in the keyframe.

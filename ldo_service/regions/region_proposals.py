@@ -44,9 +44,10 @@ class RegionProposalConfig:
     )
     # Maximum size of a region as a fraction of the image; larger ones are rooms, not objects.
     max_share: float = 0.5
-    # Minimum fraction of its box that a region fills; with less, it is a frame around something.
+    # Minimum fraction of its box that a region fills; a region that fills less is a frame around
+    # another object.
     min_fill: float = 0.25
-    most: int = 32  # Maximum proposals of a keyframe, the largest.
+    most: int = 32  # Maximum proposals of a keyframe; the largest regions are proposed.
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     segments: GeometricSegmentationConfig = field(default_factory=GeometricSegmentationConfig)
 
@@ -73,7 +74,7 @@ class RegionProposalConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionProposal:
-    """Region that has no reliable label, or that a box with a high score shows.
+    """Region without a reliable label, or region of a detector's box with a high score.
 
     Attributes:
         box_px: Box of the region, [4], x0 y0 x1 y1, pixels.
@@ -104,7 +105,7 @@ def propose_regions(
     room: Sequence[Foreground],
     config: RegionProposalConfig,
 ) -> list[RegionProposal]:
-    """Return the regions of a keyframe that need a label, and those of boxes with a high score.
+    """Return the regions of a keyframe that need a label, and the regions of high-score boxes.
 
     The region tracker follows both kinds. The result is deterministic.
 
@@ -154,9 +155,9 @@ def _boxed(
 ) -> tuple[list[RegionProposal], list[bool]]:
     """Return a proposal for each distinct box, and which of the regions `found` were used for them.
 
-    The arguments are those of `propose_regions`. The mask of a box is that of the region that fits
-    the box best or, if no region fits, the foreground of the box. Structural planes are removed
-    from the foreground if the remainder is large enough.
+    The arguments are those of `propose_regions`. A proposal has the mask of the region that fits
+    the box best. If no region fits, the mask is the foreground of the box; structural planes are
+    removed from the foreground if the remainder is large enough.
     """
     proposals, is_taken, pieces = [], [False] * len(found), None
     regions_px = _boxes(found)
@@ -177,7 +178,7 @@ def _boxed(
 
 
 def remove_structure(part: Foreground, room: Sequence[Foreground], inside: float) -> Foreground:
-    """Remove structural planes that lie mostly outside of an object's box from the object's mask.
+    """Remove from an object's mask the structural planes that lie mostly outside of its box.
 
     Examples are the wall between the leaves of a plant, and the floor between the legs of a table.
     The mask stays unchanged if most of it would be removed. An example is a clock, whose mask lies
@@ -186,7 +187,7 @@ def remove_structure(part: Foreground, room: Sequence[Foreground], inside: float
     Args:
         part: The mask of the object.
         room: Structural planes.
-        inside: Fraction of a plane inside the box, from which the plane is not removed.
+        inside: Fraction, 0..1. A plane is removed if less than this fraction of it is in the box.
 
     >>> plant, wall = np.ones((2, 4), bool), np.zeros((6, 8), bool)
     >>> wall[:, 3:] = True
@@ -264,8 +265,8 @@ def distinct_boxes(
 ) -> list[int]:
     """Return the numbers of the boxes that show different objects.
 
-    Of several boxes that show the same object, that with the highest score is returned. A box shows
-    the object of a box with a higher score if their IoU exceeds `same_iou`.
+    Of several boxes that show the same object, the one with the highest score is returned. Two
+    boxes show the same object if their IoU exceeds `same_iou`.
 
     >>> boxes = np.array([[0, 0, 10, 10], [1, 0, 10, 10], [20, 0, 30, 10.0]])
     >>> distinct_boxes(boxes, np.array([0.9, 0.4, 0.5]), RegionProposalConfig())
@@ -278,7 +279,7 @@ def distinct_boxes(
 def _is_plausible(
     candidate: RegionProposal, shape: tuple[int, ...], config: RegionProposalConfig
 ) -> bool:
-    """Return whether the size of a region and its fraction of its box are those of an object."""
+    """Return whether a region has the size of an object and fills enough of its box."""
     width, height = candidate.box_px[2:] - candidate.box_px[:2]
     size_px = np.count_nonzero(candidate.part.mask)
     is_object = size_px <= config.max_share * shape[0] * shape[1]

@@ -219,7 +219,7 @@ class RegionTracker:
     ) -> list[RegionRequest]:
         """Return label requests for the regions that need a label now, up to the allowed number.
 
-        Regions come first whose view quality increased most since their last request; the increase
+        Regions whose view quality increased most since their last request come first. The increase
         is weighted by the region's size and kind (see `_priority`).
 
         Args:

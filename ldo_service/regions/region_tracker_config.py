@@ -25,13 +25,15 @@ class RegionTrackerConfig:
     per_keyframe: float = 2.5
     # Maximum label requests at one keyframe, if earlier keyframes made fewer than per_keyframe.
     at_once: int = 4
-    # Minimum ratio of the views' summed quality to that at the last request for another request.
+    # A label is requested again if the summed quality of the views is at least this multiple of the
+    # sum at the last request.
     gain: float = 1.3
-    # Minimum confidence of a label result or score of a box after which no label is requested.
+    # A label result with at least this confidence, or a box with at least this score, ends the
+    # label requests of a region.
     settled: float = 0.6
-    # Weight of the vote of a label result relative to that of a box, because a result is based on
-    # several views. All boxes with the same label together have at most as many votes as one label
-    # result with confidence 1.
+    # Weight of the vote of a label result; a box has the weight 1. A label result weighs more,
+    # because it is based on several views. All boxes with the same label together have at most as
+    # many votes as one label result with confidence 1.
     answer_weight: float = 4.0
     # True: boxes vote for the label of a region. False: labels of boxes are fused per Gaussian
     # (III.B), and the label of a region comes from the labeller only. A change does not affect the
@@ -46,13 +48,14 @@ class RegionTrackerConfig:
     # Two observations show the same region if at least this fraction of the points of each lies in
     # the mask of the other.
     overlap: float = 0.6
-    # Maximum difference between the depth of a projected point and the measured depth at its pixel
-    # for the point to be visible (delta_z, III.A).
+    # Maximum difference between the depth of a visible point of a region and the measured depth at
+    # the point's pixel (delta_z, III.A).
     max_gap_m: float = 0.1
     # Minimum points of a region that must be visible in a keyframe to match the region there.
     min_points: int = 12
-    min_quality: float = 0.02  # Minimum quality of a view; in worse views, a labeller sees nothing.
-    # Maximum regions; the region observed longest ago is dropped. A region takes about 50 kB: five
+    # Minimum quality of a view; in worse views, a labeller recognizes nothing.
+    min_quality: float = 0.02
+    # Maximum regions; the ones observed longest ago are dropped. A region takes about 50 kB: five
     # views of 5 kB and two masks of 12 kB.
     most: int = 1024
     view: ViewConfig = field(default_factory=ViewConfig)
@@ -89,8 +92,8 @@ class RegionTrackerConfig:
             )
         if self.views > MAX_VIEWS:
             raise ConfigError(
-                f"views={self.views} must be at most {MAX_VIEWS}, the maximum number of views in a "
-                "label request."
+                f"RegionTrackerConfig.views={self.views} must be at most {MAX_VIEWS}, the maximum "
+                "number of views in a label request."
             )
         if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.min_points >= 1):
             raise ConfigError(

@@ -63,7 +63,9 @@ class MapView:
     def __post_init__(self) -> None:
         n, v, size = len(self.rows), len(self.indices), (self.camera.height, self.camera.width)
         if not len(self.labels) == len(self.ids) == len(self.anchors) == n:
-            raise ValueError(f"labels, ids and anchors must each have {n} rows, as the map has.")
+            raise ValueError(
+                f"labels, ids and anchors must each have {n} rows, one per Gaussian of the map."
+            )
         if len(self.regions) != v or (v and not self.indices[-1] < n):
             raise ValueError(
                 f"regions has {len(self.regions)} entries for {v} Gaussians: it must have one for "
@@ -75,12 +77,13 @@ class MapView:
             )
         if len(self.classes) != len(self.boxes):
             raise ValueError(
-                f"there are {len(self.classes)} classes for {len(self.boxes)} regions, must be one "
-                "per region."
+                f"classes has {len(self.classes)} rows for {len(self.boxes)} regions, must have "
+                "one row per region."
             )
         if self.depth_m.shape != size:
             raise ValueError(
-                f"depth has shape {self.depth_m.shape}, must have that of its camera, {size}."
+                f"depth_m has shape {self.depth_m.shape}, must have {size}, the size of the "
+                "camera's images."
             )
 
 
@@ -113,7 +116,8 @@ def compute_region_statistics(
 ) -> RegionStatistics:
     """Compute the statistics of the regions of a keyframe.
 
-    Only the max_regions regions with the most Gaussians are used, min_gaussians or more each.
+    Only regions with at least min_gaussians Gaussians are used, and at most max_regions of them,
+    those with the most Gaussians.
     """
     hit = np.flatnonzero(view.regions >= 0)
     counts = np.bincount(view.regions[hit], minlength=len(view.boxes))
@@ -157,7 +161,11 @@ def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationCon
 def whole_regions(
     view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
 ) -> tuple[MapView, RegionStatistics]:
-    """Merge regions that show parts of one object; return the new view and its statistics."""
+    """Merge regions that show parts of one object.
+
+    Returns:
+        The view with the merged regions, and their statistics.
+    """
     regions = compute_region_statistics(view, T_camera_map, config)
     whole = merge_parts(view, regions, config)
     return whole, regions if whole is view else compute_region_statistics(
@@ -174,10 +182,10 @@ def find_containing_regions(
 ) -> np.ndarray:
     """Find the region that contains each of M regions of a keyframe.
 
-    Region a contains region b if all of these hold: they share a class; the gap between their depth
-    ranges is at most max_depth_gap_m; the fraction part_inside of the box of b lies in the larger
-    box of a. A region without Gaussians gets the depth range of the largest region in its box:
-    regions of parts are smaller, and all Gaussians may have been assigned to them.
+    Region a contains region b if three conditions hold: the regions share a class; the gap between
+    their depth ranges is at most max_depth_gap_m; and at least the fraction part_inside of the box
+    of b lies in the larger box of a. If all Gaussians of a region were assigned to the smaller
+    regions of its parts, it gets the depth range of the largest of these regions.
 
     Args:
         boxes: Boxes of the regions, [M, 4], x0 y0 x1 y1, pixels.
@@ -289,8 +297,8 @@ def predict_boxes(
 ) -> PredictedBoxes:
     """Predict boxes and visibility of landmarks in a keyframe.
 
-    `table` has K records of `LANDMARK`. A landmark without resident members is represented by its
-    centroid.
+    `table` has K records of `LANDMARK`. A landmark without reliable resident members is represented
+    by its centroid.
     """
     where = rows_of(table["members"], view.ids)
     there = ((where >= 0) & reliable_members(table))[:, :PROBES]

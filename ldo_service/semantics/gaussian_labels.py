@@ -77,11 +77,11 @@ def smooth_labels(
         p_i <- (1 - rate K_i) p_i + rate sum_j k_ij p_j,  K_i = sum_j k_ij
 
     It follows the gradient of the expected disagreement, sum_j k_ij p_j, and its result is again a
-    distribution. All p on the right are those before the step.
+    distribution. All p on the right have their values before the step.
 
     Neighbors are Gaussians in `indices` within radius_m. They are chosen from at most sixteen
-    candidates, found in voxels two sigma wide: the first eight Gaussians in the same voxel and the
-    first ones of the surrounding voxels. The result is bitwise equal for any number of threads.
+    candidates in voxels two sigma wide: at most eight Gaussians from the same voxel, and the others
+    from the surrounding voxels. The result is bitwise equal for any number of threads.
 
     Args:
         rows: Gaussians of the map, [N, 16].
@@ -104,7 +104,7 @@ def smooth_labels(
     >>> rows[1, 0] = 0.05
     >>> fields(labels)["weights"][0, 0], fields(labels)["ids"][0, 0] = 1, 2
     >>> loss = smooth_labels(rows, labels, np.arange(2, dtype=np.uint32), ConsistencyConfig())
-    >>> round(loss.literal, 3), round(loss.expected, 3)  # both see each other: 2 exp(-1)
+    >>> round(loss.literal, 3), round(loss.expected, 3)  # Each is the other's neighbor: 2 exp(-1).
     (0.736, 0.736)
     >>> distribution(labels, 3).astype(float).round(3).tolist()
     [[0.037, 0.0, 0.963], [0.963, 0.0, 0.037]]
@@ -123,8 +123,9 @@ class LabelConfig:
     """
 
     ema: Literal["paper", "corrected"] = "corrected"  # Rule of the update; see `observe`.
-    keep: float = 0.9  # Factor on earlier observations at each new one: lambda (III.A).
-    # Misses in a row after which a Gaussian becomes background, with `paper`: N_miss (III.A).
+    # Factor by which each new observation reduces the weight of earlier ones: lambda (III.A).
+    keep: float = 0.9
+    # Misses in a row after which the rule `paper` makes a Gaussian background: N_miss (III.A).
     miss_limit: int = 5
     # A miss with `corrected` is evidence for background if the object would appear large enough for
     # the detector to find it. The next three settings define this.
@@ -132,12 +133,12 @@ class LabelConfig:
     min_px: float = 40.0  # Minimum side (pixels) of an object's box for a miss to count.
     # Assumed size of a Gaussian's object while no label of the Gaussian has been observed.
     usual_extent_m: float = 0.5
-    # Damping, 0..1, of observations with low confidence of Gaussians with low entropy; 0: none.
+    # Damping, 0..1, of low-confidence observations of low-entropy Gaussians; 0: no damping.
     hold_back: float = 1.0
 
     def __post_init__(self) -> None:
         if self.ema not in ("paper", "corrected"):
-            raise ConfigError(f"ema={self.ema!r} must be 'paper' or 'corrected'.")
+            raise ConfigError(f"LabelConfig.ema={self.ema!r} must be 'paper' or 'corrected'.")
         if not (0 <= self.keep < 1 and 0 <= self.miss_weight <= 1 and 0 <= self.hold_back <= 1):
             raise ConfigError(
                 named(self, "keep", "miss_weight", "hold_back")
@@ -188,14 +189,14 @@ def observe(
     observation has the weight w = confidence. W is the sum of the decayed weights: W <- keep W + w
     and a = w / W, so that the first observation has a = 1. A miss is an observation of background
     with w = miss_weight. A miss counts only if the object would appear at least min_px large. The
-    size of the object is that at the last observation of a label, or else usual_extent_m.
+    size of the object was stored at the last observation of a label; before the first observation,
+    it is usual_extent_m.
 
     An observation with low confidence changes a Gaussian less if the entropy H of p (nats) is low:
     the factor 1 - hold_back exp(-2 H) (1 - confidence) multiplies a with `paper` and w with
     `corrected`. It is applied only if p has a label other than background.
 
-    The result is bitwise equal for any number of threads. Paper, III.A; ALGORITHMS, Semantics on
-    Gaussians.
+    The result is bitwise equal for any number of threads. Paper, III.A.
 
     Raises:
         ValueError: If the shapes or types of the arrays do not fit.
@@ -241,8 +242,8 @@ def observe(
 def clear_background(labels: np.ndarray, indices: np.ndarray) -> None:
     """Remove the weight of background from rows `indices` [V] of labels [N, 32], in place.
 
-    The weights of the other labels are scaled to a sum of one. The evidence is multiplied by the
-    sum that they had before.
+    The weights of the other labels are scaled to a sum of one. The evidence is multiplied by their
+    sum before the scaling.
 
     >>> labels = new_labels(1)
     >>> row = fields(labels)
@@ -271,7 +272,7 @@ def background(labels: np.ndarray) -> np.ndarray:
 def top_labels(labels: np.ndarray) -> np.ndarray:
     """Return the likeliest label of each label row [N, 32], [N] uint8.
 
-    If background is as likely as the likeliest other label, it is background.
+    If background is as likely as the likeliest other label, the result is background.
     """
     rows = fields(labels)
     return np.where(rows["weights"][:, 0] > background(labels), rows["ids"][:, 0], BACKGROUND)

@@ -32,7 +32,7 @@ class AssignmentConfig:
 
     def __post_init__(self) -> None:
         if self.rule not in ("coverage", "iou"):
-            raise ConfigError(f"rule={self.rule!r} must be 'coverage' or 'iou'.")
+            raise ConfigError(f"AssignmentConfig.rule={self.rule!r} must be 'coverage' or 'iou'.")
         if not (0 <= self.min_overlap <= 1 and self.max_depth_gap_m > 0):
             raise ConfigError(
                 named(self, "min_overlap", "max_depth_gap_m")

@@ -27,8 +27,8 @@ _AT_A_TIME = 128  # Landmarks per batch of `derive_in_batches`, to stay in cache
 LANDMARK = np.dtype(
     [
         ("id", "<i8"),  # Id of the object for other programs; -1 for a candidate.
-        ("seen", "<i4"),  # Keyframes that observed the object.
-        ("missed", "<i4"),  # Keyframes that should have observed the object and did not.
+        ("seen", "<i4"),  # Number of keyframes that observed the object.
+        ("missed", "<i4"),  # Number of keyframes that should have observed the object and did not.
         ("misses", "<i4"),  # Misses in a row since the last observation.
         ("first", "<i8"),  # First and last keyframe that observed the object.
         ("last", "<i8"),
@@ -263,8 +263,8 @@ def boxes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return boxes around K sets of points.
 
-    By default, a box is parallel to the axes of the map. If the box along the principal axes of the
-    points has less than four fifths of that volume, the box along the principal axes is returned.
+    By default, a box is parallel to the axes of the map. If a box along the principal axes of the
+    points has less than four fifths of this box's volume, the smaller box is returned instead.
 
     Args:
         p_map: Points in the map frame, [K, M, 3], meters.

@@ -88,7 +88,8 @@ class Objects:
                 knows all labels.
             is_late: True if the keyframe was observed before and the view has only regions whose
                 labels arrived later. Objects then gain no observation, and nothing is missed. A
-                candidate gains one only if the keyframe is outside of its first to last keyframe.
+                candidate gains an observation only if the keyframe is before its first or after its
+                last observation.
 
         Returns:
             The changes of the objects.
@@ -194,7 +195,10 @@ class Objects:
         ]
 
     def _lacks(self, which: np.ndarray, keyframe: int) -> np.ndarray:
-        """Return which rows [K] are candidates first seen after or last seen before a keyframe."""
+        """Return which landmarks are candidates that lack observations around a keyframe, [K] bool.
+
+        Such a candidate was first observed after the keyframe, or last observed before it.
+        """
         table = self._table[which]
         is_within = (table["first"] <= keyframe) & (keyframe <= table["last"])
         return (table["id"] == CANDIDATE) & ~is_within
@@ -303,7 +307,10 @@ class Objects:
 
     # --- candidates -------------------------------------------------------------------------------
     def _begin(self, view: MapView, regions: RegionStatistics, left: np.ndarray) -> None:
-        """Create candidates for the regions `left`; drop those seen longest ago if too many."""
+        """Create candidates for the regions `left`.
+
+        If there are too many candidates, those observed longest ago are dropped.
+        """
         new = new_landmarks(len(left), view.keyframe)
         new["members"], new["seen"] = regions.members[left], 1
         new["votes"] = one_each(new["members"])
@@ -314,7 +321,8 @@ class Objects:
         candidates = np.flatnonzero(self._table["id"] == CANDIDATE)
         excess = len(candidates) - self.config.max_candidates
         if excess > 0:
-            # New candidates, at the end, are dropped last: a late label may have an old keyframe.
+            # New candidates are at the end of the table. They are dropped last, because a late
+            # label may have an old keyframe.
             is_new = candidates >= len(self._table) - len(new)
             oldest = np.lexsort((self._table["last"][candidates], is_new))[:excess]
             self._table = np.delete(self._table, candidates[oldest])

@@ -35,10 +35,12 @@ class AssociationConfig:
         if self.max_depth_gap_m <= 0 or min(self.min_gaussians, self.max_regions) < 1:
             raise ConfigError(
                 named(self, "max_depth_gap_m", "min_gaussians", "max_regions")
-                + ": max_depth_gap_m must be positive, the counts at least 1."
+                + ": max_depth_gap_m must be positive, min_gaussians and max_regions at least 1."
             )
         if self.part_inside <= 0:
-            raise ConfigError(f"part_inside={self.part_inside:g} must be positive.")
+            raise ConfigError(
+                f"AssociationConfig.part_inside={self.part_inside:g} must be positive."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +50,8 @@ class ObjectsConfig:
     association: AssociationConfig = field(default_factory=AssociationConfig)
     # Keyframes that must observe a candidate before it becomes an object (III.C).
     min_keyframes: int = 3
-    # Maximum divergence (nats) of the label distributions of a candidate and its observation, above
-    # which the count of `min_keyframes` starts again (III.C).
+    # Divergence (nats) of the label distributions of a candidate and its observation from which the
+    # candidate's count of observations starts again (III.C).
     max_divergence: float = 0.2
     # Misses in a row after which an object is removed (III.C).
     miss_limit: int = 10
@@ -59,12 +61,13 @@ class ObjectsConfig:
     uncertain_entropy: float = 0.5
     # Value of miss_limit for candidates; a removed candidate can be created again.
     candidate_miss_limit: int = 3
-    # Minimum fraction of an object's members that are in view and not occluded for a miss to count.
+    # A miss counts only if at least this fraction of an object's members is visible, which means in
+    # view and not occluded.
     min_visible: float = 0.5
-    # Minimum square root of the predicted box's area for a miss to count: a detector may overlook
-    # smaller objects.
+    # A miss counts only if the square root of the predicted box's area is at least this length,
+    # because a detector may overlook smaller objects.
     min_side_px: float = 20.0
-    # Minimum fraction of the members of one object in the box of another for the two to merge.
+    # Two objects merge if at least this fraction of one object's members lies in the other's box.
     merge_overlap: float = 0.5
     # Maximum objects; 2000 take 6 MB, and some ms per keyframe if all of them are in view.
     max_objects: int = 2000

@@ -147,7 +147,7 @@ def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: floa
 
     Args:
         one: First landmark, as an array with one record of `LANDMARK`.
-        other: Second landmark, likewise.
+        other: Second landmark, in the same format.
         view: The map with the Gaussians of both landmarks.
         least: Minimum fraction of the reliable resident members, 0..1.
     """

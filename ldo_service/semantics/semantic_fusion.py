@@ -52,7 +52,9 @@ class FusionConfig:
 
     def __post_init__(self) -> None:
         if self.rule not in ("adaptive", "fixed", "detector"):
-            raise ConfigError(f"rule={self.rule!r} must be 'adaptive', 'fixed' or 'detector'.")
+            raise ConfigError(
+                f"FusionConfig.rule={self.rule!r} must be 'adaptive', 'fixed' or 'detector'."
+            )
         if not (self.beta > 0 and self.epsilon > 0 and 0 <= self.fixed_alpha <= 1):
             raise ConfigError(
                 named(self, "beta", "epsilon", "fixed_alpha")
@@ -100,8 +102,8 @@ def fuse_confidences(
         detector_confidences: Confidences of the detector, [V], 0..1; 0 without a detection.
         overlaps: IoU or coverage of region and Gaussian, [V], 0..1.
         open_labels: Labels of the labeller, [V] int.
-        open_confidences: Confidences of the labeller, [V], 0..1; 0 if not invoked or without a
-            label.
+        open_confidences: Confidences of the labeller, [V], 0..1; 0 if the labeller was not invoked
+            or gave no label.
         config: Settings of the fusion.
 
     Example: a box with a score of 0.8 covers half of a splat, and the labeller has a confidence of
@@ -204,7 +206,9 @@ class SemanticFusionConfig:
 
     def __post_init__(self) -> None:
         if self.region not in ("foreground", "box"):
-            raise ConfigError(f"region={self.region!r} must be 'foreground' or 'box'.")
+            raise ConfigError(
+                f"SemanticFusionConfig.region={self.region!r} must be 'foreground' or 'box'."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

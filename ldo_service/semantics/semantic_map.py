@@ -282,7 +282,8 @@ class SemanticMap:
         self.refresh(view)
         at = self._map_view(view, made_by.indices, labelled.assigned.regions, detections)
         is_undetectable = self._is_labellers(int(detections.open_labels[0]))
-        # If the detector found the region, the detections of each keyframe observe its object.
+        # If the detector found the region, its detections in each keyframe already observe the
+        # object.
         if self.config.uses_labeller and (is_undetectable or detections.confidences[0] == 0):
             views = [at, *self._other_views(region, keyframe, is_labelled=is_undetectable)]
             for seen in sorted(views, key=lambda seen: seen.keyframe):
@@ -298,7 +299,7 @@ class SemanticMap:
             region: Id of the region, which has a label.
             labelled_keyframe: Keyframe in which the label was fused already.
             is_labelled: True: fuse the label in these keyframes too. This is meant for labels that
-                the detector never gives; others were fused with the keyframes' detections.
+                the detector never gives; other labels were fused with the keyframes' detections.
         """
         assert self.naming is not None
         views = []
@@ -378,7 +379,7 @@ class SemanticMap:
             "detections_too_early": self._too_early,  # Dropped before their keyframe was mapped.
             # Keyframes with detections, but without stored images.
             "boxes_without_images": self._without_images,
-            # Gaussians of dynamic classes, removed again.
+            # Gaussians of dynamic classes that were removed from the map.
             "gaussians_dynamic_removed": self._movable,
             "label_disagreement_literal": self._disagreement.literal,
             "label_disagreement_expected": self._disagreement.expected,

@@ -19,9 +19,9 @@ class SemanticMapConfig:
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     naming: OpenVocabularyConfig = field(default_factory=OpenVocabularyConfig)
     movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
-    # Minimum score of a detection that removes dynamic surface from the map. Lower scores are not
-    # relied on elsewhere either. A false detection, such as a picture of a person, would cut a hole
-    # into the map, which is worse than a person left in it.
+    # Minimum score of a detection that removes dynamic surface from the map. Detections with this
+    # score need no label request either. A false detection, such as a picture of a person, would
+    # cut a hole into the map, which is worse than a person left in the map.
     movable_confidence: float = 0.6
     max_names: int = MAX_LABELS  # Maximum names in the vocabulary; further names become `other`.
     # Maximum keyframes whose detections are stored until the mapper has mapped the keyframe: as

@@ -63,7 +63,9 @@ def read_semantics(path: Path, gaussians: int | None = None) -> SavedSemantics:
         saved = read_arrays(path, MAX_BYTES)
         arrays = {name: saved[name] for name in ("names", *COLUMNS)}
     except UNREADABLE as error:
-        raise DataError(f"{path} cannot be read as labels of a map: {error}") from error
+        raise DataError(
+            f"{path} cannot be read as labels of a map: {error}. Use the semantics.npz of a run."
+        ) from error
     labels = new_labels(len(arrays["weights"]))
     for name in COLUMNS:
         _require(path, name, arrays[name], len(labels))
@@ -81,9 +83,15 @@ def read_semantics(path: Path, gaussians: int | None = None) -> SavedSemantics:
 def _require(path: Path, name: str, values: np.ndarray, count: int) -> None:
     base, shape = ROW[name].base, (count, *ROW[name].shape)
     if values.dtype != base or values.shape != shape:
-        raise DataError(f"{path}: {name} is {values.dtype}{values.shape}, must be {base}{shape}.")
+        raise DataError(
+            f"{path}: {name} is {values.dtype}{values.shape}, must be {base}{shape}. Use the "
+            "semantics.npz of a run."
+        )
     if values.dtype.kind == "f" and not (np.isfinite(values).all() and (values >= 0).all()):
-        raise DataError(f"{path}: {name} must be finite and not negative.")
+        raise DataError(
+            f"{path}: {name} has negative numbers, NaN or infinity; all must be finite and not "
+            "negative. Use the semantics.npz of a run."
+        )
 
 
 def _require_names(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> None:
@@ -92,5 +100,5 @@ def _require_names(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> No
     if not last < len(names) <= MAX_LABELS:
         raise DataError(
             f"{path} has {len(names)} names and labels up to {last}; it must have {last + 1} to "
-            f"{MAX_LABELS} names."
+            f"{MAX_LABELS} names. Use the semantics.npz of a run."
         )

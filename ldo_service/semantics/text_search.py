@@ -79,7 +79,9 @@ def text_similarity(
     if encode is not None and others:
         vectors = encode([normalized(text), *others])
         if not vectors[0].any():
-            raise TextComparisonError(f"The text encoder has no vector for {text!r}.")
+            raise TextComparisonError(
+                f"The text encoder has no vector for {text!r}. Search for another word."
+            )
         cosines = np.clip(vectors[1:] @ vectors[0], 0, 1)
         for name, cosine in zip(others, cosines.tolist(), strict=True):
             if cosine >= MIN_COSINE:
@@ -94,5 +96,5 @@ def suggest_names(text: str, names: Sequence[str], max_names: int = 5) -> str:
     """
     distinct = sorted(set(names), key=lambda name: (-names.count(name), name))
     more = " and more" if len(distinct) > max_names else ""
-    common = f"There is {', '.join(distinct[:max_names])}{more}."
+    common = f"The names in the map are {', '.join(distinct[:max_names])}{more}."
     return did_you_mean(normalized(text), distinct, common)

@@ -109,12 +109,12 @@ def test_configured_names_override_names_of_the_file(tmp_path, layout) -> None:
     ("metadata", "message"),
     [
         (None, "3 classes without names"),
-        ("{0: 'a', 1: 'b'}", "3 classes and its metadata names 2"),
-        ("{0: 'a', 1: 'b', 3: 'c'}", "metadata names no classes"),
+        ("{0: 'a', 1: 'b'}", "3 classes, but the entry `names` of its metadata has 2"),
+        ("{0: 'a', 1: 'b', 3: 'c'}", "Expected: a list of class names"),
         ("['a', 'b', 3]", "names that are not of 1 to 100 characters"),
         ("['a', 'b', '']", "names that are not of 1 to 100 characters"),
         ("['a', 'b', '_ -']", "names that are not of 1 to 100 characters"),
-        ("__import__('os').getcwd()", "metadata names no classes"),
+        ("__import__('os').getcwd()", "Expected: a list of class names"),
     ],
 )
 def test_invalid_class_names_in_metadata_raise(tmp_path, layout, metadata, message: str) -> None:
@@ -124,7 +124,7 @@ def test_invalid_class_names_in_metadata_raise(tmp_path, layout, metadata, messa
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("a\nb\n", "file of names has 2"), ("a\n\nc\n", "line 2 of"), (None, "read")],
+    [("a\nb\n", "list of names has 2"), ("a\n\nc\n", "line 2 of"), (None, "read")],
 )
 def test_invalid_names_file_raises_config_error(tmp_path, text: str | None, message: str) -> None:
     if text is not None:

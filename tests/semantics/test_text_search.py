@@ -62,5 +62,5 @@ def test_search_matches_brute_force_sorted_by_score() -> None:
 def test_suggestion_is_similar_name_or_most_common_names() -> None:
     names = ["chair", "chair", "couch", "vase"]
     assert suggest_names("Chiar", names) == "Did you mean chair?"
-    assert suggest_names("xylophone", names) == "There is chair, couch, vase."
-    assert suggest_names("xylophone", names, 2) == "There is chair, couch and more."
+    assert suggest_names("xylophone", names) == "The names in the map are chair, couch, vase."
+    assert suggest_names("xylophone", names, 2) == "The names in the map are chair, couch and more."

@@ -93,8 +93,8 @@ def read_answer(body: bytes) -> Answer:
         choice = msgspec.json.decode(body, type=_Completion).choices[0]
     except (msgspec.DecodeError, IndexError, RecursionError, UnicodeDecodeError) as error:
         raise EndpointError(
-            f"the response {body[:60]!r} is not a chat completion: is this the address of an "
-            "OpenAI-compatible server, with its path (often /v1)?"
+            f"the response {body[:60]!r} is not a chat completion: check that vlm_labeller.url is "
+            "the address of an OpenAI-compatible server, with its path (often /v1)."
         ) from error
     return Answer((choice.message.content or "").strip(), _logprobs(choice.logprobs))
 
@@ -161,7 +161,7 @@ class HttpConfig:
     # Confidence of an answer: the product of its tokens' probabilities, or their geometric mean.
     confidence: Sureness = "product"
     confidence_untold: float = 0.3  # Confidence if the server returns no log-probabilities.
-    max_words: int = 4  # Maximum words of a name; an answer with more is a sentence.
+    max_words: int = 4  # Maximum words of a name; a longer answer is rejected as a sentence.
     max_tokens: int = 16  # Maximum tokens of an answer.
     endpoint: HttpClientConfig = field(default_factory=HttpClientConfig)
 
@@ -221,7 +221,9 @@ class HttpLabeller:
             ConfigError: If it is not a valid name, or the labeller has no list of names.
         """
         if not is_name(name):
-            raise ConfigError(f"{name[:40]!r} is not a name: write 1 to {LONGEST} characters.")
+            raise ConfigError(
+                f"{name[:40]!r} is not a name: write a name of 1 to {LONGEST} characters."
+            )
         if not self._names:
             raise ConfigError(
                 f"the labeller {self.identity} has no list of names and may answer {name!r} "
@@ -235,7 +237,7 @@ class HttpLabeller:
 
         A view with a rejected answer has no label. If the server fails after some views have
         labels, these labels are used. All views together may take `patience_s`. Once the remaining
-        time is shorter than the slowest view took, the remaining views are omitted.
+        time is shorter than the time of the slowest view, the remaining views are omitted.
         """
         views: list[list[ScoredLabel]] = []
         until_s, slowest_s = self._clock() + self.config.endpoint.patience_s, 0.0
@@ -256,8 +258,9 @@ class HttpLabeller:
         """Return the counters of the labeller.
 
         `answers_refused` counts answers that are no name or not in the list of names.
-        `answers_none` counts answers that the model cannot recognize the object.
-        `answers_without_logprobs` counts answers with the confidence `http.confidence_untold`.
+        `answers_none` counts the answer "none", which means that the model cannot recognize the
+        object. `answers_without_logprobs` counts answers without log-probabilities; they have the
+        confidence `HttpConfig.confidence_untold`.
         """
         return {
             "names": len(self._names),
@@ -285,8 +288,8 @@ class HttpLabeller:
             return confidence(answer.logprobs, self.config.confidence)
         if not self._untold:
             log.warning(
-                "labeller: %s returns no log-probabilities; its answers have confidence %g "
-                "(http.confidence_untold).",
+                "labeller: %s returns no log-probabilities; its answers have the confidence %g. To "
+                "change it, set vlm_labeller.http.default_confidence; otherwise no action needed.",
                 self.identity,
                 self.config.confidence_untold,
             )

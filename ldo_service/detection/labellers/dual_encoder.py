@@ -43,11 +43,12 @@ class DualEncoderConfig:
         "a cropped photo of a {}.",
         "a {} in a room.",
     )
-    # Mean and standard deviation of RGB in 0..1, to normalize images; empty: from the metadata of
-    # the image encoder, or CLIP's.
+    # Mean and standard deviation of RGB in 0..1, to normalize images; empty: the values in the
+    # metadata of the image encoder, or CLIP's values.
     mean: tuple[float, ...] = ()
     std: tuple[float, ...] = ()
-    # Factor on the cosines before the softmax; 0: from the files of the pair, or CLIP's 100.
+    # Factor on the cosines before the softmax; 0: the factor in the files of the pair, or CLIP's
+    # 100.
     logit_scale: float = 0.0
     # Names that have a probability like all others but are never returned, such as wall and floor.
     nothing: tuple[str, ...] = ()
@@ -58,14 +59,14 @@ class DualEncoderConfig:
     def __post_init__(self) -> None:
         if not self.prompts or any(not _is_prompt(prompt) for prompt in self.prompts):
             raise ConfigError(
-                f"dual_encoder.prompts={list(self.prompts)}: each must contain {{}} for the name "
-                "once, and no other braces."
+                f"dual_encoder.prompts={list(self.prompts)}: there must be at least one prompt, "
+                "and each must contain {} for the name once and no other braces."
             )
         are_three = len(self.mean) in (0, 3) and len(self.std) in (0, 3)
         if not are_three or min(self.std, default=1) <= 0:
             raise ConfigError(
-                f"dual_encoder: mean={self.mean} and std={self.std} must be three numbers each, "
-                "std positive."
+                f"dual_encoder: mean={self.mean} and std={self.std} must each be empty or three "
+                "numbers, std positive."
             )
         if not 0 <= self.logit_scale < float("inf") or self.threads < 1:
             raise ConfigError(
@@ -89,13 +90,13 @@ class EncoderFiles:
     def __post_init__(self) -> None:
         if (self.text is None) != (self.vocabulary is None):
             raise ConfigError(
-                "a text encoder needs its byte pairs, and byte pairs a text encoder: give both, "
-                "--text and --vocabulary (CLIP's is bpe_simple_vocab_16e6.txt.gz)."
+                "a text encoder needs its byte pairs, and byte pairs need a text encoder: give "
+                "both --text and --vocabulary (for CLIP, bpe_simple_vocab_16e6.txt.gz)."
             )
         if self.text is None and self.embeddings is None:
             raise ConfigError(
-                f"{self.image} needs texts: give a text encoder (--text and --vocabulary) or "
-                "embeddings of names (--embeddings)."
+                f"the image encoder {self.image} needs text embeddings: give a text encoder "
+                "(--text and --vocabulary) or a file of embeddings (--embeddings)."
             )
 
 
@@ -109,14 +110,14 @@ class DualEncoder:
         names: Sequence[str] = (),
         name: str = "",
     ) -> None:
-        """Open a pair and run both encoders once, on noise and on a word.
+        """Open a pair; run the image encoder once on noise and the text encoder once on a word.
 
         Args:
             pair: Files of the pair.
             config: Settings.
             names: Names to choose from; empty: the names in the file of embeddings or, without such
-                a file, the 80 of COCO.
-            name: Name of the pair in errors and `identity`; empty: that of the image encoder's
+                a file, the 80 names of COCO.
+            name: Name of the pair in errors and `identity`; empty: the name of the image encoder's
                 file.
 
         Raises:
@@ -134,15 +135,15 @@ class DualEncoder:
         for space in (self.texts.encoder, self.texts.cached):
             if space and space.dimensions != self._image.dimensions:
                 raise ModelError(
-                    f"{what} cannot be used as a labeller: its images have "
-                    f"{self._image.dimensions} dimensions and its texts {space.dimensions}. Use "
-                    "the encoders of one pair."
+                    f"{what} cannot be used as a labeller: its image embeddings have "
+                    f"{self._image.dimensions} dimensions and its text embeddings "
+                    f"{space.dimensions}. Use the encoders of one pair."
                 )
         self.logit_scale = self._logit_scale()
         self.identity = f"{name or pair.image.stem} {sha256(pair.image)[:12]}"
         self._rows: dict[str, np.ndarray] = {}  # Text embeddings by canonical name.
-        # Names to choose from and those of `nothing`, by canonical name. The value is the spelling
-        # that was given first, which the text encoder gets.
+        # Names to choose from and names in `nothing`, by canonical name. Of several spellings of a
+        # name, the value is the first one. The text encoder gets this spelling.
         self._listed: dict[str, str] = {}
         for entry in (*(names or self._own_names()), *self.config.nothing):
             self._listed.setdefault(canonical(entry), entry)
@@ -151,16 +152,13 @@ class DualEncoder:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Canonical names to choose from, without those of `nothing`."""
+        """Canonical names to choose from, without the names in `nothing`."""
         nothing = set(map(canonical, self.config.nothing))
         return tuple(name for name in self._listed if name not in nothing)
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Names to choose from and those of `nothing`, in the spelling that was given.
-
-        The text encoder gets this spelling.
-        """
+        """Names to choose from and names in `nothing`, in the spelling for the text encoder."""
         return tuple(self._listed.values())
 
     def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
@@ -192,7 +190,9 @@ class DualEncoder:
                 encoder to compute one.
         """
         if not is_name(name):
-            raise ConfigError(f"{name[:40]!r} is not a name: write 1 to {LONGEST} characters.")
+            raise ConfigError(
+                f"{name[:40]!r} is not a name: write a name of 1 to {LONGEST} characters."
+            )
         if canonical(name) not in self._listed:
             self._rows[canonical(name)] = self._place(name)
             self._listed[canonical(name)] = name
@@ -225,8 +225,8 @@ class DualEncoder:
         if row is not None:
             return row
         raise ConfigError(
-            f"{name!r} is not among the names with embeddings in {self.identity}, and there is "
-            "no text encoder to compute one: register the pair with --text and --vocabulary."
+            f"{name!r} has no stored embedding in {self.identity}, and there is no text encoder "
+            "to compute it: register the pair with --text and --vocabulary."
         )
 
     def _own_names(self) -> tuple[str, ...]:
@@ -266,7 +266,7 @@ class ImageEncoder:
         )
 
     def metadata_numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """Return `count` numbers from an entry of the network's metadata; empty if it is missing.
+        """Return `count` numbers from an entry of the network's metadata; empty without this entry.
 
         The text of the entry is like "0.5, 0.5, 0.5" or "[0.5, 0.5, 0.5]".
 
@@ -285,7 +285,8 @@ class ImageEncoder:
         if not is_usable or (key != "mean" and min(values) <= 0):
             raise ModelError(
                 f"the network's metadata has {key}={text[:60]!r}. Expected: {count} finite "
-                "numbers, positive unless they are the mean."
+                "numbers, which are positive except in `mean`. Export the network again with a "
+                "valid entry."
             )
         return values
 
@@ -301,7 +302,7 @@ def _square_input(network: Network) -> tuple[str, int]:
     """Return the name of the network's only input, and the side of its square images in pixels.
 
     Raises:
-        ModelError: If the network has other inputs.
+        ModelError: If the network has other inputs than one square image.
     """
     inputs = network.inputs
     name, kind, shape = inputs[0] if len(inputs) == 1 else ("", "", [])
@@ -310,7 +311,8 @@ def _square_input(network: Network) -> tuple[str, int]:
     if kind != "tensor(float)" or not fits or len(sides) > 1:
         found_inputs = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
         raise ModelError(
-            f"the network's inputs are {found_inputs}. Expected: one image, float32 [N, 3, S, S]."
+            f"the network's inputs are {found_inputs}. Expected: one image, float32 [1, 3, S, S], "
+            "with equal sides S. Export the image encoder with an image as its only input."
         )
     return name, next(iter(sides), CLIP_PX)
 

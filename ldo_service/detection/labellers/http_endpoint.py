@@ -1,4 +1,4 @@
-"""HTTP client of a labelling server, with retries, a rate limit and a deadline."""
+"""HTTP client for a labelling server, with retries, a rate limit and a deadline."""
 
 import asyncio
 import os
@@ -27,10 +27,10 @@ class HttpClientConfig:
     # supervision.backend_step_timeout_s, after which an actor is stopped.
     patience_s: float = 40.0
     per_minute: float = 60.0  # Maximum attempts per minute, evenly spaced.
-    # Time after a failed request in which further requests fail at once, without an attempt. It is
-    # doubled with each further failure in a row.
+    # Time after a failed request in which further requests fail at once, without an attempt. The
+    # time is doubled after each further failure in a row.
     pause_s: float = 10.0
-    max_pause_s: float = 300.0  # Maximum of that time.
+    max_pause_s: float = 300.0  # Maximum of the doubled pause_s.
     key_variable: str = ""  # Environment variable with the API key; empty: none.
 
     def __post_init__(self) -> None:
@@ -46,16 +46,16 @@ class HttpClientConfig:
                     "pause_s",
                     "max_pause_s",
                 )
-                + ": timeout_s, patience_s and per_minute must be positive, the others not "
-                "negative."
+                + ": timeout_s, patience_s and per_minute must be positive, the other settings "
+                "not negative."
             )
         if self.patience_s < self.timeout_s:
             raise ConfigError(
-                f"patience_s={self.patience_s:g} must be at least timeout_s={self.timeout_s:g}, "
-                "which one attempt may take."
+                f"HttpClientConfig.patience_s={self.patience_s:g} must be at least "
+                f"timeout_s={self.timeout_s:g}, which one attempt may take."
             )
         if self.attempts < 1:
-            raise ConfigError(f"attempts={self.attempts} must be at least 1.")
+            raise ConfigError(f"HttpClientConfig.attempts={self.attempts} must be at least 1.")
 
 
 class DeadlineExceeded(EndpointError):
@@ -119,8 +119,8 @@ class HttpClient:
         """
         if self._clock() < self._paused_until_s:
             raise EndpointError(
-                f"{self.url}: circuit breaker open after a failed request; it closes within "
-                f"{self._config.max_pause_s:g} s."
+                f"{self.url}: circuit breaker open after a failed request; no request is sent for "
+                f"up to {self._config.max_pause_s:g} s. Check that the server is up."
             )
         try:
             answer = self._post_with_retries(path, body, until_s)
@@ -136,7 +136,10 @@ class HttpClient:
 
     def _post_with_retries(self, path: str, body: bytes, until_s: float) -> bytes:
         """Send a request until an attempt succeeds, the server rejects it or no attempt is left."""
-        failure = DeadlineExceeded(f"{self.url}: no time within patience_s for another attempt.")
+        failure = DeadlineExceeded(
+            f"{self.url}: vlm_labeller.http.deadline_s leaves no time for another attempt. Raise "
+            "it or vlm_labeller.http.max_requests_per_minute, or lower vlm_labeller.http.max_views."
+        )
         for attempt in range(self._config.attempts):
             pause_s = self._config.backoff_s * 2 ** (attempt - 1) if attempt else 0.0
             self._wait(pause_s, until_s, failure)
@@ -147,8 +150,8 @@ class HttpClient:
                 if within_s < self._config.timeout_s and self._clock() >= until_s:
                     raise failure from passing  # The server did not have its full timeout_s.
                 failure = EndpointError(
-                    f"{self.url} {passing} ({attempt + 1} attempts): is the server up, and the "
-                    "address right?"
+                    f"{self.url} {passing} ({attempt + 1} attempts): check that the server is up "
+                    "and the address is right."
                 )
         raise failure
 
@@ -212,8 +215,8 @@ class HttpClient:
             raise _TransientError(status)
         if response.status_code != 200:
             raise EndpointError(
-                f"{self.url} {status}: check the address (often it ends in /v1), the name of the "
-                "model and the key."
+                f"{self.url} {status}: check the address (it often ends in /v1), the name of the "
+                "model and the API key."
             )
         return answer
 
@@ -241,9 +244,9 @@ def _address(url: str) -> httpx2.URL:
         )
     if address.userinfo:
         raise ConfigError(
-            f"{_without_user(url)!r} contains a name or password, which every saved configuration "
-            "would show: put the key into an environment variable and set key_variable to its "
-            "name."
+            f"{_without_user(url)!r} contains a user name or password, which every saved "
+            "configuration would show: put the API key into an environment variable and set "
+            "vlm_labeller.http.api_key_variable to the variable's name."
         )
     return address
 
@@ -267,7 +270,7 @@ def _key(variable: str) -> dict[str, str]:
     key = os.environ.get(variable, "").strip()
     if not key or not key.isascii() or not key.isprintable():
         raise ConfigError(
-            f"the environment variable {variable} holds no usable API key: set it where the "
-            "service is started, or leave key_variable empty."
+            f"the environment variable {variable} has no usable API key: set the variable where "
+            "the service is started, or leave vlm_labeller.http.api_key_variable empty."
         )
     return {"Authorization": f"Bearer {key}"}

@@ -18,7 +18,7 @@ from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
 WORD_END = "</w>"
 START, END = "<|startoftext|>", "<|endoftext|>"
 # Maximum merges that are read. CLIP's vocabulary has 49,408 tokens: 512 for bytes, two for start
-# and end of a text, the others for merges. Its file has more merges.
+# and end of a text, the others for merges. CLIP's file has more merges than CLIP uses.
 MAX_MERGES = 49_408 - 512 - 2
 MAX_VOCABULARY_BYTES = 1 << 26  # Maximum size of the unpacked file; CLIP's has 3 MB.
 _WORDS = r"'(?:s|t|re|ve|m|ll|d)|\p{L}+|\p{N}|[^\s\p{L}\p{N}]+"  # Words as in CLIP.
@@ -53,8 +53,8 @@ def read_tokenizer(path: Path) -> Tokenizer:
     ids = {symbol: number for number, symbol in enumerate(symbols)}
     if not merges or len(pairs) < len(merges) or not ids.keys() >= {*chain.from_iterable(pairs)}:
         raise ModelError(
-            f"{path} is not a list of byte pairs: a comment line is expected, then two symbols "
-            "per line, as in CLIP's bpe_simple_vocab_16e6.txt.gz."
+            f"{path} is not a list of byte pairs. Give a file with a comment line, then two "
+            "symbols per line, such as CLIP's bpe_simple_vocab_16e6.txt.gz."
         )
     tokenizer = Tokenizer(models.BPE(ids, pairs, end_of_word_suffix=WORD_END))
     tokenizer.normalizer = normalizers.Lowercase()
@@ -82,10 +82,16 @@ def _text(path: Path) -> str:
             with gzip.open(path) as file:
                 body = file.read(MAX_VOCABULARY_BYTES + 1)
         if len(body) > MAX_VOCABULARY_BYTES:
-            raise ModelError(f"{path} must have at most {MAX_VOCABULARY_BYTES} bytes unpacked.")
+            raise ModelError(
+                f"{path} has more than {MAX_VOCABULARY_BYTES} bytes unpacked. Give a list of byte "
+                "pairs such as CLIP's bpe_simple_vocab_16e6.txt.gz."
+            )
         return body.decode("utf-8")
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
-        raise ModelError(f"the byte pairs in {path} cannot be read: {error}.") from error
+        raise ModelError(
+            f"the byte pairs in {path} cannot be read: {error}. Give a list of byte pairs such as "
+            "CLIP's bpe_simple_vocab_16e6.txt.gz."
+        ) from error
 
 
 class TextEncoder:
@@ -149,18 +155,18 @@ class CachedEmbeddings:
             embeddings = np.asarray(arrays["embeddings"], np.float32)
         except (*UNREADABLE, SafetensorError) as error:
             raise ModelError(
-                f"{path} holds no embeddings ({error}): `names` and `embeddings` are expected, "
-                ".npz or .safetensors."
+                f"{path} cannot be read as embeddings ({error}). Give a file in .npz or "
+                ".safetensors with `names` and `embeddings`."
             ) from error
         if embeddings.ndim != 2 or len(embeddings) != len(names) or not all(map(is_name, names)):
             raise ModelError(
-                f"{path} has {len(names)} names and embeddings {list(embeddings.shape)}: a row for "
-                "each name is expected."
+                f"{path} has {len(names)} names and embeddings of shape {list(embeddings.shape)}. "
+                "Write one row of embeddings per name, and names of 1 to 100 characters."
             )
         if not (np.isfinite(embeddings).all() and np.linalg.norm(embeddings, axis=1).all()):
             raise ModelError(
-                f"{path} has embeddings that are zero, NaN or infinite: all must be finite and "
-                "not zero."
+                f"{path} has embeddings with NaN, infinity or only zeros. Compute them again; all "
+                "numbers must be finite, and each row must have a number other than 0."
             )
         self.names = names
         self.dimensions = embeddings.shape[1]
@@ -172,7 +178,7 @@ class CachedEmbeddings:
     def find(self, name: str) -> np.ndarray | None:
         """Return the embedding of a name or one of its synonyms, [D] float32 of length 1.
 
-        None if the file has neither the name nor a synonym.
+        The result is None if the file has neither the name nor a synonym.
         """
         row = self._rows.get(normalized(name), self._rows.get(canonical(name)))
         return None if row is None else unit(row)
@@ -187,7 +193,7 @@ class TextEmbeddings:
     def find(self, text: str) -> np.ndarray | None:
         """Return the embedding of a text, [D] float32 of length 1.
 
-        None if the file does not have the text and there is no text encoder.
+        The result is None if the file does not have the text and there is no text encoder.
         """
         row = self.cached.find(text) if self.cached else None
         if row is None and self.encoder is not None:
@@ -231,7 +237,10 @@ def only_embedding(outputs: Sequence[np.ndarray]) -> np.ndarray:
     found = [output for output in outputs if output.ndim == 2 and len(output) == 1]
     if len(found) != 1 or found[0].shape[1] < 2:
         shapes = ", ".join(str(list(output.shape)) for output in outputs)
-        raise ModelError(f"the network's outputs are {shapes}. Expected: one embedding, [N, D].")
+        raise ModelError(
+            f"the network's outputs have the shapes {shapes}. Expected: exactly one output of "
+            "shape [1, D], the embedding of one image or text. Export the network with this output."
+        )
     return found[0][0].astype(np.float32)
 
 
@@ -250,7 +259,8 @@ def _text_inputs(network: Network) -> tuple[dict[str, type[np.integer]], int]:
         found_inputs = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
         raise ModelError(
             f"the network's inputs are {found_inputs}. Expected: tokens, int64 or int32 "
-            "[N, length]."
+            "[1, length], and optionally an attention mask of the same shape. Export the text "
+            "encoder with these inputs."
         )
     return {name: kinds[kind] for name, kind, _ in inputs}, int(min(lengths, default=CONTEXT))
 
@@ -271,5 +281,5 @@ def _scale(value: np.ndarray | None, path: Path) -> float | None:
         return None
     scale = float(np.asarray(value).reshape(-1)[0]) if np.size(value) == 1 else float("nan")
     if not 0 < scale < float("inf"):
-        raise ModelError(f"{path} has logit_scale {value}: one positive number is expected.")
+        raise ModelError(f"{path} has logit_scale={value}. Write one positive, finite number.")
     return scale

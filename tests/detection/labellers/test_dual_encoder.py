@@ -120,7 +120,7 @@ def test_new_name_without_text_encoder_raises_with_advice(
     cached_files: EncoderFiles,
 ) -> None:
     labeller = DualEncoder(cached_files)
-    with pytest.raises(ConfigError, match=r"'teapot' is not among .* --text and --vocabulary"):
+    with pytest.raises(ConfigError, match=r"'teapot' has no stored .* --text and --vocabulary"):
         labeller.add("teapot")
     assert labeller.names == tuple(COLORS)
     with pytest.raises(ConfigError, match="'teapot'"):
@@ -162,7 +162,7 @@ def test_label_is_bitwise_equal_after_other_crops(full_files: EncoderFiles) -> N
 # --- invalid files and settings -------------------------------------------------------------------
 def test_mismatched_embedding_dimensions_raise(tmp_path: Path) -> None:
     image = replace(PAIR, image_dimensions=4).image(tmp_path / "image.onnx")
-    with pytest.raises(ModelError, match="4 dimensions and its texts 3"):
+    with pytest.raises(ModelError, match="4 dimensions and its text embeddings 3"):
         DualEncoder(EncoderFiles(image, embeddings=embeddings(tmp_path / "n.npz")))
 
 
@@ -224,7 +224,7 @@ def test_invalid_embeddings_raise(tmp_path: Path, arrays: dict) -> None:
 def test_incomplete_pair_raises_config_error(full_files: EncoderFiles) -> None:
     with pytest.raises(ConfigError, match="needs its byte pairs"):
         EncoderFiles(full_files.image, text=full_files.text)
-    with pytest.raises(ConfigError, match="needs texts"):
+    with pytest.raises(ConfigError, match="needs text embeddings"):
         EncoderFiles(full_files.image)
 
 
