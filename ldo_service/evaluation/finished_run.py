@@ -136,7 +136,7 @@ class FinishedRun:
         return next(frame for frame in self.frames if frame.index == index)
 
     def counts(self) -> FrameCounts:
-        """Count the frames, those with a pose in the map, and those of them with status OK."""
+        """Count all frames, frames with a pose in the map, and frames with pose and status OK."""
         final = self.estimates["final"]
         ok = at_stamps(final, self.stamps_s("OK"))
         return FrameCounts(len(self.frames), len(final.stamps_s), len(ok.stamps_s))
@@ -155,8 +155,9 @@ class FinishedRun:
             is_there = 0 <= frame.index < len(sequence)
             if not is_there or sequence.stamps_ns[frame.index] != frame.stamp_ns:
                 raise DataError(
-                    f"the run has a frame {frame.index} at {frame.stamp_ns} ns, but "
-                    f"{sequence.name} has none. Pass the SOURCE that the run was made from."
+                    f"the run has frame {frame.index} with the stamp {frame.stamp_ns} ns, but "
+                    f"{sequence.name} has no such frame. Pass the SOURCE that the run was made "
+                    "from."
                 )
 
 

@@ -1,4 +1,4 @@
-"""Lists of label names for evaluation, and mappings of data-set and map labels to them."""
+"""Lists of label names for evaluation, and mappings from labels of data sets and maps to them."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ def coco_list(class_names: Iterable[str]) -> LabelSet:
     """Return the list of background and the COCO classes that a data set contains.
 
     The table of synonyms maps names of the data set to COCO classes. Names without a COCO class map
-    to background, except `other`: that name of a map is not in the list.
+    to background, except `other`, which is not in the list.
     """
     mapped = {coco_class(name) for name in class_names}
     return LabelSet("COCO", (BACKGROUND, *(n for n in COCO if n in mapped)), _in_coco)

@@ -77,7 +77,7 @@ def correspondences(
 
 
 def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) -> Agreement:
-    """Count the corresponding pixels with an object, and those of them with equal labels.
+    """Count the corresponding pixels that show an object, and how many of them have equal labels.
 
     Args:
         first: Labels of the first view, [H, W]; 0 is background.
@@ -104,17 +104,17 @@ class DetectionCounts:
 
     @property
     def recall(self) -> float:
-        """Fraction of `wanted` that is right; NaN without any."""
+        """Fraction of `wanted` that is right; NaN if `wanted` is 0."""
         return self.right / self.wanted if self.wanted else float("nan")
 
     @property
     def precision(self) -> float:
-        """Fraction of `named` that is right; NaN without any."""
+        """Fraction of `named` that is right; NaN if `named` is 0."""
         return self.right / self.named if self.named else float("nan")
 
 
 class OpenNames:
-    """Scores of names without a COCO class, over pixels and over objects, added view by view.
+    """Scores of names without a COCO class, over pixels and over objects, summed view by view.
 
     An object is an instance of the data set. The map's name of an object is the name of most of the
     object's pixels, over all views in which the object fills at least 0.5 % of the image. Parts of
@@ -189,18 +189,18 @@ class Segmentation:
     """Segmentation metrics, 0..1; NaN if no pixel is evaluated."""
 
     classes: int  # Number of evaluated classes.
-    pixel_accuracy: float  # Fraction of all pixels with ground truth that is right.
-    mean_accuracy: float  # Mean over the evaluated classes.
-    mean_iou: float  # Mean over the evaluated classes.
-    object_iou: float  # Mean over the evaluated classes except background.
+    pixel_accuracy: float  # Fraction of the pixels with ground truth that have the right label.
+    mean_accuracy: float  # Mean accuracy over the evaluated classes.
+    mean_iou: float  # Mean IoU over the evaluated classes.
+    object_iou: float  # Mean IoU over the evaluated classes except background.
     weighted_iou: float  # Mean IoU, weighted by the number of true pixels of each class.
 
 
 def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
-    """Count pixels by true class and class shown: a confusion matrix.
+    """Return the confusion matrix: the number of pixels by true class and by class in the map.
 
-    The matrices of several images may be added. The metrics of the sum are those of all pixels
-    together.
+    The matrices of several images may be added. The metrics of the sum are the metrics of all
+    pixels together.
 
     >>> confusion(np.uint8([0, 0, 1, 255]), np.uint8([0, 1, 254, 1]), 2).tolist()
     [[1, 1, 0], [0, 0, 1]]
@@ -211,7 +211,7 @@ def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
         classes: Number of names, C.
 
     Returns:
-        Pixels by true class and shown class, [C, C + 1] int64; the last column is unknown.
+        Pixels by true class and class in the map, [C, C + 1] int64; the last column is unknown.
     """
     counted = truth != VOID
     columns = np.minimum(shown[counted], classes)

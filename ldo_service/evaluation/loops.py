@@ -19,12 +19,14 @@ LEFTOVER, LEAST = 5, 3  # Maximum and minimum keyframes of a subgraph that loops
 
 PROTOCOL = """\
 Loops: two keyframes overlap if each sees more than 30 % of the other's measured pixels, by the
-source's depth (within 5 cm + 3 %) and true poses. A pair of subgraphs is true if a keyframe of one
-overlaps a keyframe of the other, and these two are more than 100 frames apart. Precision: fraction
-of the closures that connect a true pair. Recall: of the subgraphs in a true pair with an older
-subgraph, the fraction that a closure connects to such an older subgraph. Keyframes that are in no
-subgraph of loops.json form subgraphs of five; fewer than three are ignored. Errors: pose of each
-closure against the true pose. Time: of a search, divided by its number of candidates."""
+source's depth (within 5 cm + 3 %) and true poses, and their viewing directions differ by at most 90
+degrees. A pair of subgraphs is true if a keyframe of one overlaps a keyframe of the other, and
+these two are more than 100 frames apart. Precision: fraction of the closures that connect a true
+pair. Recall: of the subgraphs in a true pair with an older subgraph, the fraction that a closure
+connects to such an older subgraph. Consecutive keyframes that are in no subgraph of loops.json form
+subgraphs of at most five; groups of fewer than three are ignored. Errors: relative pose of each
+closure, compared with the true relative pose. Time: duration of a search, divided by its number of
+candidates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +150,7 @@ def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> 
 
     Args:
         found: Candidates and closures of a run.
-        keyframes: Keyframes with a true pose, by id. Keyframes that are not here are ignored.
+        keyframes: Keyframes with a true pose, by id. All other keyframes are ignored.
     """
     subgraphs = _subgraphs(found, keyframes)
     index = {subgraph: number for number, subgraph in enumerate(subgraphs)}

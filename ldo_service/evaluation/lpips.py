@@ -38,7 +38,8 @@ class Lpips:
             )
         except Exception as error:  # The exceptions of onnxruntime have no common base class.
             raise ConfigError(
-                f"--lpips {path} cannot be opened: {_first_line(error)}. Expected: {LAYOUT}."
+                f"--lpips {path} cannot be opened: {_first_line(error)}. Give an ONNX file with "
+                f"{LAYOUT}."
             ) from error
         self._names = [node.name for node in self._session.get_inputs()]
         self._require_layout()
@@ -61,7 +62,7 @@ class Lpips:
                 f"{_first_line(error)}. Export it with dynamic height and width."
             ) from error
         if out.size != 1:
-            raise self._misfit(f"its output has the shape {out.shape}")
+            raise self._misfit(f"its output has the shape {out.shape}, expected one number")
         return float(out.item())
 
     def _require_layout(self) -> None:
@@ -72,15 +73,23 @@ class Lpips:
             for node in inputs
         )
         if len(inputs) != 2 or len(outputs) != 1 or not are_images:
-            raise self._misfit(f"it has inputs {shapes} and {len(outputs)} outputs")
+            raise self._misfit(
+                f"it has inputs of the shapes {shapes} and {len(outputs)} outputs, expected two "
+                "float32 images [1, 3, H, W] and one output"
+            )
 
     def _require_distance(self, image: np.ndarray) -> None:
         itself = self._distance(image, image)
         if not abs(itself) <= OF_EQUAL_IMAGES:
-            raise self._misfit(f"its distance of an image to itself is {itself:.3g}, not 0")
+            raise self._misfit(
+                f"its distance of an image to itself is {itself:.3g}, expected almost 0"
+            )
 
     def _misfit(self, finding: str) -> ConfigError:
-        return ConfigError(f"--lpips {self.path} is no LPIPS: {finding}. Expected: {LAYOUT}.")
+        return ConfigError(
+            f"--lpips {self.path} is not an LPIPS network: {finding}. Export it again. Expected: "
+            f"{LAYOUT}."
+        )
 
 
 def _planes(image: np.ndarray) -> np.ndarray:

@@ -29,7 +29,8 @@ NO_LABELS = "The map has no labels to evaluate. Run with a detector: --set detec
 class Results:
     """Scores and pictures of a run."""
 
-    trajectories: dict[str, TrajectoryErrors] | None  # By estimate; None without ground truth.
+    # Trajectory errors by name of the estimate; None without ground truth.
+    trajectories: dict[str, TrajectoryErrors] | None
     evaluated: EvaluatedFrames
     renderings: list[RenderingErrors]
     labels: list[LabelErrors]  # One per map with labels; empty if the source has no true labels.
@@ -66,8 +67,8 @@ def evaluate_run(
     if truth is None and not (evaluated.posed and run.maps):
         missing = "pose to render from" if run.maps else "map"
         raise DataError(
-            f"{sequence.name} has no ground truth and {run.folder} no {missing}, so there is "
-            "nothing to evaluate."
+            f"{sequence.name} has no ground truth and {run.folder} has no {missing}, so there is "
+            "nothing to evaluate. Evaluate a run with a map, or a source with ground truth."
         )
     trajectories = None if truth is None else compare(run, truth)
     renderings = views.evaluate_rendering(
@@ -92,7 +93,10 @@ def evaluate_run(
 
 
 def work(run: FinishedRun, sequence: Sequence) -> int:
-    """Return the total number of frames of `evaluate_run`: to render, plus to label."""
+    """Return the total number of frames that `evaluate_run` reports to `advance`.
+
+    A frame counts once for its rendering, and a second time if its labels are evaluated.
+    """
     labelled = has_labels(run) and sequence.true_labels() is not None
     return len(EvaluatedFrames.of(run.frames).posed) * (1 + labelled)
 

@@ -30,7 +30,8 @@ from .views import EvaluatedFrames
 
 APART = 3  # Difference of the frame indices of the two views of a pair.
 GATES = {"from 0.2 %": 0.002, "all": 0.0}  # Minimum fraction of pixels of an evaluated class.
-SAME_STAMP_S = 0.02  # Maximum difference of a frame's stamp to a true pose, as for trajectories.
+# Maximum difference between the stamps of a frame and of its true pose, as for trajectories.
+SAME_STAMP_S = 0.02
 
 PROTOCOL = """\
 Labels are rendered for the frames of A and B above, at the same poses. A pixel has the label s with
@@ -39,9 +40,9 @@ true label are ignored. A name of the map that is not in the list is always wron
 COCO: the list of background and the COCO classes of the source, by detection/synonyms.yaml; all
 other classes are background. All names: the list of background (wall, floor, ceiling) and every
 object name of the source; an object with a COCO class has the name of that class. mIoU, accuracy
-and IoU by frequency are means over classes: those with more than 0.2 % of the pixels, and all that
-occur. Pixel accuracy is over all pixels. Per image: mIoU over the classes of a frame, averaged over
-the frames.
+and IoU by frequency are means over classes. They are given twice: for the classes with more than
+0.2 % of the pixels, and for all that occur. Pixel accuracy is over all pixels. Per image: mIoU over
+the classes of a frame, averaged over the frames.
 Consistency: fraction of equal labels in two frames 3 apart, among the pixels that show an object in
 at least one of them. Pixels correspond by measured depth and true poses, or by the run's final
 poses if no true poses are known.
@@ -201,7 +202,7 @@ def evaluate_labels(
         threads: Threads of the renderer.
 
     Returns:
-        Errors of each map; empty if the run has no labels or the source no true labels.
+        Errors of each map; empty if the run has no labels or the source has no true labels.
 
     Raises:
         DataError: If a frame has no true labels or no pose.
@@ -235,7 +236,7 @@ def labelled_maps(
 
 
 class Pairs:
-    """Pairs of frames whose indices differ by three and that both have a pose."""
+    """Frame pairs: two frames that have a pose and whose indices differ by three."""
 
     def __init__(self, sequence: datasets.Sequence, run: FinishedRun) -> None:
         self._sequence = sequence

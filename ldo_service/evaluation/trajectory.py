@@ -19,13 +19,13 @@ ATE: positions after SE(3) alignment of the estimate to the truth over all pairs
 pairs j = i + n, where n is 1 s in poses at the median rate; its translation and rotation angle.
 `evo_ape tum TRUTH ESTIMATE --align --t_max_diff 0.02` and `evo_rpe tum TRUTH ESTIMATE --delta n
 --delta_unit f --all_pairs --t_max_diff 0.02 [--pose_relation angle_deg]` print the same values,
-unless a pose is the nearest of two poses, as with clocks half a frame apart: evo then uses that
+unless one pose is the nearest to two poses, as with clocks half a frame apart: evo then uses that
 pose twice. Some published systems print the mean as RMSE; both are given here."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """Statistics of one error over a trajectory, in the unit in the name of its field."""
+    """Statistics of one error over a trajectory, in the unit of the error, such as meters."""
 
     rmse: float
     mean: float

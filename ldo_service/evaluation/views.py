@@ -28,7 +28,7 @@ the run. Colors are in 0..1; renderings are clipped. PSNR: over all pixels and c
 SSIM: Wang et al. 2004, Gaussian window of 11x11 pixels and sigma 1.5 px, over windows inside the
 image; some published systems print MS-SSIM, whose values are often higher. Depth L1: mean error of
 the rendered depth, over pixels with measured depth and rendered opacity above 0.5; "of measured" is
-the fraction of measured pixels that this covers. Cells: mean / median over the frames.
+the fraction of the measured pixels that are compared. Table cells: mean / median over the frames.
 online: the map at the end of the stream, refitted after loop closures. refined: the map after the
 further iterations of --refine-iterations.
 A: held-out frames, which are tracked and never mapped, without the black rim of rectification. The
@@ -150,7 +150,8 @@ class RenderedView:
     exposure: Exposure = field(default_factory=Exposure)
     # Pixels that show the camera image, not the rim of rectification, [H, W] bool; None for all.
     valid: np.ndarray | None = None
-    # Correction of the camera at the time of the frame. The rendering gets its vignetting.
+    # Correction of the camera at the time of the frame. `shown` has the vignetting of this
+    # correction.
     correction: CameraCorrection = field(default_factory=CameraCorrection)
 
     @property
@@ -201,7 +202,7 @@ class RenderingErrors:
     views: tuple[ViewErrors, ...]
 
     def mean(self, figure: str) -> float | None:
-        """Return the mean over frames of a metric, without NaN; None if all values are NaN.
+        """Return the mean of a metric over the frames, ignoring NaN; None if all values are NaN.
 
         Args:
             figure: Metric, the name of a field of ViewErrors.
@@ -210,7 +211,7 @@ class RenderingErrors:
         return float(np.mean(values)) if len(values) else None
 
     def median(self, figure: str) -> float | None:
-        """Return the median over frames of a metric, without NaN; None if all values are NaN."""
+        """Return the median of a metric over the frames, ignoring NaN; None if all are NaN."""
         values = self._values(figure)
         return float(np.median(values)) if len(values) else None
 
@@ -282,7 +283,7 @@ class EvaluatedFrames:
     def counts(self) -> str:
         """Return a text with the numbers of frames of protocols A and B."""
         if not self.held_out:
-            a = "A: none, since all frames were mapped; `ldo run --hold-out-every 5` keeps some."
+            a = "A: none, because all frames were mapped; use `ldo run --hold-out-every 5`."
         else:
             a = f"A: {_counted(self.held_out)}."
         return f"{a} B: {_counted(self.training)}."
