@@ -15,7 +15,7 @@ OTHERS = tuple(
     name for name in encoder.NAMES if name not in (*CLASS_NAMES[:COCO_COUNT], *BUILDING.split())
 )
 SURE = 0.5  # Minimum confidence of the predictions that are also counted separately.
-LARGE_SHARE = 0.01  # Minimum size of crops that are counted separately, as a fraction of the image.
+LARGE_SHARE = 0.01  # Minimum size of large crops: visible object pixels, fraction of the image.
 
 
 def naming_report(naming: Naming, is_large: np.ndarray) -> dict:
@@ -23,7 +23,7 @@ def naming_report(naming: Naming, is_large: np.ndarray) -> dict:
 
     Args:
         naming: Predicted names of the crops.
-        is_large: Crops whose accuracies are also counted separately, [N] bool.
+        is_large: Mask [N] of the large crops, which are also counted separately.
     """
     large = Naming(naming.truth[is_large], naming.told[is_large], naming.confidence[is_large])
     coco = [name for name in encoder.NAMES if name in CLASS_NAMES[:COCO_COUNT]]
@@ -105,16 +105,16 @@ def _totals(report: dict) -> str:
     }
     named = {
         "crops": "crops of ground-truth boxes",
-        "top1": "names: top-1, all",
-        "top1_coco": "names: top-1, COCO's",
-        "top1_others": "names: top-1, others",
-        "top1_building": "names: top-1, wall, floor, ceiling",
-        "large": f"crops of {LARGE_SHARE:.0%} of the image or more",
-        "large_coco": "names: top-1 of those, COCO's",
-        "large_others": "names: top-1 of those, others",
-        "sure_share": f"names: fraction with confidence of {SURE:g} or more",
-        "sure_top1": "names: top-1 of those",
-        "calibration_error": "names: calibration error",
+        "top1": "correct names: all crops",
+        "top1_coco": "correct names: classes of COCO",
+        "top1_others": "correct names: other classes",
+        "top1_building": "correct names: wall, floor, ceiling",
+        "large": f"large crops ({LARGE_SHARE:.0%} of the image or more)",
+        "large_coco": "correct names: large crops, classes of COCO",
+        "large_others": "correct names: large crops, other classes",
+        "sure_share": f"crops with a confidence of {SURE:g} or more",
+        "sure_top1": "correct names: crops with this confidence",
+        "calibration_error": "expected calibration error of the names",
     }
     sets = report["held_out"], report["flat"]
     lines = [_row(label, *(one[key] for one in sets)) for key, label in rows.items()]
@@ -125,12 +125,12 @@ def _totals(report: dict) -> str:
 def _of_regions(regions: dict) -> str:
     rows = {
         "regions": "regions",
-        "things": "fraction with an object or a part of one",
-        "things_right": "object: correct name",
-        "things_sure_right": f"object: correct name with confidence of {SURE:g} or more",
-        "things_sure_wrong": f"object: wrong name with confidence of {SURE:g} or more",
-        "no_things_unnamed": "no object: recognized as none",
-        "no_things_sure": f"no object: name with confidence of {SURE:g} or more",
+        "things": "regions with an object or a part of one",
+        "things_right": "with object: correct name",
+        "things_sure_right": f"with object: correct name, confidence of {SURE:g} or more",
+        "things_sure_wrong": f"with object: wrong name, confidence of {SURE:g} or more",
+        "no_things_unnamed": "without object: recognized as such",
+        "no_things_sure": f"without object: name of an object, confidence of {SURE:g} or more",
     }
     return "\n".join(_row(label, regions[key]) for key, label in rows.items())
 
@@ -157,9 +157,9 @@ def _row(name: str, *values: float | str) -> str:
 TEXT = """\
 # The built-in demo networks
 
-Small networks for the synthetic scenes of this package. With them, `ldo demo` shows the whole
-semantic path without a download. They do not work on real images: for these, register a detector
-trained on COCO (`ldo models add`) and an image-text model.
+These are small networks for the synthetic scenes of this package. With them, `ldo demo` shows the
+whole semantic path without a download. They do not work on real images. For real images, register a
+detector trained on COCO (`ldo models add`) and an image-text model.
 
 {note}| file | size |
 |---|---|
@@ -169,50 +169,53 @@ License: Apache-2.0, like the rest of the package. `python training/train_demo.p
 and this card.
 
 ## What they are
-- `detector.onnx`: the layout of YOLOv8. Input `images` [1, 3, 256, 320], RGB 0..1: the image in the
-  center, padded with gray 114. Output `output0` [1, 4 + C, 1680]. A proposal network predicts boxes
-  from the whole image. A copy of the image encoder rescores the best 64 boxes; all others have
-  score 0. The classes are those classes of COCO that the synthetic scenes contain; the file's
-  metadata has their names:
+- `detector.onnx` has the input and output of YOLOv8. Input: `images` [1, 3, 256, 320], RGB in 0..1,
+  the image in the center and padding of gray 114. Output: `output0` [1, 4 + C, 1680]. A proposal
+  network predicts boxes from the whole image. A copy of the image encoder rescores the best 64
+  boxes; all other boxes have score 0. The C classes are the classes of COCO that occur in the
+  synthetic scenes; the file's metadata has their names:
   {coco}.
-- `image_encoder.onnx`: the layout of CLIP. Input `pixel_values` [N, 3, 64, 64], RGB normalized with
-  CLIP's mean and deviation: the box of a region with a margin of 0.15 of its sides, scaled with its
-  aspect ratio and centered in a square of CLIP's mean. Output `image_embeds` [N, D]: unit vectors,
-  each the normalized sum of the vectors of the crop and of its mirror image. The encoder is trained
-  on regions as the service proposes them: a third of them show no object, and a third show a part
-  of one.
-- `text_embeddings.npz`: `names` [T], unit vectors `embeddings` [T, D] and `logit_scale` (also in
+- `image_encoder.onnx` has the input and output of CLIP. Input: `pixel_values` [N, 3, 64, 64], RGB
+  normalized with CLIP's mean and standard deviation. Each crop shows the box of a region and a
+  margin of 0.15 of the box's width and height. The crop keeps its aspect ratio and is centered in a
+  square of CLIP's mean color. Output: `image_embeds` [N, D], unit vectors. Each vector is the
+  normalized sum of the vectors of the crop and of its mirror image.
+- `text_embeddings.npz` has `names` [T], unit vectors `embeddings` [T, D] and `logit_scale` (also in
   the encoder's metadata). Confidences are softmax(logit_scale * image . text) over all T names,
   calibrated for the regions that a labeller receives. The names are those of the detector;
   {others};
-  and {building} and background, which mean that there is no object.
+  and {building} and background, which all mean that there is no object.
 
-There is no text encoder, so the labeller can choose only from the names of the file above and their
-synonyms. If the service runs with a shorter list of names, `ldo control add-label` adds such a name
-to the list; any other name is rejected.
+There is no text encoder, so the labeller can choose only from the names in `text_embeddings.npz`
+and their synonyms. If the service runs with a shorter list of names, `ldo control add-label` can
+add more of these names. It rejects any other name.
 
 ## Training data
-Renders at 320x240 of random furnished rooms, with random exposure, tint, motion blur and noise. The
-rooms have the catalog of objects, the paints and the lens of the sequence `synthetic:flat` (the
-flat), but other sizes, layouts and seeds. The flat is used only for the scores below. Because it
-has the same catalog as the rooms, these scores are for known shapes in new arrangements and paints,
-not for new shapes.
+The networks are trained on renderings of random furnished rooms, 320x240 pixels, with random
+exposure, tint, motion blur and noise. The rooms have the catalog of objects, the paints and the
+lens of the sequence `synthetic:flat` (the flat), but other sizes, layouts and seeds. The flat is
+used only for the scores below. The flat has the same catalog as the rooms. Its scores are thus for
+known shapes in new arrangements and paints, not for new shapes.
+
+The encoder is trained in two rounds. The first round uses crops of objects. In the second round,
+half of the crops show regions as the service proposes them. A third of these regions show no
+object, and a third show a part of an object.
 
 Rendering took {rendering} minutes of CPU time. Training took {training} minutes of CPU time for
-{detector} steps of the detector's proposal network and {encoder} steps of the encoder. The second
-round of the encoder includes regions. The seed is {seed}.
+{detector} steps of the detector's proposal network and {encoder} steps of the encoder. The
+seed is {seed}.
 
 ## Scores
 These are scores of the shipped files. `rooms` are held-out rooms; `flat` is every 8th frame of
-`synthetic:flat`. For the detector, objects smaller than 0.1 % of the image count neither as objects
-nor as false detections. Crops are of all objects of at least 0.04 % that fill an eighth of their
-box.
+`synthetic:flat`. For the detector, objects smaller than 0.1 % of the image are not counted, nor are
+the boxes that match them. The crops show all objects that cover at least 0.04 % of the image and an
+eighth of their box. In the rooms, some crops show a bare wall, floor or ceiling.
 
 | | rooms | flat |
 |---|---|---|
 {totals}
 
-Regions of the held-out rooms, as `regions/geometric_segmentation.py` proposes them:
+Names of the regions that `regions/geometric_segmentation.py` proposes in the held-out rooms:
 
 | | rooms |
 |---|---|
@@ -225,7 +228,7 @@ boxes with a score of at least 0.25.
 |---|---|---|---|---|---|---|---|---|
 {detected}
 
-Fraction of crops with the correct name, by true name, among all names:
+Fraction of crops that get their correct name among all names, by true name:
 
 | | rooms | flat |
 |---|---|---|
@@ -234,13 +237,13 @@ Fraction of crops with the correct name, by true name, among all names:
 ## Limits
 - Large objects in partial view (the corner of a bed, a couch's side, a table under other objects)
   often get a wrong box or name. So do cabinets, suitcases, and shelves from the side. The scores
-  above count every view; in good views of an object, names are far better.
+  above count every view of an object. In good views, names are correct far more often.
 - In the synthetic scenes, apples, oranges, sports balls and mice are all balls of any color. Only
-  size and surroundings distinguish them, and a crop does not show size. A door is a bare board,
+  their size and surroundings differ, and a crop does not show the size. A door is a bare board,
   which can be mistaken for a wall.
 - Objects of a few pixels (mouse, remote, cell phone, fruit) are mostly missed.
 - Scores of the detector are not probabilities: more than 60 % of the boxes with a score of 0.6 or
   more are correct. Confidences of the names are calibrated for regions of similar rooms and for the
-  whole table of names. They are not meaningful for other images.
+  full list of names. They are not meaningful for other images.
 - Training is deliberately short: with more steps both networks still improve.
 """

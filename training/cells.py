@@ -12,16 +12,16 @@ INPUT_PX = (320, 256)  # Width and height.
 STRIDES_PX = (8, 16, 32)
 CELL_COUNT = sum(INPUT_PX[1] // s * (INPUT_PX[0] // s) for s in STRIDES_PX)
 THINGS = tuple(name for name in CLASS_NAMES if name in CATALOG)
-NAMES = tuple(name for name in CLASS_NAMES[:COCO_COUNT] if name in CATALOG)  # The first of THINGS.
+NAMES = tuple(name for name in CLASS_NAMES[:COCO_COUNT] if name in CATALOG)  # First in THINGS.
 NOTHING = len(THINGS)  # Index of the background.
 
 # Range of sqrt(box area) of the objects whose boxes a grid predicts, for each grid.
 SIDES_PX = ((0, 56), (40, 130), (96, 1000))
 BOXES_CELLS = 1.5  # Initial distance from the center of a cell to each side of its box, in cells.
-# A cell can predict an object if the object covers the fraction COVERED of the cell, or if the
-# fraction OF_OBJECT of the object's pixels lies in the cell.
+# A cell can predict an object if the object covers at least the fraction COVERED of the cell, or if
+# at least the fraction OF_OBJECT of the object's pixels lies in the cell.
 COVERED, OF_OBJECT = 0.4, 0.25
-# A cell without an object has weight 0 if objects cover more than this fraction of it.
+# A cell that predicts no object has weight 0 if objects cover more than this fraction of the cell.
 UNCLEAR = 0.3
 NOTHING_WEIGHT = 0.1  # Weight of a background cell of the finest grid in the loss.
 MIN_PX = 20  # Minimum visible pixels of an object in the targets.
@@ -69,8 +69,8 @@ def visible(plane: np.ndarray, names: np.ndarray) -> Visible:
 def make_targets(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
     """Return the training targets of all N cells.
 
-    The target of a cell is the smallest object that covers the fraction COVERED of the cell, or of
-    which the fraction OF_OBJECT lies in the cell.
+    The target of a cell is the smallest object that covers at least the fraction COVERED of the
+    cell, or that has at least the fraction OF_OBJECT of its pixels in the cell.
 
     Args:
         plane: Instance ids [H, W].
@@ -120,8 +120,8 @@ def _of_grid(
     """Return the targets of the cells of one grid.
 
     Args:
-        counts: Number of pixels of each object in each cell, [cells, M + 1]; the background comes
-            last, the smallest object first.
+        counts: Number of pixels of each object in each cell, [cells, M + 1]. The objects ascend by
+            size; the background comes last.
         stride_px: Side of a cell.
         pixels: Number of visible pixels of each object, [M].
         is_for: Objects whose boxes this grid predicts, [M] bool.

@@ -10,7 +10,7 @@ MARGIN = 0.1  # Margin of a crop around a box, as a fraction of the box's sides.
 
 
 def crop(image: np.ndarray, box_px: np.ndarray, side_px: int = INPUT_PX) -> np.ndarray:
-    """Crop a box of an image, scaled to fit into a square of CLIP's mean color.
+    """Crop a box out of an image, and scale the crop to fit into a square of CLIP's mean color.
 
     Args:
         image: Image [H, W, 3] uint8.
@@ -43,7 +43,7 @@ def resized(part: np.ndarray, side_px: int, is_ids: bool = False) -> np.ndarray:
 
 
 def framed(part: np.ndarray, side_px: int) -> np.ndarray:
-    """Return an image [h, w, 3] centered in a square of CLIP's mean color, with this side."""
+    """Return an image [h, w, 3] centered in a square of CLIP's mean color with side `side_px`."""
     canvas = np.full((side_px, side_px, 3), np.round(MEAN * 255), np.uint8)
     height, width = part.shape[:2]
     left, top = (side_px - width) // 2, (side_px - height) // 2

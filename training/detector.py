@@ -3,7 +3,7 @@
 Each cell predicts the name of its object, as in semantic segmentation. Each cell also predicts the
 box of the object and the fit, which is the IoU of the predicted box with the true one. Every cell
 has a training target in every frame, so that few frames are enough. The network learns all names of
-the catalog, not only those of COCO.
+the catalog, not only the names of COCO.
 """
 
 from collections.abc import Sequence
@@ -59,7 +59,7 @@ def _trunk(net: JaxNetwork | Graph, image) -> tuple:
 
 
 def _neck(net: JaxNetwork | Graph, fine, middle, coarse) -> list:
-    """Combine the features of all grids: pool the coarsest, then add coarse ones to finer ones.
+    """Combine the features of all grids: pool the coarsest, then add coarse to finer features.
 
     The results are in the order of `_trunk`, with WIDE channels each.
     """
@@ -98,7 +98,7 @@ def predicted(net: JaxNetwork, images):
 
 
 def loss(weights: Weights, batch: tuple):
-    """Return the weighted sum of cross entropies of names and fits and the GIoU loss of boxes.
+    """Add up the cross entropies of names and fits and the GIoU loss of boxes, all weighted.
 
     Args:
         weights: Weights of the network.
@@ -118,9 +118,14 @@ def loss(weights: Weights, batch: tuple):
 
 
 def overlaps(a, b):
-    """Return the IoU and GIoU, [...] each, of boxes a and b [..., 4], x0, y0, x1, y1.
+    """Calculate the IoU and the GIoU of boxes (Rezatofighi et al., CVPR 2019).
 
-    Rezatofighi et al., CVPR 2019.
+    Args:
+        a: Boxes [..., 4], x0, y0, x1, y1.
+        b: Boxes [..., 4].
+
+    Returns:
+        IoU [...] and GIoU [...].
     """
     low, high = jnp.maximum(a[..., :2], b[..., :2]), jnp.minimum(a[..., 2:], b[..., 2:])
     common = jnp.maximum(high - low, 0).prod(-1)

@@ -29,7 +29,7 @@ from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES
 DIMENSIONS = 96
 NAMES = tuple(name for name in CLASS_NAMES if name in CATALOG or name in BUILDING.split())
 
-# Minimum side of a box for training, and minimum fraction of the box that its object fills.
+# Minimum side of a box for training, and minimum fraction of the box that the object fills.
 SIDE_MIN_PX, FILLED_MIN = 6, 0.12
 CUT_MOST = 0.5  # Maximum fraction of a box that is cut off at one side.
 # Fraction of the crops with an occluder, and the occluder's size as a fraction of the crop's side.
@@ -94,7 +94,7 @@ class Pair:
 
 
 def unit(x):
-    """Return vectors scaled to unit length."""
+    """Scale vectors to unit length."""
     return x / jnp.sqrt((x * x).sum(-1, keepdims=True) + 1e-12)
 
 
@@ -104,7 +104,7 @@ def normalized(crops):
 
 
 def loss(weights: Weights, batch: tuple):
-    """Return the cross entropy of the names with label smoothing.
+    """Calculate the cross entropy of the names with label smoothing.
 
     Args:
         weights: Weights of the network and the table of names.
@@ -121,7 +121,8 @@ def loss(weights: Weights, batch: tuple):
 def learnable(seen: VisibleBoxes) -> tuple[VisibleBoxes, np.ndarray]:
     """Return the boxes that show enough of their object, and the indices of their names in NAMES.
 
-    A box must have sides of at least SIDE_MIN_PX, and its object must fill the fraction FILLED_MIN.
+    A box must have sides of at least SIDE_MIN_PX, and its object must fill at least the fraction
+    FILLED_MIN of the box.
     """
     sides = seen.boxes_px[:, 2:] - seen.boxes_px[:, :2]
     chosen = seen.chosen(
@@ -140,7 +141,7 @@ def batches(
 
     Args:
         material: Training frames.
-        rng: Source of the choice and the augmentation.
+        rng: Source of the random choice of boxes and of the augmentation.
         side_px: Side of the crops.
         size: Number of crops in a batch.
 
@@ -183,7 +184,7 @@ def shown_in(
     rng: np.random.Generator,
     framing: Framing,
 ) -> Shown:
-    """Cut one box out of its frame, with random margins, offsets and missing sides.
+    """Cut one box out of its frame, with a random margin, offset and missing side.
 
     Args:
         material: Training frames.
@@ -211,7 +212,7 @@ def shown_in(
 def example(
     shown: Shown, before: Shown | None, side_px: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return an augmented crop of `shown`, occluded by `before` unless that is None."""
+    """Return an augmented crop of `shown`, occluded by the object of `before` if it is given."""
     color = recolor(shown.color, shown.plane, rng)
     if before is not None:
         _cover(color, before, rng)

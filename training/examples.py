@@ -18,14 +18,14 @@ PADDING = 114  # Gray level outside the frame.
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """Size of an example's image, and range of the factor by which the frame in it is scaled."""
+    """Size of a training image, and range of the factor by which the frame in it is scaled."""
 
     size_px: tuple[int, int] = INPUT_PX  # Width and height, multiples of the widest cell.
     zoom: tuple[float, float] = (0.8, 1.5)  # Minimum and maximum.
 
 
-# Canvas of the first round, with three eighths of the pixels of the second. The objects in it are
-# at most about as large as in the second round.
+# Canvas of the first training round, with three eighths of the pixels of the second round. Objects
+# are at most about as large as in the second round.
 SMALL = Canvas((192, 160), (0.5, 1.2))
 
 
@@ -101,7 +101,7 @@ def _example(
 def _windows(
     size_px: tuple[int, int], place_px: np.ndarray, zoom: float, canvas_px: tuple[int, int]
 ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Return the visible window of a frame and the window of the canvas that shows it.
+    """Return the part of a frame that lies on the canvas, and the part of the canvas that it fills.
 
     Args:
         size_px: Width and height of the frame.

@@ -31,11 +31,13 @@ Point = tuple[float, float, float]
 GAP_M = 0.015  # Maximum overlap of the boxes of two objects; it lets objects stand on rugs.
 TRIES = 12  # Number of positions to try before an object is omitted.
 HEADROOM_M = 0.6  # Free height above tables and seats.
-# Maximum number of chairs at a table, and range of the length of a chair that is under the table.
+# Maximum number of chairs at a table, and range of the depth to which a chair is pushed under the
+# table, meters.
 CHAIRS_MOST, PUSHED_M = 4, (-0.15, 0.3)
 
 # Headings (direction of an object's x axis), named by the direction that the object's front faces.
-# Objects at the back wall, the front wall, and the walls at +x and -x have these four, in order.
+# An object at the back wall has TO_FRONT, at the front wall TO_BACK, at the wall at +x TO_LEFT, and
+# at the wall at -x TO_RIGHT.
 TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT = (1.0, 0.0), (-1.0, 0.0), (0.0, -1.0), (0.0, 1.0)
 ASKEW = ((1.0, 0.0), (0.96, 0.28), (0.8, 0.6), (0.8, -0.6), (0.96, -0.28))  # Small rotations.
 
@@ -126,10 +128,7 @@ def furnish(builder: Builder) -> None:
 
 
 def _place(builder: Builder, thing: SceneObject, places: Iterable[Point]) -> None:
-    """Place an object and what belongs to it.
-
-    A dining table gets chairs; tables, seats and shelves get objects on them.
-    """
+    """Place an object, chairs at a dining table, and objects on a table, seat or shelf."""
     placed = builder.put(thing, places)
     if placed is not None:
         if placed.label == "dining table":
@@ -182,8 +181,8 @@ def _along_walls(
     Args:
         builder: The room.
         thing: The object at the origin, facing TO_FRONT.
-        on_floor: True: the object stands on the floor; false: it is on the wall, at a random height
-            from HUNG.
+        on_floor: True: the object stands on the floor. False: the object is fixed to the wall, at a
+            random height from HUNG.
 
     Returns:
         The turned object at the origin, and TRIES positions, meters.

@@ -1,7 +1,7 @@
 """Layers of convolutional networks, for training in JAX and for export to ONNX.
 
-A network is a function of a backend `net` and an image, which calls a method of the backend for
-each layer. Two backends have the same methods: `JaxNetwork` computes arrays [N, H, W, C] for
+A network is a function of a backend `net` and an image. The function calls a method of the backend
+for each layer. Two backends have the same methods: `JaxNetwork` computes arrays [N, H, W, C] for
 training, and `Graph` adds ONNX nodes and returns the names of tensors [N, C, H, W].
 """
 
@@ -41,8 +41,8 @@ class JaxNetwork:
 
         Args:
             weights: Weights by name.
-            statistics: Mean and variance for the normalization of each layer, by name. None: those
-                of the batch are used.
+            statistics: Mean and variance for the normalization of each layer, by name. None uses
+                the mean and variance of each batch.
             rng: Random generator that initializes missing weights. None: a missing weight raises
                 KeyError.
         """
@@ -73,7 +73,7 @@ class JaxNetwork:
     def folded(self, x, side: int):
         """Merge each square of `side` x `side` pixels into the channels of one pixel.
 
-        This is the operation space to depth.
+        This is the ONNX operation SpaceToDepth.
         """
         n, height, width, channels = x.shape
         x = x.reshape(n, height // side, side, width // side, side, channels)
@@ -81,16 +81,16 @@ class JaxNetwork:
         return x.reshape(n, height // side, width // side, side * side * channels)
 
     def enlarged(self, x):
-        """Return the image at twice its size by nearest-neighbor upsampling."""
+        """Enlarge an image to twice its size by nearest-neighbor upsampling."""
         return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)
 
     def widest(self, x):
-        """Return the maximum of the 5x5 pixels around each pixel, per channel."""
+        """Replace each pixel by the maximum of the 5x5 pixels around it, per channel."""
         window = (1, 5, 5, 1)
         return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, window, (1, 1, 1, 1), "SAME")
 
     def mean(self, x):
-        """Return the mean over all pixels, [N, 1, 1, C]."""
+        """Average an image over all its pixels, per channel; the result is [N, 1, 1, C]."""
         return x.mean(axis=(1, 2), keepdims=True)
 
     def _convolved(self, x, name: str, channels: int, stride: int, size: int):
@@ -124,9 +124,10 @@ class JaxNetwork:
 
 
 class Graph:
-    """Backend of a network that builds an ONNX graph, with normalization in the convolutions.
+    """Backend of a network that builds an ONNX graph.
 
-    The methods of layers are those of `JaxNetwork`; they take and return names of tensors.
+    The normalization of a layer becomes a part of its convolution. The methods of layers are those
+    of `JaxNetwork`; they take and return names of tensors.
     """
 
     def __init__(self, weights: Weights, statistics: Statistics) -> None:
@@ -136,7 +137,7 @@ class Graph:
         self._statistics = statistics
 
     def beside(self, weights: Weights, statistics: Statistics) -> "Graph":
-        """Return a backend that adds the nodes of another network to the graph of this one."""
+        """Return a backend with other weights, which adds its nodes to the graph of this one."""
         other = Graph(weights, statistics)
         other.nodes, other.constants = self.nodes, self.constants
         return other
@@ -204,7 +205,7 @@ class Graph:
         return self.constant(np.array(value, np.float32))
 
     def halved(self, values: np.ndarray) -> str:
-        """Add a constant in half precision with a cast to float, which halves the file's size."""
+        """Add a constant in half precision, to halve the file's size, and a cast to float."""
         return self.node("Cast", self.constant(values.astype(np.float16)), to=TensorProto.FLOAT)
 
     def constant(self, values: np.ndarray) -> str:

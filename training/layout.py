@@ -45,7 +45,7 @@ def inside_m(flat: Flat) -> tuple[float, float]:
 def _panels(
     rng: np.random.Generator, size_m: tuple[float, float], door_m: float
 ) -> Iterator[Panel]:
-    """Yield the four walls, one with the doorway, the hallway behind it, floor and ceiling."""
+    """Yield the panels of walls, floor and ceiling of a room and of the hallway behind its door."""
     width, depth = size_m
     paint = ("wall_a", "wall_b", "wall_c")[int(rng.integers(3))]
     floor = ("floor_a", "floor_b", "floor_c")[int(rng.integers(3))]

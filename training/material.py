@@ -1,4 +1,4 @@
-"""Training frames of many rooms, which several processes render once and store."""
+"""Training frames of many rooms. Several processes render the frames that are not stored yet."""
 
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass

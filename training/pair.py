@@ -1,8 +1,9 @@
 """The two training rounds of the dual encoder: first on objects, then on objects and regions.
 
-The service requests labels for region proposals from geometry and color (`regions`). A third of
-these show no object, and a third show a part of one. In the second round, half of each batch is
-therefore crops of such regions, with one additional name for regions without an object.
+The service requests labels for region proposals, which it computes from geometry and color
+(`regions`). A third of the regions show no object, and a third show a part of an object. In the
+second round, half of the crops in each batch therefore show such regions. Regions without an object
+get an additional name.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -23,13 +24,13 @@ from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES
 
 NO_NAME = "background"  # Name of a region that shows no object.
 NO_THINGS = (*BUILDING.split(), NO_NAME)
-# Sides of crops in pixels with their fraction of a round's steps, for each round. Small crops come
-# first, because a step with small crops takes a fraction of the time (Tan and Le, EfficientNetV2,
-# ICML 2021).
+# Sides of the crops in pixels, each with its fraction of the steps, for each round. Small
+# crops come first, because a step with small crops takes a fraction of the time (Tan and Le,
+# EfficientNetV2, ICML 2021).
 SIDES = ((32, 0.3), (48, 0.7)), ((48, 0.5), (INPUT_PX, 0.5))
 # Variation of the crops of regions. Nothing is cut off, because many regions are already cut off.
 ABOUT_REGIONS = Framing((0.1, 0.2), 0.04, 0.0)
-# Fraction of regions in a batch, and fraction of these that show no object.
+# Fraction of crops of regions in a batch, and fraction of these regions that show no object.
 REGIONS_SHARE, NO_THING_SHARE = 0.5, 0.35
 MARGIN = ViewConfig().context  # Margin of a labeller's crop, as a fraction of the region's sides.
 
@@ -64,7 +65,7 @@ def train(material: Views, steps: Sequence[int], seed: int) -> Pair:
 
 
 def _with_no_name(texts: np.ndarray) -> np.ndarray:
-    """Return the table [T + 1, D] with NO_NAME, initialized to the mean of wall, floor, ceiling."""
+    """Add a vector for NO_NAME to the table [T, D]: the mean of wall, floor and ceiling."""
     building = [NAMES.index(name) for name in BUILDING.split()]
     return np.concatenate([texts, texts[building].mean(axis=0, keepdims=True)])
 
@@ -120,7 +121,7 @@ def crops_of(regions: VisibleBoxes, colors: Sequence[np.ndarray]) -> tuple[np.nd
 
 
 def is_right(names: np.ndarray) -> np.ndarray:
-    """Return the names that are correct for regions, [N, T + 1] bool.
+    """Return the mask of the names that are correct for each region, [N, T + 1] bool.
 
     For a region without an object, all names in NO_THINGS are correct.
 

@@ -19,16 +19,17 @@ from ldo_service.synthetic.flat.sensor import measured_depth_m
 TRIGGER = RegionProposalConfig(min_side_px=12)
 BLUR_PX = 4.0  # Maximum motion blur of the color images.
 NO_THING = -1  # Class of a region that shows no object.
-OWN = 0.7  # Minimum fraction of a region's pixels that one object covers, to show this object.
-# Minimum fraction of an object's visible pixels in a region; regions with less are omitted.
+OWN = 0.7  # A region shows an object that covers at least this fraction of the region's pixels.
+# A region that shows a smaller fraction than this of the object's visible pixels is omitted.
 SHOWN = 0.1
 
 
 def regions(frame: FlatRendering, lens: Camera, rng: np.random.Generator) -> Iterator[tuple]:
     """Yield the region proposals of a frame, with the object that each of them shows.
 
-    The proposals are computed from color and depth with the errors of a camera. Where the camera
-    measures no depth, the exact depth is used, because the service uses the depth of the map there.
+    The proposals are computed from color and depth with simulated camera errors. Where the
+    simulated camera measures no depth, the exact depth is used, because the service uses the depth
+    of the map there.
 
     Args:
         frame: The exact frame.
@@ -38,8 +39,8 @@ def regions(frame: FlatRendering, lens: Camera, rng: np.random.Generator) -> Ite
     Yields:
         Class id, instance id, x0, y0, x1, y1 of the box in pixels from the corner of the first
         pixel, and number of the region's pixels on the object. A region without an object has the
-        class NO_THING, the instance 0, and the number of all of its pixels. A region with too small
-        a piece of an object is omitted.
+        class NO_THING, the instance 0, and the number of all of its pixels. A region that shows too
+        small a piece of its object is omitted.
     """
     sharp = np.floor(np.clip(frame.light, 0, 1) * 255 + 0.5).astype(np.uint8)
     measured_m = measured_depth_m(frame.depth_m, frame.light, lens.fx, rng)

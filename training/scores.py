@@ -1,6 +1,6 @@
 """Scores of the exported files.
 
-The networks run in onnxruntime, without any code of the training, as in any other program.
+The networks run in onnxruntime, without any code of the training.
 """
 
 from collections.abc import Iterable
@@ -92,7 +92,7 @@ def detection(
 ) -> dict[str, ClassScore]:
     """Return the scores of each class that occurs, by name.
 
-    Objects below SHARE_MIN count neither as objects nor as false detections.
+    Objects below SHARE_MIN are not counted, nor are the boxes that match them.
 
     Args:
         found: Detections of each frame.
@@ -169,7 +169,7 @@ class Naming:
     confidence: np.ndarray  # Softmax probabilities [N] of the predicted names.
 
     def accuracy(self, names: Iterable[str] = encoder.NAMES) -> float:
-        """Return the fraction of correct predictions among the crops with these true names."""
+        """Return the fraction of correct predictions among crops with a true name in `names`."""
         mine = np.isin(self.truth, [encoder.NAMES.index(name) for name in names])
         return float(np.mean(self.told[mine] == self.truth[mine])) if mine.any() else float("nan")
 

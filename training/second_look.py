@@ -4,8 +4,8 @@ Input:
     images: RGB [1, 3, 256, 320] in 0..1, the frame centered on gray.
 
 Output:
-    output0: Array [1, 4 + C, 1680] of cx, cy, w, h in pixels of the input, then a score per class
-        of COCO.
+    output0: Array [1, 4 + C, 1680] of cx, cy, w, h in pixels of the input, then the scores of the C
+        classes of `cells.NAMES`.
 
 The proposal network (`detector`) predicts boxes. The image encoder of the dual encoder classifies
 the LOOKS most likely boxes again. The score of such a box is the class probability from both
@@ -92,7 +92,7 @@ def output(
 
 
 def _best(graph: Graph, corners: str, fit: str, logits: str) -> str:
-    """Add the choice of the cells with the most likely objects, after non-maximum suppression.
+    """Add nodes that choose the cells with the most likely objects, by non-maximum suppression.
 
     Returns:
         Name of the tensor with the indices [K] of the cells, K <= LOOKS.
@@ -105,13 +105,13 @@ def _best(graph: Graph, corners: str, fit: str, logits: str) -> str:
 
 
 def _rows(graph: Graph, x: str, cells: str) -> str:
-    """Return the name of the rows [K, C] for `cells` [K] of a tensor x [1, C, N]."""
+    """Return the name of a tensor [K, C]: the values of x [1, C, N] at the indices `cells` [K]."""
     rows = graph.node("Transpose", graph.node("Squeeze", x, graph.integers(0)), perm=[1, 0])
     return graph.node("Gather", rows, cells, axis=0)
 
 
 def _second_logits(graph: Graph, boxes: str, pair: Pair, scale: float) -> str:
-    """Return the name of the dual encoder's logits of names and background, [K, T + 1]."""
+    """Return the name of the tensor of the dual encoder's logits [K, T + 1], background last."""
     # Mirror images would double the work for the many crops.
     images = embedded(graph, _crops(graph, boxes), with_mirror=False)
     cosines = graph.node("MatMul", images, graph.constant(SECOND_WEIGHT * scale * pair.texts.T))
@@ -125,7 +125,7 @@ def _joined(graph: Graph, first: str, second: str) -> str:
 
 
 def _crops(graph: Graph, boxes: str) -> str:
-    """Return the name of the normalized crops [K, 3, 64, 64] of boxes [K, 4].
+    """Return the name of the tensor of normalized crops [K, 3, 64, 64] of boxes [K, 4].
 
     The crops are those of `crops.crop` and `crops.planes`, apart from the interpolation.
     """
@@ -173,7 +173,7 @@ def _masked(graph: Graph, crops: str, extents: str) -> str:
 
 
 def _write(graph: Graph, corners: str, cells: str, scores: str) -> None:
-    """Add `output0`: the boxes of all cells, and the scores of the rescored ones."""
+    """Add `output0`: the boxes and scores of all cells; a cell that is not rescored has score 0."""
     empty = graph.constant(np.zeros((CELL_COUNT, len(NAMES)), np.float32))
     rows = graph.node("Unsqueeze", cells, graph.integers(1))
     scores = graph.node("ScatterND", empty, rows, scores)

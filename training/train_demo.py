@@ -146,8 +146,8 @@ def export(first: FirstStage, both: Pair, work: Path, out: Path) -> None:
     views = CALIBRATION.load(work)
     colors = _as_recorded(views)
     _export_labeller(both, views, colors, out)
-    # The detector only classifies boxes of objects. Its copy of the dual encoder therefore has no
-    # NO_NAME, and crops of objects calibrate it.
+    # The detector only classifies boxes of objects. Its copy of the dual encoder therefore lacks
+    # NO_NAME and is calibrated on crops of objects.
     things = replace(both, texts=both.texts[: len(encoder.NAMES)], names=encoder.NAMES)
     crops, names = encoder.crops_of(views.seen, colors)
     is_right = names[:, None] == np.arange(len(things.names))
@@ -194,7 +194,7 @@ def score(work: Path, out: Path) -> dict:
 
 
 def _as_recorded(views: Views) -> list[np.ndarray]:
-    """Return the frames with the errors of a camera, which are the same in each call."""
+    """Return the frames with simulated camera errors, which are the same in each call."""
     return [
         degrade(color, np.random.default_rng([SEED, 3, k])) for k, color in enumerate(views.colors)
     ]

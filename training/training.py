@@ -43,8 +43,8 @@ def fit_in_rounds(
 ) -> Weights:
     """Fit the weights in consecutive rounds, each with its own warm-up and decay.
 
-    When the rate rises again in the next round, the weights may leave a local minimum and reach a
-    better one (Loshchilov and Hutter, SGDR, ICLR 2017).
+    The rate rises again in the next round, so that the weights may leave a local minimum and reach
+    a better one (Loshchilov and Hutter, SGDR, ICLR 2017).
 
     Args:
         loss: Function of weights and a batch.
@@ -123,7 +123,7 @@ def statistics(
 ) -> Statistics:
     """Return the mean and variance of each normalized layer, by name, for inference.
 
-    Both are averaged over the first STATISTICS_BATCHES batches of `inputs`.
+    Means and variances are averaged over the first STATISTICS_BATCHES batches of `inputs`.
     """
 
     @jax.jit

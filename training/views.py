@@ -26,9 +26,10 @@ WALL_AHEAD_M = 1.3  # Minimum distance to the wall in front of the camera.
 # with the most objects is used.
 GLANCES, NEAR_M = 2, 3.0
 SHARE_MIN = 3.9e-4  # Minimum size of an object, as a fraction of the image: 30 pixels.
-# Random windows per frame. A window on a bare wall, floor or ceiling becomes a training example.
+# Random rectangles per frame. A rectangle that shows a bare wall, floor or ceiling becomes a
+# training example of this class.
 WINDOWS = 6
-PURITY = 0.8  # Minimum fraction of such a window that one surface covers.
+PURITY = 0.8  # Minimum fraction of such a rectangle that the wall, floor or ceiling covers.
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +40,8 @@ class VisibleBoxes:
     class_ids: np.ndarray  # Index [B] into CLASS_NAMES; -1 for a region without an object.
     instances: np.ndarray  # Instance id [B]; 0 for the building and for no object.
     boxes_px: np.ndarray  # Boxes [B, 4], x0, y0, x1, y1, from the corner of the first pixel.
-    # Number [B] of visible pixels of the object. For a region, number of its pixels on the object
-    # or, without an object, of all of its pixels.
+    # Number [B] of visible pixels of the object. For a region: number of the region's pixels on the
+    # object, or of all its pixels if it shows no object.
     pixels: np.ndarray
 
     def __len__(self) -> int:
@@ -72,7 +73,7 @@ class Views:
 
     colors: np.ndarray  # RGB [F, H, W, 3] uint8, sharp and without noise.
     instances: np.ndarray  # Instance ids [F, H, W] uint8; 0 for the building.
-    seen: VisibleBoxes  # Visible objects and pieces of the building.
+    seen: VisibleBoxes  # Visible objects, and rectangles on bare walls, floors and ceilings.
     regions: VisibleBoxes  # Region proposals, see `regions`.
 
 
@@ -125,12 +126,12 @@ def cached(folder: Path, seed: int, count: int) -> Views:
 def seen_in(
     planes: list[tuple[np.ndarray, np.ndarray]], rng: np.random.Generator | None = None
 ) -> VisibleBoxes:
-    """Return the boxes of the visible objects in frames.
+    """Return the boxes of the visible objects in frames, and optionally of bare walls.
 
     Args:
         planes: Class ids [H, W] and instance ids [H, W] of each frame.
-        rng: Source of random windows on bare walls, floors and ceilings, which are added. None: no
-            windows are added.
+        rng: Random generator of image rectangles. Those that show a bare wall, floor or ceiling are
+            returned as boxes of this class, besides the objects. None returns objects only.
     """
     rows = [
         (frame, *row)
@@ -157,7 +158,10 @@ def _objects(class_ids: np.ndarray, instance_ids: np.ndarray) -> Iterator[tuple]
 
 
 def _building(class_ids: np.ndarray, rng: np.random.Generator) -> Iterator[tuple]:
-    """Yield random windows on a bare wall, floor or ceiling, as rows like those of `_objects`."""
+    """Yield random image rectangles that show a bare wall, floor or ceiling.
+
+    The rows have the columns of `_objects`.
+    """
     height, width = class_ids.shape
     for _ in range(WINDOWS):
         w, h = rng.integers(12, 100, 2)
