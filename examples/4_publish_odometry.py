@@ -2,8 +2,8 @@
 
 The service uses the prior as the initial guess of tracking. Each message is the pose of the robot's
 base in a fixed frame that the sender chooses; only the motion between two messages is used. Stamps
-must be of the same clock as the stamps of the camera's frames. The setting `tracker.T_base_camera`
-of the service is the pose of the camera on the base.
+must come from the same clock as the stamps of the camera frames. The setting
+`tracker.T_base_camera` of the service is the pose of the camera in the frame of the base.
 
 A real robot publishes the poses that its odometry measures. This example reads poses from a file
 instead and sends each pose at its time. The lines of the file are `stamp tx ty tz qx qy qz qw`, in

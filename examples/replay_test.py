@@ -9,8 +9,8 @@ Run `.venv/bin/pip install pytest`, copy this file to a folder of your own and r
 
     LDO_RECORDING=recordings/desk pytest replay_test.py
 
-In a clone of this repository, run `make test` once before, which installs the plugins that its
-pytest settings need.
+In a clone of this repository, first run `make test` once. It installs the plugins that the pytest
+settings of the clone need.
 
 Each recorded actor is one test case. A failure reports the step and the message that differs.
 """

@@ -103,7 +103,7 @@ class Client:
     def publish_color(
         self, color: np.ndarray, camera: CameraModel, stamp_ns: int | None = None
     ) -> None:
-        """Send a color image of a camera that has separate depth images; see `publish_depth`.
+        """Send a color image of a camera that sends depth separately, by `publish_depth`.
 
         The arguments are those of `publish`.
         """
@@ -146,8 +146,8 @@ class Client:
 
         Args:
             T_prior_base: Pose of the robot's base in the frame of that odometry, meters.
-            stamp_ns: Time of the measurement, ns; the current time by default. It must be of the
-                same clock as the stamps of the camera frames.
+            stamp_ns: Time of the measurement, ns; the current time by default. It must come from
+                the same clock as the stamps of the camera frames.
         """
         message = OdometryPrior(stamp_ns=_stamp(stamp_ns), T_prior_base=T_prior_base)
         self._sender.send(message, "odometry", self._priors)
@@ -174,7 +174,7 @@ class Client:
         A new connection learns of subscribers after a short delay.
 
         Returns:
-            False if none was found within `timeout_s`.
+            False if no subscriber was found within `timeout_s`.
         """
         return self._sender.wait_for_subscriber(CameraRgbd, timeout_s)
 
@@ -222,7 +222,7 @@ class Client:
             timeout_s: Maximum time to wait, seconds.
 
         Returns:
-            All parts of the value; empty if there is no value yet.
+            The messages of the value, several for a map snapshot; empty if there is no value yet.
 
         Raises:
             ConfigError: No topic has this name, or the topic is not a state topic.
@@ -239,17 +239,17 @@ class Client:
         """Request the current objects of the map.
 
         Raises:
-            ConfigError: The service does not reply or has no objects, for example without a
-                detector.
+            ConfigError: The service does not reply, or it has no objects, for example because no
+                detector runs.
         """
         for message in self.latest(MAP_OBJECTS, timeout_s):
             assert isinstance(message, MapObjects)
             return message
         if "mapper" in self.live_actors():
             raise ConfigError(
-                "the map has no objects yet. They need a keyframe, also after a restart, and a "
+                "the map has no objects yet. Objects need a keyframe, also after a restart, and a "
                 "detector: `ldo serve --set detector.model=...`; `ldo models` shows how. A service "
-                "that only localizes publishes no objects; the folder of its map has them."
+                "that only localizes publishes no objects; they are in the folder of its map."
             )
         raise self._no_service("replies", MAP_OBJECTS)
 
@@ -286,13 +286,13 @@ class Client:
     ) -> None:
         """Request further optimization of the Gaussians with the existing keyframes.
 
-        The call returns at once; the changes are published on `map/delta`.
+        The call does not wait for the optimization, whose changes are published on `map/delta`.
 
         Args:
             iterations: Number of iterations, at most 500.
             first_rate: Factor of the step size in the first iteration, in (0, 1].
             last_rate: Factor of the step size in the last iteration, in (0, 1].
-            timeout_s: Maximum time to wait for the mapper to be connected, seconds.
+            timeout_s: Maximum time to wait for the connection to the mapper, seconds.
 
         Raises:
             ValueError: An argument is out of range.
@@ -337,7 +337,7 @@ class Client:
         raise self._no_service("replies", LABEL_ADD)
 
     def _send_request(self, topic: Topic, message: RefineMap | AddLabel, timeout_s: float) -> None:
-        """Publish a request once it has a subscriber.
+        """Publish a request as soon as its topic has a subscriber.
 
         Raises:
             ConfigError: No actor subscribes to the request within `timeout_s` seconds.
@@ -381,7 +381,7 @@ def connect(
 
     Args:
         robot: Name of the robot.
-        endpoint: Address of its router.
+        endpoint: Address of the router of the service.
         keys: Folder with TLS keys, created by `ldo keys`; needed for a `tls/` endpoint.
 
     Raises:

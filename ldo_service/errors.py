@@ -34,21 +34,21 @@ class ConfigError(LdoError):
 
 
 class LosslessCycle(ConfigError):
-    """Error of a graph of actors: a cycle of lossless inputs, in which all actors could deadlock.
+    """Cycle of lossless inputs in a graph of actors; all actors of the cycle could deadlock.
 
-    A lossless input makes the sending actor wait for the receiving one.
+    A lossless input makes the sending actor wait for the receiving actor.
     """
 
     def __init__(self, path: list[str]) -> None:
         super().__init__(
-            f"lossless cycle {' -> '.join(path)}: each actor could wait for credit of the next "
-            "forever. Make one of these inputs Latest."
+            f"lossless cycle {' -> '.join(path)}: each actor could wait forever for credit from "
+            "the next one. Change one of these inputs to the policy Latest."
         )
         self.path = path
 
 
 class EndpointError(ConfigError):
-    """Failed request to an HTTP server, such as a labeller's: no reply or an invalid one."""
+    """Failed request to an HTTP server, such as a labeller: no reply or an invalid reply."""
 
 
 class ModelError(ConfigError):
@@ -62,7 +62,7 @@ class DataError(LdoError):
 
 
 class FrameError(DataError):
-    """Single frame that cannot be used; the caller skips and counts it, and logs the first one."""
+    """Single unusable frame; callers skip and count such frames, and log the first one."""
 
 
 class StageError(LdoError):
@@ -77,13 +77,13 @@ class RestartsExhausted(StageError):
     def __init__(self, actor: str, restarts: int, window_s: float) -> None:
         super().__init__(
             f"{actor} failed {restarts} times within {window_s:g} s, so the service stops. The log "
-            "above has each failure. Fix its cause, or raise supervision.max_restarts."
+            "above has each failure. Fix the cause, or raise supervision.max_restarts."
         )
         self.actor, self.restarts, self.window_s = actor, restarts, window_s
 
 
 class StageStalled(StageError):
-    """Step of an actor, the handling of one message, that exceeds its time limit."""
+    """Step of an actor that exceeds its time limit; a step is the handling of one message."""
 
     def __init__(self, actor: str, age_s: float, setting: str) -> None:
         super().__init__(

@@ -87,4 +87,4 @@ class Array(msgspec.Struct, frozen=True):
         """Raise ValueError unless the array [N] holds ids of at least 0 in ascending order."""
         ids = self.numpy()
         if (ids.size and ids[0] < 0) or (ids[1:] <= ids[:-1]).any():
-            raise ValueError(f"{name} must be ascending and at least 0")
+            raise ValueError(f"{name} must hold ascending ids of at least 0")

@@ -20,7 +20,7 @@ class ControlRequest(Message, frozen=True, kw_only=True):
 class ControlAnswer(Message, frozen=True, kw_only=True):
     """Reply to a command, sent after all actors have executed it.
 
-    stamp_ns is that of the request.
+    stamp_ns is the stamp of the request.
     """
 
     ok: bool

@@ -7,7 +7,7 @@ from ldo_service.schemas.message import Message, require_count, require_finite
 
 MAX_LABEL_LENGTH = 100  # Characters.
 MAX_DETECTIONS = 10_000
-TOLERANCE_PX = 1e-3  # Tolerance for rounding beyond the edge of the image.
+TOLERANCE_PX = 1e-3  # Rounding may move a box beyond the image edge by this much.
 
 
 class Detection(msgspec.Struct, frozen=True, kw_only=True):
@@ -38,21 +38,22 @@ class Detection(msgspec.Struct, frozen=True, kw_only=True):
 class DetectionBoxes(Message, frozen=True, kw_only=True):
     """Detections in a keyframe, published on detection/boxes once for every keyframe.
 
-    stamp_ns is the stamp of the keyframe. If `network` is empty, no detector ran. `detections` is
-    then empty even if the keyframe shows objects.
+    stamp_ns is the stamp of the keyframe. If no detector ran, `network` and `detections` are empty,
+    even if the keyframe shows objects.
     """
 
     keyframe: int  # Id of the keyframe.
     width: int  # Width of the keyframe's image, pixels.
     height: int  # Height of the keyframe's image, pixels.
     detections: tuple[Detection, ...] = ()  # Sorted by descending score.
-    network: str = ""  # Name and checksum of the network that ran; empty: none ran.
+    network: str = ""  # Name and checksum of the network that ran; empty if none ran.
 
     def check(self) -> None:
         require_count("keyframe", self.keyframe)
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
             raise ValueError(
-                f"image size is {self.width}x{self.height}, must have 1 to {MAX_PIXELS} pixels"
+                f"image size is {self.width}x{self.height}, must be 1 to {MAX_PIXELS} pixels in "
+                "total"
             )
         if len(self.detections) > MAX_DETECTIONS:
             raise ValueError(
@@ -60,8 +61,8 @@ class DetectionBoxes(Message, frozen=True, kw_only=True):
             )
         if self.detections and not self.network:
             raise ValueError(
-                f"message has {len(self.detections)} detections and an empty network; network must "
-                "name the network that made them"
+                f"message has {len(self.detections)} detections, but `network` is empty; `network` "
+                "must name the network that made the detections"
             )
         for detection in self.detections:
             self._require_inside(detection)

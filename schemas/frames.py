@@ -29,7 +29,8 @@ class CameraModel(msgspec.Struct, frozen=True, kw_only=True):
         require_finite("camera intrinsics", (self.fx, self.fy, self.cx, self.cy, *self.distortion))
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
             raise ValueError(
-                f"image size is {self.width}x{self.height}, must have 1 to {MAX_PIXELS} pixels"
+                f"image size is {self.width}x{self.height}, must be 1 to {MAX_PIXELS} pixels in "
+                "total"
             )
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"focal lengths are {self.fx:g}, {self.fy:g} px, must be positive")
@@ -60,7 +61,8 @@ class Image(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
             raise ValueError(
-                f"image size is {self.width}x{self.height}, must have 1 to {MAX_PIXELS} pixels"
+                f"image size is {self.width}x{self.height}, must be 1 to {MAX_PIXELS} pixels in "
+                "total"
             )
         raw = self.width * self.height * BYTES_PER_PIXEL.get(self.encoding, 0)
         if self.encoding in BYTES_PER_PIXEL and self.data.nbytes != raw:
@@ -90,7 +92,7 @@ class CameraRgbd(Message, frozen=True, kw_only=True):
     stamp_ns is the time of the exposure, by the clock of the camera.
     """
 
-    frame: int  # Running number of the camera program; gaps are dropped frames.
+    frame: int  # Number of the frame, counted by the camera program; gaps are dropped frames.
     camera: CameraModel
     color: Image
     depth: Image
@@ -115,7 +117,8 @@ class CameraColor(Message, frozen=True, kw_only=True):
     stamp of the color image.
     """
 
-    frame: int  # Running number of the camera program; the resulting frame has the same number.
+    # Number of the image, counted by the camera program; the resulting frame has the same number.
+    frame: int
     camera: CameraModel
     image: Image
 
@@ -132,7 +135,8 @@ class CameraDepth(Message, frozen=True, kw_only=True):
     depth image to the color image.
     """
 
-    frame: int  # Running number of the camera program; images are paired by stamp, not by number.
+    # Number of the image, counted by the camera program; images are paired by stamp, not by number.
+    frame: int
     camera: CameraModel  # Intrinsics of the depth image.
     image: Image
     depth_scale: float  # Depth units per meter, as in camera/rgbd.

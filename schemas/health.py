@@ -12,14 +12,14 @@ class InputCount(msgspec.Struct, frozen=True, kw_only=True):
 
     topic: str
     delivered: int  # Messages handled by the actor.
-    dropped: int  # Messages dropped for newer ones by the policy of the input.
+    dropped: int  # Messages that the policy of the input dropped because newer ones arrived.
     rejected: int  # Messages that failed to decode or to pass the checks.
     gaps: int  # Lossless inputs only: gaps in the sequence, for which retransmission was requested.
     queued: int  # Messages in the mailbox now.
     peak_queued: int  # Maximum of `queued` so far.
     dropped_paused: int = 0  # Messages dropped while the service was paused.
-    # Messages that never arrived, counted by gaps in the sequence. For lossless inputs: messages
-    # that the producer had to drop.
+    # Messages that never arrived, counted by gaps in the sequence. For lossless inputs, only
+    # messages that the producer had to drop.
     lost: int = 0
 
 
@@ -28,14 +28,14 @@ class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
 
     topic: str
     sent: int
-    backpressure_waits: int  # Times that the stage waited because a consumer's window was full.
+    backpressure_waits: int  # Number of waits because a consumer's window was full.
     evicted_consumers: int  # Consumers evicted because their window stayed full.
     # Lossless messages sent again, after a loss or from a backlog.
     retransmitted: int = 0
-    # Number of messages that a consumer with a backlog has not handled yet, by consumer name.
+    # Number of messages not handled yet by each consumer with a backlog, by consumer name.
     behind: dict[str, int] = {}
     backlog_mb: float = 0.0  # Size of the backlog on disk, MB.
-    backlog_dropped: int = 0  # Messages that the maximum size of the backlog dropped.
+    backlog_dropped: int = 0  # Messages dropped because the backlog had its maximum size.
 
 
 class Health(Message, frozen=True, kw_only=True):
@@ -51,11 +51,11 @@ class Health(Message, frozen=True, kw_only=True):
     epoch: int  # Number that changes when the process restarts or the actor is reset.
     steps: int  # Handled messages.
     failures: int  # Exceptions in the handler.
-    restarts: int  # Times that the actor was rebuilt from its last state.
+    restarts: int  # Number of times that the actor was rebuilt from its last state.
     dead_lettered: int  # Messages that failed twice.
     step_age_s: float  # Time since the last step finished.
     current_step_s: float  # Age of the current step; 0 while waiting.
-    step_ms_p50: float  # Median duration of recent steps, without steps that only store a message.
+    step_ms_p50: float  # Median duration of recent steps, except steps that only store a message.
     step_ms_p95: float  # 95th percentile of the same durations.
     rss_mb: float  # Resident memory of the process.
     inputs: tuple[InputCount, ...]

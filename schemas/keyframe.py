@@ -35,12 +35,13 @@ NO_TERMS: Terms = (0.0, 0.0, 0.0)
 
 
 class CameraCorrection(msgspec.Struct, frozen=True, kw_only=True):
-    """Correction of the camera that the self-calibration applied to color and depth.
+    """Correction that the self-calibration of the camera applied to color and depth.
 
-    x = (u - cu) / (w/2) and y = (v - cv) / (w/2) are coordinates around the image center, and r is
-    the distance from it, 1 in the corners. The corrected depth z has 1/z = 1/z_measured + b1 x^2 +
-    b2 x y + b3 y^2. A measured color is V(r) times the corrected one, with log V = a1 r^2 +
-    a2 r^4 + a3 r^6 per channel. All colors are scaled by the smallest V, so that none is clipped.
+    For an image of width w with the center (cu, cv), x = (u - cu) / (w/2) and y = (v - cv) / (w/2).
+    r is the distance from the center, 1 in the corners. The corrected depth z fulfills 1/z =
+    1/z_measured + b1 x^2 + b2 x y + b3 y^2. The vignetting V of a channel is given by log V =
+    a1 r^2 + a2 r^4 + a3 r^6. The corrected color is the measured color times V_min / V. V_min is
+    the smallest V of the channel in the image, so the correction clips no color.
     """
 
     depth_bias: Terms = NO_TERMS  # b1, b2, b3 in 1/m.
@@ -57,12 +58,12 @@ class Keyframe(Message, frozen=True, kw_only=True):
     """Frame to be mapped, with its pose relative to a reference keyframe.
 
     Published on keyframe/new. The message has no pose in the map, because the pose-graph optimizer
-    changes those poses. A receiver computes T_map_keyframe = T_map_reference @
-    T_reference_keyframe. If the receiver missed the reference, it uses T_odom_keyframe and any
-    other keyframe of the submap.
+    changes the poses in the map. A receiver computes T_map_keyframe = T_map_reference @
+    T_reference_keyframe. If the receiver missed the reference, it computes T_map_keyframe from
+    T_odom_keyframe and any other keyframe of the submap.
 
-    The first keyframe of a submap has no reference: tracking was lost before this keyframe, so its
-    pose in other submaps is unknown.
+    The first keyframe of a submap has no reference: tracking started with it or was lost before it,
+    so its pose in other submaps is unknown.
     """
 
     keyframe: int  # Id, ascending.
@@ -75,14 +76,15 @@ class Keyframe(Message, frozen=True, kw_only=True):
     information: Matrix6  # Information of T_reference_keyframe for a perturbation on the right.
     T_odom_keyframe: Pose
     overlap: float = 1.0  # Fraction of the reference keyframe's surface that this keyframe sees.
-    # Poses of this keyframe in other keyframes of the same submap, without the reference.
+    # Poses of this keyframe in keyframes of the same submap other than `reference`.
     window_measurements: tuple[MeasuredPose, ...] = ()
     # Mask u1 [H, W]; 1 where pixels move and are not mapped. Shape [0, 0] if nothing moves.
     dynamic_mask: Array = NO_MASK
     submap: int = 0  # Number of the submap; each loss of tracking starts a new one.
-    # Poses of this keyframe in keyframes of other submaps; they connect its submap with these.
+    # Poses of this keyframe in keyframes of other submaps; they connect the submaps.
     submap_measurements: tuple[MeasuredPose, ...] = ()
-    camera_correction: CameraCorrection = CameraCorrection()  # Applied to `color` and `depth_m`.
+    # Correction that `color` and `depth_m` already contain.
+    camera_correction: CameraCorrection = CameraCorrection()
 
     def check(self) -> None:
         require_rgbd(self.camera, self.color, self.depth_m)
@@ -118,7 +120,7 @@ def _check_measurements(message: Keyframe | KeyframeMeasurements) -> None:
     """Check the fields that both messages have.
 
     Raises:
-        ValueError: If a field is out of range, or a measurement is of another keyframe.
+        ValueError: If a field is out of range, or a measurement belongs to another keyframe.
     """
     keyframe = message.keyframe
     require_count("keyframe", keyframe)
@@ -126,13 +128,13 @@ def _check_measurements(message: Keyframe | KeyframeMeasurements) -> None:
     require_count("submap", message.submap)
     if any(pose.keyframe != keyframe for pose in message.submap_measurements):
         raise ValueError(
-            f"submap_measurements of keyframe {keyframe} must measure this keyframe, not another "
-            "one"
+            f"submap_measurements of keyframe {keyframe} contain the pose of another keyframe; all "
+            "must be poses of this keyframe"
         )
     if message.reference is not None and not 0 <= message.reference < keyframe:
         raise ValueError(
-            f"keyframe {keyframe} has the reference {message.reference}, not an older one: the "
-            f"reference must be in 0..{keyframe - 1}"
+            f"keyframe {keyframe} has the reference {message.reference}; the reference must be an "
+            f"older keyframe, in 0..{keyframe - 1}"
         )
     for pose in message.window_measurements:
         if not pose.reference < pose.keyframe == keyframe:

@@ -5,8 +5,8 @@ from ldo_service.schemas.frames import Image
 from ldo_service.schemas.message import Message, require_count, require_finite
 
 MAX_CROPS = 8
-MAX_ALTERNATIVES = 8  # Maximum labels in addition to the first one.
-MAX_CROP_PX = 1 << 20  # Maximum pixels of a crop; networks use 0.1 megapixels.
+MAX_ALTERNATIVES = 8  # Maximum number of labels in addition to the first one.
+MAX_CROP_PX = 1 << 20  # Maximum width times height of a crop; networks use 0.1 megapixels.
 MAX_NAMES = 10_000
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in pixels; pixel centers at integers.
 
@@ -17,10 +17,12 @@ class LabelRequest(Message, frozen=True, kw_only=True):
     stamp_ns is the stamp of `keyframe`.
     """
 
-    region: int  # Id of the region; a newer request for a region replaces one that still waits.
+    # Id of the region. A newer request for the same region replaces a request that still waits.
+    region: int
     keyframe: int  # Id of the newest keyframe that shows the region.
     box_px: Box  # Edges x0, y0, x1, y1 in that keyframe's image, pixels, as in detection/boxes.
-    crops: tuple[Image, ...]  # Color images of the region, cropped from its best views, best first.
+    # Color images of the region, cropped from the keyframes that show it best, the best first.
+    crops: tuple[Image, ...]
     label: str = ""  # Label from the detector; empty if there is none.
     score: float = 0.0  # Score of the detector, 0..1.
 
@@ -71,7 +73,7 @@ class LabelResult(Message, frozen=True, kw_only=True):
         names = [self.label, *(name for name, _ in self.alternatives)]
         if self.alternatives and (not all(names) or len(set(names)) < len(names)):
             raise ValueError(
-                f"label and alternatives are {names}: each must appear once, and none is empty"
+                f"label and alternatives are {names}: all must be different, and none may be empty"
             )
 
 
@@ -86,12 +88,13 @@ class AddLabel(Message, frozen=True, kw_only=True):
     def check(self) -> None:
         if not 0 < len(self.name.strip()) <= MAX_LABEL_LENGTH:
             raise ValueError(
-                f"name has {len(self.name)} characters, must have 1 to {MAX_LABEL_LENGTH}"
+                f"name has {len(self.name)} characters, must have 1 to {MAX_LABEL_LENGTH} without "
+                "spaces at its ends"
             )
 
 
 class LabelNames(Message, frozen=True, kw_only=True):
-    """Reply to a label/add, published on label/names.
+    """Reply to a request on label/add, published on label/names.
 
     stamp_ns is the stamp of the request.
     """
@@ -112,15 +115,15 @@ def _require_crop(crop: Image) -> None:
         )
     if crop.width * crop.height > MAX_CROP_PX:
         raise ValueError(
-            f"crop has {crop.width}x{crop.height} pixels, must have at most {MAX_CROP_PX}"
+            f"crop is {crop.width}x{crop.height}, must have at most {MAX_CROP_PX} pixels in total"
         )
 
 
 def _require_opinion(label: str, score: float) -> None:
-    require_finite("confidence", (score,))
+    require_finite("score or confidence", (score,))
     if len(label) > MAX_LABEL_LENGTH:
         raise ValueError(f"label has {len(label)} characters, must have at most {MAX_LABEL_LENGTH}")
     if not 0 <= score <= 1:
-        raise ValueError(f"confidence is {score:g}, must be within 0..1")
+        raise ValueError(f"score or confidence is {score:g}, must be within 0..1")
     if score > 0 and not label:
-        raise ValueError(f"confidence is {score:g} without a label, must be 0")
+        raise ValueError(f"score or confidence is {score:g} without a label, must be 0")

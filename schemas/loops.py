@@ -44,8 +44,8 @@ class LoopCandidate(Message, frozen=True, kw_only=True):
     reference: int  # Newest keyframe of the older subgraph.
     keyframes: tuple[int, ...]  # Keyframes of the newer subgraph.
     reference_keyframes: tuple[int, ...]  # Keyframes of the older subgraph.
-    similarity: float  # Cosine of the label histograms (TF-IDF), 0..1.
-    appearance: float  # Cosine of the visual-word histograms, 0..1.
+    similarity: float  # Cosine similarity of the label histograms (TF-IDF), 0..1.
+    appearance: float  # Cosine similarity of the visual-word histograms, 0..1.
     evidence: Evidence = ""  # Source of the pose; "": no pose was found.
     inliers: int = 0  # Landmarks or features that agree with the pose.
     divergence: float = 0.0  # Mean KL divergence between matched landmarks, nats.

@@ -33,7 +33,7 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
     bytes  0..19  five weights (f4), the largest first
     bytes 20..23  sum of the weights of all observations; the weights of older ones decay (f4)
     bytes 24..25  extent in mm of the object that the Gaussian was last observed to belong to (u2)
-    byte  26      keyframes since that observation that show the Gaussian in no object (u1)
+    byte  26      number of keyframes since then that show the Gaussian in no object (u1)
     bytes 27..31  labels of the five weights, indices into `label_names` (u1)
 
     The weights sum to at most 1. The difference to 1 is the weight of background, label 0. The
@@ -76,7 +76,7 @@ class MapDelta(Message, frozen=True, kw_only=True):
     removed: Array  # Ids of removed Gaussians, i8 [R], ascending.
     changed: Gaussians
     added: Gaussians
-    # Names of all labels by index, if there are new ones, else empty; indices never change.
+    # Names of all labels by index if this delta adds labels, else empty; indices never change.
     label_names: tuple[str, ...] = ()
 
     def check(self) -> None:
@@ -99,8 +99,8 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
     """One of several messages that together contain the whole map at `version`.
 
     The messages are published on map/snapshot and numbered by `part`, from 0 to parts - 1. Part 0
-    also has the exposure of each keyframe and the names of the labels. Where the map has a color in
-    0..1, the image of a keyframe has gain * color + bias per channel.
+    also has the exposure of each keyframe and the names of the labels. A map color in 0..1 appears
+    in the image of a keyframe as gain * color + bias, per channel.
     """
 
     version: int

@@ -62,6 +62,6 @@ def require_finite(name: str, numbers: Iterable[float]) -> None:
 
 
 def require_count(name: str, value: int) -> None:
-    """Raise ValueError unless an id, version or counter is at least 0 and fits an int64."""
+    """Raise ValueError unless an id, version or counter is at least 0 and fits in an int64."""
     if not 0 <= value <= LAST_INTEGER:
         raise ValueError(f"{name} is {value}, must be in 0 .. 2^63 - 1")

@@ -15,22 +15,22 @@ ROUNDING = 1e-3  # Tolerance of a sum of probabilities.
 
 Vector3 = tuple[float, float, float]  # x, y, z.
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in pixels; pixel centers at integers.
-# Names and probabilities of the likeliest classes, in descending order. The difference of the sum
-# to 1 is the probability of `other`, which stands for all classes that are not listed.
+# Names and probabilities of the likeliest classes, in descending order. One minus their sum is the
+# probability of `other`, which stands for all classes that are not listed.
 Distribution = tuple[tuple[str, float], ...]
 
 
 class ObjectObservation(Message, frozen=True, kw_only=True):
     """Observation of an object in a keyframe, or a miss, published on object/observation.
 
-    A miss is an object that should be visible in the keyframe and was not detected. stamp_ns is the
+    A miss is an object that should be visible in the keyframe but was not detected. stamp_ns is the
     stamp of the keyframe.
     """
 
     keyframe: int  # Id of the keyframe.
     object: int  # Id of the object, as in map/objects.
     box_px: Box  # Detected box, or for a miss the expected box.
-    # Classes of the Gaussians in the box; for a miss, the classes of the object before.
+    # Classes of the Gaussians in the box; for a miss, the classes of the object before the miss.
     distribution: Distribution
     entropy: float  # Entropy over all classes, nats; `distribution` lists only the likeliest ones.
     is_miss: bool = False  # True if the object is in view and not occluded, but not detected.
@@ -74,7 +74,7 @@ class MapObject(msgspec.Struct, frozen=True, kw_only=True):
     miss_count: int  # Number of keyframes in which the object was in view but not detected.
     first_keyframe: int  # First keyframe in which the object was observed.
     last_keyframe: int  # Last keyframe in which the object was observed.
-    views: tuple[ObjectView, ...] = ()  # Best views first.
+    views: tuple[ObjectView, ...] = ()  # Keyframes that show the object best, the best first.
 
     def __post_init__(self) -> None:
         for name in ("id", "observation_count", "miss_count", "first_keyframe", "last_keyframe"):
@@ -125,9 +125,7 @@ def require_distribution(distribution: Distribution) -> None:
     weights = [weight for _, weight in distribution]
     require_finite("distribution", weights)
     if not 0 < len(weights) <= MAX_CLASSES:
-        raise ValueError(
-            f"distribution is over {len(weights)} classes, must have 1 to {MAX_CLASSES}"
-        )
+        raise ValueError(f"distribution has {len(weights)} classes, must have 1 to {MAX_CLASSES}")
     if len({name for name, _ in distribution}) != len(weights):
         raise ValueError("distribution names a class twice")
     if min(weights) < 0 or sum(weights) > 1 + ROUNDING:

@@ -7,8 +7,8 @@ from ldo_service.schemas.pose import Pose
 class OdometryPrior(Message, frozen=True, kw_only=True):
     """Pose of the robot's base from another odometry, published on odometry/prior.
 
-    stamp_ns is the time of the pose, by the same clock as the stamps of the frames.
+    stamp_ns is the time of the pose, by the same clock as the stamps of the camera frames.
     """
 
-    # Pose in the frame of that odometry, `prior`; only the motion between two messages is used.
+    # Pose in the frame of the other odometry. Only the motion between two messages is used.
     T_prior_base: Pose

@@ -59,8 +59,8 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     # Covariance of T_reference_camera for a perturbation on the right.
     covariance: Matrix6 = (0.0,) * 36
     inlier_fraction: float = 0.0  # Fraction of the residuals that are inliers.
-    residual_color: float = 0.0  # Robust sigma, gray levels of 0..255.
-    residual_depth: float = 0.0  # Robust sigma, relative to the sigma of the sensor model.
+    residual_color: float = 0.0  # Robust sigma of the color residuals, gray levels 0..255.
+    residual_depth: float = 0.0  # Robust sigma of the depth residuals, in sigmas of the sensor.
     overlap: float = 0.0  # Fraction of the reference keyframe's surface that this frame sees.
     iterations: int = 0
     # Initial guess that led to the pose: "direct", "prior", "features", "gicp", "relocalized" or

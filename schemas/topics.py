@@ -31,7 +31,8 @@ class Topic:
     message: type[Message]
     description: str
     is_state: bool = False  # True if the topic also answers queries with its last value.
-    # Field by which an input with the policy `Latest(per_key=True)` keeps the latest message each.
+    # Message field. Inputs with the policy `Latest(per_key=True)` keep the latest message per value
+    # of this field.
     key: str | None = None
     answer: type[Message] | None = None  # Type of the reply if `message` is the payload of a query.
     is_per_actor: bool = False  # True if each actor publishes on its own key, `<name>/<actor>`.
@@ -67,8 +68,8 @@ DETECTION_BOXES = Topic(
 LABEL_REQUEST = Topic(
     "label/request", LabelRequest, "image crops of a region that needs a label", key="region"
 )
-LABEL_RESULT = Topic("label/result", LabelResult, "label of a region, with delay", key="region")
-LABEL_ADD = Topic("label/add", AddLabel, "request to add a name for the labeller")
+LABEL_RESULT = Topic("label/result", LabelResult, "label of a requested region", key="region")
+LABEL_ADD = Topic("label/add", AddLabel, "request to add a name to the labeller's list")
 LABEL_NAMES = Topic(
     "label/names", LabelNames, "names that the labeller chooses from", is_state=True
 )
@@ -86,7 +87,7 @@ CONTROL = Topic(
 
 MAP_OBJECTS = Topic("map/objects", MapObjects, "labelled objects of the map", is_state=True)
 OBJECT_OBSERVATION = Topic(
-    "object/observation", ObjectObservation, "object that a keyframe shows or misses"
+    "object/observation", ObjectObservation, "observation or miss of an object in a keyframe"
 )
 LOOP_CLOSURE = Topic("loop/closure", LoopClosure, "verified pose between two distant keyframes")
 LOOP_CANDIDATE = Topic(

@@ -11,7 +11,7 @@ from ldo_service.schemas import CameraModel, CameraRgbd, Image
 
 WAIT_MS = 5000  # Maximum time to wait for a frame; the first one may take two seconds.
 GRID = 16, 12  # Columns and rows of the image points that the lens distortion is fitted to.
-MAX_FIT_PX = 0.5  # Maximum difference of OpenCV's distortion model from that of the device, pixels.
+MAX_FIT_PX = 0.5  # Maximum difference between OpenCV's and the device's distortion model, pixels.
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ def messages(rs: Any, source: Any, camera: CameraModel) -> Iterator[CameraRgbd]:
 
     Args:
         rs: The module pyrealsense2.
-        source: A `pipeline`, or another object with its `wait_for_frames`.
+        source: A `pipeline`, or another object with the method `wait_for_frames`.
         camera: The color camera.
 
     Raises:
@@ -140,7 +140,7 @@ def camera_model(rs: Any, intrinsics: Any) -> CameraModel:
 def _require_device(rs: Any, serial: str) -> None:
     """Raise ConfigError at once if the device is not connected.
 
-    Without this check, a pipeline waits 15 s for the device.
+    Without this check, a pipeline would wait 15 s for the device.
     """
     devices = rs.context().query_devices()
     found = [device.get_info(rs.camera_info.serial_number) for device in devices]
@@ -164,8 +164,9 @@ def _config(rs: Any, stream: RealSenseStream) -> Any:
 def _seen_through(rs: Any, intrinsics: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sample the distortion model of the device on a grid of points.
 
-    The inverse Brown-Conrady model maps distorted to undistorted points, so the grid consists of
-    distorted points. All other models map undistorted points, so the grid consists of those.
+    The inverse Brown-Conrady model maps distorted to undistorted points, so its grid consists of
+    distorted points. All other models map in the opposite direction, so their grid consists of
+    undistorted points.
 
     Returns:
         Distorted coordinates [N, 2], and undistorted coordinates x and y [N]; all are normalized by

@@ -32,7 +32,7 @@ from .ros_messages import (
 KEEP = 4
 # Maximum number of images of a topic that wait for their counterpart: 0.27 s at 30 Hz.
 PAIR_BUFFER = 8
-# If a stamp is earlier than the newest one by more than this, the camera has restarted.
+# If a stamp is this much earlier than the newest stamp, the camera counts as restarted.
 RESTARTED_AFTER_NS = 1_000_000_000
 # Time without a message after which a topic is reported as silent; interval of these reports.
 SILENT_AFTER_S = 5.0
@@ -47,8 +47,8 @@ class RosTopics:
 
     color: str
     depth: str
-    info: str = ""  # Topic of camera info of color; empty: `camera_info` in the namespace of color.
-    # Maximum difference of the stamps of color and depth: less than half a period at 30 Hz.
+    info: str = ""  # Camera info of color; empty: `camera_info` in the namespace of `color`.
+    # Maximum difference between the stamps of color and depth: less than half a period at 30 Hz.
     max_skew_s: float = 0.015
     # True if the images have no distortion. The intrinsics are then the matrix P of the camera
     # info.
@@ -135,7 +135,7 @@ class RosCamera:
 
     @property
     def statistics(self) -> str:
-        """Text with the numbers of frames, and of rejected, unpaired and dropped images."""
+        """Text with the number of frames, and of rejected, unpaired and dropped messages."""
         return (
             f"{self.frames_made} frames, {self.rejected} images rejected, {self._pairing.lost_a} "
             f"color and {self._pairing.lost_b} depth images unpaired, {self._inbox.dropped} dropped"
@@ -177,7 +177,7 @@ class RosCamera:
             yield from self._pairing_at(depth.stamp_ns).add_b(depth)
 
     def _pairing_at(self, stamp_ns: int) -> StreamPairer[RosImage, RosImage]:
-        """Return the pairer of color and depth, or a new one if the stamps were set back.
+        """Return the pairer of color and depth; replace it first if the stamps were set back.
 
         A stamp more than RESTARTED_AFTER_NS before the newest one means that the camera driver or
         the bag was restarted.
@@ -208,5 +208,5 @@ class RosCamera:
         if silent:
             self._notify(
                 f"No messages on {', '.join(silent)} for {SILENT_AFTER_S:g} s. Check that `ros2 "
-                "topic hz` shows them and that the bridge is connected to this network."
+                "topic hz` shows messages and that the bridge is connected to this network."
             )

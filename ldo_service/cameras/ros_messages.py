@@ -43,7 +43,7 @@ class RosImage:
 
 
 def is_compressed(topic: str) -> bool:
-    """Return whether the name of a topic is that of compressed images in image_transport."""
+    """Return whether image_transport uses this topic name for compressed images."""
     return topic.endswith(("/compressed", "/compressedDepth"))
 
 
@@ -107,7 +107,8 @@ def read_camera(body: bytes, is_rectified: bool) -> CameraModel:
 
     Args:
         body: The message in CDR.
-        is_rectified: True uses the left 3x3 of P, without distortion, instead of K and D.
+        is_rectified: True takes the intrinsics from P (its left 3x3), without distortion, instead
+            of K and D.
 
     Raises:
         FrameError: The message is invalid, or its distortion model is not supported.
@@ -138,7 +139,7 @@ def joined(
         depth: Depth image.
         camera: The color camera.
         frame: Number of the frame.
-        is_registered: True accepts depth as registered to color even if the frame_ids differ.
+        is_registered: True declares depth to be registered to color even if the frame_ids differ.
 
     Raises:
         FrameError: The frame_ids differ, or the size of an image is wrong.
@@ -148,12 +149,13 @@ def joined(
             f"depth has frame_id {depth.frame_id!r} and color {color.frame_id!r}. Subscribe to "
             "depth that is registered to color (realsense2_camera: align_depth.enable:=true; else "
             "the node `register` of depth_image_proc), or give --registered if this depth is "
-            "registered too."
+            "already registered."
         )
     if (color.image.width, color.image.height) != (camera.width, camera.height):
         raise FrameError(
             f"color has {color.image.width}x{color.image.height} pixels and its camera info "
-            f"{camera.width}x{camera.height}. Check that the info belongs to this topic."
+            f"{camera.width}x{camera.height}. Check that the camera info belongs to this color "
+            "topic."
         )
     try:
         return CameraRgbd(
@@ -255,6 +257,6 @@ def _distortion(info: Any) -> tuple[float, ...]:
     if info.distortion_model not in (PLUMB_BOB, RATIONAL):
         raise FrameError(
             f"distortion model {info.distortion_model!r} is not supported, expected {PLUMB_BOB} or "
-            f"{RATIONAL}. Subscribe to rectified images, with --rectified."
+            f"{RATIONAL}. Subscribe to rectified images, and give --rectified."
         )
     return d

@@ -27,8 +27,8 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
 
     Args:
         source: A folder, whose layout is detected, or `synthetic[:name]`.
-        options: Registration of depth to color; None uses the defaults. Other values are valid for
-            ScanNet and 7-Scenes only, where depth and color come from two cameras.
+        options: Registration of depth to color; None uses the defaults. Options other than the
+            defaults are valid for ScanNet and 7-Scenes only, which have two cameras.
 
     Raises:
         DataError: The source does not exist or has no known layout.
@@ -42,7 +42,7 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     folder = Path(source).expanduser()
     if not folder.is_dir():
         found = "is a file" if folder.exists() else "does not exist"
-        raise DataError(f"{source} {found}. A source is a folder in one of the layouts {LAYOUTS}.")
+        raise DataError(f"{source} {found}. Expected a folder in one of these layouts: {LAYOUTS}.")
     return _open_folder(folder, options)
 
 

@@ -122,7 +122,7 @@ def read_transform(path: Path) -> np.ndarray | None:
     """Read a rigid transform [4, 4] from a text file.
 
     Returns:
-        The transform, or None if the file contains NaN or infinity, which mean an unknown pose.
+        The transform, or None if the file contains NaN or infinity, which mark an unknown pose.
 
     Raises:
         DataError: The file cannot be read, or the matrix is not a rigid transform.
@@ -209,7 +209,7 @@ def _number(word: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class NumberedFrames:
-    """Frames with both color and depth, in the order of their numbers."""
+    """Frames with both color and depth, in the order of the numbers in their file names."""
 
     numbers: np.ndarray  # [N] int64, ascending, with gaps where files are missing.
     color: list[Path]
@@ -222,7 +222,7 @@ class NumberedFrames:
 
 
 def numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """Return the files of a folder by number.
+    """Return the files of a folder by the number in the file name.
 
     Args:
         folder: The folder.
@@ -233,7 +233,7 @@ def numbered(folder: Path, pattern: str) -> dict[int, Path]:
 
 
 def pair_by_number(color: dict[int, Path], depth: dict[int, Path], folder: Path) -> NumberedFrames:
-    """Pair color and depth images of equal numbers.
+    """Pair color and depth images whose file names contain the same number.
 
     Args:
         color: Files of color images by number.
@@ -241,18 +241,18 @@ def pair_by_number(color: dict[int, Path], depth: dict[int, Path], folder: Path)
         folder: Folder of the files, for messages.
 
     Raises:
-        DataError: No number has both images.
+        DataError: No color image has the number of a depth image.
     """
     numbers = sorted(color.keys() & depth.keys())
     if not numbers:
         raise DataError(
-            f"{folder} has {len(color)} color and {len(depth)} depth images, and no number has "
-            "both. Check the names of the files."
+            f"{folder} has {len(color)} color and {len(depth)} depth images, but no color image "
+            "has the same number in its file name as a depth image. Check the file names."
         )
     alone = len(color) + len(depth) - 2 * len(numbers)
     if alone:
         log.info(
-            "%s: skipping %d images, which have no color or depth image of the same number.",
+            "%s: skipping %d images; the color or depth image of the same number is missing.",
             *(folder, alone),
         )
     return NumberedFrames(

@@ -41,10 +41,10 @@ def read_depth(path: Path) -> np.ndarray:
 
 
 def read_labels(path: Path, dtype: type[np.unsignedinteger]) -> np.ndarray:
-    """Read a label image [H, W] of a data type.
+    """Read a label image [H, W] of type `dtype`.
 
     Raises:
-        FrameError: The file cannot be read or decoded, or has another data type.
+        FrameError: The file cannot be read or decoded, or its pixels are not of type `dtype`.
     """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != dtype or image.ndim != 2:

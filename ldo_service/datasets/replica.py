@@ -9,7 +9,7 @@
 Optional labels, as Habitat renders them:
 
     semantic_class/*.png                     8 bits per pixel: the class; named by frame number
-    instance/*.png                           16 bits per pixel: the object; named likewise
+    instance/*.png                           16 bits per pixel: the object; named by frame number
     labels.json                              {"classes": {"<class>": name}}
 """
 
@@ -51,7 +51,7 @@ class ReplicaLabels:
         self._folder, self._numbers = folder, numbers
 
     def read(self) -> TrueLabels | None:
-        """Return the labels, or None without a labels.json.
+        """Return the labels, or None if there is no labels.json.
 
         Raises:
             DataError: The class names are invalid.
@@ -122,19 +122,19 @@ class ReplicaSequence(Sequence):
         )
 
     def truth(self) -> Trajectory | None:
-        """Return the trajectory of traj.txt, or None without that file."""
+        """Return the trajectory of traj.txt, or None if the file does not exist."""
         path = self._folder / "traj.txt"
         if not path.is_file():
             return None
         poses = _poses(path)
-        # traj.txt has one line per frame, or one line per original frame number if files of frames
-        # were removed.
+        # traj.txt has one line per frame. If files of frames were removed, it may still have the
+        # lines of these frames; line k, counted from 0, then belongs to frame number k.
         lines = self._files.numbers if len(poses) > len(self) else np.arange(len(self))
         known = lines < len(poses)
         return Trajectory(self.stamps_ns[known] / 1e9, poses[lines[known]])
 
     def true_labels(self) -> TrueLabels | None:
-        """Return the ground-truth labels, or None without a labels.json."""
+        """Return the ground-truth labels, or None if there is no labels.json."""
         return ReplicaLabels(self._folder, self._files.numbers).read()
 
 

@@ -51,8 +51,8 @@ class SequenceOptions:
 
     # True registers depth to the color camera, at the size of the color image.
     register_depth: bool = False
-    # Values that replace those of the files or of the data set's documentation; None: no
-    # replacement.
+    # Replacements of the values in the files or in the data set's documentation; None replaces
+    # nothing.
     color_camera: Camera | None = None
     depth_camera: Camera | None = None
     T_color_depth: np.ndarray | None = None  # Depth to color coordinates, [4, 4], meters.

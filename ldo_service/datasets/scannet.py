@@ -64,10 +64,10 @@ class ScanNetSequence(Sequence):
         return RawFrame(index, stamp_ns, color, depth, depth_scale, self.raw_camera)
 
     def truth(self) -> Trajectory | None:
-        """Return the ground-truth trajectory, or None without poses.
+        """Return the ground-truth trajectory, or None if there are no poses.
 
-        The poses are those of the color camera if depth is registered to it, else of the depth
-        camera.
+        If depth is registered to the color camera, the poses are those of the color camera, else
+        those of the depth camera.
         """
         paths = [self._folder / "pose" / f"{path.stem}.txt" for path in self._files.color]
         depth = read_trajectory(self.stamps_ns, paths)

@@ -52,7 +52,10 @@ class _Listing:
 
 
 class TumSequence(Sequence):
-    """TUM sequence: color and depth paired by nearest stamp within 20 ms, with color's stamps."""
+    """TUM sequence of color images, each with the nearest depth image within 20 ms.
+
+    The stamp of a frame is the stamp of the color image.
+    """
 
     def __init__(self, folder: Path) -> None:
         """Open the sequence of a folder."""
@@ -61,8 +64,8 @@ class TumSequence(Sequence):
         pairs = associate(color.stamps_ns, depth.stamps_ns, ASSOCIATION_TOLERANCE_NS)
         if len(pairs) == 0:
             raise DataError(
-                f"{folder}: none of {len(color.files)} color and {len(depth.files)} depth images "
-                "are within 20 ms of each other. Check the stamps in rgb.txt and depth.txt."
+                f"{folder}: none of the {len(color.files)} color images is within 20 ms of any of "
+                f"the {len(depth.files)} depth images. Check the stamps in rgb.txt and depth.txt."
             )
         if len(pairs) < len(color.files):
             log.info(
@@ -87,7 +90,7 @@ class TumSequence(Sequence):
         )
 
     def truth(self) -> Trajectory | None:
-        """Return the trajectory of groundtruth.txt, or None without that file."""
+        """Return the trajectory of groundtruth.txt, or None if the file does not exist."""
         path = self._folder / "groundtruth.txt"
         return Trajectory.load(path) if path.is_file() else None
 
@@ -114,7 +117,7 @@ def _listing(path: Path) -> _Listing:
 def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
     words = line.split(maxsplit=1)
     try:
-        # The stamp is parsed as Decimal, since a float cannot represent nanoseconds since 1970.
+        # The stamp is parsed as Decimal, because a float cannot hold nanoseconds since 1970.
         stamp_ns = int(Decimal(words[0]) * 10**9)
         name = words[1].strip()
         if abs(stamp_ns) > LAST_STAMP_NS or "\0" in name:
@@ -126,7 +129,7 @@ def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
     if Path(name).is_absolute() or ".." in Path(name).parts:
         raise DataError(
             f"{path}, line {line_number}: {name[:80]} is outside the folder. Copy or link the "
-            "images into it."
+            "images into the folder."
         )
     return stamp_ns, name
 
@@ -142,6 +145,6 @@ def _calibration(folder: Path) -> Calibration:
     if recording is None:
         raise DataError(
             f"{folder} has no camera.json, and its name does not contain freiburg1, 2 or 3, for "
-            f"which intrinsics are published. Write {path} such as {CAMERA_JSON}."
+            f"which intrinsics are published. Create {path}, such as {CAMERA_JSON}."
         )
     return Calibration(PUBLISHED_CAMERAS[recording[0]], DEPTH_SCALE)

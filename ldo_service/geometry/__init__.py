@@ -6,7 +6,7 @@ Transforms  `T_a_b` maps coordinates in b to coordinates in a: `p_a = T_a_b @ p_
 Frames      `camera`: x right, y down, z forward (optical). `odom`: the odometry's frame, in which
             poses are continuous until tracking is lost. `map`: globally consistent; its poses
             change when the pose graph is optimized. `map` and `odom` initially equal the first
-            camera frame. (REP-105)
+            camera frame. The names follow REP-105.
 Units       Meters, radians, seconds. Stamps are integer nanoseconds. Depth is z, not range;
             0 means "not measured".
 Pixels      Centers are at integer coordinates: pixel (0, 0) covers [-0.5, 0.5]. Halving an image

@@ -11,7 +11,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 
-# Minimum and maximum of focal length over image side: fields of view of 175 and 0.6 degrees.
+# Minimum and maximum ratio of focal length to image side: fields of view of 175 and 0.6 degrees.
 MIN_FOCAL_RATIO, NARROWEST = 0.02, 100.0
 
 # Maximum radius in normalized coordinates: 76 degrees from the axis, beyond any pinhole model.
@@ -50,17 +50,17 @@ class Camera:
                 raise DataError(
                     f"focal length {name}={focal:g} px is implausible for an image side of "
                     f"{side} px: expected {MIN_FOCAL_RATIO * side:g} to {NARROWEST * side:g} px. "
-                    "Check that it is in pixels and for this resolution."
+                    "Check that the focal length is in pixels and for this image size."
                 )
         if not (-self.width < self.cx < 2 * self.width):
             raise DataError(
                 f"cx={self.cx:g} px is far outside the image, which is {self.width} px wide. "
-                "Check that the intrinsics are for this resolution."
+                "Check that the intrinsics are for this image size."
             )
         if not (-self.height < self.cy < 2 * self.height):
             raise DataError(
                 f"cy={self.cy:g} px is far outside the image, which is {self.height} px high. "
-                "Check that the intrinsics are for this resolution."
+                "Check that the intrinsics are for this image size."
             )
         if len(self.distortion) not in (0, 4, 5, 8):
             raise DataError(
@@ -70,7 +70,7 @@ class Camera:
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> "Camera":
-        """Restore a camera from its fields by name; `distortion` may be a list."""
+        """Create a camera from the values of its fields by name; `distortion` may be a list."""
         return Camera(**{**values, "distortion": tuple(values["distortion"])})
 
     @property
@@ -109,7 +109,8 @@ class Camera:
             v: Rows in pixels; broadcast with u to [...].
 
         Returns:
-            Rays with z = 1 in the camera frame, [..., 3] float64: `rays * depth_m` are points.
+            Rays with z = 1 in the camera frame, [..., 3] float64. A ray times the depth of its
+            pixel is the 3D point.
         """
         x, y = np.broadcast_arrays((u - self.cx) / self.fx, (v - self.cy) / self.fy)
         return np.stack([x, y, np.ones(x.shape)], axis=-1)
@@ -130,7 +131,7 @@ class Camera:
         return self.rays_at(u, v) * np.asarray(depth_m)[..., None]
 
     def backproject(self, depth_m: np.ndarray) -> np.ndarray:
-        """Return camera points [H, W, 3] of depth [H, W], meters; the origin where depth is 0."""
+        """Return camera points [H, W, 3] of depth [H, W], meters; 0 0 0 where depth is 0."""
         return (self.rays() * depth_m[..., None]).astype(np.float32)
 
     def project(self, points_camera: np.ndarray) -> np.ndarray:
@@ -210,5 +211,5 @@ def _turning_r2(camera: Camera) -> float:
 
 
 def _coefficients(camera: Camera) -> np.ndarray:
-    """Return k1 k2 p1 p2 k3 k4 k5 k6 [8]; 0 for those that the camera's model lacks."""
+    """Return k1 k2 p1 p2 k3 k4 k5 k6 [8]; coefficients that the camera does not have are 0."""
     return np.r_[camera.distortion, np.zeros(8)][:8]

@@ -143,7 +143,7 @@ def _pixels(data: memoryview | bytes, dtype: type, shape: tuple[int, ...]) -> np
 
 
 def _expand(data: memoryview, size: int) -> bytes:
-    """Decompress at most `size` + 1 bytes, since a small message may expand to gigabytes."""
+    """Decompress at most `size` + 1 bytes, because a small message may expand to gigabytes."""
     try:
         return zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
     except zstandard.ZstdError as error:
@@ -157,7 +157,7 @@ def _decompress(data: memoryview, flags: int, encoding: str, width: int, height:
         raise FrameError(f"{len(data)} bytes of data are not a readable {encoding} image.")
     if announced != (width, height):
         raise FrameError(
-            f"{encoding} image is {announced[0]}x{announced[1]}, announced as {width}x{height}."
+            f"{encoding} image is {announced[0]}x{announced[1]}, declared as {width}x{height}."
         )
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -172,12 +172,12 @@ def _decompress(data: memoryview, flags: int, encoding: str, width: int, height:
 def _require_size(image: np.ndarray, width: int, height: int, encoding: str) -> None:
     if image.shape[:2] != (height, width):
         raise FrameError(
-            f"{encoding} image is {image.shape[1]}x{image.shape[0]}, announced as {width}x{height}."
+            f"{encoding} image is {image.shape[1]}x{image.shape[0]}, declared as {width}x{height}."
         )
 
 
 def shrunk(crop: np.ndarray, side_px: int) -> np.ndarray:
-    """Return an image scaled down to at most `side_px` on its longer side; it is never enlarged."""
+    """Scale an image down to at most `side_px` pixels on its longer side; never enlarge it."""
     height, width = crop.shape[:2]
     scale = side_px / max(height, width)
     if scale >= 1:

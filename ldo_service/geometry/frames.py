@@ -34,12 +34,12 @@ class RgbdFrame:
         if self.color.shape != (*size, 3) or self.color.dtype != np.uint8:
             raise FrameError(
                 f"frame {self.index}: color is {self.color.dtype}{self.color.shape}, "
-                f"expected uint8{(*size, 3)}, the size of its camera."
+                f"expected uint8{(*size, 3)} to fit the intrinsics."
             )
         if self.depth_m.shape != size or self.depth_m.dtype != np.float32:
             raise FrameError(
                 f"frame {self.index}: depth is {self.depth_m.dtype}{self.depth_m.shape}, "
-                f"expected float32{size}, the size of its camera."
+                f"expected float32{size} to fit the intrinsics."
             )
         lowest, highest = float(self.depth_m.min()), float(self.depth_m.max())
         if not (lowest >= 0.0 and highest < np.inf):  # NaN fails each comparison.
@@ -89,7 +89,7 @@ class RawFrame:
         if self.depth.shape != size:
             raise FrameError(
                 f"frame {self.index}: images are {_size(self.depth)} pixels and the intrinsics "
-                f"are for {size[1]}x{size[0]}. Use the intrinsics of this resolution."
+                f"are for {size[1]}x{size[0]}. Use intrinsics for the size of the images."
             )
         if not (isfinite(self.depth_scale) and self.depth_scale > 0):
             raise FrameError(
@@ -156,8 +156,8 @@ def rectify(raw: RawFrame, maps: Maps | None) -> RgbdFrame:
 
     The intrinsic matrix does not change. Color is interpolated bilinearly. Depth is taken from the
     nearest pixel, because a mean of depths across an edge lies on no surface. Pixels outside the
-    distorted image are black with depth 0. Without distortion, the result refers to the color
-    array of `raw`.
+    distorted image are black with depth 0. Without distortion, the result shares the color array
+    of `raw`.
 
     Args:
         raw: The frame.

@@ -83,7 +83,7 @@ class KeyframePoses:
     ) -> np.ndarray:
         """Add a keyframe, and return its T_map_keyframe [4, 4].
 
-        The reference keyframe is unknown here if its message was missed. The pose then comes from
+        The reference keyframe is unknown if its message was missed. The pose then comes from
         odometry, relative to the newest known keyframe of the submap.
 
         Args:
@@ -104,7 +104,7 @@ class KeyframePoses:
     def place(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
         """Set the pose of a known keyframe until the next correction.
 
-        Its relative pose to the reference changes accordingly.
+        The stored pose relative to the reference keyframe changes accordingly.
 
         Args:
             keyframe: Id of the keyframe.
@@ -121,14 +121,15 @@ class KeyframePoses:
     ) -> None:
         """Apply optimized poses of the pose graph; ignore them if the version is not newer.
 
-        The poses of keyframes newer than the correction are computed again from their references.
+        Keyframes with ids above all ids in `T_map` are newer than the correction. Their poses are
+        computed again from their reference keyframes.
 
         Args:
             version: Version of the pose graph.
             T_map: Corrected T_map_keyframe [4, 4] by id.
-            held: Keyframes whose relative pose here is more accurate than the relative pose that
-                the pose graph used. If their reference keyframe is known, their poses are computed
-                from it instead of taken from `T_map`.
+            held: Keyframes whose stored pose relative to the reference keyframe is more accurate
+                than the one that the pose graph used. If the reference keyframe is known, the pose
+                is computed from it; otherwise it is taken from `T_map`.
         """
         if version <= self.version or not T_map:
             return
@@ -160,8 +161,8 @@ class KeyframePoses:
     def _placed(self, record: np.void, newest: int | None) -> np.ndarray:
         """Compute T_map_keyframe [4, 4] of a record.
 
-        The pose is relative to the reference keyframe if that is known. Otherwise it comes from
-        odometry, relative to the keyframe `newest`. If `newest` is None, it comes from odometry in
+        The pose is computed from the reference keyframe if that keyframe is known. Otherwise it
+        comes from odometry: relative to the keyframe `newest` or, if `newest` is None, relative to
         the provisional pose of the submap.
         """
         reference = int(record["reference"])

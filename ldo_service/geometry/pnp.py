@@ -1,4 +1,4 @@
-"""Camera pose from points and their pixels by PnP RANSAC. Conventions: `ldo_service.geometry`."""
+"""Camera pose from 3D points and their pixels, by PnP. Conventions: `ldo_service.geometry`."""
 
 import cv2
 import numpy as np
@@ -26,12 +26,14 @@ def solve_pnp(
         points: Points in the reference frame, [N, 3] meters.
         pixels: Pixels of these points in the camera, [N, 2].
         camera: Intrinsics of the camera, without distortion.
-        reprojection_px: Inlier threshold at an image width of 640; scaled with it.
+        reprojection_px: Inlier threshold in pixels, for an image 640 pixels wide. The threshold is
+            scaled with the image width, which counts as at least 160 pixels.
         iterations: Maximum number of RANSAC iterations.
         min_inliers: Minimum number of inliers.
 
     Returns:
-        T_camera_reference [4, 4] and the indices of the inliers [M]; None if there are too few.
+        T_camera_reference [4, 4] and the indices of the inliers [M]; None if PnP fails or finds
+        fewer than `min_inliers`.
     """
     if len(points) < min_inliers:
         return None

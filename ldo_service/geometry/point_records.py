@@ -1,4 +1,4 @@
-"""Compact tables of records by id, for data of each keyframe in the map."""
+"""Compact tables of records by id, for data that every keyframe of the map has."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 MIN_ROOM = 64  # Minimum capacity in records.
-GROWTH = 1.25  # Factor by which the capacity grows: at most a fifth of it is unused.
+GROWTH = 1.25  # Factor by which the capacity grows: at most a fifth of the capacity is unused.
 
 
 class RecordTable:
@@ -37,12 +37,12 @@ class RecordTable:
         return self.all["id"]
 
     def row(self, id_: int) -> int | None:
-        """Return the row of an id, or None if it is unknown."""
+        """Return the row number of an id, or None if the id is unknown."""
         row = int(np.searchsorted(self.ids, id_))
         return row if row < self._count and self.ids[row] == id_ else None
 
     def rows(self, ids: Iterable[int]) -> np.ndarray:
-        """Return the rows of those ids that are known, in the given order with repetitions."""
+        """Return the row number of each known id in `ids`, in the order of `ids`."""
         rows, is_known = self._found(ids)
         return rows[is_known]
 
@@ -63,7 +63,7 @@ class RecordTable:
 
         Args:
             id_: Id of the record.
-            *values: The other fields, in their order.
+            *values: Values of the other fields, in the order of the dtype.
         """
         row = int(np.searchsorted(self.ids, id_))
         if row == self._count or self.ids[row] != id_:
@@ -100,7 +100,7 @@ class RecordTable:
         self._room, self._count = room, len(records)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return a copy of the table as arrays by the name of the field."""
+        """Return a copy of the table: one array per field, by field name."""
         return {name: self.all[name].copy() for name in self._room.dtype.names or ()}
 
     def restore(self, columns: Mapping[str, np.ndarray]) -> None:
@@ -112,7 +112,7 @@ class RecordTable:
 
 
 class PoseTable(MutableMapping[int, np.ndarray]):
-    """Transforms [4, 4] by ascending id, in 136 bytes each."""
+    """Mapping from ids to transforms [4, 4], in ascending order of ids; an entry has 136 bytes."""
 
     def __init__(self) -> None:
         self._records = RecordTable([("id", np.int64), ("T", float, (4, 4))])
@@ -144,9 +144,9 @@ class PoseTable(MutableMapping[int, np.ndarray]):
         return id_ in self._records
 
     def of(self, ids: Iterable[int]) -> np.ndarray:
-        """Return the transforms [n, 4, 4] of those ids that are known."""
+        """Return the transforms [n, 4, 4] of the known ids in `ids`."""
         return self._records.all["T"][self._records.rows(ids)]
 
     def become(self, ids: Collection[int], T: np.ndarray) -> None:
-        """Replace the table by transforms [n, 4, 4] with ascending ids."""
+        """Replace all entries by ids [n], which ascend, and their transforms T [n, 4, 4]."""
         self._records.restore({"id": np.fromiter(ids, np.int64), "T": T})

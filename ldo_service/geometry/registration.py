@@ -17,16 +17,16 @@ MAX_STRETCH = 2.0  # Maximum size of a cell relative to its nominal size.
 def register_depth(
     depth_m: np.ndarray, depth_camera: Camera, color_camera: Camera, T_color_depth: np.ndarray
 ) -> np.ndarray:
-    """Register a depth image to the color camera, including the lens distortion of that camera.
+    """Register a depth image to a color image, which may have lens distortion.
 
     Each measured depth pixel becomes a rectangle in the color image, called its cell. The cell is
     `fx_color / fx_depth * z_depth / z_color` pixels wide, and its center is
 
         project_color(T_color_depth @ (ray_depth * depth_m)).
 
-    A cell is stretched halfway to its neighbors on the same surface. This avoids holes where the
-    color image is finer than the depth image or the surface is slanted. A color pixel gets the
-    depth of the nearest cell that covers it; depth is not interpolated. The result is
+    A cell is stretched halfway to its neighbors on the same surface. The stretching avoids holes
+    where the color image is finer than the depth image or the surface is slanted. A color pixel
+    gets the smallest depth of all cells that cover it; depth is not interpolated. The result is
     deterministic, because a minimum does not depend on the order of the pixels.
 
     Args:
@@ -42,12 +42,12 @@ def register_depth(
         camera, so rectify it together with the color image.
 
     Raises:
-        FrameError: The depth image has another size than its camera.
+        FrameError: The size of the depth image differs from that of `depth_camera`.
     """
     if depth_m.shape != (depth_camera.height, depth_camera.width):
         raise FrameError(
             f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} pixels and its camera "
-            f"{depth_camera.width}x{depth_camera.height}. Use the intrinsics of this resolution."
+            f"{depth_camera.width}x{depth_camera.height}. Use intrinsics for the size of the image."
         )
     depth_m = np.asarray(depth_m, np.float32)
     x, y, z = _points(depth_m, depth_camera, T_color_depth)
@@ -78,9 +78,10 @@ def _points(
 
 
 def _same_surface(z: np.ndarray, is_seen: np.ndarray, axis: int) -> np.ndarray:
-    """Return for each pixel whether it and the next one along `axis` lie on one surface.
+    """Return for each pixel whether this pixel and the next one along `axis` lie on one surface.
 
-    Both must be measured (`is_seen`), and their depths must differ by less than SAME_SURFACE.
+    Both must be measured (`is_seen`), and their depths must differ by less than the fraction
+    SAME_SURFACE.
     """
     (first, second), (a, b) = _neighbors(z, axis), _neighbors(is_seen, axis)
     return a & b & (np.abs(second - first) < SAME_SURFACE * first)
@@ -105,11 +106,11 @@ def _covered(
     half of that displacement.
 
     Args:
-        center: Centers of the cells in this direction, [Hd, Wd] pixels.
-        half: Half of the nominal size of the cells, [Hd, Wd] pixels.
-        is_joined: Which neighbors along axes 0 and 1 are on the same surface.
-        axis: Array axis of the direction.
-        size: Size of the color image in this direction, pixels.
+        center: Coordinates of the cell centers along `axis`, [Hd, Wd] pixels.
+        half: Half of the nominal size of the cells along `axis`, [Hd, Wd] pixels.
+        is_joined: Results of `_same_surface` along array axes 0 and 1.
+        axis: Image axis as an array axis: 0 for rows (v), 1 for columns (u).
+        size: Size of the color image along `axis`, pixels.
 
     Returns:
         First and last pixel of each cell, [Hd, Wd] int32, clipped to the image.
@@ -174,10 +175,10 @@ def _cover_row(nearest: np.ndarray, z: np.ndarray, pixel: np.ndarray, more: np.n
 def resample_color(
     color: np.ndarray, color_camera: Camera, depth_camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Resample a color image to the depth camera, for cameras of equal center and orientation.
+    """Resample a color image to the pixels of a depth camera of equal center and orientation.
 
-    To avoid aliasing, the color image is first halved until it is at most 1.5 times finer than the
-    depth image. Then it is interpolated bilinearly.
+    To avoid aliasing, the color image is halved until its resolution is at most 1.5 times that of
+    the depth image. Then the color image is interpolated bilinearly.
 
     Args:
         color: Color image, [Hc, Wc, 3] uint8.
@@ -189,12 +190,12 @@ def resample_color(
         view of the color camera.
 
     Raises:
-        FrameError: The color image has another size than its camera.
+        FrameError: The size of the color image differs from that of `color_camera`.
     """
     if color.shape[:2] != (color_camera.height, color_camera.width):
         raise FrameError(
             f"color is {color.shape[1]}x{color.shape[0]} pixels and its camera "
-            f"{color_camera.width}x{color_camera.height}. Use the intrinsics of this resolution."
+            f"{color_camera.width}x{color_camera.height}. Use intrinsics for the size of the image."
         )
     while min(color_camera.fx / depth_camera.fx, color_camera.fy / depth_camera.fy) > 1.5:
         color, color_camera = _halved(color), color_camera.halved()

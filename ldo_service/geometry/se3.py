@@ -97,7 +97,7 @@ def distances(T: Array) -> Array:
 
 
 def transform(T: Array, points: Array) -> Array:
-    """Return points [..., 3] of frame b mapped by T_a_b [4, 4] to frame a."""
+    """Transform points [..., 3] from frame b to frame a by T = T_a_b [4, 4]."""
     return points @ T[:3, :3].T + T[:3, 3]
 
 
@@ -147,11 +147,11 @@ def transforms_differ(
     Args:
         T_a: Transforms, [K, 4, 4].
         T_b: Transforms, [K, 4, 4].
-        distance_m: Maximum distance of the positions, meters.
-        angle_rad: Maximum angle between the rotations, radians.
+        distance_m: Distance between the positions above which a pair differs, meters.
+        angle_rad: Angle between the rotations above which a pair differs, radians.
 
     Returns:
-        [K] bool.
+        [K] bool; True for pairs that differ.
     """
     T_a, T_b = np.reshape(T_a, (-1, 4, 4)), np.reshape(T_b, (-1, 4, 4))
     apart_m = np.linalg.norm(T_a[:, :3, 3] - T_b[:, :3, 3], axis=1)
@@ -167,12 +167,12 @@ def interpolate(T_a: np.ndarray, T_b: np.ndarray, share: np.ndarray) -> np.ndarr
         T = T_a (exp(s omega), s t),   (exp(omega), t) = T_a^-1 T_b
 
     The rotation is about one axis at a constant rate; the translation is on a straight line. The
-    result of a pair does not depend on the other pairs of the call, bit for bit.
+    result of a pair is bitwise independent of the other pairs of the call.
 
     Args:
         T_a: Transforms at s = 0, [N, 4, 4].
         T_b: Transforms at s = 1, [N, 4, 4].
-        share: Parameters s, [N].
+        share: Interpolation parameters s, [N].
 
     Returns:
         [N, 4, 4].

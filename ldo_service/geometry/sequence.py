@@ -25,7 +25,8 @@ class TrueLabels:
     """Ground-truth labels of a sequence."""
 
     class_names: tuple[str, ...]  # Indexed by class id; classes in VOID_NAMES mean no label.
-    frame: Callable[[int], FrameLabels]  # Labels of a frame by its index; raises FrameError.
+    # Returns the labels of the frame with an index; raises DataError if they cannot be read.
+    frame: Callable[[int], FrameLabels]
 
 
 class Sequence(ABC):
@@ -63,7 +64,7 @@ class Sequence(ABC):
         """Return the ground-truth `T_world_camera` in the data set's world frame, or None."""
 
     def true_labels(self) -> TrueLabels | None:
-        """Return the ground-truth labels, or None without labels.
+        """Return the ground-truth labels, or None if the sequence has none.
 
         Raises:
             DataError: A file of the labels is invalid.

@@ -80,11 +80,11 @@ class StreamBuffer:
         """Add a measurement.
 
         Raises:
-            FrameError: The stamp is not after the last one of the stream.
+            FrameError: The stamp is not later than the last stamp of the stream.
         """
         if self.stamps_ns and half.stamp_ns <= self.stamps_ns[-1]:
             raise FrameError(
-                f"its stamp {half.stamp_ns} ns is not after the last one of its stream, "
+                f"the stamp {half.stamp_ns} ns must be later than the last stamp of the stream, "
                 f"{self.stamps_ns[-1]} ns. Send images in the order of their exposure; if the "
                 "camera's clock was set back, run `ldo control reset`."
             )
@@ -138,7 +138,7 @@ class StreamPairer(Generic[A, B]):
         """Add a half of the first stream, and return the pairs that it completes.
 
         Raises:
-            FrameError: The stamp is not after the last one of the stream.
+            FrameError: The stamp is not later than the last stamp of the stream.
         """
         self._a.add(half)
         return self._decided()
@@ -147,7 +147,7 @@ class StreamPairer(Generic[A, B]):
         """Add a half of the second stream, and return the pairs that it completes.
 
         Raises:
-            FrameError: The stamp is not after the last one of the stream.
+            FrameError: The stamp is not later than the last stamp of the stream.
         """
         self._b.add(half)
         return self._decided()

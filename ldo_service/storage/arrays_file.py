@@ -10,7 +10,7 @@ from numpy.lib import format as npy
 
 UNREADABLE = (
     *(OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error),
-    *(MemoryError, OverflowError, NotImplementedError),  # Invalid sizes or methods in a header.
+    *(MemoryError, OverflowError, NotImplementedError),  # Invalid sizes or compression in a header.
     *(RuntimeError, SyntaxError),  # Encrypted entries; headers that are no Python literal.
 )
 
@@ -20,7 +20,7 @@ def read_arrays(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
 
     Args:
         path: The .npz file.
-        max_bytes: Maximum total size of the arrays, bytes, checked before memory is allocated.
+        max_bytes: Maximum total size of the arrays in bytes, checked before they are allocated.
 
     Raises:
         Exception: The file is damaged, too large or not readable; the type is one of UNREADABLE.

@@ -1,9 +1,9 @@
 """Files and folders that appear whole or not at all.
 
-The content is first written to a temporary file or folder next to the target. A rename moves the
-complete one to the target, so a reader sees the old or the new content, never an incomplete one. A
-failed write removes the temporary file. A killed process may leave a temporary file, whose name
-ends in `UNFINISHED`.
+The content is first written to a temporary file or folder next to the target. A rename then
+replaces the target, so a reader sees the whole old content or the whole new content. A failed write
+removes the temporary file or folder; a killed process may leave it. The name of a temporary file
+ends in `UNFINISHED`, and the name of a temporary folder begins with it.
 """
 
 import os
@@ -22,7 +22,7 @@ def write_atomically(path: Path, *parts: bytes, syncs: bool = False, unique: boo
         path: The file; its folder must exist.
         parts: The content, concatenated in order.
         syncs: Wait until the content and the name are on the disk, so a power cut loses nothing.
-        unique: Use a temporary name that no other process uses. It is needed if several processes
+        unique: Use a temporary name that no other process uses. This is needed if several processes
             may write the file at the same time.
 
     Returns:
@@ -51,7 +51,9 @@ def write_atomically(path: Path, *parts: bytes, syncs: bool = False, unique: boo
 
 @contextmanager
 def folder_made_atomically(path: Path) -> Iterator[Path]:
-    """Yield a temporary path for a new folder, which is renamed to `path` at the end of the block.
+    """Yield a temporary path, and rename the folder created there to `path` after the block.
+
+    The block must create the folder.
 
     Raises:
         OSError: The folder cannot be created; no part of it remains.

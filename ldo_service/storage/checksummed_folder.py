@@ -1,6 +1,6 @@
 """Folder of numbered files with checksums.
 
-A file begins with a checksum of its content. It gets its final name when it is completely written.
+A file begins with a checksum of its content, and gets its final name when it is completely written.
 A reader gets exactly the written content or an error. Files are not synced to the disk, so a power
 cut may damage the files written last.
 """
@@ -37,9 +37,9 @@ class ChecksummedFolder:
         """Create or open the folder.
 
         Args:
-            folder: The folder; None for a temporary one that is deleted with this object.
+            folder: The folder; None for a temporary folder, which is deleted with this object.
             suffix: Suffix of the files.
-            consequence: Sentence about the consequence of a failed write, for its log message.
+            consequence: Sentence about the consequence of a failed write, for the log message.
 
         Raises:
             ConfigError: The folder cannot be used.

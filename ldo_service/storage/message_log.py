@@ -15,8 +15,8 @@ from .atomic_write import sync
 
 log = logging.getLogger(__name__)
 
-# Size at which a segment, which is one file of the log, ends, bytes. A segment is deleted only as a
-# whole, so handled messages may still occupy this much disk space.
+# Size in bytes at which the log starts a new segment. A segment is one file. It is deleted only as
+# a whole, so handled messages may still occupy this much disk space.
 SEGMENT_BYTES = 32_000_000
 # Record before each message: its number, the sizes of its header and body in bytes, and the CRC-32
 # of both.
@@ -55,8 +55,8 @@ class MessageLog:
     The numbers of the messages are consecutive, except where the disk lost messages, as in a power
     cut.
 
-    The oldest messages are deleted when the log exceeds its maximum size. The numbers of the log
-    belong to one epoch of their producer. Files of other epochs are deleted.
+    The oldest messages are deleted when the log exceeds its maximum size. The numbers of the
+    messages belong to one epoch of their producer. Files of other epochs are deleted.
     """
 
     def __init__(
@@ -68,7 +68,8 @@ class MessageLog:
             folder: Folder of the log; created with the first message.
             epoch: Epoch of the numbers.
             first: Number of the first message that is still needed.
-            end: Number after the last message. A killed process may have written more.
+            end: Number after the last message to keep. A killed process may have written messages
+                with this number and above.
             max_bytes: Maximum size of the log, bytes.
             syncs: Sync every message to the disk, so that the log survives a power cut too.
         """
@@ -83,7 +84,7 @@ class MessageLog:
 
     @property
     def first(self) -> int:
-        """Number of the first message."""
+        """Number of the first message; equal to `next` if the log is empty."""
         with self._lock:
             return max(self._first, self._segments[0].first) if self._segments else self._first
 
@@ -106,10 +107,11 @@ class MessageLog:
     def append(self, messages: Iterable[LoggedMessage]) -> None:
         """Append messages with ascending numbers; numbers before `next` are skipped.
 
-        Only one thread may append at a time. Other threads do not wait for the disk meanwhile.
+        Only one thread may append at a time. Calls of other methods do not wait for the disk
+        meanwhile.
 
         Raises:
-            OSError: The disk is full or cannot be written. The log ends after a whole message.
+            OSError: The disk is full or cannot be written. The log then ends with a whole message.
         """
         for message in messages:
             with self._lock:
@@ -190,11 +192,11 @@ class MessageLog:
         return LoggedMessage(seq, header, body)
 
     def after(self, seq: int, end: int) -> int:
-        """Return the number of the first message after an unreadable one that may be readable.
+        """Return the number of the next message to read, after message `seq` was unreadable.
 
         Args:
-            seq: Number of the message that cannot be read.
-            end: Number after the last message; returned if the log has none after `seq`.
+            seq: Number of the unreadable message.
+            end: Number to return if the log has no message after `seq`.
         """
         with self._lock:
             if self._segment_of(seq) is not None:
@@ -244,7 +246,7 @@ class MessageLog:
         return self._folder / f"{self._epoch}-{first:012d}.log"
 
     def _scan(self, end: int) -> None:
-        """Index the files of this epoch up to message `end`, and delete those of other epochs."""
+        """Index the messages below `end` of this epoch, and delete the files of other epochs."""
         for path in sorted(self._folder.glob("*.log")):
             epoch, _, number = path.stem.partition("-")
             first = int(number) if number.isdecimal() else -1

@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 # change since the last step is the same object: only new objects are written.
 State = Mapping[str, Any]
 CONTENTS = "contents.msgpack"
-# Version of the content of the parts. A change of any actor's state that makes older states
-# incompatible increments it. Version 1 had no number.
+# Version of the content of the parts. Increment it when a change of any actor's state makes older
+# states incompatible. States of version 1 contain no version number.
 STATE_VERSION = 3
 
 
@@ -67,7 +67,7 @@ class StateStore(Protocol):
 
 
 class MemoryStore:
-    """Store in memory; it is lost when its process ends, but not when an actor fails."""
+    """Store in memory; the states are lost when the process ends, but not when an actor fails."""
 
     syncs = False
 
@@ -153,15 +153,15 @@ class FolderStore:
     def load(self, actor: str) -> State | None:
         """Load the last state of an actor.
 
-        A damaged state is logged and its folder renamed to `<actor>.unreadable`. An earlier folder
-        of that name is deleted.
+        If the state is damaged, the error is logged and the folder of the state is renamed to
+        `<actor>.unreadable`. An earlier folder of that name is deleted.
 
         Returns:
             The state; None if there is none or it is damaged.
 
         Raises:
-            DataError: The state exists, but the disk or a limit of the process prevents reading
-                it, or another version of the service wrote it.
+            DataError: The state cannot be read because of the disk or a limit of the process, or
+                another version of the service wrote the state.
         """
         folder = self._folder / actor
         try:
@@ -171,15 +171,15 @@ class FolderStore:
             }
         except (FileNotFoundError, ValueError) as error:  # A file name may contain a null byte.
             log.error(
-                "%s: its saved state cannot be read: %s. The actor starts with an empty state; the "
-                "damaged one is kept as %s.unreadable.",
+                "%s: the saved state cannot be read: %s. The actor starts with an empty state; the "
+                "damaged state is kept as %s.unreadable.",
                 actor, error, folder,
             )  # fmt: skip
             _set_aside(folder)
             return None
         except OSError as error:
             raise DataError(
-                f"the state of {actor} in {folder} cannot be read: {error.strerror}. It is "
+                f"the state of {actor} in {folder} cannot be read: {error.strerror}. The state is "
                 "unchanged: repair the disk, or raise the limit of the process, and start again."
             ) from error
         return parts or None
@@ -207,7 +207,7 @@ def _set_aside(folder: Path) -> None:
 
 
 def _remove_unreferenced(folder: Path, files: Mapping[str, str]) -> None:
-    """Remove the files that are not in `files`; a process that was killed left them."""
+    """Remove the files that are not in `files`; killed processes may have left some."""
     for file in folder.glob("*"):
         if file.name not in (CONTENTS, *files.values()):
             _remove(file)

@@ -27,7 +27,7 @@ for _one in (_Loader, _Dumper):
 def load_yaml(text: str | bytes) -> Any:
     """Parse YAML into numbers, text, dates, lists and dictionaries.
 
-    The parser is the one in Python, because libyaml (C) overflows its stack on deeply nested
+    PyYAML's parser in Python is used, because libyaml (C) overflows its stack on deeply nested
     brackets.
 
     Raises:

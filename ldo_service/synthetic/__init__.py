@@ -10,8 +10,8 @@ Sequences:
 - `room`, `tour`: One furnished room, rendered when read.
 - `person`: The same room, with a person who walks through it.
 - `room-noisy`, `tour-noisy`, `person-noisy`: The sequences above with the depth errors of a Kinect.
-- `flat`: Two rooms and a corridor with ground-truth labels, designed to be hard.
-- `flat-exact`: The same flat without sensor noise.
+- `flat`: Two rooms and a corridor with ground-truth labels, designed to be hard for SLAM.
+- `flat-exact`: The same flat without motion blur, noise and other sensor errors.
 - `room-handheld`, `tour-handheld`, `person-handheld`, `flat-handheld`: Faster motion, seen by a
   camera with simulated effects of real cameras, such as motion blur. All effects are on by default.
   A colon and effect names joined by `+` select some: `tour-handheld:rolling-shutter+stereo`.
@@ -42,13 +42,14 @@ SCENES = (*room_sequence.NAMED, *flat.NAMED, *handheld.NAMED)  # Names of all bu
 
 
 def open_synthetic(name: str) -> SyntheticSequence | FlatSequence | HandheldSequence:
-    """Return the sequence `synthetic:NAME`.
+    """Return a built-in sequence.
 
     Args:
-        name: Name of a sequence, with an optional `@SEED`; the module docstring lists the names.
+        name: Name of the sequence without `synthetic:`, such as `room@3`. The module docstring
+            lists the names.
 
     Raises:
-        DataError: If the name is unknown (the message lists the known ones) or the seed is not
+        DataError: If the name is unknown (the message lists the known names) or the seed is not
             a whole number.
     """
     plain, at, seed = name.partition("@")

@@ -11,7 +11,7 @@ LAMP_GRID = 4  # The lamp is an area of 4x4 points, so its shadows are soft.
 LIGHT_CELL_M = 0.06  # Cell size of the grids of light on walls, floors and ceilings.
 AMBIENT = 0.42  # Light that comes from all directions, 0..1.
 LAMP = 0.55  # Light of the lamp at normal incidence, before falloff.
-SIDE = 0.06  # Fraction of the ambient light by which a surface that faces +x gets more.
+SIDE = 0.06  # Additional light of a surface that faces +x, as a fraction of the ambient light.
 
 
 def shade(
@@ -26,7 +26,7 @@ def shade(
         point: Points of the surface, [P], meters.
         normal: Unit normals at the points.
         lit: Visible fraction of the lamp, 0..1.
-        side: Fraction of the ambient light by which a surface that faces +x gets more.
+        side: Additional light of a surface that faces +x, as a fraction of the ambient light.
 
     Returns:
         Light [P]; 1 leaves the albedo unchanged.
@@ -52,7 +52,7 @@ def light_on_face(room: Room, face: int) -> np.ndarray:
         face: Index of the face, in the order -x, +x, -y, +y, -z, +z.
 
     Returns:
-        Light [rows, columns] on cells of LIGHT_CELL_M.
+        Light [rows, columns] on a grid with cells of LIGHT_CELL_M; 1 leaves the albedo unchanged.
     """
     axis, sign = face // 2, 2 * (face % 2) - 1
     a, b = plane_axes(axis)
@@ -135,7 +135,7 @@ def _is_between(solid: Solid, point: Vector, lamp_m: Vector) -> np.ndarray:
 
 
 def interpolated(grid: np.ndarray, u_m: np.ndarray, v_m: np.ndarray) -> np.ndarray:
-    """Return bilinearly interpolated values [P] of a grid with cells of LIGHT_CELL_M."""
+    """Interpolate a grid with cells of LIGHT_CELL_M bilinearly at u_m, v_m [P]; return [P]."""
     x, y = u_m / LIGHT_CELL_M, v_m / LIGHT_CELL_M
     column = np.clip(x.astype(np.int64), 0, grid.shape[1] - 2)
     row = np.clip(y.astype(np.int64), 0, grid.shape[0] - 2)

@@ -13,7 +13,7 @@ class Path:
     targets_m: np.ndarray  # Points [M, 3] in the world that the camera looks at.
 
 
-# A sweep over the room and back on another path; the camera sees every part of the walls twice.
+# A sweep over the room and back on another path; the camera sees the same walls twice.
 LOOK_AROUND = Path(
     eyes_m=np.array(
         [
@@ -39,7 +39,7 @@ LOOK_AROUND = Path(
     ),
 )
 
-# One turn past all four walls that ends close to its start.
+# One turn that shows all four walls and ends close to its start.
 TOUR = Path(
     eyes_m=np.array(
         [
@@ -97,7 +97,7 @@ SWAY_TARGET_M = 0.03
 
 
 def poses(path: Path, count: int, seed: int) -> np.ndarray:
-    """Return T_world_camera [count, 4, 4] once around; `seed` determines the hand shake."""
+    """Return T_world_camera [count, 4, 4] for one turn on a path; `seed` sets the hand shake."""
     rng = np.random.default_rng(seed)
     along = np.arange(count) * (len(path.eyes_m) / count)
     eyes = closed_spline(path.eyes_m, along) + _sway(rng, count, SWAY_EYE_M)
@@ -116,12 +116,12 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def looking(eyes: np.ndarray, gazes: np.ndarray, rolls: np.ndarray) -> np.ndarray:
-    """Return T_world_camera [N, 4, 4] with z along the gaze, rolled by a small angle.
+    """Return T_world_camera [N, 4, 4] with z along the gaze, rolled by small angles.
 
     Args:
         eyes: Camera centers [N, 3].
         gazes: Viewing directions [N, 3], of any length.
-        rolls: Angles [N] about the gaze, radians; valid for small ones.
+        rolls: Angles [N] about the gaze, radians; must be small.
     """
     z = gazes / lengths(gazes)[:, None]
     level = np.stack([z[:, 1], -z[:, 0], np.zeros(len(z))], axis=1)

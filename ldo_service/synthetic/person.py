@@ -17,7 +17,7 @@ WAY_M = np.array([[-3.1, 0.9], [0.6, 0.9], [1.3, 0.25], [3.2, 0.0]])
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One solid of a body that faces +x, with its feet at the origin."""
+    """One solid of a body that faces +x and stands at the origin."""
 
     shape: Shape
     center_m: tuple[float, float, float]

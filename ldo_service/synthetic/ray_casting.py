@@ -1,4 +1,4 @@
-"""Ray casting of a camera image with exact depth; a box, the shell, encloses the scene."""
+"""Ray casting of a camera image with exact depth, in a scene enclosed by a box, the shell."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from .optics import max_displacement_px, undistorted
 from .solids import Solid, Vector, interval, vector
 
 NEAR_M = 0.05
-# If each row has its own pose, a solid is projected at ROW_POSES of them. ROW_MARGIN_PX is for
-# solids that are in view at only one of these poses, so that their motion is not measured.
+# If each row has its own pose, a solid is projected at ROW_POSES of these poses. ROW_MARGIN_PX
+# widens its window, because the motion of a solid in view at only one of them is unknown.
 ROW_POSES, ROW_MARGIN_PX = 5, 4.0
 
 
@@ -142,9 +142,9 @@ EMPTY = _Window(1, 0, 1, 0)
 def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
     """Return the window of a solid at one pose [4, 4], or at the poses of all rows [H, 4, 4].
 
-    With one pose for each row, the window is the union over a few row poses, grown by the largest
-    motion between two consecutive ones. With lens distortion, the window also grows by the largest
-    displacement of a pixel.
+    With one pose for each row, the window is the union over a few of the row poses, grown by the
+    largest motion from one of these poses to the next. With lens distortion, the window also grows
+    by the largest displacement of a pixel.
     """
     if T.ndim == 2 and not any(camera.distortion):
         return _window_at(solid, camera, T)

@@ -31,7 +31,8 @@ PATHS = {"look_around": path.LOOK_AROUND, "tour": path.TOUR, "linger": path.LING
 def kinect_depth(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return depth with the errors of a Kinect.
 
-    The error grows with the square of depth: 3 mm steps at 1 m, 26 mm at 3 m.
+    Depth has steps that grow with the square of depth: 3 mm at 1 m, 26 mm at 3 m. The matching
+    noise is half a step.
 
     Args:
         depth_m: Exact depth [H, W], meters.
@@ -64,9 +65,9 @@ class SyntheticConfig:
     width_px: int = 320
     height_px: int = 240
     path: Literal["look_around", "tour", "linger"] = "look_around"
-    noise: bool = False  # Depth errors of a Kinect; exact depth otherwise.
-    person: bool = False  # A person walks through the room.
-    seed: int = 0  # Seed of the textures, the hand's sway and the noise.
+    noise: bool = False  # True adds the depth errors of a Kinect; False gives exact depth.
+    person: bool = False  # True adds a person who walks through the room.
+    seed: int = 0  # Seed of the textures, the hand shake and the noise.
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.width_px < 8 or self.height_px < 8:

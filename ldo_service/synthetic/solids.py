@@ -74,9 +74,9 @@ class Solid:
         """Return normals and texture coordinates at world points on the surface.
 
         Returns:
-            Unit normals in the world, and texture coordinates u_m [P] and v_m [P]. The solid's axis
-            nearest to the normal is left out; u and v run along the two remaining axes. On the
-            sides of the solid, v points up.
+            Unit normals in the world, and texture coordinates u_m [P] and v_m [P]. u and v run
+            along the two axes of the solid that are farthest from the normal. On the sides of the
+            solid, v points up.
         """
         local = self.point_to_local(point)
         normal, axis = self.normal(local)

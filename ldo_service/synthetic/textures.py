@@ -161,7 +161,7 @@ def fabric(rng: np.random.Generator, color: Color, thread: Color) -> np.ndarray:
 
 
 def rug(rng: np.random.Generator, ground: Color, figure: Color) -> np.ndarray:
-    """Draw nested diamonds, worn by use."""
+    """Draw a worn rug with nested diamonds."""
     y, x = np.mgrid[:TILE_TEXELS, :TILE_TEXELS]
     rings = (np.abs(x - 128) + np.abs(y - 128)) // 16 % 3 == 0
     return blend(ground, figure, 0.1 + 0.75 * rings + 0.35 * noise(rng, (16, 16)))

@@ -16,7 +16,7 @@ from skimage import measure
 
 from ldo_service.errors import ConfigError
 
-STEPS = np.array([1 << 40, 1 << 20, 1])  # Change of a packed triple per step along each axis.
+STEPS = np.array([1 << 40, 1 << 20, 1])  # Change of a packed triple (`pack`) per step on each axis.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -28,8 +28,8 @@ class LatticeBlock:
         values: Function values, [S + 1, S + 1, S + 1] float32, finite. Neighboring blocks must have
             equal values at common corners.
         attributes: C further values at each corner, such as colors, [S + 1, S + 1, S + 1, C].
-        is_used: Cells to process, [S, S, S] bool. At least one of them must contain the surface: it
-            has a corner with a value < 0 and one with a value >= 0.
+        is_used: Cells to process, [S, S, S] bool. At least one of these cells must contain the
+            surface: one of its corners has a value < 0, and another one a value >= 0.
     """
 
     origin: np.ndarray
@@ -103,14 +103,14 @@ def _interpolated(attributes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def pack(lattice: np.ndarray) -> np.ndarray:
-    """Pack each integer triple of [..., 3] into one int64 below 2^60; the order is preserved.
+    """Pack integer triples [..., 3] into int64 below 2^60; lexicographic order is preserved.
 
     Raises:
         ConfigError: A coordinate is 2^19 or more from the origin: 10 km with voxels of 2 cm.
     """
     if len(lattice) and max(lattice.max(), -lattice.min()) >= 1 << 19:
         raise ConfigError(
-            "the map extends more than 524,288 voxels from its origin. Choose larger voxels with "
+            "the map extends 524,288 voxels or more from its origin. Choose larger voxels with "
             "--voxel."
         )
     return lattice.astype(np.int64) @ STEPS + (1 << 19) * STEPS.sum()

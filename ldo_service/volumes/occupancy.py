@@ -38,19 +38,19 @@ class OccupancyConfig:
     """Settings of the occupancy grid."""
 
     voxel_m: float = 0.1
-    min_opacity: float = 0.5  # Least opacity of a Gaussian that occupies voxels.
-    # Least area of the Gaussians in an occupied voxel, as a fraction of the area of a voxel face. A
-    # wall through the middle of a voxel has 1, single stray Gaussians have less than a hundredth.
+    min_opacity: float = 0.5  # Minimum opacity of a Gaussian that occupies voxels.
+    # Minimum area of the Gaussians in an occupied voxel, as a fraction of the area of a voxel face.
+    # A wall through the middle of a voxel has 1, a single stray Gaussian less than 0.01.
     min_cover: float = 0.1
-    max_sigma_voxels: float = 10.0  # Larger Gaussians are background and occupy nothing.
-    max_voxels: int = 200_000_000  # One byte each.
+    max_sigma_voxels: float = 10.0  # Larger Gaussians are background and occupy no voxel.
+    max_voxels: int = 200_000_000  # Maximum number of voxels of the grid, one byte each.
 
     def __post_init__(self) -> None:
         if not 0.005 <= self.voxel_m <= 10:
             raise ConfigError(f"voxel_m={self.voxel_m} must lie between 0.005 and 10 m.")
         for name in ("min_opacity", "min_cover"):
             if not 0 < getattr(self, name) <= 1:
-                raise ConfigError(f"{name}={getattr(self, name)} must lie between 0 and 1.")
+                raise ConfigError(f"{name}={getattr(self, name)} must be above 0 and at most 1.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +117,9 @@ def occupancy(
 def occupied_voxels(rows: np.ndarray, config: OccupancyConfig) -> np.ndarray:
     """Return the integer coordinates of the voxels that opaque Gaussians cover, [V, 3].
 
-    The coordinates of a voxel are positions divided by the voxel size and rounded down. A Gaussian
-    covers the area 2 pi s1 s2 times its opacity, with the standard deviations s1 and s2 of its two
-    longer axes. A large Gaussian distributes its area over several voxels.
+    A position in meters, divided by the voxel size and rounded down, gives the coordinates of its
+    voxel. A Gaussian covers the area 2 pi s1 s2 times its opacity, with the standard deviations s1
+    and s2 of its two longer axes. The area of a large Gaussian is distributed over several voxels.
     """
     sigmas_m, opacities = np.exp(rows[:, 3:6]), 1 / (1 + np.exp(-rows[:, 10]))
     matter = (opacities >= config.min_opacity) & (
@@ -142,7 +142,7 @@ def _split(
     """Split Gaussians into parts until no axis is longer than `max_sigma_m`.
 
     A Gaussian is split along its longest axis, with standard deviation s, into two Gaussians with
-    s / 2 along that axis. Their means lie at +- sqrt(3)/2 s on the axis, so that both together have
+    s / 2 along this axis. Their means lie at +- sqrt(3)/2 s on the axis, so that both together have
     the original variance. The parts of a large Gaussian are evenly spaced, at most
     2 sqrt(3) `max_sigma_m` apart.
 
@@ -196,8 +196,8 @@ def _carve(
 ) -> None:
     """Mark the voxels between a camera and the surface that it sees as free.
 
-    These are the voxel that contains the camera, and all visible voxels whose center lies at least
-    one voxel size in front of the rendered surface.
+    The function marks the voxel that contains the camera, and all visible voxels whose center lies
+    at least one voxel size in front of the rendered surface.
 
     Args:
         states: States of the grid, [X, Y, Z]; changed in place.
@@ -233,7 +233,7 @@ def _slabs(shape: tuple[int, ...], corners: np.ndarray) -> Iterator[np.ndarray]:
         corners: The points, [P, 3], in voxels.
 
     Yields:
-        Indices [V, 3] of some layers, with at most `SLAB` voxels unless it is a single layer.
+        Indices [V, 3] of the voxels of some layers: at most `SLAB` voxels or a single layer.
     """
     start = np.maximum(np.floor(corners.min(axis=0)).astype(int), 0)
     stop = np.minimum(np.ceil(corners.max(axis=0)).astype(int), shape)
@@ -272,15 +272,16 @@ def floor_plan(
 ) -> FloorPlan:
     """Make a floor plan of the voxels whose center lies in a range of heights.
 
-    A cell is occupied if at least one voxel above it is occupied. Otherwise it is free if at least
-    one voxel is free, and unknown if none is.
+    A cell of the plan stands for a vertical column of these voxels. The cell is occupied if at
+    least one of them is occupied. Otherwise it is free if at least one of them is free, else
+    unknown.
 
     Args:
         grid: The occupancy grid.
         up: Axis of the map that is up, a key of `UP`. The map has the axes of the first camera,
             and -y is up if that camera was level.
-        heights_m: Range of heights along `up`, relative to the origin of the map, where the
-            first camera was.
+        heights_m: Range of heights along `up`, relative to the origin of the map, which is the
+            position of the first camera.
 
     Raises:
         ConfigError: `up` is not an axis, or the range contains no voxel.
@@ -320,7 +321,7 @@ def write_floor_plan(path: Path, plan: FloorPlan) -> None:
         "origin": [*plan.origin_m, 0.0],  # Position of the lower left pixel, and yaw.
         "negate": 0,
         "occupied_thresh": 0.65,
-        # The gray value 205 is an occupancy of 0.196, which is not below this, so it is unknown.
+        # Cells below this occupancy are free. The gray value 205, an occupancy of 0.1961, is not.
         "free_thresh": 0.196,
     }
     low_m, high_m = plan.heights_m

@@ -20,10 +20,10 @@ BLOCK = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), -1).reshape
 GRID = np.stack(np.meshgrid(*[np.arange(SIDE + 1)] * 3, indexing="ij"), -1)  # [9, 9, 9, 3].
 CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])  # c = x + 2 y + 4 z.
 VOXEL_BYTES = 4 + 4 + 3 * 4  # Distance, weight, color.
-# Largest difference, in voxels, between the mean and the median depth of a pixel that is used. In
-# the synthetic room with voxels of 2 cm, 2 voxels put 0.3 % of the vertices off by 4 cm and omit
-# 1 % of the surface. With 4 voxels, 1.1 % are off; with 1 voxel, 0.06 % are off and 3.5 % are
-# omitted.
+# Maximum difference, in voxels, between the mean and the median depth of a pixel that is used. In
+# the synthetic room with voxels of 2 cm, a limit of 2 voxels puts 0.3 % of the vertices 4 cm off
+# the surface and omits 1 % of the surface. With 4 voxels, 1.1 % of the vertices are off. With
+# 1 voxel, 0.06 % are off, and 3.5 % of the surface is omitted.
 SURE_VOXELS = 2.0
 CHUNK = 512  # Blocks processed at a time: a quarter of a million voxels.
 
@@ -116,8 +116,8 @@ class Tsdf:
     def integrate(self, depth_m: np.ndarray, color: np.ndarray, viewpoint: Viewpoint) -> None:
         """Fuse a depth image.
 
-        Each voxel near the surface has the weighted mean of distance and color over all images. The
-        weight is the inverse square of the depth, like the density of pixels on the surface.
+        Each voxel near the surface stores the weighted mean of distance and color over all images.
+        The weight is the inverse square of the depth, like the density of pixels on the surface.
 
         Args:
             depth_m: [H, W]; 0 where unknown.
@@ -125,7 +125,7 @@ class Tsdf:
             viewpoint: Camera and pose of the image.
 
         Raises:
-            ConfigError: The blocks would exceed `max_memory_mb`. The images fused before stay.
+            ConfigError: The blocks would exceed `max_memory_mb`. The TSDF is then unchanged.
         """
         touched = self._touched(depth_m, viewpoint)
         self._allocate(touched)
@@ -153,7 +153,7 @@ class Tsdf:
         if total > self.config.max_blocks:
             raise ConfigError(
                 f"voxels of {self.config.voxel_m} m need more than max_memory_mb="
-                f"{self.config.max_memory_mb} for this map. Choose larger voxels or allow more."
+                f"{self.config.max_memory_mb} for this map. Choose larger voxels or more memory."
             )
         self._blocks = np.concatenate([self._blocks, new])
         keys = pack(self._blocks)
@@ -164,7 +164,7 @@ class Tsdf:
         self._color = _grown(self._color, total)
 
     def _find(self, blocks: np.ndarray) -> np.ndarray:
-        """Return the storage index (slot) of each block [B, 3], as [B]; -1 if it is not stored."""
+        """Return the storage indices (slots) [B] of blocks [B, 3]; -1 for blocks not stored."""
         if not len(self._keys):
             return np.full(len(blocks), -1)
         keys = pack(blocks)
@@ -196,9 +196,9 @@ class Tsdf:
     def mesh(self) -> Mesh:
         """Return the surface as a triangle mesh.
 
-        Only cells with eight observed corners are used. Cells whose distances differ by more than
-        the truncation distance are skipped. They lie at the outline of an object, where no surface
-        connects the object and the background.
+        Only cells with eight observed corners are used. A cell is skipped if the distances at its
+        corners differ by more than the truncation distance. Such a cell lies at the outline of an
+        object, where no surface connects the object and the background.
         """
         surface = marching_cubes(self._crossed_blocks(), attributes=3)
         return Mesh(
@@ -231,7 +231,7 @@ class Tsdf:
             slots: Slots of the blocks, [B].
 
         Returns:
-            Slot [B, 9, 9, 9] of each corner, -1 if that block is not stored; and the index
+            Slot [B, 9, 9, 9] of the block of each corner, -1 if the block is not stored; and index
             [9, 9, 9] of the voxel within its block.
         """
         neighbors = np.stack([self._find(self._blocks[slots] + step) for step in CORNERS], -1)

@@ -16,10 +16,10 @@ class Lookup:
 
     Attributes:
         z_m: Depth of the points themselves in the camera frame, [...].
-        seen_m: Value of the depth image at the nearest pixel, [...]; 0 outside the image and where
-            the depth is unknown.
-        row: Row of that pixel, [...].
-        column: Column of that pixel, [...].
+        seen_m: Value of the depth image at the pixel nearest to each point, [...]; 0 outside the
+            image and where the depth is unknown.
+        row: Row of this pixel, [...]; 0 outside the image.
+        column: Column of this pixel, [...]; 0 outside the image.
     """
 
     z_m: np.ndarray

@@ -58,7 +58,7 @@ def test_an_eight_bit_depth_png_is_rejected() -> None:
 
 def test_image_of_another_size_than_announced_is_rejected() -> None:
     _, data = cv2.imencode(".png", COLOR)
-    with pytest.raises(FrameError, match="announced as 8x6"):
+    with pytest.raises(FrameError, match="declared as 8x6"):
         codecs.decode_color("png", 8, 6, memoryview(data.tobytes()))
 
 
@@ -82,5 +82,5 @@ def test_header_that_announces_gigabytes_is_rejected_before_decoding() -> None:
     _, data = cv2.imencode(".png", COLOR)
     huge = bytearray(data.tobytes())
     huge[16:24] = (60000).to_bytes(4, "big") * 2
-    with pytest.raises(FrameError, match="60000x60000, announced as 9x6"):
+    with pytest.raises(FrameError, match="60000x60000, declared as 9x6"):
         codecs.decode_color("png", 9, 6, memoryview(bytes(huge)))

@@ -67,7 +67,7 @@ def test_other_formats_have_no_size_and_are_rejected(data: bytes) -> None:
 
 @pytest.mark.parametrize("size", [(20_000, 20_000), (65_500, 65_500), (53, 38)])
 def test_an_image_that_announces_another_size_is_rejected(size: tuple[int, int]) -> None:
-    with pytest.raises(FrameError, match=f"is {size[0]}x{size[1]}, announced as 53x37"):
+    with pytest.raises(FrameError, match=f"is {size[0]}x{size[1]}, declared as 53x37"):
         decode_color("jpeg", 53, 37, memoryview(bomb(*size)))
 
 

@@ -102,7 +102,7 @@ def test_decreasing_stamps_are_rejected_without_effect() -> None:
     pairs = pairing()
     feed(pairs, ("a", 100))
     for stamp_ms in (100, 67):
-        with pytest.raises(FrameError, match="not after the last one"):
+        with pytest.raises(FrameError, match="must be later than the last"):
             feed(pairs, ("a", stamp_ms))
     assert feed(pairs, ("b", 101)) == [(100, 101)]
 

@@ -195,7 +195,7 @@ def test_read_error_raises_and_leaves_the_state_unchanged(
         raise OSError(errno.EMFILE, "Too many open files")
 
     monkeypatch.setattr(Path, "read_bytes", fail)
-    with pytest.raises(DataError, match=r"Too many open files\. It is unchanged"):
+    with pytest.raises(DataError, match=r"Too many open files\. The state is unchanged"):
         FolderStore(tmp_path).load("mapper")
     monkeypatch.undo()
     assert FolderStore(tmp_path).load("mapper") == {"step": [1]}

@@ -32,8 +32,8 @@ class MotionSpeeds:
 class Contents:
     """Statistics of the labels and depth of several frames."""
 
-    wall_share: float  # Fraction of all pixels.
-    missing_depth_share: float  # Fraction of all pixels.
+    wall_share: float  # Fraction of the pixels that show a wall.
+    missing_depth_share: float  # Fraction of the pixels without measured depth.
     objects_per_class: dict[str, int]  # Number of objects visible in at least one frame.
 
     @property

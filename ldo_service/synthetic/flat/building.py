@@ -23,7 +23,7 @@ CORRIDOR = Placement((0.0, 0.0, 0.0))
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Slab of a wall, floor or ceiling; shadows are computed only on the face toward its room."""
+    """Slab of a wall, floor or ceiling; only its face toward the room receives shadows."""
 
     solid: Solid
     class_id: int
@@ -62,7 +62,7 @@ def _room(placed: Placement, room: int, paint: str, floor: str) -> list[Panel]:
 def _corridor() -> list[Panel]:
     """Return the panels of the corridor.
 
-    A half turn about z copies one side wall with a doorway and one end wall to the opposite ones.
+    A half turn about z copies one side wall with a doorway and one end wall to the opposite sides.
     """
     length, width = CORRIDOR_SIZE_M
     door_m = ROOM_A.origin_m[0] + DOOR_X_M

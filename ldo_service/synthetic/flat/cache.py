@@ -49,7 +49,7 @@ class FrameCache:
     """Disk cache of the frames of one sequence.
 
     The cache deletes the oldest sequences when all of them together exceed LIMIT_BYTES. A cache
-    that cannot be written is not an error: the sequence then renders a frame each time it is read.
+    that cannot be written is not an error: frames are then rendered at each read.
     """
 
     def __init__(self, identity: str, width: int, height: int) -> None:

@@ -22,7 +22,7 @@ Point = tuple[float, float, float]
 
 
 def light_on_panel(panel: Panel, lamp_center_m: Point, solids: tuple[Solid, ...]) -> np.ndarray:
-    """Return the light on the face of a panel toward its room.
+    """Return the light on the face of a panel that points into the room.
 
     Args:
         panel: The panel.
@@ -55,7 +55,7 @@ def interpolated_on_panel(panel: Panel, grid: np.ndarray, local: Vector) -> np.n
 
 
 def is_on_face(panel: Panel, local: Vector) -> np.ndarray:
-    """Return a mask [P] of the points that lie on the face of a panel toward its room.
+    """Return a mask [P] of the points on the face of a panel that points into the room.
 
     Args:
         panel: The panel.

@@ -59,7 +59,7 @@ class SceneObject:
 
     @property
     def bounds_m(self) -> tuple[np.ndarray, np.ndarray]:
-        """Center [3] and size [3], meters, of the bounding box along the axes of that frame."""
+        """Center [3] and size [3], meters, of the bounding box in the frame of the solids."""
         corners = np.concatenate([solid.corners_m() for solid in self.solids])
         low, high = corners.min(axis=0), corners.max(axis=0)
         return (low + high) / 2, high - low

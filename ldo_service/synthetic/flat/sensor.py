@@ -10,10 +10,11 @@ from ldo_service.synthetic.room_sequence import DISPARITY_SIGMA_STEPS, DISPARITY
 from .render import FlatRendering
 from .walk import FRAMES, RATE_HZ, CameraPath, closed_spline
 
-# Exposure time indoors in the evening; a turn of 60 degrees per second blurs 11 of 640 pixels.
+# Exposure time indoors in the evening. A turn of 60 degrees per second blurs over 11 pixels, at an
+# image width of 640.
 SHUTTER_S = 0.02
 BLUR_TAPS = 7  # Samples along the motion of each pixel.
-# Time between the knots of the gain's random drift, and its largest deviation as a fraction.
+# Random drift of the gain: time between its knots, and largest deviation from 1.
 EXPOSURE_S, EXPOSURE_SPREAD = 3.0, 0.2
 NOISE = 0.008  # Standard deviation as a fraction of full scale: 2 gray levels.
 

@@ -31,9 +31,8 @@ class FlatConfig:
 
     width_px: int = 640
     height_px: int = 480
-    noise: bool = (
-        True  # Motion blur, exposure drift, noise and a Kinect's depth errors; else exact.
-    )
+    # True adds motion blur, exposure drift, noise and a Kinect's depth errors.
+    noise: bool = True
     seed: int = 0  # Seed of textures, materials, hand shake and noise.
 
     def __post_init__(self) -> None:
@@ -138,7 +137,7 @@ def prerender(
     frames: range | None = None,
     advance: Callable[[int], None] | None = None,
 ) -> None:
-    """Render the frames that are not cached yet in several processes.
+    """Render all frames that are missing in the cache, in several processes.
 
     A frame of 640x480 pixels takes a process about one second.
 

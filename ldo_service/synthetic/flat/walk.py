@@ -1,4 +1,4 @@
-"""Walk with a hand-held camera: each room is visited twice, with the corridor between the rooms."""
+"""Walk of a hand-held camera, which visits each room twice and passes the corridor in between."""
 
 from dataclasses import dataclass
 
@@ -9,9 +9,9 @@ from ldo_service.synthetic.path import closed_spline, lengths, looking
 RATE_HZ = 15
 FRAMES = 640
 
-# Knots of a way around room A and along the corridor to the door of room B. Each has the camera
-# position x, y, z in meters and the viewing direction x, y, z. A half turn about the world's z axis
-# gives the way around room B and back to the door of room A.
+# Knots of a way around room A and along the corridor to the door of room B. Each knot has the
+# camera position x, y, z in meters and the viewing direction x, y, z. A half turn about the world's
+# z axis gives the way around room B and back to the door of room A.
 FIRST_HALF = np.array(
     [
         # Room A, from left to right.
@@ -64,7 +64,7 @@ TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE = 0.2, 0.0015, 0.004
 
 @dataclass(frozen=True, slots=True)
 class CameraPath:
-    """Closed camera path that takes `FRAMES` frames once around."""
+    """Motion along a closed camera path; one turn takes `FRAMES` frames."""
 
     along: np.ndarray  # Spline parameter [M + 1], in knots, at equal time steps.
     # Knots [K, 7] of closed splines that are added to camera center, viewing direction and roll.
@@ -98,8 +98,8 @@ def _shake(rng: np.random.Generator, period_s: float, eye_m: float, gaze: float)
 def timed_positions() -> np.ndarray:
     """Return the spline parameter [M + 1], in knots, at equal time steps around the walk.
 
-    Steps with a long way or a large turn take more time, in proportion to WALK_M_S and TURN_RAD_S.
-    The sequence scales all times to its own duration.
+    Long steps and steps with a large turn take more time, according to WALK_M_S and TURN_RAD_S. The
+    sequence scales all times to its own duration.
     """
     place = np.arange(len(KNOTS) * STEPS_PER_KNOT + 1) / STEPS_PER_KNOT
     state = closed_spline(KNOTS, place[:-1])

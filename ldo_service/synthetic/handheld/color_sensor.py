@@ -10,19 +10,19 @@ from ldo_service.synthetic.optics import undistorted
 
 # Vignetting of the green channel of an ASUS Xtion (Bonn RGB-D Dynamic, `crowd`). The radius r is 1
 # in the corners. The factor on the light is 0.65 there and 0.73 in the middle of the left side.
-VIGNETTING = (-0.62, 0.42, -0.15)  # Coefficients of r^2, r^4, r^6 in the factor minus 1.
-CHANNEL_LOSS = (1.06, 1.0, 0.88)  # Red, green, blue: scales the factor minus 1.
+VIGNETTING = (-0.62, 0.42, -0.15)  # Coefficients of r^2, r^4, r^6 in (factor - 1).
+CHANNEL_LOSS = (1.06, 1.0, 0.88)  # Red, green, blue: multiples of (factor - 1) of green.
 TARGET = 0.42  # Mean gray value, 0..1, that automatic exposure aims at.
 MIN_GAIN, MAX_GAIN = 0.4, 3.0
 # Fraction of the difference from the target that exposure and white balance correct per frame.
 EXPOSURE_RATE, BALANCE_RATE = 0.3, 0.1
-# Exposure and white balance of a frame are simulated over this number of frames before the frame.
+# Number of earlier frames over which the exposure and white balance of a frame are simulated.
 MEMORY_FRAMES = 12
 NOISE = 0.006  # Standard deviation at a gain of 1, as a fraction of full scale.
 
 
 def vignetting(camera: Camera) -> np.ndarray:
-    """Return the factor of the vignetting on the light of each pixel and channel, [H, W, 3]."""
+    """Return the factor by which vignetting reduces the light, by pixel and channel [H, W, 3]."""
     half_w, half_h = camera.width / 2, camera.height / 2
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     x, y = u - (camera.width - 1) / 2, v - (camera.height - 1) / 2
@@ -33,7 +33,7 @@ def vignetting(camera: Camera) -> np.ndarray:
 
 
 def automatic_gains(means: np.ndarray) -> np.ndarray:
-    """Return the channel gains [3] of automatic exposure and white balance after some frames.
+    """Return the channel gains [3] that exposure and white balance control reach after N frames.
 
     Args:
         means: Mean light of each channel in each frame, [N, 3], oldest first; N is at least 1.

@@ -14,7 +14,7 @@ class Effects:
 
     rolling_shutter: bool = False  # The rows of an image are exposed one after the other.
     late_depth: bool = False  # Depth is measured later than color.
-    blur: bool = False  # The camera moves during the exposure.
+    blur: bool = False  # Motion blur, because the camera moves during the exposure.
     distortion: bool = False  # Lens distortion of the color camera.
     vignetting: bool = False  # The corners of the color image are darker.
     exposure: bool = False  # Automatic exposure and white balance, and sensor noise.

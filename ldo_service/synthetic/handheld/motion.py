@@ -15,7 +15,7 @@ TREMOR_S, TREMOR_EYE_M, TREMOR_RAD = 0.2, 0.002, 0.008
 
 @dataclass(frozen=True, slots=True)
 class HandMotion:
-    """Closed camera path that takes `duration_s` once around."""
+    """Motion along a closed camera path; one turn takes `duration_s`."""
 
     knots: np.ndarray  # Camera center in meters and viewing direction, [M, 6].
     along: np.ndarray  # Spline parameter [K + 1], in knots, at equal time steps.
