@@ -103,7 +103,8 @@ class Detector(Actor):
 def require_detector(config: DetectorConfig) -> None:
     """Check that the configured model can be used.
 
-    Offline runs call this before they start. A service starts without detections instead.
+    An offline run calls this function first, and does not start after an error. A live service
+    starts without detections instead.
 
     Raises:
         ConfigError: The model is unknown or unusable.

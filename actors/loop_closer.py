@@ -4,7 +4,7 @@ in   keyframe/new       Keyframe         Backlog(4)    a lost keyframe could nev
 in   detection/boxes    DetectionBoxes   Backlog(16)   object classes in every keyframe
 in   graph/correction   GraphCorrection  Latest(1)     has all poses, so the newest suffices
 out  loop/closure       LoopClosure                    each accepted candidate
-out  loop/candidate     LoopCandidate                  each candidate; the reason if it is rejected
+out  loop/candidate     LoopCandidate                  each candidate, with a reason if rejected
 
 The actor processes a keyframe when its detections have arrived. The detector publishes a message
 for every keyframe. The field `network` of this message is empty if the detector has no network or
@@ -52,7 +52,7 @@ log = logging.getLogger(__name__)
 # If more wait, the oldest is compared without its detections.
 MAX_PENDING_KEYFRAMES = 256
 # Number of newest keyframes for which the optimizer may not have published a pose yet. The tracker
-# keeps the poses of as many.
+# keeps the poses of the same number of keyframes.
 RECENT_KEYFRAMES = 32
 
 
@@ -320,7 +320,7 @@ class LoopCloser(Actor):
             "subgraphs": len(self.recognizer.subgraphs),
             "loops_accepted": self._accepted,
             "loops_rejected": self._refused,
-            # Keyframes for which no detections came.
+            # Keyframes for which no detections arrived.
             "keyframes_without_detections": self._without_boxes,
             "keyframes_repeated": self._repeated,
         }

@@ -1,6 +1,6 @@
 """Mapping with labelled 3D Gaussians and objects.
 
-in   keyframe/new          Keyframe             Lossless(8)        the map lacks a lost keyframe
+in   keyframe/new          Keyframe             Lossless(8)        the map would lack a lost one
 in   detection/boxes       DetectionBoxes       Lossless(8)        labels come from detections
 in   label/result          LabelResult          Lossless(8)        one result for each request
 in   graph/correction      GraphCorrection      Latest(1)          the newest has all poses
@@ -248,7 +248,7 @@ class Mapper(Actor):
     def _correct(self, message: GraphCorrection) -> Iterator[Output]:
         """Move the Gaussians with their anchor keyframes to the corrected poses.
 
-        The motions are rounded as in the message, so that the maps of subscribers stay equal.
+        The motions are rounded as in the message, so that map replicas stay equal to this map.
         """
         held = self._links.acknowledged(message.last_refinement)
         self._poses.correct(
@@ -277,9 +277,9 @@ class Mapper(Actor):
         return np.array(list(placed), np.int64)[shows].tolist()
 
     def _motion(self, keyframe: int) -> AnchorMotion:
-        """Return the motion that moves a keyframe's Gaussians to its current pose.
+        """Return the motion that moves a keyframe's Gaussians to the current pose of the keyframe.
 
-        It starts at the pose to which these Gaussians were last moved.
+        The motion starts at the pose to which these Gaussians were last moved.
         """
         T_map_gaussians = self._map.views.poses[keyframe]
         T_new_old = pose_to_message(self._poses[keyframe] @ se3.inverse(T_map_gaussians))

@@ -31,8 +31,8 @@ class MapperConfig:
     measured_keyframes: int = 64
     # Keyframes between two saved maps. After a crash, at most so many are mapped again.
     checkpoint_keyframes: int = 5
-    # Minimum motion of a keyframe by a correction that moves its Gaussians. A smaller motion is not
-    # visible: 0.1 px.
+    # Gaussians move with their anchor keyframe when a correction has moved it by more than this.
+    # Smaller motions, below 0.1 px, are not visible.
     motion_min_m: float = 2e-4
     motion_min_rad: float = 2e-4  # The same for rotations; equal to MapBuilderConfig.refined_rad.
     refit: LoopRefitConfig = field(default_factory=LoopRefitConfig)
@@ -46,9 +46,9 @@ class MapperConfig:
             raise ConfigError(named(self, *counts) + " must be at least 1.")
 
     def thread_count(self) -> int:
-        """Return the threads of the renderer while the camera moves."""
+        """Return the number of renderer threads while keyframes arrive."""
         return self.threads or max(1, (os.cpu_count() or 1) - 1)
 
     def idle_thread_count(self) -> int:
-        """Return the threads of the refit while no keyframe arrives: all cores by default."""
+        """Return the number of refit threads while no keyframe arrives: all cores by default."""
         return self.threads or os.cpu_count() or 1

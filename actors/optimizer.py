@@ -1,6 +1,6 @@
 """Optimization of the pose graph of keyframes and objects.
 
-in   keyframe/measurements  KeyframeMeasurements  Backlog(64)   relative to earlier keyframes
+in   keyframe/measurements  KeyframeMeasurements  Backlog(64)   poses relative to earlier keyframes
 in   keyframe/refinement    KeyframeRefinement    Backlog(64)   better relative-pose measurements
 in   loop/closure           LoopClosure           Backlog(64)   rare, and costly to detect
 in   object/observation     ObjectObservation     Backlog(64)   every observation adds information
@@ -56,8 +56,8 @@ from ldo_service.schemas.topics import (
 
 log = logging.getLogger(__name__)
 
-# Maximum number of messages of each input in memory. Messages are small, so the value is large, and
-# few reads take a backlog from the disk.
+# Maximum number of messages of each input in memory. Messages are small, so the value can be large,
+# and a backlog is sent from disk in few steps.
 WINDOW = 64
 
 
@@ -68,9 +68,10 @@ class OptimizerConfig:
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     landmarks: ObjectLandmarkConfig = field(default_factory=ObjectLandmarkConfig)
     uses_objects: bool = True  # False optimizes poses alone, to measure the benefit of landmarks.
-    # Maximum number of closures, and of observations, that wait for keyframes not received yet.
+    # Maximum number of closures that are stored until their keyframes arrive. The same maximum
+    # applies to observations.
     max_early: int = 512
-    # Number of newest keyframes whose intrinsics are kept; observations come a few keyframes late.
+    # Number of newest keyframes whose intrinsics are kept, for observations that arrive late.
     cameras: int = 64
 
     def __post_init__(self) -> None:
@@ -81,7 +82,7 @@ class OptimizerConfig:
 class Optimizer(Actor):
     """Actor that optimizes the pose graph.
 
-    No other actor decides the poses of keyframes in the map, or which submaps are merged.
+    It alone decides the poses of keyframes in the map and which submaps are merged.
     """
 
     name = "optimizer"
@@ -220,8 +221,8 @@ class Optimizer(Actor):
         known, T_odom_known = newest
         log.warning(
             "optimizer: reference keyframe of keyframe %d was never received; using odometry from "
-            "keyframe %d instead. No action needed; many of these mean lost messages (see input "
-            'gaps in "ldo doctor").',
+            "keyframe %d instead. No action needed; many such warnings mean lost messages (see "
+            'input gaps in "ldo doctor").',
             keyframe,
             known,
         )
@@ -286,7 +287,7 @@ class Optimizer(Actor):
     def _observe(self) -> None:
         """Pass the stored observations in known keyframes on to the landmarks.
 
-        They enter the pose graph when a later keyframe is added.
+        The observations enter the pose graph when a later keyframe is added.
         """
         later = []
         for seen in self._early_observations:

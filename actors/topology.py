@@ -100,7 +100,7 @@ def actor_spec(name: str) -> ActorSpec:
         if box.name == name:
             return box
     names = ", ".join(box.name for box in GRAPH)
-    raise ConfigError(f"there is no actor {name!r}; it must be one of {names}.")
+    raise ConfigError(f"there is no actor {name!r}. Choose one of {names}.")
 
 
 def make_actors(parameters: ActorParameters) -> list[Actor]:

@@ -2,7 +2,7 @@
 
 in   frame/rgbd       FrameRgbd        Latest(1)    a late frame is worth less than the next one
 in   graph/correction GraphCorrection  Latest(1)    has all poses, so the newest suffices
-in   odometry/prior   OdometryPrior    Latest(64)   0.3 s at 200 Hz: the time to track a frame;
+in   odometry/prior   OdometryPrior    Latest(64)   0.3 s at 200 Hz, the time to track a frame;
                                                     older poses may be dropped
 in   detection/boxes  DetectionBoxes   Latest(1)    dynamic objects are masked for tracking
 out  pose/tracked     TrackedPose                   one for every tracked frame
@@ -12,7 +12,7 @@ out  keyframe/measurements  KeyframeMeasurements    each keyframe without its im
 The actor converts messages, buffers the odometry prior and counts results. `Odometry.process`
 tracks a frame in one call. If `TrackerConfig.localize` names a finished run, a `Localizer` replaces
 the odometry. The localizer makes no keyframes, so the mapper and the optimizer are idle and the map
-does not change. Subscribers receive poses as from the odometry.
+does not change. Subscribers receive the same pose messages in both cases.
 """
 
 import logging
@@ -215,9 +215,9 @@ class Tracker(Actor):
         self._missed = 0 if result.has_prior else self._missed + 1
         if self._missed == MISSED_PRIOR_WARNING_COUNT:
             log.warning(
-                "tracker: %d frames in a row had no odometry/prior; its newest pose is %.3f s "
-                "older than the last frame. Check that it is still published, and that camera and "
-                "odometry use one clock.",
+                "tracker: %d frames in a row had no odometry/prior; the newest pose of the prior "
+                "is %.3f s older than the last frame. Check that odometry/prior is still "
+                "published, and that camera and odometry use one clock.",
                 self._missed, 1e-9 * (frame.stamp_ns - self._prior.poses[-1].stamp_ns),
             )  # fmt: skip
 
@@ -320,7 +320,7 @@ def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry
 
 
 def _make_calibration(config: TrackerConfig) -> SelfCalibration:
-    """Return a new self-calibration, or the finished one of the map of a finished run.
+    """Return a new self-calibration; for localization, the final one of the finished run.
 
     Raises:
         DataError: The folder of the run has no usable keyframes.json.
@@ -331,6 +331,6 @@ def _make_calibration(config: TrackerConfig) -> SelfCalibration:
 
 
 def _box(detection: Detection) -> Box:
-    """Convert a detection to a box with integer coordinates at pixel edges instead of centers."""
+    """Convert a detection to a box; its origin is a corner of the first pixel, not the center."""
     x0, y0, x1, y1 = (edge + 0.5 for edge in detection.box_px)
     return Box(detection.label, x0, y0, x1, y1)

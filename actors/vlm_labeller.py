@@ -2,7 +2,7 @@
 
 in   label/request   LabelRequest   Backlog(2)             one request waits, one is labelled
 in   label/add       AddLabel       Latest(32)             has priority, because a user waits
-out  label/result    LabelResult                           one for every request, with delay
+out  label/result    LabelResult                           one for every request, often late
 out  label/names     LabelNames                            one for every label/add
 
 The actor labels one region at a time. No other actor waits for it, however long a request takes.
@@ -42,7 +42,7 @@ class VlmLabellerConfig:
     model: str = ""  # Dual encoder: a name of `ldo models list`, or a folder; empty: none.
     url: str = ""  # OpenAI-compatible server, such as http://127.0.0.1:8000/v1; empty: none.
     # File with the names to choose from, one per line. Empty: a dual encoder uses its own names, or
-    # without own names the 80 classes of COCO. A server may then return any name.
+    # the 80 classes of COCO if it has none; a server may return any name.
     names: str = ""
     dual_encoder: DualEncoderConfig = field(default_factory=DualEncoderConfig)
     http: HttpConfig = field(default_factory=HttpConfig)
@@ -207,8 +207,8 @@ def labeller_from_config(config: VlmLabellerConfig) -> Labeller | None:
 def require_labeller(config: VlmLabellerConfig) -> None:
     """Check that the configured labeller can be used.
 
-    Offline runs call this before they start. A service starts without a labeller instead. A server
-    is contacted only with the first request.
+    An offline run calls this function first, and does not start after an error. A live service
+    starts without a labeller instead. The first label request is the first contact with a server.
 
     Raises:
         ConfigError: The labeller cannot be used.

@@ -77,7 +77,7 @@ def tracked_pose_message(
 
     Args:
         frame: The frame.
-        result: Its tracking result.
+        result: Tracking result of the frame.
         T_base_camera: Pose of the camera in the base frame of the robot, [4, 4].
     """
     keyframe = result.keyframe
@@ -110,13 +110,13 @@ def keyframe_message(
     keyframe: NewKeyframe,
     correction: CameraCorrection | None = None,
 ) -> Keyframe:
-    """Return the message of the keyframe that was made of a tracked frame.
+    """Return the message of a keyframe.
 
     Args:
-        frame: The frame as it was tracked.
-        result: Its pose.
-        keyframe: The keyframe.
-        correction: Correction of the camera that was applied to the frame; None for none.
+        frame: The frame of the keyframe, corrected by `correction`.
+        result: Tracking result of the frame.
+        keyframe: Keyframe that the tracker made of the frame.
+        correction: Correction of the camera that was applied to the frame; None if there was none.
     """
     used = CameraCorrection() if correction is None else correction
     merge = keyframe.submap_measurement

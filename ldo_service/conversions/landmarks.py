@@ -1,7 +1,7 @@
-"""Conversion of messages of object observations to landmark observations of the pose graph.
+"""Conversion of object observations from messages to landmark observations of the pose graph.
 
-The conversion has a module of its own, because the pose graph imports gtsam. In the module
-`objects`, it would make every actor import gtsam.
+This module is separate from `objects`, because it imports gtsam with the pose graph. Most actors
+need `objects` without gtsam.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from .objects import dense_distribution
 def landmark_observation_from_message(
     message: ObjectObservation, camera: Camera, class_index: Callable[[str], int]
 ) -> LandmarkObservation:
-    """Convert the observation of an object to that of a landmark of the pose graph.
+    """Convert the message of an object observation to a landmark observation of the pose graph.
 
     Args:
         message: Observation of the object in a keyframe.

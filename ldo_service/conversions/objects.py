@@ -113,8 +113,8 @@ def dense_distribution(
     """Return the distribution of a message as a vector [C] that sums to 1.
 
     Args:
-        distribution: Pairs of label and probability. If their sum is below 1, the rest is assigned
-            to the class `other`.
+        distribution: Pairs of label and probability. If the probabilities sum to less than 1, the
+            rest is assigned to the class `other`.
         index: Function from a label to the index of its class.
         classes: Number of classes C.
     """
@@ -125,7 +125,7 @@ def dense_distribution(
 
 
 def map_objects(table: np.ndarray, names: Sequence[str]) -> tuple[MapObject, ...]:
-    """Convert a table of K objects (see `semantics.object_landmarks`) to messages, in its order.
+    """Convert a table of K objects (see `semantics.object_landmarks`) to K messages in this order.
 
     Args:
         table: The objects, [K] records.
@@ -203,8 +203,8 @@ def scale_boxes(detections: Sequence[Detection], times: float) -> list[MovableBo
         times: Size of the original image divided by the size of the smaller one.
 
     Returns:
-        Boxes in pixels of the smaller image, with the origin at the corner of its first pixel
-        instead of the center.
+        Boxes in pixels of the smaller image. Their origin is the corner of the first pixel, while
+        the origin of the detections is the center of the first pixel.
     """
     return [
         MovableBox(one.label, *((edge + 0.5) / times for edge in one.box_px)) for one in detections

@@ -8,12 +8,12 @@ from ldo_service.schemas import LabelRequest, decode, encode
 # Maximum number of waiting requests, some 10 kB each. It equals the maximum number of requests that
 # the map keeps pending, three for each of 32 regions.
 MAX_WAITING = 96
-# Maximum number of regions whose shown surface is stored, 16 bytes each.
+# Maximum number of regions for which the largest shown surface is stored, 16 bytes each.
 MAX_REGIONS = 4096
 
 
 class WaitingRequest(NamedTuple):
-    """Label request, and the area of its region's surface that the view shows, square meters."""
+    """Label request, and the area of the region's surface that its view shows, square meters."""
 
     request: LabelRequest
     surface_m2: float
@@ -22,10 +22,10 @@ class WaitingRequest(NamedTuple):
 class LabelRequestQueue:
     """Queue of label requests, at most one for each region.
 
-    A labeller that has room for all waiting requests gets them in order. A slower labeller gets the
-    requests with the most new surface: the area that the view shows, minus the largest area that an
-    earlier request of the region showed. The rate of requests therefore follows the speed of the
-    labeller, and large objects get their label first.
+    A labeller that has room for all waiting requests gets them in order. A slower labeller first
+    gets the requests with the most new surface: the area that the view of the request shows, minus
+    the largest area that an earlier request of the same region showed. The rate of requests
+    therefore follows the speed of the labeller, and large objects get their label first.
     """
 
     def __init__(self) -> None:
@@ -37,10 +37,10 @@ class LabelRequestQueue:
         return len(self._waiting)
 
     def add(self, request: LabelRequest, surface_m2: float) -> list[LabelRequest]:
-        """Add a request, and return the requests that it displaces from the queue.
+        """Add a request, and return the requests that are dropped from the queue.
 
-        The new request replaces an earlier one of its region. If the queue is full, the request
-        with the least new surface is displaced.
+        The new request replaces an earlier one of the same region. If the queue is then too long,
+        the request with the least new surface is dropped.
 
         Args:
             request: Label request of a region.

@@ -28,8 +28,8 @@ from ldo_service.semantics.objects import Objects
 
 from .messages import NO_GAUSSIANS, NO_IDS, gaussians_message, rechunk, split_changes
 
-# Number that a restored mapper adds to the version in its checkpoint. It must not reuse a version
-# that replicas may have, and publishes fewer versions than this number between two checkpoints.
+# A restored mapper adds this number to the map version in its checkpoint, so that it does not reuse
+# a version that replicas may have. Between two checkpoints, it publishes fewer versions.
 VERSIONS_IN_A_CHECKPOINT = 1 << 20
 
 
@@ -159,7 +159,7 @@ class MapPublisher:
 
         Args:
             now: Context of the message.
-            motions: Motions of anchor keyframes, with which their Gaussians move.
+            motions: Motions of anchor keyframes; the Gaussians move with their anchor keyframe.
             removed: Ids of the removed Gaussians, [N] int64.
             changed: Gaussians that replace published ones with the same ids.
             added: New Gaussians.

@@ -26,7 +26,7 @@ class RelativeMeasurements:
 
     def __init__(self, poses: KeyframePoses, recent: int) -> None:
         self._poses, self._most_recent = poses, recent
-        # Information by keyframe, then by reference.
+        # Information matrix by keyframe and by reference keyframe.
         self._recent: dict[int, dict[int, Matrix6]] = {}
         self._older = RecordTable(LINK)
         self._refinements = 0  # Number of published refinements.
@@ -101,7 +101,7 @@ class RelativeMeasurements:
         )
 
     def acknowledged(self, refinements: int) -> KeysView[int]:
-        """Mark refinements as included in a pose correction, and return the remaining keyframes.
+        """Delete the refinements that a pose correction includes; return the keyframes of the rest.
 
         Args:
             refinements: Number of the last refinement message that the correction includes.

@@ -9,7 +9,7 @@ from ldo_service.schemas import MapDelta, MapSnapshot
 
 from .messages import piece_of
 
-NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)  # Gains and biases of a camera, [2, 3].
+NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)  # Default gains and biases, [2, 3].
 # A bounded replica is reduced to its limit when its size exceeds the limit by this factor.
 SLACK = 1.25
 

@@ -1,1 +1,1 @@
-"""Recordings of a service: the inputs and outputs of each actor on disk, and their replay."""
+"""Recordings of a service, with the inputs of each actor, and their replay."""

@@ -110,8 +110,8 @@ class FileArchive:
         for name, expected in checksums.items():
             if not (PATH.fullmatch(name) and CHECKSUM.fullmatch(expected)):
                 raise DataError(
-                    f"{self._recording} names {name!r} with checksum {expected!r} as a file of its "
-                    "actor, but a path such as images/1.keyframe and 8 hexadecimal digits are "
+                    f"{self._recording} lists the file {name!r} with checksum {expected!r}, but a "
+                    "path such as images/1.keyframe and a checksum of 8 hexadecimal digits are "
                     "expected. Copy the recording again, or make a new one."
                 )
             kept = self._path(name, expected)
@@ -156,7 +156,7 @@ class FileArchive:
         if size_gb > config.max_gb:
             raise OSError(
                 errno.EFBIG,
-                f"with {1e-9 * added_bytes:.3g} GB of files the recording would have "
+                f"these files have {1e-9 * added_bytes:.3g} GB, and would enlarge the recording to "
                 f"{size_gb:.3g} GB, more than recording.max_gb={config.max_gb:g}",
             )
 

@@ -1,9 +1,9 @@
 """MCAP files of a recording: written message by message, and indexed for reading.
 
-Records are not chunked, because writing chunks costs five times as much. If a killed process or a
-full disk cuts off a file, the file is readable up to its last whole record. `McapIndex` accepts
-such a file, unlike the readers of the library `mcap`. The index does not need the summary at the
-end of the file, and reads message bodies from the disk only on request.
+Records are not grouped into chunks, because writing chunks takes five times as long. If a killed
+process or a full disk cuts off a file, the file is readable up to its last whole record.
+`McapIndex` accepts such a file, unlike the readers of the library `mcap`. The index does not need
+the summary at the end of the file, and reads message bodies from the disk only on request.
 Format: https://mcap.dev/spec
 """
 
@@ -144,9 +144,9 @@ def require_version(index: McapIndex) -> None:
     version = index.metadata.get(ABOUT, {}).get("version", "1")
     if version != str(RECORDING_VERSION):
         raise DataError(
-            f"{index.path} has version={version}, but must have version={RECORDING_VERSION} to be "
-            "replayed. Another version of the service recorded it. Replay it with that version, or "
-            "give it to `ldo run` as SOURCE, which reads its camera frames."
+            f"{index.path} has recording version {version}, but this service replays only version "
+            f"{RECORDING_VERSION}. Replay the file with the version of the service that recorded "
+            "it, or give it to `ldo run` as SOURCE to use its camera frames."
         )
 
 
@@ -176,7 +176,7 @@ def _read_chunk(file: BinaryIO) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class RecordConfig:
-    """Limits of a recording. A camera with 640x480 at 30 Hz needs 100 MB/s."""
+    """Limits of a recording, which grows by 100 MB/s with a camera of 640x480 at 30 Hz."""
 
     max_gb: float = 50.0  # Size of the recording's folder at which recording stops.
     # Free disk space below which recording stops, for other files such as the actors' states.
@@ -268,7 +268,7 @@ class RecordingFile:
         return self._channels[topic]
 
     def is_over_limit(self) -> bool:
-        """Return whether the folder exceeds `max_gb` or the disk has less than `min_free_gb`.
+        """Return whether the folder exceeds `max_gb`, or less than `min_free_gb` of disk is free.
 
         The sizes are checked after every `CHECK_EVERY_BYTES`; between checks the result is False.
         """

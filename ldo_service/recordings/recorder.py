@@ -146,7 +146,7 @@ class Recorder(Journal):
         """Record a finished step, unless its input was dropped.
 
         Args:
-            kind: What the actor did, and whether it succeeded.
+            kind: Outcome of the step.
             situation: Credits and backlog that the actor had during the step.
             produced: Outputs of the step.
             error: Error of a failed step; "" if it succeeded.

@@ -82,7 +82,7 @@ class JournalFile:
         """
         if step.taken not in self._by_number:
             raise DataError(
-                f"{self.path}: the message of step {step.step} is missing. Copy the recording "
+                f"{self.path}: the input of step {step.step} is missing. Copy the recording "
                 "again, or make a new one."
             )
         return self.body(self._by_number[step.taken])

@@ -1,8 +1,8 @@
 """Replay of a recorded actor with the same inputs, flow status and restarts.
 
 The outputs must have the digests of the recording. A step that failed when it was recorded had no
-effect on the actor's state. If such a step succeeds in the replay, the replay therefore continues.
-It counts the steps that fail again.
+effect on the actor's state. The replay therefore continues even if such a step succeeds now, and
+counts the steps that fail again.
 """
 
 from collections import Counter
@@ -145,7 +145,7 @@ class ReplaySession:
         taken = self._file.messages
         if not taken or (self._last and self._last.taken == taken[-1].number):
             return ""
-        return f" while it handled {taken[-1].topic} (stamp {taken[-1].stamp_ns} ns)"
+        return f" while the actor handled {taken[-1].topic} (stamp {taken[-1].stamp_ns} ns)"
 
     def _start(self, start: Started) -> None:
         self._replayed.starts += 1

@@ -39,9 +39,9 @@ class Backlog(Lossless):
     """Policy of a lossless input for which the producer never waits.
 
     The producer stores on disk all messages that the consumer has not handled, up to
-    `supervision.backlog_mb`. A slow, stopped or dead consumer therefore delays no other actor. When
-    the consumer continues, it receives every message in order. `window` bounds only the consumer's
-    queue in memory.
+    `supervision.backlog_mb`; beyond this size, it drops the oldest ones. A slow, stopped or dead
+    consumer therefore delays no other actor. When the consumer continues, it receives the stored
+    messages in order. `window` bounds only the consumer's queue in memory.
     """
 
     def __str__(self) -> str:
@@ -52,15 +52,16 @@ class Backlog(Lossless):
 class Latest:
     """Policy of an input that queues the newest messages; older ones are dropped and counted."""
 
-    depth: int = 1  # Maximum number of queued messages; with `per_key`, for each key.
+    depth: int = 1  # Maximum number of messages in a queue.
     per_key: bool = False  # Keep one queue for each value of the message field `Topic.key`.
-    # Maximum number of queues; a new key beyond it drops the queue with the oldest message.
+    # Maximum number of queues. If a new key exceeds it, the queue with the oldest message is
+    # dropped.
     max_keys: int = 32
 
     def __post_init__(self) -> None:
         if self.depth < 1 or self.max_keys < 1:
             raise ConfigError(
-                f"Latest.depth={self.depth}, Latest.max_keys={self.max_keys} must be at least 1."
+                f"Latest.depth={self.depth} and Latest.max_keys={self.max_keys} must be at least 1."
             )
 
     def __str__(self) -> str:
@@ -114,8 +115,8 @@ class FlowStatus:
 class Actor:
     """Unit of computation that handles messages.
 
-    A step is the handling of one message. Before each step, the stage, which is the runtime around
-    the actor, sets `situation` to the current credits and backlogs.
+    A step is the handling of one message. The stage is the runtime around the actor. Before each
+    step, it sets `situation` to the current credits and backlogs.
     """
 
     name: ClassVar[str]
@@ -141,7 +142,7 @@ class Actor:
     def has_credit(self, topic: Topic) -> bool:
         """Return whether a message of the topic may be sent without waiting.
 
-        The result is always True for an output that is not nonblocking.
+        The result is always True for an output without `Out.is_nonblocking`.
         """
         return self.situation.credits.get(topic, UNLIMITED) > 0
 
@@ -189,8 +190,7 @@ class Actor:
         """Return the complete state, including changes that `snapshot` may omit.
 
         The call may take seconds. The stage calls this method for the command `save`, after
-        `on_restored` and `on_stop`, and when its write-ahead log is full. This log has the inputs
-        since the last changed state.
+        `on_restored` and `on_stop`, and when its write-ahead log of inputs is full.
         """
         return self.snapshot()
 

@@ -64,7 +64,7 @@ def finish_order(actors: Iterable[T]) -> list[T]:
     The final messages of an actor may cause new inputs of other actors, directly or through actors
     in between. For example, the last loop closure causes a correction of the map. An actor with
     final messages therefore finishes after the actors whose final messages reach it, and after the
-    actors in between. There is no such rule for two actors whose final messages reach each other.
+    actors in between. The rule does not apply to two actors whose final messages reach each other.
 
     Args:
         actors: The actors, producers first.
@@ -120,7 +120,8 @@ def producers(actors: Iterable[HasPorts]) -> dict[str, str]:
             if port.topic.name in makers:
                 raise ConfigError(
                     f"topic {port.topic.name} has two producers, {makers[port.topic.name]} and "
-                    f"{actor.name}; it must have one. Remove it from the outputs of one actor."
+                    f"{actor.name}, but may have only one. Remove the topic from the outputs of "
+                    "one of these actors."
                 )
             makers[port.topic.name] = actor.name
     return makers
@@ -136,7 +137,7 @@ def lossless_consumers(actors: Iterable[HasPorts], topic_name: str) -> frozenset
 
 
 def consumers_with_backlog(actors: Iterable[HasPorts], topic_name: str) -> frozenset[str]:
-    """Return the names of the lossless consumers for which the producer of a topic never waits."""
+    """Return the names of the consumers of a topic that have policy `Backlog`."""
     return frozenset(
         actor.name
         for actor in actors

@@ -1,4 +1,4 @@
-"""Lossless consumers of a topic, as its producer tracks them."""
+"""Lossless consumers of a topic, and what the producer of the topic knows of them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,9 +10,12 @@ from .actor import UNLIMITED
 
 @dataclass
 class Consumer:
-    """State of one consumer of a topic, which the producer updates from its messages."""
+    """State of one lossless consumer, as the producer of the topic knows it.
 
-    # True: the producer waits for the consumer's credit. False: the consumer has a backlog.
+    The producer updates the state when a hello or a credit message of the consumer arrives.
+    """
+
+    # True: the producer waits for the consumer's credit. False: the consumer has policy Backlog.
     is_awaited: bool = True
     alive: bool = False  # The consumer is connected.
     handled: int = 0  # Offset of the first message that the consumer has not handled.
@@ -22,8 +25,8 @@ class Consumer:
     repeated_at_s: float = 0.0  # Event-loop time of the last retransmission.
     # Event-loop time at which the window became full; None while it has room.
     shut_since_s: float | None = None
-    # Offset after the last message sent to a consumer with a backlog, and the event-loop time at
-    # which it was sent.
+    # Offset after the last message that was sent to a consumer with policy Backlog, and the
+    # event-loop time at which it was sent. Unused for other consumers.
     pushed: int = 0
     pushed_at_s: float = 0.0
 
@@ -31,12 +34,17 @@ class Consumer:
 class Consumers:
     """Connected and required consumers of a topic, and the credit that they grant together.
 
-    Consumers in `expected` are required: they must not miss a message. The producer therefore has
-    no credit while one of them is disconnected. Other consumers limit the credit only while they
-    are connected. The argument `seq` of all methods is the offset of the producer's next message.
+    Consumers in `expected` are required: they must not miss a message. Each consumer has one of two
+    policies:
 
-    The producer never waits for a consumer with a backlog, required or not. The credit of such a
-    consumer only decides how many messages of the backlog the producer sends next.
+    - `Lossless`: The producer waits for credit of the consumer. It has no credit while a required
+      consumer is disconnected. A consumer that is not required limits the credit only while it is
+      connected.
+    - `Backlog`: The producer never waits for the consumer, and stores its unhandled messages on
+      disk: the backlog. The credit of the consumer only decides how many messages of the backlog
+      the producer sends next.
+
+    The argument `seq` of all methods is the offset of the producer's next message.
     """
 
     def __init__(
@@ -47,7 +55,7 @@ class Consumers:
         Args:
             expected: Names of the required consumers.
             handled: Each required consumer has handled every message before this offset.
-            with_backlog: Names of the consumers for which the producer does not wait.
+            with_backlog: Names of the consumers with policy `Backlog`.
         """
         self.with_backlog = frozenset(with_backlog)
         self._known = {
@@ -62,7 +70,7 @@ class Consumers:
 
     @property
     def has_backlogs_only(self) -> bool:
-        """True if there are required consumers, and all of them have a backlog."""
+        """True if there are required consumers, and all of them have policy `Backlog`."""
         return bool(self.expected) and self.expected <= self.with_backlog
 
     def __contains__(self, name: str) -> bool:
@@ -78,26 +86,30 @@ class Consumers:
         return max(0, min(limits, default=UNLIMITED))
 
     def window_room(self, seq: int) -> int:
-        """Return the number of messages that fit into the windows of all consumers.
+        """Return the number of messages for which every consumer has room in its window.
 
-        This includes consumers with a backlog. The result is 0 without consumers.
+        Consumers with policy `Backlog` count too. The result is 0 if a consumer is disconnected, or
+        if there are no consumers.
         """
         limits = [c.limit - seq if c.alive else 0 for c in self._known.values()]
         return max(0, min(limits, default=0))
 
     def handled(self, seq: int) -> int:
-        """Return the offset of the first message not handled by all consumers, at most `seq`."""
+        """Return the offset of the first message that at least one consumer has not handled.
+
+        The result is `seq` if there are no consumers.
+        """
         return min((c.handled for c in self._known.values()), default=seq)
 
     def all_received(self, seq: int, *, awaited_only: bool = False) -> bool:
         """Return whether every consumer has received every message before `seq`.
 
-        A consumer with a backlog only needs the messages for which its window has room. The other
-        messages stay in the backlog.
+        A connected consumer with policy `Backlog` only needs the messages for which its window has
+        room. The other messages stay in the backlog.
 
         Args:
             seq: Offset of the next message.
-            awaited_only: Ignore the consumers with a backlog.
+            awaited_only: Ignore the consumers with policy `Backlog`.
         """
         awaited = [c for c in self._known.values() if c.is_awaited]
         others = [c for c in self._known.values() if not c.is_awaited and c.alive]
@@ -106,7 +118,10 @@ class Consumers:
         return has_awaited and has_others
 
     def behind(self, seq: int) -> dict[str, int]:
-        """Return the number of unhandled messages of each consumer with a backlog, by name."""
+        """Return the number of unhandled messages of each consumer, by name.
+
+        Only consumers with policy `Backlog` are included.
+        """
         return {name: seq - c.handled for name, c in self._known.items() if not c.is_awaited}
 
     def next_seq_by_consumer(self) -> dict[str, int]:
@@ -117,7 +132,7 @@ class Consumers:
         """Connect a consumer that sent a hello.
 
         A new consumer starts at message `seq`. A known consumer receives all messages again that it
-        has not handled. With `has_backlog`, the producer does not wait for the consumer.
+        has not handled. `has_backlog` is True for a consumer with policy `Backlog`.
         """
         self._evicted.pop(name, None)
         consumer = self._known.setdefault(name, Consumer(handled=seq))
@@ -128,16 +143,16 @@ class Consumers:
     def note_sent(self, seq: int, now_s: float) -> None:
         """Note that message `seq` was published to all consumers at event-loop time `now_s`.
 
-        For a consumer with a backlog, the message counts as sent only if all earlier messages were
-        sent to it and its window has room. Otherwise the consumer rejects the message, and the
-        producer sends it from the backlog later.
+        For a consumer with policy `Backlog`, the message counts as sent only if the window of the
+        consumer has room and all earlier messages were sent to it. Otherwise the consumer rejects
+        the message, and the producer sends the message from the backlog later.
         """
         for consumer in self._known.values():
             if not consumer.is_awaited and consumer.pushed == seq < consumer.limit:
                 consumer.pushed, consumer.pushed_at_s = seq + 1, now_s
 
     def next_of_backlog(self, name: str, seq: int, now_s: float, repeat_after_s: float) -> range:
-        """Return the offsets of the messages to send now to a consumer with a backlog.
+        """Return the offsets of the messages to send now to a consumer with policy `Backlog`.
 
         These messages then count as sent.
 
@@ -165,7 +180,7 @@ class Consumers:
                 offset.
 
         Returns:
-            True if some consumer misses messages and now continues at `first`.
+            True if a consumer now continues at `first`, and therefore misses messages.
         """
         late = [c for c in self._known.values() if since <= c.handled < first]
         for consumer in late:
@@ -178,7 +193,7 @@ class Consumers:
         consumer = self._known[grant.consumer]
         consumer.alive = True
         consumer.handled = max(consumer.handled, grant.handled)
-        consumer.arrived = grant.arrived  # May decrease: a restarted consumer may have fewer.
+        consumer.arrived = grant.arrived  # May decrease: the consumer may have restarted.
         if grant.limit > consumer.limit or grant.waits_for_disk:
             consumer.limit, consumer.shut_since_s = max(grant.limit, consumer.limit), None
         return consumer
@@ -186,11 +201,11 @@ class Consumers:
     def leave(self, name: str) -> bool:
         """Mark a consumer as disconnected.
 
-        The producer forgets it, unless it is required. A required consumer without a backlog then
-        blocks the producer until it connects again.
+        The producer forgets a consumer that is not required. If a required consumer with policy
+        `Lossless` disconnects, the producer waits until this consumer connects again.
 
         Returns:
-            True if the producer now waits until the consumer connects again.
+            True if the producer now waits for the consumer.
         """
         consumer = self._known[name]
         consumer.alive, consumer.shut_since_s = False, None
@@ -201,7 +216,7 @@ class Consumers:
     def stalled(self, now_s: float, patience_s: float, seq: int) -> list[str]:
         """Return the names of the consumers whose window has been full for over `patience_s`.
 
-        Only connected consumers without a backlog count.
+        Only connected consumers with policy `Lossless` count.
         """
         names: list[str] = []
         for name, consumer in self._known.items():
@@ -218,8 +233,9 @@ class Consumers:
         self.leave(name)
 
     def is_still_stuck(self, grant: Credit) -> bool:
-        """Return whether the sender of a credit message was evicted and handled no message since.
+        """Return whether an evicted consumer sent this credit message without having made progress.
 
-        Credit messages alone are no progress, because a consumer repeats them with each heartbeat.
+        Progress is a message handled since the eviction. Credit messages alone are no progress,
+        because a consumer repeats them with each heartbeat.
         """
         return grant.handled <= self._evicted.get(grant.consumer, -1)

@@ -5,7 +5,7 @@ The stage saves these parts in one write with the actor's state:
 - `stage.offsets`: Offset of the next message on each lossless topic.
 - `stage.outbox T N`: Message N of topic T, which a required consumer has not handled.
 - `stage.wal N`: Entry N of the write-ahead log, only for an actor with `Actor.lags`. Such an actor
-  saves the state of an earlier step. The log has the inputs that it has handled since that step.
+  saves the state of an earlier step. The log has the inputs that the actor has handled since then.
 
 A restored stage therefore continues after the last saved step. It does not take the input of that
 step again. It sends the outputs of that step again until all required consumers have handled them.
@@ -28,7 +28,7 @@ from .step import produce
 log = logging.getLogger(__name__)
 
 OFFSETS, OUTBOX, WAL = "stage.offsets", "stage.outbox", "stage.wal"
-# Maximum number of messages that a restored lagging actor handles again: some seconds of work.
+# Maximum number of messages that a restored actor with `lags` handles again: some seconds of work.
 MAX_WAL_ENTRIES = 64
 
 
@@ -51,7 +51,7 @@ class LoggedInput(NamedTuple):
         return cls(topic, bytes(body), credits, backlog)
 
     def situation(self, actor: Actor) -> FlowStatus:
-        """Return the flow status of the step, with the topics of the actor's ports."""
+        """Return the flow status of the step, by topic instead of topic name."""
         return FlowStatus(
             credits=counts_by_topic(self.credits, (out.topic for out in actor.outputs)),
             backlog=counts_by_topic(self.backlog, (port.topic for port in actor.inputs)),
@@ -70,7 +70,7 @@ class RestoredState:
 
     @classmethod
     def of(cls, state: State | None) -> "RestoredState":
-        """Split a state that the store has loaded; None or an empty state: nothing was saved."""
+        """Split a state that the store has loaded; it is None or empty if nothing was saved."""
         if not state:
             return cls(is_none=True)
         links = state.get(OFFSETS, {"in": {}, "out": {}})  # Absent without lossless links.
@@ -122,7 +122,7 @@ class DeliveryState:
             whole: True if `own` is a checkpoint: it includes the last step and needs no log.
 
         Returns:
-            Parts to save. A new state clears the write-ahead log.
+            Parts to save. If the actor's state is new, the write-ahead log is empty.
         """
         is_new = own.keys() != self._own.keys() or any(own[p] is not self._own[p] for p in own)
         if is_new or whole:
@@ -158,8 +158,8 @@ def restore_actor(actor: Actor, past: RestoredState, make: Callable[[], Actor]) 
     """Restore a new actor to the end of the last saved step.
 
     The actor handles the logged inputs again to rebuild its state. The resulting outputs are
-    discarded, because the outbox has them already. If an input raises an exception, the function
-    starts again with another new actor and without this input.
+    discarded, because the outbox has them already. If the handling of an input raises an exception,
+    the function starts again with another new actor and without this input.
 
     Args:
         actor: A new actor.

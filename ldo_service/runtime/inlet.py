@@ -18,7 +18,7 @@ from .actor import Backlog, In, Latest, Lossless
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Delivery:
-    """Message as it arrived, not decoded."""
+    """Message as it arrived, with its header; the body is not decoded."""
 
     port: In
     header: Header
@@ -27,7 +27,7 @@ class Delivery:
 
 @dataclass
 class Inlet:
-    """Input with policy Latest; its counters become the fields of `InputCount`."""
+    """Queue and counters of an input with policy `Latest`."""
 
     port: In
     waiting: deque[Delivery] = field(default_factory=deque)
@@ -45,11 +45,11 @@ class Inlet:
             self.numbers.observe(header)
 
     def accept(self, header: Header) -> bool:  # noqa: ARG002
-        """Return whether to queue the message."""
+        """Return whether to queue the message with this header."""
         return True
 
     def offer(self, delivery: Delivery) -> list[Delivery]:
-        """Queue a delivery and return the deliveries that it displaced."""
+        """Queue a delivery, and return the older deliveries that are dropped for it."""
         self.waiting.append(delivery)
         displaced = self._overflow(delivery)
         for old in displaced:
@@ -102,7 +102,7 @@ class Inlet:
 
 @dataclass
 class LosslessInlet(Inlet):
-    """Consumer end of a lossless link: message order, gaps and credits."""
+    """Lossless input, which checks the order of messages, reports gaps and grants credit."""
 
     epoch: int = 0  # Epoch of the connected producer; 0 before the first hello.
     handled: int = 0  # Offset of the first message that was not handled.
@@ -133,7 +133,7 @@ class LosslessInlet(Inlet):
             return 0
         lost = start - self.arrived if known else 0
         self.numbers.lost += lost
-        if not (known and self.waiting):  # Otherwise `done` advances it with the queue.
+        if not (known and self.waiting):  # Otherwise `done` advances `handled`.
             self.handled = start
         self.epoch, self.arrived = epoch, start
         self.gap = True  # Request the messages that were sent before the hello.
@@ -148,14 +148,14 @@ class LosslessInlet(Inlet):
             return False
         self.gap = header.seq > self.arrived or len(self.waiting) >= self.window
         if self.gap:
-            # A producer with a backlog also publishes while the window is full. This is no gap.
+            # The producer of a Backlog input also publishes while the window is full.
             self.gaps += not isinstance(self.port.policy, Backlog)
             return False
         self.arrived += 1
         return True
 
     def discard_backlog(self) -> None:
-        """Keep the queued messages of a paused stage; a full window makes the producer wait."""
+        """Keep the queued messages of a paused stage, because no message may be lost."""
 
     def reset(self) -> None:
         """Clear the queue and the connection; the producer must send its hello again."""

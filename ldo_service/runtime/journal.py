@@ -7,8 +7,9 @@
 | `journal/gap`   | `Gap`        | Entries are missing from here on.                               |
 
 Inputs are recorded between these entries, each on the channel of its topic, with its encoded bytes.
-Steps are numbered from 0 in each file. The outputs of an actor depend on nothing else, so
-`ldo_service.recordings.replay` can repeat and verify every step.
+Steps are numbered from 0 in each file. The outputs of an actor depend only on its state at the
+start, its inputs and the flow status. `ldo_service.recordings.replay` can therefore repeat and
+verify every step.
 """
 
 import asyncio
@@ -55,7 +56,7 @@ class Started(msgspec.Struct, frozen=True, kw_only=True):
     """Start of a new or restored actor."""
 
     step: int  # Number of the next step.
-    state: dict[str, bytes] | None  # Parts as `state_store` encodes them; None: a new actor.
+    state: dict[str, bytes] | None  # Parts as `state_codec` encodes them; None: a new actor.
     # CRC-32 of each file that the state refers to, by its path in the actor's folder. None if the
     # actor has no such files.
     files: dict[str, str] | None = None
@@ -123,7 +124,7 @@ def digest_of(outputs: Iterable[Output]) -> str:
 
 
 class Journal:
-    """Receiver of journal entries that discards them; `Recorder` writes them to a file."""
+    """Receiver of journal entries; this class discards them, and `Recorder` writes a file."""
 
     def record_files(self) -> None:
         """Record the files that a saved state refers to; called before each start of the actor."""
@@ -171,5 +172,7 @@ async def close_journal(journal: Journal, actor: str) -> None:
     if not done:
         written.cancel()
         log.error(
-            "%s: the end of its recording was not written in time; a replay stops earlier.", actor
+            "%s: the last entries of its recording were not written in time; a replay ends before "
+            "them.",
+            actor,
         )

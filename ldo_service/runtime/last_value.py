@@ -1,4 +1,4 @@
-"""Last value of a state topic, which answers queries of late subscribers."""
+"""Last value of a state topic, which is the reply to queries of late subscribers."""
 
 from ldo_service.schemas import Message
 
@@ -20,6 +20,6 @@ class LastValue:
             self.parts = tuple(self._incomplete)
 
     def clear(self) -> None:
-        """Forget the value."""
+        """Delete the value."""
         self._incomplete.clear()
         self.parts = ()

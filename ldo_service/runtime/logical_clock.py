@@ -1,12 +1,13 @@
 """Offline run of the whole actor graph, on a logical clock that ticks once per frame.
 
-The poses of an odometry prior are delivered in the ticks of the frames. Before each frame come all
-poses up to the first one that is not older than the frame.
+A tick delivers one frame and, before it, poses of the odometry prior: all poses that are older than
+the frame and were not delivered yet, and the first pose that is not older.
 
 Each actor has a configured latency in ticks. With a latency of n, consumers receive the outputs of
 a step n ticks after its input, however long the step takes. Actors compute in parallel, each in its
-own thread. The clock waits for a thread only at the tick of its output. The result therefore
-depends only on the input and the latencies, not on the machine or its load. No message is dropped.
+own thread. The clock waits for a step only at the tick in which its outputs are delivered. The
+result therefore depends only on the input and the latencies, not on the machine or its load. No
+message is dropped.
 """
 
 import heapq
@@ -42,7 +43,7 @@ class PendingOutput:
 
     tick: int  # Tick at which the outputs are delivered.
     rank: int  # Position of the actor in the graph.
-    order: int  # Number of the step over all actors.
+    order: int  # Number of the step, counted over all actors.
     answer: Future[StepOutput] = field(compare=False)
 
 
@@ -67,7 +68,7 @@ class ActorThread:
 
     def _step(self, message: Message) -> StepOutput:
         answer = _timed(self.actor.handle(message))
-        if answer.messages or not self.actor.outputs:  # Steps without outputs bias the timing.
+        if answer.messages or not self.actor.outputs:  # Other steps only stored their input.
             self.step_ms.append(answer.step_ms)
         return answer
 
@@ -79,7 +80,7 @@ def _timed(messages: Iterator[Message]) -> StepOutput:
 
 
 class LogicalClock:
-    """Runner of an actor graph on a logical clock, for one source or several in sequence.
+    """Runner of an actor graph on a logical clock, for one source or a sequence of sources.
 
     Example:
         with LogicalClock(actors, latencies) as clock:

@@ -37,8 +37,8 @@ class Mailbox:
     """Queue of all inputs of an actor.
 
     Any thread may add messages; only the event loop takes them. A delivery counts as handled when
-    `done` is called. If the actor's process is killed before that, the restored actor receives the
-    message again, unless the input has policy Latest.
+    `done` is called. If the actor's process is killed before this call, the restored actor receives
+    the message again, unless the input has policy Latest.
     """
 
     def __init__(
@@ -152,9 +152,10 @@ class Mailbox:
             self._ask_for_grants()
         if lost:
             log.error(
-                "%s: lost %d messages of %s, which their producer no longer has: this actor was "
-                "evicted as too slow, its backlog was full, or the disk lost them. Reduce its "
-                "load, or raise supervision.evict_after_s or supervision.backlog_mb.",
+                "%s: lost %d messages of %s, because the producer no longer has these messages. "
+                "Either this actor was evicted as too slow, its backlog was full, or a disk error "
+                "destroyed the messages. Reduce the load of this actor, or raise "
+                "supervision.evict_after_s or supervision.backlog_mb.",
                 self._consumer, lost, inlet.port.topic.name,
             )  # fmt: skip
 
@@ -264,8 +265,8 @@ class Mailbox:
     def send_credits(self) -> None:
         """Send the current credit of every lossless input to its producer.
 
-        The stage repeats this with each heartbeat, because a credit message may be lost. Before a
-        producer has sent its hello, the mailbox sends it a hello instead of a credit.
+        The stage calls this method with each heartbeat, because a credit message may be lost. A
+        producer that has not sent its hello yet receives a hello instead of a credit.
         """
         with self._lock:
             self._grant_pending = False

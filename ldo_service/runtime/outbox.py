@@ -1,4 +1,4 @@
-"""Outbox of a topic: the messages that some lossless consumer has not handled."""
+"""Outbox of a topic: the messages that at least one lossless consumer has not handled."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -7,8 +7,8 @@ from threading import Lock
 from ldo_service.storage.message_log import LoggedMessage, MessageLog
 from ldo_service.transport.flow_control import UnackedMessage
 
-# Number of newest messages that stay in memory although the log on disk has them. Therefore
-# retransmissions to consumers that are not behind do not read the disk.
+# Number of newest messages that stay in memory although the log on disk has them. Retransmissions
+# to consumers that are not far behind then need not read the disk.
 MESSAGES_IN_MEMORY = 8
 
 
@@ -95,7 +95,7 @@ class Outbox:
                 self._bytes -= len(self._memory.popleft().body)
 
     def read(self, seq: int) -> UnackedMessage | None:
-        """Return message `seq`, None if it is lost; may read the disk, so call it in a thread."""
+        """Return message `seq`; None if it is lost. The call may read the disk: use a thread."""
         with self._lock:
             if self._memory and self._memory[0].seq <= seq <= self._memory[-1].seq:
                 return self._memory[seq - self._memory[0].seq]
@@ -103,7 +103,7 @@ class Outbox:
         return UnackedMessage(*found) if found else None
 
     def after(self, seq: int, end: int) -> int:
-        """Return the number of the first message after a lost one that may be readable.
+        """Return the number of the next message that may be readable after a lost message.
 
         Args:
             seq: Number of the lost message.

@@ -36,19 +36,21 @@ log = logging.getLogger(__name__)
 class Outlet:
     """Sending half of a topic, with credit-based flow control for lossless consumers.
 
-    The outlet numbers messages, waits for credit from every lossless consumer, and retransmits lost
-    messages. The required consumers (`expected`) must not miss a message, so there is no credit
-    while one of them is disconnected. Other consumers limit the credit only while they are
-    connected. A nonblocking port does not wait, because its actor has checked the credits before.
+    The outlet numbers messages, waits for credit from every consumer with policy `Lossless`, and
+    retransmits lost messages. Required consumers (`expected`) must not miss a message, so there is
+    no credit while one of them is disconnected. Other consumers limit the credit only while they
+    are connected. The outlet of a nonblocking port does not wait, because the actor checks the
+    credit before it yields a message.
 
-    The outlet never waits for a consumer with a backlog. It keeps the unhandled messages in its
-    outbox on disk, and sends them as the consumer grants credit.
+    The outlet never waits for a consumer with policy `Backlog`. It keeps the unhandled messages in
+    its outbox on disk, and sends them as the consumer grants credit.
     """
 
     # Time after which a message counts as lost, seconds: half a credit period. A shorter time would
     # retransmit messages that are still on their way.
     REPEAT_AFTER_S = 0.25
-    # Maximum time to wait at the end for consumers with a backlog, seconds: two credit periods.
+    # Maximum time to wait at the end for consumers with policy `Backlog`, seconds: two credit
+    # periods.
     FLUSH_BACKLOG_S = 1.0
 
     def __init__(
@@ -75,9 +77,9 @@ class Outlet:
             expected: Names of the required consumers.
             evict_after_s: Time after which a consumer with a full window is evicted, seconds.
             on_evicted: Called with the name of an evicted consumer.
-            past: Position of the previous process. The outlet continues its numbering, and sends
-                again the messages that a required consumer has not handled.
-            with_backlog: Names of the required consumers for which the outlet does not wait.
+            past: Position of the previous process. The outlet continues the numbering of that
+                process, and sends again the messages that a required consumer has not handled.
+            with_backlog: Names of the required consumers with policy `Backlog`.
             outbox: Storage of unhandled messages; by default in memory.
         """
         self.port, self.topic = port, port.topic
@@ -115,10 +117,11 @@ class Outlet:
 
     # --- sending ----------------------------------------------------------------------------
     def credits(self) -> int:
-        """Return how many messages may be sent now; 0 while staged messages are not sent.
+        """Return the number of messages that may be sent now; 0 while staged messages wait.
 
-        A nonblocking port whose required consumers all have a backlog gets the room in their
-        windows as credit: the actor then sends no more than they can queue, so no backlog grows.
+        If the port is nonblocking and all required consumers have policy `Backlog`, the credit is
+        the room in the windows of the consumers. The actor then sends no more messages than the
+        consumers can queue, so that no backlog grows.
         """
         if self._unsent:
             return 0
@@ -181,7 +184,8 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until every lossless consumer has received all messages.
 
-        For consumers with a backlog, which may have stopped, it waits at most `FLUSH_BACKLOG_S`.
+        The wait for consumers with policy `Backlog`, which may have stopped, ends after
+        `FLUSH_BACKLOG_S`.
         """
         self._post_hellos()  # Each consumer replies with its credit at once.
         while not self._consumers.all_received(self._seq, awaited_only=True):
@@ -266,9 +270,10 @@ class Outlet:
         """Log once that a consumer has received messages that this outlet never sent."""
         if grant.consumer not in self._ahead:
             log.error(
-                "%s: %s has received %d messages, but only %d were sent: its state is newer than "
-                "that of %s, so it receives no messages. Restore both states from one copy, or "
-                "start with an empty map by `ldo control reset`.",
+                "%s: consumer %s has received %d messages, but only %d were sent. The state of the "
+                "consumer is newer than the state of the producer %s, so the consumer receives no "
+                "messages. Restore both states from one copy, or start with an empty map by "
+                "`ldo control reset`.",
                 self.topic.name, grant.consumer, grant.arrived, self._seq, self._source,
             )  # fmt: skip
         self._ahead.add(grant.consumer)
@@ -309,7 +314,8 @@ class Outlet:
     def _retransmit(self, consumer: Consumer, gap: bool) -> None:
         """Retransmit the messages that a consumer has not received.
 
-        Without a reported gap, they may be on their way, so it first waits `REPEAT_AFTER_S`.
+        If the consumer reports no gap, the messages may still be on their way. The outlet then
+        retransmits them only after `REPEAT_AFTER_S`.
         """
         now = self._loop.time()
         recently = now - consumer.repeated_at_s < self.REPEAT_AFTER_S
@@ -337,7 +343,7 @@ class Outlet:
                 self._repeating = None
 
     def _skip_lost(self, seq: int) -> None:
-        """Let consumers that handled all earlier messages skip `seq`, which the disk has lost."""
+        """Let consumers that handled all earlier messages skip message `seq`, which is lost."""
         if self._consumers.skip(self._outbox.after(seq, self._seq), since=seq):
             self._post_hellos()
 
@@ -365,8 +371,9 @@ class Outlet:
         for name in overdue:
             log.error(
                 "%s: consumer %s evicted: it took no message for %.0f s "
-                "(supervision.evict_after_s). A child process of the service is restarted; any "
-                "other consumer is ignored until it handles a message.",
+                "(supervision.evict_after_s). If the consumer is a child process of the service, "
+                "the service restarts it. Any other consumer is ignored until it handles a "
+                "message.",
                 self.topic.name, name, self._evict_after_s,
             )  # fmt: skip
             self.evicted += 1

@@ -19,15 +19,14 @@ from .supervision_policy import SupervisionConfig
 
 @dataclass(frozen=True, slots=True)
 class OutletOpener:
-    """Opener of the outlets of a stage, which continue where its previous process stopped.
+    """Opener of the outlets of a stage, which continue at the positions of the previous process.
 
     Attributes:
         transport: The network.
         config: Limits of supervision.
         store: Storage of the state. Backlogs are on disk if the state is on disk, else in memory.
         expected: Names of the required consumers, by topic name.
-        with_backlog: Names of the required consumers with a backlog, for which the stage does not
-            wait, by topic name.
+        with_backlog: Names of the required consumers with policy `Backlog`, by topic name.
         on_evicted: Called with the name of an evicted consumer.
     """
 
@@ -45,7 +44,7 @@ class OutletOpener:
 
         Args:
             port: The output of the actor.
-            source: Name of the actor, and epoch of its messages if `past` has no position.
+            source: Name of the actor, and epoch of the topic if `past` has no position of it.
             past: Saved position of the previous process, by topic name.
         """
         name, epoch = source
@@ -105,7 +104,7 @@ class Outlets:
         return any(outlet.position() for outlet in self._all.values())
 
     def credits(self) -> dict[Topic, int]:
-        """Return the credits of the nonblocking ports; their actor checks them before a step."""
+        """Return the number of messages that each nonblocking port may send now, by topic."""
         return {
             outlet.topic: outlet.credits()
             for outlet in self._all.values()
@@ -113,7 +112,7 @@ class Outlets:
         }
 
     def past(self) -> dict[str, OutletPosition | None]:
-        """Return the position to save, by topic name; None if a topic has no required consumer."""
+        """Return the position to save of each outlet, by topic name; None: no required consumer."""
         return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
 
     def stage_outputs(self, produced: Sequence[Produced]) -> None:
@@ -148,7 +147,7 @@ class Outlets:
             outlet.rollback()
 
     async def flush(self) -> None:
-        """Wait until every lossless consumer has received all messages."""
+        """Wait until the consumers of all topics have received all messages; see `Outlet.flush`."""
         for outlet in self._all.values():
             await outlet.flush()
 
@@ -158,7 +157,7 @@ class Outlets:
             outlet.reset(epoch)
 
     def check_windows(self) -> None:
-        """Evict the consumers of all topics whose window has been full for too long."""
+        """Evict every consumer whose window has been full for too long."""
         for outlet in self._all.values():
             outlet.evict_stalled()
 

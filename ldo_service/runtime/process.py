@@ -1,4 +1,4 @@
-"""Child processes: actors that run in processes of their own, handled by the parent process."""
+"""Child processes for actors, which the main process starts and watches."""
 
 import asyncio
 import ctypes
@@ -97,8 +97,8 @@ class ChildProcess:
                 window.
             silent_after_s: Maximum time between heartbeats, seconds; then the process is killed.
             start_within_s: Maximum time from the start to the first heartbeat, seconds.
-            step_timeout_s: Maximum duration of a step, seconds. It is also the time after which a
-                suspended process (SIGSTOP, a debugger), which sends no heartbeats, is killed.
+            step_timeout_s: Maximum duration of a step, seconds. A process that is suspended
+                (SIGSTOP, a debugger) sends no heartbeats and is killed after the same time.
         """
         self.name = name
         self._command, self._transport = command, transport
@@ -231,8 +231,8 @@ class ChildProcess:
                 if self._suspended_at_s is None:
                     self._suspended_at_s = now_s
                     log.warning(
-                        "%s: its process %d is suspended and is killed after %.0f s, its step "
-                        "timeout. Resume it with `kill -CONT %d`.",
+                        "%s: its process %d is suspended, and is killed after %.0f s, the step "
+                        "timeout. Resume the process with `kill -CONT %d`.",
                         self.name, self.pid, self._step_timeout_s, self.pid,
                     )  # fmt: skip
                 if now_s - self._suspended_at_s < self._step_timeout_s:
@@ -261,5 +261,5 @@ def _is_suspended(pid: int) -> bool:
 
 
 def python_command(*arguments: str) -> list[str]:
-    """Return the command line of this installation with the given arguments."""
+    """Return the command line that runs `ldo` of this installation with the given arguments."""
     return [sys.executable, "-m", "ldo_service", *arguments]

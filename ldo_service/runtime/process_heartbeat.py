@@ -1,8 +1,8 @@
-"""Heartbeat between a child process and its parent, over a pipe.
+"""Heartbeat from a child process to its parent process, over a pipe.
 
 The health message of a stage comes from its event loop. A step that holds the GIL, such as a solve
-of gtsam, stops the event loop for as long as the step lasts. This heartbeat comes from a thread in
-C++ that does not need the GIL. It contains the age of the current step.
+of gtsam, stops the event loop for as long as the step lasts. A heartbeat over the pipe comes from a
+thread in C++ that does not need the GIL. It contains the age of the current step.
 """
 
 import asyncio
@@ -13,12 +13,12 @@ from collections.abc import Callable, Mapping
 from ._heartbeat import Heartbeat
 
 PIPE_VARIABLE = "LDO_HEARTBEAT_FD"  # File descriptor of the pipe in the child process.
-PERIOD_S = 0.5  # Time between two beats.
+PERIOD_S = 0.5  # Time between two heartbeats.
 _BEAT = struct.Struct("d")  # Age of the current step, seconds; 0 between steps.
 
 
 def start_heartbeat(environment: Mapping[str, str] = os.environ) -> Heartbeat | None:
-    """Start the heartbeat of this process; None if no parent process reads it."""
+    """Start the heartbeat of this process; return None if no parent process reads it."""
     number = environment.get(PIPE_VARIABLE, "")
     return Heartbeat(int(number), PERIOD_S) if number.isdecimal() else None
 

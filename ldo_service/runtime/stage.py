@@ -67,7 +67,7 @@ class Stage:
             config: Limits of supervision.
             store: Storage of the state; in memory by default.
             expected: Required consumers, which must not miss a message, by output topic.
-            with_backlog: Required consumers for which the stage does not wait, by output topic.
+            with_backlog: Required consumers with policy `Backlog`, by output topic.
             on_evicted: Called with the name of an evicted consumer.
             journal: Receiver of the journal entries.
             heartbeat: Heartbeat of this process; None if no parent process reads it.

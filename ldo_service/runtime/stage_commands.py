@@ -15,10 +15,10 @@ Commands:
 - `save`: Write the whole state now.
 
 `Control` replies once for the whole service, when all its actors have replied. `reset` first pauses
-every actor, producers first, so that no message of the old run is in flight when they restart.
-Otherwise a late graph correction of the old run could arrive in the new run. After 50 keyframes,
-for example, it would have a higher graph version than the first correction of the new run, and
-would supersede that correction.
+every actor, producers first, so that no message of the old run is in flight when the actors
+restart. Otherwise a graph correction of the old run could arrive in the new run. Its graph version
+would be higher than the first versions of the new run, so the actors would ignore the first
+corrections of the new run.
 """
 
 import asyncio
@@ -151,7 +151,7 @@ class CommandSender:
 
 
 class ControlError(Exception):
-    """Command that some actors did not execute; the text names them."""
+    """Error of a command that some actors did not execute; the text names these actors."""
 
 
 class Control:
@@ -248,8 +248,8 @@ class Control:
         reply.
 
         Raises:
-            ControlError: Some actors did not execute the command. It is raised after the command
-                was sent to all actors, and names those that failed.
+            ControlError: Some actors did not execute the command. The error names them, and is
+                raised after the command was sent to all actors.
         """
         failures, until_s = [], time.monotonic() + self._timeout_s
         for actor in actors:
@@ -257,8 +257,8 @@ class Control:
             error = await self._commander.order(what, actor, within_s)
             failures += [f"{actor} {error}"] if error else []
         if failures:
-            advice = "`ldo doctor` shows the state of the actors; then repeat the command."
-            raise ControlError(f"could not {what} all actors: {'; '.join(failures)}. {advice}")
+            advice = "Check the actors with `ldo doctor`, then repeat the command."
+            raise ControlError(f"some actors did not {what}: {'; '.join(failures)}. {advice}")
 
     # --- actors that were restarted ---------------------------------------------------------------
     def _presence(self, name: str, alive: bool) -> None:

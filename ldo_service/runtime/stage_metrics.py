@@ -18,7 +18,7 @@ from .process import resident_mb
 
 @dataclass
 class StageMetrics:
-    """Counters and step times of a stage; times are of the monotonic clock."""
+    """Counters and step times of a stage; fields `..._at_s` are times of the monotonic clock."""
 
     heartbeat: Heartbeat | None = None  # Heartbeat of this process, if a parent process reads it.
     state: Literal["starting", "ready", "draining"] = "starting"
@@ -38,7 +38,7 @@ class StageMetrics:
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """Measure the duration of a handler; only a step that does not raise is timed."""
+        """Measure the duration of the step in the block, unless the step raises an exception."""
         started_s = self.started_at_s = time.monotonic()
         if self.heartbeat is not None:
             self.heartbeat.begin()
@@ -55,8 +55,8 @@ class StageMetrics:
 
         Args:
             message: Input of the step.
-            is_timed: Whether `step_ms` includes its duration. Steps that only store their input are
-                excluded, because they would lower the percentiles.
+            is_timed: Whether to add the duration of the step to `step_ms`. Steps that only store
+                their input are not added, because they would lower the percentiles.
         """
         self.steps += 1
         if is_timed:
@@ -71,7 +71,7 @@ class StageMetrics:
         return 0.0 if started_s is None else time.monotonic() - started_s
 
     def health(self, **of_the_stage: Any) -> Health:
-        """Return the health message; `of_the_stage` contains the fields not stored here."""
+        """Return the health message; `of_the_stage` has the fields that only the stage knows."""
         step_ms = np.array(self.step_ms or [0.0])
         is_busy = self.started_at_s is not None and self.state == "ready"
         return Health(

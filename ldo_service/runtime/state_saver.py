@@ -51,7 +51,7 @@ class StateSaver:
             checkpointer: Writer of the state.
             worker: The actor's thread.
             outlets: Outputs of the stage, whose positions are saved.
-            metrics: Counters of the stage; every write updates the actor's metrics in it.
+            metrics: Counters of the stage; every save updates the actor's metrics in this object.
             journal: Journal of the stage, for its metrics.
             is_draining: Function that returns True if the stage is about to end.
         """
@@ -91,7 +91,7 @@ class StateSaver:
         Args:
             actor: The actor of the stage.
             delivery: The delivery of the current step, which counts as handled.
-            taken: The delivery's entry of the write-ahead log; None unless `Actor.lags`.
+            taken: Entry of the delivery in the write-ahead log; None unless `Actor.lags`.
             whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`.
 
         Returns:
@@ -114,7 +114,7 @@ class StateSaver:
         return True
 
     async def save_checkpoint(self, actor: Actor) -> None:
-        """Save a checkpoint once, on request.
+        """Save a checkpoint on request, without retries.
 
         Raises:
             OSError: The state cannot be written.

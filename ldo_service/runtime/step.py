@@ -1,4 +1,4 @@
-"""Step of an actor: decoding of its input, encoding and checks of its outputs.
+"""Step of an actor: decoding of the input, checks and encoding of the outputs.
 
 The service and the replay share this code.
 """
@@ -28,11 +28,11 @@ class Produced:
 
 
 def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
-    """Encode the outputs of a step.
+    """Check and encode the outputs of a step.
 
     Args:
         actor: The actor, with the flow status of the step.
-        messages: The outputs, as its handler yields them.
+        messages: The outputs that the actor's handler yields.
 
     Raises:
         TypeError: A message belongs to none of the actor's outputs.
@@ -52,8 +52,8 @@ def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
             credits[topic] -= 1
             if credits[topic] < 0:
                 raise RuntimeError(
-                    f"{actor.name} produced a message of {topic.name} without credit; it must "
-                    "check has_credit first."
+                    f"{actor.name} produced a message of {topic.name} without credit. Its handler "
+                    "must check has_credit before it yields such a message."
                 )
         produced.append(Produced(topic, message, encode(message)))
     return produced
@@ -67,7 +67,7 @@ class MessageDecoder:
 
     def __init__(self, actor: str) -> None:
         self._actor = actor
-        self._rejecting: set[Topic] = set()  # Topics with a malformed last message.
+        self._rejecting: set[Topic] = set()  # Topics whose last message was malformed.
 
     def message_of(self, delivery: Delivery) -> Message | None:
         """Decode a delivery; return None if it is malformed."""
@@ -77,7 +77,8 @@ class MessageDecoder:
         except msgspec.DecodeError as error:
             if topic not in self._rejecting:
                 log.warning(
-                    "%s: message of %s (#%d from %s) rejected: %s. Later ones are only counted.",
+                    "%s: message of %s (#%d from %s) rejected: %s. Further malformed messages of "
+                    "this topic are only counted.",
                     self._actor, topic.name, header.seq, header.source, error,
                 )  # fmt: skip
             self._rejecting.add(topic)

@@ -1,6 +1,6 @@
 """Supervision of all stages of a process in one task group, and the watchdog of systemd.
 
-An error that a stage cannot recover from ends all stages. The watchdog uses the protocol of
+An error that a stage cannot recover from ends all stages. `Watchdog` uses the protocol of
 sd_notify(3): it sends datagrams with one word to the socket in NOTIFY_SOCKET. If the unit of the
 service sets `WatchdogSec=`, systemd restarts the service when its event loop is blocked for that
 time.
@@ -90,8 +90,8 @@ async def supervise(
         runners: Stages and child processes, producers first.
         stop: The stop request.
         sources: Number of runners at the start of `runners` that get inputs from outside the
-            service. After these have ended, the others have `drain_s` seconds to handle all
-            messages that result from their last outputs.
+            service. After these sources have ended, the other runners have `drain_s` seconds to
+            handle all messages that result from the last outputs of the sources.
         drain_s: Time that each runner has for a soft stop before it is cancelled, seconds.
 
     Raises:

@@ -54,20 +54,20 @@ class SupervisionConfig:
     restart_window_s: float = 60.0
     restart_delay_s: float = 0.05  # Doubled with each failure in the window.
     restart_delay_max_s: float = 5.0
-    heartbeat_s: float = 0.5  # Heartbeat period; a stopped process is noticed within two periods.
+    heartbeat_s: float = 0.5  # Heartbeat period.
     # Maximum duration of a step, seconds: 100x the slowest one measured (mapper, 1.5 M Gaussians).
     stall_after_s: float = 60.0
     # The same limit for actors that no other actor waits for: one optimization may take minutes.
     backend_stall_after_s: float = 600.0
-    # Maximum size on disk of the unhandled messages of one topic, MB: 11 minutes of keyframes of
-    # 640x480 at 2 Hz.
+    # Maximum size on disk of the unhandled messages of one topic, MB: almost 8 minutes of keyframes
+    # of 640x480 at 2 Hz.
     backlog_mb: float = 2000.0
-    # Time without progress after which a consumer is evicted, because it holds up the robot.
+    # Time without progress after which a consumer is evicted, because its producer waits for it.
     evict_after_s: float = 30.0
     # Nice value of threads with work that may be late. On a shared core (Linux) they have a
     # tenth of the weight of threads that a robot waits for.
     nice: int = 10
-    # Larger messages are not decoded; raw color and depth of 8 MP have 58 MB.
+    # Maximum size of a message that is decoded, MB; raw color and depth of 8 MP have 58 MB.
     max_message_mb: float = 64.0
 
     def __post_init__(self) -> None:
@@ -99,7 +99,7 @@ class SupervisionConfig:
             raise ConfigError(f"supervision.background_nice={self.nice} must be within 0..19.")
 
     def step_limit(self, is_backend: bool) -> tuple[float, str]:
-        """Return the maximum duration of a step in seconds, and the setting that limits it."""
+        """Return the maximum duration of a step in seconds, and the name of its setting."""
         if is_backend:
             return self.backend_stall_after_s, "supervision.backend_step_timeout_s"
         return self.stall_after_s, "supervision.step_timeout_s"

@@ -75,7 +75,7 @@ def diagnose(seen: ActorStatus, heartbeat_s: float = 0.5) -> Iterator[Problem]:
 def _silent(how_long: str) -> Problem:
     return Problem(
         f"has a process, but no heartbeat {how_long}",
-        "its process is stopped or the machine overloaded; reduce the load. After "
+        "its process is stopped or the machine is overloaded; reduce the load. After "
         "service.heartbeat_timeout_s the service kills and restarts it",
     )
 
@@ -103,7 +103,7 @@ def _waiting(health: Health) -> int:
 
 
 def _waits_for_server(health: Health) -> bool:
-    """Return whether the actor is a labeller with a server.
+    """Return whether the actor is a labeller that uses an HTTP server.
 
     A slow server is no problem: its timeout bounds the step, and mapping continues.
     """
@@ -137,7 +137,7 @@ def _is_backend(actor: str) -> bool:
 def _of_disk(health: Health) -> Iterator[Problem]:
     if health.metrics.get("checkpoint_failing"):
         yield Problem(
-            "cannot save its last step and takes no more keyframes until it can",
+            "cannot save its last step and handles no more keyframes until the save succeeds",
             "free some disk space, or start the service with another folder for --state",
         )
 
@@ -221,8 +221,8 @@ def _of_answers(health: Health) -> Iterator[str]:
     if refused := health.metrics.get("answers_refused"):
         questions = health.metrics.get("questions", 0)
         yield (
-            f"rejected {refused:.0f} of {questions:.0f} label results, which had no label or none "
-            "of the vocabulary; these regions have no label"
+            f"rejected {refused:.0f} of {questions:.0f} label results, because they had no label "
+            "or a label outside the vocabulary; the regions of these results have no label"
         )
     if untold := health.metrics.get("answers_without_logprobs"):
         yield (

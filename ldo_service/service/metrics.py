@@ -37,7 +37,7 @@ OF_ACTOR: dict[Row, Callable[[Health], float]] = {
     (
         CounterMetricFamily,
         "failures",
-        "Exceptions of handlers, restores and final messages, and series of failed saves.",
+        "Exceptions in handlers, restores and final messages; failed saves in a row count once.",
     ): lambda h: h.failures,
     (CounterMetricFamily, "restarts", "Restarts of the actor within its process."): lambda h: (
         h.restarts
@@ -55,25 +55,25 @@ OF_ACTOR: dict[Row, Callable[[Health], float]] = {
     (GaugeMetricFamily, "paused", "1 while the actor is paused."): lambda h: h.paused,
 }
 OF_INPUT: dict[Row, Callable[[InputCount], float]] = {
-    (CounterMetricFamily, "input_messages", "Messages of the topic handled."): lambda i: (
+    (CounterMetricFamily, "input_messages", "Handled messages of the topic."): lambda i: (
         i.delivered
     ),
     (CounterMetricFamily, "input_dropped", "Messages dropped for newer ones."): lambda i: i.dropped,
-    (CounterMetricFamily, "input_rejected", "Malformed messages rejected."): lambda i: i.rejected,
+    (CounterMetricFamily, "input_rejected", "Invalid or too big messages."): lambda i: i.rejected,
     (CounterMetricFamily, "input_dropped_paused", "Messages dropped while paused."): lambda i: (
         i.dropped_paused
     ),
-    (CounterMetricFamily, "input_lost", "Messages lost, by sequence number."): lambda i: i.lost,
+    (CounterMetricFamily, "input_lost", "Messages that never arrived."): lambda i: i.lost,
     (CounterMetricFamily, "input_gaps", "Messages that arrived out of order."): lambda i: i.gaps,
     (GaugeMetricFamily, "input_queued", "Messages in the mailbox now."): lambda i: i.queued,
 }
 OF_OUTPUT: dict[Row, Callable[[OutputCount], float]] = {
-    (CounterMetricFamily, "output_messages", "Messages of the topic sent."): lambda o: o.sent,
+    (CounterMetricFamily, "output_messages", "Sent messages of the topic."): lambda o: o.sent,
     (CounterMetricFamily, "output_backpressure_waits", "Waits for credit."): lambda o: (
         o.backpressure_waits
     ),
-    (CounterMetricFamily, "output_evicted", "Consumers evicted."): lambda o: o.evicted_consumers,
-    (CounterMetricFamily, "output_retransmitted", "Messages retransmitted."): lambda o: (
+    (CounterMetricFamily, "output_evicted", "Evicted consumers."): lambda o: o.evicted_consumers,
+    (CounterMetricFamily, "output_retransmitted", "Retransmitted messages."): lambda o: (
         o.retransmitted
     ),
     (
@@ -81,13 +81,13 @@ OF_OUTPUT: dict[Row, Callable[[OutputCount], float]] = {
         "output_backlog_messages",
         "Messages that the slowest consumer with a backlog has not handled.",
     ): lambda o: max(o.behind.values(), default=0),
-    (GaugeMetricFamily, "output_backlog_mb", "Disk space of the backlog, MB."): lambda o: (
+    (GaugeMetricFamily, "output_backlog_mb", "Size of the stored backlog, MB."): lambda o: (
         o.backlog_mb
     ),
     (
         CounterMetricFamily,
         "output_backlog_dropped",
-        "Messages dropped at the maximum size of the backlog.",
+        "Messages dropped because the backlog was full.",
     ): lambda o: o.backlog_dropped,
 }
 
@@ -206,7 +206,7 @@ def _processes(begun_anew: dict[str, int]) -> Metric:
 
 def _step_seconds(actors: list[Health]) -> Metric:
     metric = GaugeMetricFamily(
-        "ldo_step_seconds", "Duration of the last 200 steps.", labels=["actor", "quantile"]
+        "ldo_step_seconds", "Quantiles of the last 200 step times.", labels=["actor", "quantile"]
     )
     for health in actors:
         metric.add_metric([health.actor, "0.5"], health.step_ms_p50 * 1e-3)
@@ -216,7 +216,7 @@ def _step_seconds(actors: list[Health]) -> Metric:
 
 def _facts(actors: list[Health]) -> Metric:
     metric = GaugeMetricFamily(
-        "ldo_actor_metric", "Metric of the actor itself.", labels=["actor", "metric"]
+        "ldo_actor_metric", "Metric `metric` that the actor reports.", labels=["actor", "metric"]
     )
     for health in actors:
         for name, value in health.metrics.items():

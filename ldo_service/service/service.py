@@ -54,7 +54,7 @@ from .state_folder import claim_state
 
 log = logging.getLogger(__name__)
 
-LEAVE_WITHIN_S = 1.0  # Time that a running step has to finish after all else has ended.
+LEAVE_WITHIN_S = 1.0  # Time that a running step has to finish at the end of the service.
 
 
 def open_recorder(
@@ -67,10 +67,10 @@ def open_recorder(
         actor: Name of the actor.
         robot: Name of the robot.
         config: Configuration of the service.
-        map_folder: Folder with the mapper's files; None if this folder is temporary.
+        map_folder: Folder with the mapper's files; None if the recording needs none of them.
 
     Raises:
-        ConfigError: The folder cannot be written.
+        ConfigError: The recording cannot be written to the folder.
     """
     about = {
         "actor": actor,
@@ -87,8 +87,8 @@ def open_recorder(
         return Recorder(new_path(folder, actor), about, recording_parameters(config), files)
     except OSError as error:
         raise ConfigError(
-            f"{folder} cannot be recorded to: {error.strerror}. Choose another folder with "
-            "--record."
+            f"the recording cannot be written to {folder}: {error.strerror}. Choose another folder "
+            "with --record."
         ) from error
 
 
@@ -99,8 +99,8 @@ class Service:
     config: Config
     network: Endpoint
     state: Path  # State folder.
-    # Actors of this process, a child of the main process or on another machine. Empty: this is the
-    # main process, which runs or starts all other actors.
+    # Actors to run in this process, if it is a child process or runs on another machine. Empty:
+    # this is the main process, which runs or starts all actors except `service.remote_actors`.
     only: tuple[str, ...] = ()
     is_router: bool = True  # Open a router; False: connect to the network's router.
     is_state_kept: bool = True  # The state folder remains after the service ends.
@@ -112,7 +112,7 @@ class Service:
 
         Raises:
             ConfigError: The configuration or the state is invalid, or a port is in use.
-            StageError: An actor cannot be restarted any more.
+            StageError: An actor has used up its restart budget, or a step took too long.
         """
         check_graph(GRAPH)
         self.config.check_timeouts()
@@ -182,7 +182,7 @@ class Service:
     def _saved_where(self) -> str:
         if self.is_state_kept:
             return str(self.state)
-        return f"{self.state}, which is deleted with the service (--state DIR keeps it)"
+        return f"{self.state}, which is deleted when the service ends (--state DIR keeps it)"
 
     def _state_after_stop(self) -> str:
         if self.is_state_kept:
@@ -236,7 +236,7 @@ class Service:
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise ConfigError(
                 f"the state of {box.name} in {self.state} does not fit this version ({error!r}). "
-                "Choose another folder with --state, or delete this one to start with an empty "
+                "Choose another folder with --state, or delete this folder to start with an empty "
                 "map."
             ) from error
 

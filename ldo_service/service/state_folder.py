@@ -11,7 +11,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.runtime.delivery_state import RestoredState
 from ldo_service.storage.state_store import FolderStore
 
-# Actors whose states refer to each other. Each one has a state before the first keyframe.
+# Actors whose states refer to each other. Each one saves a state before the first keyframe arrives.
 INTERDEPENDENT_ACTORS = ("tracker", "mapper", "optimizer")
 
 
@@ -43,7 +43,7 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
     if "state" not in found and "frames.csv" in found:
         raise ConfigError(
             f"{folder} contains a run of `ldo run`, not the state of a service. Choose another "
-            f"folder with --state. To localize in its map, use --localize {folder}."
+            f"folder with --state. To localize in the map of the run, use --localize {folder}."
         )
     if "state" not in found and any(name.endswith(".mcap") for name in found):
         raise ConfigError(
@@ -57,7 +57,7 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
     """Lock the folder for this service, and check that the states of all actors match.
 
     The states of tracker, mapper and optimizer refer to the same keyframe ids and graph versions.
-    If one state was missing or older, the service would connect keyframes of two different runs.
+    If one state were missing or older, the service would connect keyframes of two different runs.
 
     Args:
         folder: The state folder.
@@ -66,7 +66,7 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
 
     Raises:
         ConfigError: Another service uses the folder, or the states do not match.
-        DataError: A state cannot be read because of the disk.
+        DataError: A state cannot be read because of a disk error.
     """
     lock = stack.enter_context((folder / "lock").open("w"))
     try:
@@ -82,14 +82,15 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
     if missing and any(past.has_passed for past in pasts.values()):
         raise ConfigError(
             f"{folder} has no readable state of {', '.join(missing)}, but has states of other "
-            "actors. Choose another folder with --state, or delete this one to start with an empty "
-            "map."
+            "actors. Choose another folder with --state, or delete this folder to start with an "
+            "empty map."
         )
     for topic, producer, consumer in _inconsistent_states(pasts):
         raise ConfigError(
-            f"in {folder} the state of {consumer} is newer than that of {producer}: it has handled "
-            f"messages of {topic} that {producer} has not produced. Restore the whole folder from "
-            "one copy, choose another with --state, or delete this one to start with an empty map."
+            f"in {folder} the state of {consumer} is newer than the state of {producer}: the newer "
+            f"state counts messages of {topic} that {producer} has not produced. Restore the whole "
+            "folder from one copy, choose another folder with --state, or delete this folder to "
+            "start with an empty map."
         )
 
 

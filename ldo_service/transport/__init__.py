@@ -1,1 +1,1 @@
-"""Transport of bytes between processes: Zenoh or memory, flow control, and access control."""
+"""Transport of bytes between actors, over Zenoh or in memory, with flow and access control."""

@@ -9,11 +9,11 @@
 | `operator` | Reads every topic; sends commands, refine requests     |
 |            | and label names.                                       |
 
-Clients without an entry may connect, but the router denies all their messages. It also denies a
-request that the rules cover only in part. A viewer that subscribes to `ldo/robot/**` therefore
-receives nothing; it must subscribe to topics by name.
+Clients without an entry may connect, but the router denies all their messages. The router also
+denies a request whose keys the rules allow only in part. A viewer that subscribes to
+`ldo/robot/**` therefore receives nothing; it must subscribe to topics by name.
 
-`access.yaml` has an entry for each certificate, by its common name:
+`access.yaml` maps the common name of each certificate to its role, robot and last valid day:
 
     front-3f9a1c02: {role: camera, robot: mule, until: 2027-11-22}
 """
@@ -58,7 +58,7 @@ EVERYTHING = (
 
 
 class AccessEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Role of one certificate."""
+    """Role, robot and last valid day of one certificate."""
 
     role: Role
     robot: str  # Name of the robot; EVERY_ROBOT for all robots.
@@ -78,7 +78,8 @@ def read_access(path: Path) -> dict[str, AccessEntry]:
         return msgspec.convert(load_yaml(path.read_bytes()), dict[str, AccessEntry])
     except OSError as error:
         raise ConfigError(
-            f"{path} cannot be read: {error.strerror}. `ldo keys` writes it for each service."
+            f"{path} cannot be read: {error.strerror}. Copy the file again from the folder that "
+            "`ldo keys` wrote for this service."
         ) from error
     except (ValueError, yaml.YAMLError) as error:
         raise ConfigError(
@@ -107,7 +108,8 @@ def access_control(access: Access) -> dict[str, Any]:
 class Rule:
     """Rule that allows some kinds of messages on some keys.
 
-    Messages from the client to the router are "ingress", those from the router "egress".
+    Messages from the client to the router are "ingress"; messages from the router to the client are
+    "egress".
     """
 
     name: str  # Name of the rule, part of its id.
@@ -116,7 +118,7 @@ class Rule:
     keys: tuple[str, ...]
 
     def for_robot(self, robot: str, part: str) -> dict[str, Any]:
-        """Return the rule in Zenoh's format; `part` is the prefix of its id."""
+        """Return the rule in Zenoh's format; `part` is the prefix of the rule's id."""
         return {
             "id": f"{part}: {self.name}",
             "permission": "allow",

@@ -1,11 +1,14 @@
 """Certificate authority of a network of robots: `ldo keys`.
 
-- `DIR/ca.crt`, `DIR/ca.key`: The authority. Its private key stays here; no robot needs it.
+The folder DIR of an authority contains:
+
+- `DIR/ca.crt`, `DIR/ca.key`: Certificate and private key of the authority. No robot needs the
+  private key, so it stays here.
 - `DIR/access.yaml`: Role of each certificate. The folder of each service has a copy.
 - `DIR/<name>/`: Files for one machine: ca.crt, tls.crt, tls.key.
 
-The common name of a certificate is its name and a random number. New keys under an old name
-therefore have another common name, and routers with the new access list deny the old keys.
+The common name of a certificate is the name of its keys and a random number. New keys under an old
+name therefore have another common name, and routers with the new access list deny the old keys.
 """
 
 import os
@@ -42,7 +45,7 @@ CA_KEY = "ca.key"
 # limit of X.509.
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,54}")
 HERE = ("localhost", "127.0.0.1", "::1")  # Addresses that the actors of a service connect to.
-HEAD = "# Who may do what. `ldo keys` writes this; routers read it when they start.\n"
+HEAD = "# Role of each certificate. `ldo keys` writes this file; routers read it at their start.\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +84,10 @@ class CertificateAuthority:
 
         Args:
             folder: The folder to create.
-            days: Validity of its certificate, days.
+            days: Validity of the authority's certificate, days.
 
         Raises:
-            ConfigError: The folder cannot be written, or exists already and stays unchanged.
+            ConfigError: The folder exists already, or cannot be written.
         """
         if folder.exists():
             raise ConfigError(
@@ -125,15 +128,16 @@ class CertificateAuthority:
             role: Role of the certificate.
             robot: Name of the robot, or EVERY_ROBOT.
             days: Validity of the certificate, days.
-            hosts: Host names and IP addresses at which clients reach a service.
+            hosts: Host names and IP addresses at which clients reach a service; empty for other
+                roles.
             now: Start of the validity; the current time by default.
 
         Returns:
             Folder with the keys, to copy to the machine.
 
         Raises:
-            ConfigError: A name is invalid or taken, or the folder cannot be written. No file
-                changes in these cases.
+            ConfigError: An argument is invalid, the name is taken, or the folder cannot be written.
+                The authority then stays unchanged.
         """
         _require_name(name)
         if robot != EVERY_ROBOT:
@@ -161,7 +165,7 @@ class CertificateAuthority:
         kept = {entry.common_name: entry.grantee for entry in self.entries if entry.name != name}
         if len(kept) == len(self._access):
             known = ", ".join(entry.name for entry in self.entries) or "none"
-            raise ConfigError(f"{self.folder} has no keys named {name!r}; it has: {known}.")
+            raise ConfigError(f"{self.folder} has no keys named {name!r}. Its keys are: {known}.")
         self._grant(kept)
         shutil.rmtree(self.folder / name, ignore_errors=True)  # The user may have moved the folder.
 

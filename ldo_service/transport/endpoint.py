@@ -8,14 +8,15 @@ from ldo_service.schemas.topics import ROBOT_PREFIX
 
 from .keys import TlsKeys
 
-# Default address of HTTP servers, which have no keys. On another address, every machine on the
-# network could see where the robot works.
+# Default address of HTTP servers. They have no access control, so on another address every machine
+# on the network could see where the robot is.
 LOOPBACK = "127.0.0.1"
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-# Maximum size of a message. A 4K frame with depth in floats has 58 MB; Zenoh's default is 1074 MB.
+# Maximum size of a message. A 4K frame with depth in floats has 58 MB. Zenoh's default maximum is
+# 1074 MB.
 MAX_MESSAGE_MB = 128
-CLOSED = {  # Zenoh settings, by path, that would open the network by default.
+CLOSED = {  # Zenoh settings, by path, that keep other programs out.
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "adminspace/enabled": False,
@@ -26,7 +27,7 @@ NOT_IN_NAMES = "/*$?#@ "  # Characters with a meaning in Zenoh, and separators o
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Name of a robot and address of its router."""
+    """Name of a robot, address of its router, and TLS keys."""
 
     robot: str = "robot"
     endpoint: str = DEFAULT_ENDPOINT
@@ -69,8 +70,8 @@ class Endpoint:
         """Check that the endpoint is on loopback or protected by TLS.
 
         Raises:
-            ConfigError: The endpoint is neither. Every machine on the network could then read
-                topics, publish messages and send commands.
+            ConfigError: The endpoint is on another address and has no TLS. Every machine on the
+                network could then read topics, publish messages and send commands.
         """
         if self.keys is None and not _is_loopback(self.address[0]):
             raise ConfigError(

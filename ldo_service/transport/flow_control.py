@@ -2,21 +2,25 @@
 
 - `ConsumerHello` (consumer to producer): Announces the consumer. It is repeated until the producer
   sends its hello.
-- `ProducerHello` (producer to consumers): Epoch of the producer and offset of the first message for
-  each known consumer. Each consumer replies at once with a hello or its credit.
-- `Credit` (consumer to producer): Three offsets, sent after each step and twice a second. `handled`
-  is that of the first message that is not handled. `arrived` is that of the first message that has
-  not arrived. `limit` is that of the first message that may not be sent yet.
+- `ProducerHello` (producer to consumers): Epoch of the producer and, for each consumer that the
+  producer knows, the offset of the first message for this consumer. Each consumer replies at once:
+  with its credit, or with a hello if it is not connected yet.
+- `Credit` (consumer to producer): Three offsets, sent after each step and twice a second. Message
+  `handled` is the first one that the consumer has not handled. Message `arrived` is the first one
+  that the consumer has not received. Message `limit` is the first one that the producer may not
+  send yet.
 
 Each of these messages has the complete state of its sender, not a change. It may therefore be lost,
 repeated or replaced by a newer one.
 
-The producer keeps the messages that are not handled, at most one window. For consumers that it does
-not wait for, the kept messages are a backlog on disk. The producer retransmits messages from
-`arrived` on when a credit message reports a gap. A restarted consumer receives the messages that it
-had not handled. Producer and consumer each save their position in one write with the actor's state
-(`runtime.delivery_state`). Each message therefore takes effect exactly once, even if either process
-is killed at any time. `SequenceTracker` counts lost messages by their sequence numbers.
+The producer keeps a message until all consumers have handled it, and waits when a consumer has a
+full window of unhandled messages. It does not wait for a consumer with policy `Backlog`: it stores
+the unhandled messages of such a consumer on disk. The producer retransmits messages from `arrived`
+on when a credit message reports a gap, or when a message is overdue. A restarted consumer receives
+the messages that it had not handled. Producer and consumer each save their position in one write
+with the actor's state (`runtime.delivery_state`). Each message therefore takes effect exactly once,
+even if either process is killed at any time. `SequenceTracker` counts lost messages by their
+sequence numbers.
 """
 
 import secrets
@@ -29,26 +33,29 @@ from ldo_service.schemas import decode
 MAX_SEQ = 1 << 62
 ALIVE = "link/alive"  # Key of the liveliness tokens of running actors.
 
-# Maximum number of missing messages that may still arrive late: half a minute of camera frames.
+# Maximum number of missing messages that are remembered, because they may still arrive: half a
+# minute of camera frames.
 MAX_MISSING = 1024
 
 
 class Header(msgspec.Struct, frozen=True, array_like=True):
-    """Header of a message, sent as an attachment.
+    """Header of a message.
 
-    Other programs can therefore decode the body directly.
+    It is sent as an attachment, apart from the body, so that other programs can decode the body
+    directly.
     """
 
     source: str  # Name of the producer.
     epoch: int  # Changes when the producer restarts its numbering.
     seq: int  # Offset of the message in this epoch.
     stamp_ns: int
-    key: str = ""  # Value of the topic's key, for `Latest(per_key=True)`.
+    key: str = ""  # Value of the message field `Topic.key`, for `Latest(per_key=True)`.
 
     def __post_init__(self) -> None:
         if not (0 <= self.seq < MAX_SEQ and self.epoch > 0):
             raise ValueError(
-                f"header epoch={self.epoch} must be positive, seq={self.seq} within 0..2^62-1"
+                f"header epoch={self.epoch} must be positive, and header seq={self.seq} must be "
+                "within 0..2^62-1"
             )
 
 
@@ -60,7 +67,7 @@ class ConsumerHello(msgspec.Struct, frozen=True, tag="join", array_like=True):
     """Handshake of a consumer."""
 
     consumer: str
-    has_backlog: bool = False  # The producer does not wait for the consumer's credit.
+    has_backlog: bool = False  # True: the producer does not wait for the consumer's credit.
 
 
 class Credit(msgspec.Struct, frozen=True, tag="grant", array_like=True):
@@ -87,11 +94,11 @@ class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
     """Handshake of a producer."""
 
     epoch: int
-    starts: dict[str, int]  # Offset of the first message to come, by consumer.
+    starts: dict[str, int]  # Offset of the first message for each known consumer, by name.
 
 
 class UnackedMessage(NamedTuple):
-    """Numbered message that some consumer has not handled."""
+    """Numbered message that at least one consumer has not handled."""
 
     seq: int
     header: bytes
@@ -99,17 +106,18 @@ class UnackedMessage(NamedTuple):
 
 
 class OutletPosition(NamedTuple):
-    """Saved position of a producer on a topic, with the messages that are not handled."""
+    """Saved position of a producer on a topic, with its unhandled messages."""
 
     epoch: int
     seq: int  # Offset of the next message.
     unhandled: tuple[UnackedMessage, ...] = ()
-    # Offset of the first unhandled message if these are in a log on disk; None: no log.
+    # Offset of the first unhandled message, if a log on disk has the unhandled messages; None
+    # without a log.
     logged_from: int | None = None
 
     @property
     def handled(self) -> int:
-        """Offset of the first message that some consumer has not handled; at most `seq`."""
+        """Offset of the first message that a consumer has not handled; `seq` if there is none."""
         if self.logged_from is not None:
             return self.logged_from
         return self.unhandled[0].seq if self.unhandled else self.seq
@@ -123,7 +131,7 @@ class InletPosition(NamedTuple):
 
 
 def new_epoch() -> int:
-    """Return a new random number that identifies one numbering of a producer's messages."""
+    """Return a new random epoch, which identifies one numbering of a producer's messages."""
     return 1 + secrets.randbits(62)
 
 
@@ -147,27 +155,28 @@ def retransmit_key(topic: str, consumer: str = "") -> str:
 
     Args:
         topic: Name of the topic.
-        consumer: Name of a consumer with a backlog. It has a key of its own, so that no other
-            consumer receives its backlog. Empty for the key of all other lossless consumers.
+        consumer: Name of a consumer with policy `Backlog`. Each such consumer has its own key, so
+            that no other consumer receives its backlog. Empty for the key that all other lossless
+            consumers share.
     """
     return f"link/again/{topic}/{consumer}" if consumer else f"link/again/{topic}"
 
 
 def credit_key(topic: str) -> str:
-    """Return the key of the messages from consumers to the producer."""
+    """Return the key on which consumers send hello and credit messages to the producer."""
     return f"link/grant/{topic}"
 
 
 def producer_hello_key(topic: str) -> str:
-    """Return the key of the producer's hello."""
+    """Return the key on which the producer of a topic sends its hello."""
     return f"link/welcome/{topic}"
 
 
 class SequenceTracker:
     """Counter of lost messages of a topic.
 
-    A message that arrives late does not count as lost. A message that arrives twice counts once,
-    because a restarted producer repeats messages that some consumer may not have received.
+    A message that arrives late does not count as lost. A repeated message changes no count: a
+    restarted producer repeats messages that a consumer may not have received.
     """
 
     def __init__(self) -> None:

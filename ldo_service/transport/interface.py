@@ -1,4 +1,4 @@
-"""Interface of the network that the runtime uses, and its implementation in memory."""
+"""Network interface of the runtime, and an implementation in memory."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
@@ -58,9 +58,9 @@ class Transport(Protocol):
         ...
 
     def serve_queries(self, key: str, last_values: LastValues) -> None:
-        """Reply to queries on a key with its last values.
+        """Reply to queries on a key with the parts that `last_values` returns.
 
-        The parts of a value share the key. A Zenoh query needs consolidation NONE to get all parts.
+        All parts have the same key, so a Zenoh query needs consolidation NONE to get all of them.
         """
         ...
 
@@ -70,7 +70,7 @@ class Transport(Protocol):
 
 
 def call_soon(loop: asyncio.AbstractEventLoop, callback: Callable[..., None], *args: Any) -> None:
-    """Schedule a callback on the event loop from any thread; ignored if the loop is closed."""
+    """Schedule a callback on the event loop from any thread, unless the loop is closed."""
     with suppress(RuntimeError):
         loop.call_soon_threadsafe(callback, *args)
 
@@ -82,7 +82,7 @@ class MemoryTransport:
         """Initialize without subscribers.
 
         Args:
-            lose: Function from the key of a message to True if the message is lost; for tests.
+            lose: Function that returns True for the key of a message to lose; for tests.
         """
         self._subscribers: dict[str, list[OnMessage]] = {}
         self._watchers: list[OnPresence] = []
@@ -111,7 +111,7 @@ class MemoryTransport:
             on_presence(name, True)
 
     def leave(self, name: str) -> None:
-        """Declare an actor no longer alive, as if its process was killed."""
+        """Declare an actor no longer alive, as if its process had been killed."""
         self._alive.remove(name)
         for on_presence in self._watchers:
             on_presence(name, False)
@@ -123,11 +123,11 @@ class MemoryTransport:
             on_presence(name, True)
 
     def serve_queries(self, key: str, last_values: LastValues) -> None:
-        """Reply to queries on a key with its last values."""
+        """Reply to queries on a key with the parts that `last_values` returns."""
         self._answers[key] = last_values
 
     def query(self, key: str) -> Sequence[tuple[bytes, bytes]]:
-        """Return the last values of a key; empty if no actor serves queries on it."""
+        """Return the parts of the last value of a key; empty if no actor serves queries on it."""
         return self._answers[key]() if key in self._answers else ()
 
     def close(self) -> None:

@@ -5,7 +5,8 @@
 - `tls.key`: Private key, not readable by other users.
 - `access.yaml`: Role of each certificate; only in the folder of a service or router.
 
-The first three have the names of a Kubernetes TLS secret, so the folder of such a secret works too.
+The first three files are named as in a Kubernetes TLS secret, so a folder with a mounted secret
+works too.
 """
 
 import socket
@@ -20,8 +21,8 @@ from .access_control import Access, access_control, read_access
 
 CA, CERTIFICATE, KEY, ACCESS = "ca.crt", "tls.crt", "tls.key", "access.yaml"
 OTHERS = 0o007  # Bits of a file mode that give access to all users of the machine.
-# Time limit for the TLS error of a server. TLS rejects a client in the handshake or one round trip
-# later.
+# Time limit for reading the TLS error of a server, seconds. A server rejects a client in the
+# handshake or one round trip later.
 ALERT_WITHIN_S = 1.0
 
 
@@ -49,7 +50,7 @@ class TlsKeys:
 
     @classmethod
     def of(cls, folder: str | Path | None) -> "TlsKeys | None":
-        """Return the keys in a folder; None without a folder."""
+        """Return the keys in a folder; None if `folder` is None."""
         return None if folder is None else cls(Path(folder).expanduser().resolve())
 
     def __post_init__(self) -> None:
@@ -101,7 +102,7 @@ class TlsKeys:
         return context
 
     def tls_error(self, host: str, port: int) -> str:
-        """Return the TLS error of a server that Zenoh cannot connect to, or an empty string."""
+        """Connect to a server by TLS and return the TLS error; an empty string without an error."""
         try:
             with (
                 socket.create_connection((host, port), ALERT_WITHIN_S) as plain,

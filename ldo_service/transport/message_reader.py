@@ -30,8 +30,8 @@ class MessageReader:
     def messages(self, topic: Topic, keep: int) -> Iterator[tuple[Header, Message]]:
         """Yield header and message of each sample on a topic, without end.
 
-        Messages that a restarted producer repeats are skipped. Of the messages that wait, at most
-        the newest `keep` are buffered.
+        Messages that a restarted producer repeats are skipped. If messages arrive faster than the
+        caller takes them, only the newest `keep` are buffered.
         """
         numbers = SequenceTracker()
         with self._subscriber(topic.subscription_key, keep) as subscriber:
@@ -68,7 +68,7 @@ class MessageReader:
     def request(
         self, topic: Topic, message: Message, answer: type[M], timeout_s: float
     ) -> M | None:
-        """Send a request; return the answer, or None without a reply within `timeout_s`."""
+        """Send a request; return the answer, or None if none arrives within `timeout_s`."""
         replies = self._session.get(
             self._network.expression(topic.name),
             payload=msgspec.msgpack.encode(message),
@@ -101,6 +101,7 @@ def _readable(samples: Iterable[Any], kind: type[M]) -> Iterator[M]:
             yield _message_of(sample, kind)
         except msgspec.DecodeError as error:
             log.warning(
-                "client: malformed %s skipped: %s. Check that the service runs the same version.",
+                "client: malformed %s skipped: %s. Check that the service has the same version as "
+                "this program.",
                 kind.__name__, error,
             )  # fmt: skip

@@ -16,7 +16,7 @@ from .flow_control import Header, encode_link
 class MessageSender:
     """Publishers of one program outside the service, such as a camera program.
 
-    A publisher is declared at the first use of its message type. A congested network drops its
+    A publisher is declared at the first use of its message type. A congested network drops
     messages.
     """
 
@@ -31,7 +31,7 @@ class MessageSender:
         Args:
             message: The message.
             source: Name of the producer in the header.
-            number: Number of the message among those of the producer.
+            number: Offset of the message in the sequence of the producer's messages on this topic.
         """
         header = Header(source, self._epoch, number, message.stamp_ns)
         body = msgspec.msgpack.encode(message)
@@ -45,7 +45,7 @@ class MessageSender:
         """Wait for a subscriber of the topic of a message type.
 
         Returns:
-            False if none was found within `timeout_s`.
+            False if there is no subscriber within `timeout_s`.
         """
         until_s = time.monotonic() + timeout_s
         while not self.has_subscriber(kind) and time.monotonic() < until_s:

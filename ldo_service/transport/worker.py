@@ -21,8 +21,8 @@ R = TypeVar("R")
 class Worker:
     """Daemon thread that runs jobs in order.
 
-    The thread of an executor keeps the interpreter from exiting while a job runs; this thread does
-    not. The queue has no limit, so callers must bound the number of jobs.
+    Unlike a thread of `ThreadPoolExecutor`, this thread does not keep the interpreter from exiting
+    while a job runs. The queue has no limit, so callers must bound the number of jobs.
     """
 
     _all: "WeakSet[Worker]" = WeakSet()
@@ -32,7 +32,7 @@ class Worker:
 
         Args:
             name: Name of the thread.
-            nice: Increase of the thread's nice value, 0..19, on Linux. Threads that it starts
+            nice: Increase of the thread's nice value, 0..19, on Linux. Threads that a job starts
                 inherit the value. A larger value gives other threads priority on a busy machine.
         """
         self.name, self._nice = name, nice
@@ -44,7 +44,7 @@ class Worker:
         Worker._all.add(self)
 
     def submit(self, job: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> "Future[R]":
-        """Queue a job for the thread. After `close` the future is cancelled at once."""
+        """Queue a job; after `close`, the job does not run and the returned future is cancelled."""
         future: Future[R] = Future()
         with self._lock:
             if self._closed:
@@ -58,14 +58,14 @@ class Worker:
         return await asyncio.wrap_future(self.submit(job, *args, **kwargs))
 
     def close(self) -> None:
-        """End the thread after the jobs submitted so far, without waiting for it."""
+        """Let the thread end after the jobs submitted so far; do not wait for its end."""
         with self._lock:
             if not self._closed:
                 self._closed = True
                 self._jobs.put(None)
 
     def join(self, timeout_s: float) -> None:
-        """Wait for the thread after `close`.
+        """Wait at most `timeout_s` for the end of the thread, after `close`.
 
         Without this wait, the end of the interpreter may kill the thread inside a library. Some
         libraries then abort the process.
@@ -74,7 +74,7 @@ class Worker:
 
     @classmethod
     def busy_workers(cls, within_s: float) -> list[str]:
-        """Return the names of closed workers that are still busy after `within_s`.
+        """Return the names of the closed workers whose threads still run after `within_s` seconds.
 
         The interpreter must not end while they run; see `join`.
         """
@@ -102,8 +102,8 @@ def _lower_priority(name: str, nice: int) -> None:
         os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + nice)
     except OSError as error:
         log.warning(
-            "%s: cannot lower the thread priority (%s); it may delay tracking on a busy machine. "
-            "Set supervision.background_nice=0 to silence this.",
+            "%s: cannot lower the thread priority (%s); this thread may delay tracking on a busy "
+            "machine. Set supervision.background_nice=0 to silence this warning.",
             name, error.strerror,
         )  # fmt: skip
 

@@ -3,13 +3,13 @@
 Properties of zenoh-python 1.x that shape this module:
 
 - Callbacks with `indirect=False` run on Zenoh's own thread, so they only store the message and
-  notify the event loop. A plain `callback=` adds a hidden queue of 256 messages. It also adds a
-  thread that keeps the interpreter alive.
+  notify the event loop. A plain `callback=` would add a hidden queue of 256 messages, and a thread
+  that keeps the interpreter alive.
 - `put` and `reply` may block, so they run in threads of this module.
 - Everything is sent with congestion control DROP. With BLOCK, one stalled subscriber stalls the
   sender for seconds and then loses messages anyway. Flow control retransmits lost messages.
-- The default configuration listens on every interface. Scouting, gossip and shared memory are
-  therefore disabled. The service listens on loopback, or over TLS for known certificates.
+- By default, Zenoh listens on every interface and searches for peers. This module therefore listens
+  only on the configured endpoint, and disables scouting, gossip and shared memory.
 """
 
 import asyncio
@@ -38,10 +38,11 @@ LEAVE_WITHIN_S = 2.0  # Time to send pending messages when a transport closes.
 
 
 def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
-    """Open a Zenoh session for a `with` block: a router of the service, or a client of one.
+    """Open a Zenoh session for a `with` block, as a router or as the client of a router.
 
     Raises:
-        ConfigError: The port is taken, no service replies there, or the keys are rejected.
+        ConfigError: The endpoint is malformed, its port is in use, no service replies on it, or the
+            keys are rejected.
     """
     try:
         config = _session_config(network, router)
@@ -82,12 +83,13 @@ def _why_not_connected(network: Endpoint) -> str:
     host, port = network.address
     if network.keys and port.isdecimal() and (why := network.keys.tls_error(host, int(port))):
         return (
-            f"{network.endpoint} and the keys in {network.keys.folder} do not accept each other: "
-            f"{why}. `ldo keys list` shows the valid keys; all of them need one authority."
+            f"the service on {network.endpoint} and the keys in {network.keys.folder} do not "
+            f"accept each other: {why}. `ldo keys list` shows the valid keys; service and client "
+            "need keys of the same authority."
         )
     return (
         f"no service replies on {network.endpoint}: start `ldo serve`, "
-        "or name its address with --endpoint."
+        "or give the address of a running service with --endpoint."
     )
 
 
@@ -146,7 +148,7 @@ class ZenohTransport:
         self._declared.append(liveliness.declare_subscriber(expression, handler, history=True))
 
     def serve_queries(self, key: str, last_values: LastValues) -> None:
-        """Reply to queries on a key with its last values."""
+        """Reply to queries on a key with the parts that `last_values` returns."""
         expression = self._network.expression(key)
 
         def reply(query: zenoh.Query) -> None:
@@ -170,7 +172,7 @@ class ZenohTransport:
     def respond(self, key: str, respond: Callable[[bytes], Awaitable[bytes]]) -> None:
         """Reply to each query on a key with the result of a coroutine on the event loop.
 
-        This is for requests that take time; `serve_queries` is for values that exist already.
+        Use this method for requests that take time, and `serve_queries` for existing values.
 
         Args:
             key: Key of the queries.
@@ -206,7 +208,7 @@ class ZenohTransport:
     def close(self) -> None:
         """End all subscriptions, queries and tokens.
 
-        Messages that are not sent yet have `LEAVE_WITHIN_S` to be sent.
+        All publishers together have `LEAVE_WITHIN_S` to send pending messages.
         """
         for task in self._responding:
             task.cancel()
@@ -260,12 +262,12 @@ class ZenohPublisher:
                         self._publisher.key_expr, error)  # fmt: skip
 
     def close(self) -> None:
-        """Accept no more messages; those accepted so far are still sent."""
+        """Accept no more messages; send those accepted so far."""
         self._thread.submit(self._undeclare)
         self._thread.close()
 
     def join(self, timeout_s: float) -> None:
-        """Wait for the thread after `close`."""
+        """Wait at most `timeout_s` for the end of the thread, after `close`."""
         self._thread.join(timeout_s)
 
     def _undeclare(self) -> None:

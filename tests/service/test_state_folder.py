@@ -64,5 +64,5 @@ def test_state_with_tracker_older_than_mapper_is_rejected(tmp_path: Path) -> Non
     offsets = {"in": {"keyframe/new": (1, 6)}, "out": {}}
     state = {**Mapper().snapshot(), "stage.offsets": offsets}
     FolderStore(tmp_path / "state").save("mapper", state)
-    with pytest.raises(ConfigError, match="mapper is newer than that of tracker"):
+    with pytest.raises(ConfigError, match="mapper is newer than the state of tracker"):
         claim(tmp_path)
