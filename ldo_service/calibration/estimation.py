@@ -65,7 +65,7 @@ class Estimate:
 
     depth_bias: np.ndarray  # [3] 1/m
     vignetting: np.ndarray  # [3, 3] channel by term
-    pairs: list[ViewPair]  # Pairs with the relative poses that were estimated jointly with the bias.
+    pairs: list[ViewPair]  # Pairs with their relative poses, estimated jointly with the bias.
     depth_check: Solution  # Solution from the dense depth alone, without features.
     color_checks: list[Solution]  # One per channel; empty if too few colors were compared.
 

@@ -25,15 +25,15 @@ def bench(
     gaussians_out_of_view: Annotated[int, argument(help="additional Gaussians out of view")] = 0,
     size: Annotated[str, argument(metavar="WxH", help="size of the image, pixels")] = "640x480",
     threads: Annotated[int, argument(help="threads of the kernels")] = 1,
-    repeats: Annotated[int, argument(help="iterations that each median is taken over")] = 20,
+    repeats: Annotated[int, argument(help="iterations; the times are medians over them")] = 20,
     json_: Annotated[bool, argument(name="json", help="print one JSON object")] = False,
 ) -> None:
     """Measure how long one iteration of the Gaussian optimizer takes on this machine.
 
-    The times are medians over all repeats on a synthetic scene, in milliseconds of wall time. The
-    step of Adam runs inside the backward pass: backward_ms is the pass without the step, and
-    adam_ms is the time that the step adds. iteration_ms is the time of forward pass, loss, backward
-    pass and step together.
+    The scene is synthetic. The times are medians over all repeats, in milliseconds of wall time.
+    The step of Adam runs inside the backward pass: backward_ms is the time of the pass without the
+    step, and adam_ms is the time that the step adds. iteration_ms is the time of forward pass,
+    loss, backward pass and step together.
 
     Set the environment variable LDO_ISA to avx512, avx2 or baseline to choose the instruction set.
     """

@@ -52,7 +52,7 @@ RENAMED_OPTIONS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run `ldo` with these arguments, or with those of the process, and exit."""
+    """Run `ldo` with `arguments`, or with the arguments of the process if None, and exit."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [OLD_OPTIONS.get(word, word) for word in words if word != "--debug"]
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run_verb(words: Sequence[str], known: dict[str, Callable[..., None]]) -> None:
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
-    if words[0] in known:  # This `prog` makes errors point to the help of the verb.
+    if words[0] in known:  # `prog` makes errors name the help of the verb.
         tyro.cli(known[words[0]], prog=f"ldo {words[0]}", args=words[1:], config=config)
     else:
         tyro.extras.subcommand_cli_from_dict(known, prog="ldo", args=words, config=config)

@@ -18,7 +18,7 @@ Verb = Annotated[
         metavar="VERB",
         help="pause: drop all frames; resume: process frames again; save: write every actor's "
         "state now; reset: start again with an empty map; refine: optimize the map further; "
-        "add-label: let the labeller choose from NAME too",
+        "add-label: add NAME to the names that the labeller chooses from",
     ),
 ]
 Name = Annotated[
@@ -28,7 +28,7 @@ Name = Annotated[
 ]
 Iterations = Annotated[
     int,
-    argument(metavar="N", help=f"iterations of refine, at most {MAX_ITERATIONS} at a time"),
+    argument(metavar="N", help=f"iterations of refine, at most {MAX_ITERATIONS} per command"),
 ]
 
 
@@ -40,13 +40,13 @@ def control(
     keys: KeysFolder = None,
     iterations: Iterations = 200,
 ) -> None:
-    """Pause, resume, save, reset or refine a running service, or add a label to it.
+    """Pause, resume, save or reset a running service, refine its map, or add a label.
 
-    The command returns when every actor has executed the request. If an actor did not, the message
-    names the actor and the exit code is 4.
+    pause, resume, save and reset return when every actor has executed them. If an actor did not,
+    the message names the actor and the exit code is 4.
 
-    `refine` goes to the mapper alone. The mapper runs the iterations before it takes its next
-    keyframe; the command does not wait for their end.
+    `refine` only sends a request to the mapper and returns at once. The mapper runs the iterations
+    before it takes its next keyframe.
 
       ldo control reset
       ldo control refine --iterations 500

@@ -24,7 +24,7 @@ from ldo_service.synthetic.flat.sequence import prerender
 from .options import Overwrite, argument, progress
 from .run import with_options
 
-FRAMES = 70  # Frames of the synthetic flat that show its first room.
+FRAMES = 70  # The first frames of the synthetic flat, which show its first room.
 HOLD_OUT = 5  # Every 5th frame is tracked but not mapped.
 PROCESSES = 4  # Maximum ray-casting processes; each takes seconds to start, then 1 s per frame.
 NETWORKS = "demo"  # Name of the networks that come with the package.
@@ -42,7 +42,7 @@ def demo(
     the blur and the depth noise of a Kinect. Every fifth frame is tracked but not mapped, and the
     PSNR is measured on these held-out frames.
 
-    Small networks that come with the package label the objects. These networks were trained on
+    The names of objects come from small networks in the package. These networks were trained on
     other synthetic rooms and recognize objects in synthetic rooms only. The settings that separate
     objects by depth were tuned on this room.
     """
@@ -88,6 +88,6 @@ def rows(
     yield "objects", ", ".join(sorted(one.name for one in found.objects)) or "none"
     for errors in results.labels:
         right = errors.lists[0].figures(gate=0.0).pixel_accuracy
-        yield "labels", f"{right:.0%} of the pixels have the right COCO class, or rightly none"
+        yield "labels", f"{right:.0%} of the pixels have the right label (COCO or background)"
     yield "speed", f"{summary['fps']:.1f} FPS ({summary['isa']}, without ray casting)"
     yield "pictures", "\n".join(map(str, results.pictures))

@@ -90,17 +90,17 @@ def doctor(
 
 
 def machine() -> Iterator[Finding]:
-    """Check version, processor and free disk space."""
+    """Report version and processor, and check the free disk space."""
     yield Finding("ok", f"ldo-slam {__version__}, Python {platform.python_version()}")
     memory_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     yield Finding(
         "ok",
         f"{platform.machine()}, {os.cpu_count()} cores, {memory_gb:.0f} GB, kernels: "
-        f"{kernels.isa()} (LDO_ISA forces another)",
+        f"{kernels.isa()} (LDO_ISA selects another)",
     )
     free_gb = shutil.disk_usage(os.getcwd()).free / 1e9
     mark = "ok" if free_gb > 1 else "bad"
-    yield Finding(mark, f"{free_gb:.1f} GB free in this folder; a run takes about 0.1 GB")
+    yield Finding(mark, f"{free_gb:.1f} GB free on the disk of this folder; keep more than 1 GB")
 
 
 def libraries() -> Iterator[Finding]:
@@ -196,7 +196,7 @@ def _seen(
 
 
 def of_actor(actor: ActorStatus) -> Iterator[Finding]:
-    """Yield the state of an actor, then its problems and remarks."""
+    """Yield the state of an actor, then its problems, then notes that need no action."""
     wrong = list(diagnose(actor))
     if actor.health is not None:
         yield Finding("bad" if wrong else "ok", _in_numbers(actor.health))

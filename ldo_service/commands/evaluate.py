@@ -40,7 +40,7 @@ NO_LPIPS = "LPIPS is not computed; --lpips FILE.onnx adds it."
 
 
 def label_table(rows: list[LabelErrors]) -> Table:
-    """Return a table with a row for each list of names and each minimum frequency of a class."""
+    """Return a table of label metrics: a row for each map, list of names and entry of GATES."""
     table = Table("map", "names", "classes", *FIGURES, "per image", "frames")
     for row in rows:
         for errors in row.lists:
@@ -55,7 +55,7 @@ def label_table(rows: list[LabelErrors]) -> Table:
 
 
 def open_table(rows: list[LabelErrors], calls_per_frame: float | None) -> Table:
-    """Return a table of view consistency, labels beyond COCO and labeller requests.
+    """Return a table of label consistency, labels beyond COCO, and requests to the labeller.
 
     Args:
         rows: Label errors of each map.
@@ -93,8 +93,8 @@ def evaluate(
         Path | None,
         argument(
             metavar="FILE.onnx",
-            help="network of LPIPS with two inputs, float32 [1, 3, H, W], RGB in -1..1, and one "
-            "output with a single number, as torch.onnx.export writes lpips.LPIPS(net='alex')",
+            help="network of LPIPS, as torch.onnx.export writes lpips.LPIPS(net='alex'): "
+            "two inputs, float32 [1, 3, H, W], RGB in -1..1; one output with a single number",
         ),
     ] = None,
     json_: Annotated[Json, argument(name="json")] = False,

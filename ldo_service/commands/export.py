@@ -57,11 +57,11 @@ def export(
         argument(metavar="FILE", help="default: a file in DIR, named after the format"),
     ] = None,
     online: Annotated[
-        bool, argument(help="export the map and poses of the run itself, not the refined ones")
+        bool, argument(help="export the map and poses before the refinement")
     ] = False,
     voxel: Annotated[
         float | None,
-        argument(metavar="M", help="side of a voxel; default: mesh 0.02, occupancy 0.1"),
+        argument(metavar="M", help="side of a voxel, meters; default: mesh 0.02, occupancy 0.1"),
     ] = None,
     up: Annotated[
         Up, argument(help="axis of the map that points up, for the floor plan of occupancy")
@@ -78,8 +78,8 @@ def export(
 
     The refined map is exported if there is one. `mesh` is a PLY file with colored triangles.
     `occupancy` is an .npz file with a grid of free, occupied and unknown voxels; a floor plan (.pgm
-    and .yaml) for map_server of ROS is written beside it. The map has the axes of the first camera,
-    so `--up -y` is right if that camera was level.
+    and .yaml) for map_server of ROS is written beside it. The map has the axes of the first camera
+    pose, so `--up -y` is right if the camera was level at the start.
 
       ldo export runs/desk --format splat
       ldo export runs/desk --format occupancy --voxel 0.05 --heights -0.8 0.3
@@ -161,7 +161,7 @@ def _mesh(job: Job) -> str:
         mesh = fuse(rows, viewpoints, config, threads=os.cpu_count() or 1, advance=advance).mesh()
     if not len(mesh.triangles):
         raise DataError(
-            "the keyframes see no surface, so the mesh would be empty. Check the map by `ldo view`."
+            "the keyframes see no surface, so the mesh would be empty. Check the map in `ldo view`."
         )
     write_mesh(job.out, mesh)
     vertices, triangles = len(mesh.vertices_m), len(mesh.triangles)

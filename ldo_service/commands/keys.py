@@ -31,7 +31,8 @@ Days = Annotated[int, argument(metavar="N", help="days that the keys are valid")
 class New:
     """Create a certificate authority in a new folder.
 
-    The private key of the authority never leaves this machine; only the keys that `add` makes do.
+    Keep the private key of the authority on this machine. Copy only the keys that `ldo keys add`
+    makes to other machines.
     """
 
     folder: Folder
@@ -70,7 +71,8 @@ class AddKeys:
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(
             metavar="HOST",
-            help="name or address of a service besides localhost; may be repeated",
+            help="name or address of the machine of a service, in addition to localhost; may be "
+            "repeated",
         ),
     ] = ()
     days: Days = 365
@@ -87,8 +89,8 @@ class ListKeys:
 class RevokeKeys:
     """Revoke keys, and delete their folder on this machine.
 
-    The revocation takes effect at a router once you have copied the new `access.yaml` there and
-    restarted the router.
+    The revocation takes effect at a service after you have copied the new `access.yaml` to it and
+    restarted it. A separate router needs a new configuration of `ldo keys router` and a restart.
     """
 
     folder: Folder
@@ -118,7 +120,7 @@ Verb = (
 def keys(verb: Verb) -> None:
     """Make and revoke the keys that authenticate programs on the network.
 
-    A service without keys accepts programs on this machine alone. These commands make keys for a
+    A service without keys accepts only programs on its own machine. These commands make keys for a
     service and for a viewer on another machine, and start the service:
 
       ldo keys init DIR

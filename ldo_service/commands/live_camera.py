@@ -29,7 +29,7 @@ class RealSenseOptions:
 
     serial: Annotated[
         str,
-        argument(metavar="NUMBER", help="serial number of the device, if there are several"),
+        argument(metavar="NUMBER", help="serial number of the camera, if several are connected"),
     ] = ""
     size: Annotated[str, argument(metavar="WxH", help="image size of color and depth")] = "640x480"
     fps: Annotated[int, argument(metavar="HZ", help="frame rate of color and depth")] = 30
@@ -55,25 +55,36 @@ class RosOptions:
 
     color: Annotated[
         str,
-        argument(metavar="TOPIC", help="Image, or CompressedImage if it ends in /compressed"),
+        argument(
+            metavar="TOPIC",
+            help="color; type Image, or CompressedImage if the name ends in /compressed",
+        ),
     ] = ""
     depth: Annotated[
         str,
-        argument(metavar="TOPIC", help="depth registered to color; may end in /compressedDepth"),
+        argument(
+            metavar="TOPIC",
+            help="depth registered to color; type Image, or CompressedImage if the name ends in "
+            "/compressedDepth",
+        ),
     ] = ""
     info: Annotated[
         str,
-        argument(metavar="TOPIC", help="CameraInfo of color; default: camera_info beside --color"),
+        argument(
+            metavar="TOPIC",
+            help="CameraInfo of color; default: camera_info in the namespace of --color",
+        ),
     ] = ""
     bridge: Annotated[
         str,
         argument(
-            metavar="ADDRESS", help="address of a bridge with its own router; default: --endpoint"
+            metavar="ADDRESS",
+            help="address of the router that the bridge is connected to; default: --endpoint",
         ),
     ] = ""
     max_skew_s: Annotated[
         float,
-        argument(metavar="S", help="maximum difference of the stamps of color and depth"),
+        argument(metavar="S", help="maximum difference of the stamps of color and depth, s"),
     ] = 0.015
     rectified: Annotated[
         bool, argument(help="images are rectified: use P of the CameraInfo, not K and D")
@@ -97,12 +108,12 @@ class RosOptions:
 def frames_of_ros(
     options: RosOptions, service: Endpoint, notify: Notify
 ) -> Generator[CameraRgbd, None, None]:
-    """Return the frames that a Zenoh bridge forwards from ROS 2.
+    """Return the frames made from ROS 2 messages that a Zenoh bridge forwards.
 
     Args:
         options: Topics and options.
-        service: Endpoint of the service. Its router also forwards the topics of the bridge, unless
-            `options.bridge` gives another router.
+        service: Endpoint of the service. The topics of ROS 2 are read from the same router, unless
+            `options.bridge` gives another one.
         notify: Callback that receives notes for the user.
 
     Raises:
@@ -131,7 +142,7 @@ def _report_at_end(
 
 
 def require_no_sequence(source: str, **options: object) -> None:
-    """Check that no option is given that applies only to recorded frames.
+    """Check that no option is given that applies only to sequences.
 
     Raises:
         ConfigError: If such an option is given.

@@ -40,7 +40,7 @@ class AddModel:
     file: Annotated[Path, tyro.conf.Positional, argument(metavar="FILE", help="network in ONNX")]
     layout: Annotated[
         Literal["yolov5", "yolox", "yolov8"] | None,
-        argument(help="layout of the network's output; default: recognized by the output's shape"),
+        argument(help="layout of the network's output; default: recognized from its shape"),
     ] = None
     names: Annotated[
         str,
@@ -57,7 +57,7 @@ class AddModel:
     text: Annotated[Path | None, argument(metavar="FILE", help="text encoder in ONNX")] = None
     vocabulary: Annotated[
         Path | None,
-        argument(metavar="FILE", help="byte pairs of the text encoder, as CLIP's .txt.gz"),
+        argument(metavar="FILE", help="byte pairs of the text encoder, a .txt.gz file as for CLIP"),
     ] = None
     embeddings: Annotated[
         Path | None,
@@ -106,8 +106,8 @@ def models(verb: Verb) -> None:
     """Register, list and remove detectors and encoder pairs.
 
     `detector.model` in the configuration takes the registered name of a detector.
-    `vlm_labeller.model` takes the registered name of an encoder pair, which labels regions. Only
-    `demo` comes with the package: a detector and a pair for the synthetic scenes.
+    `vlm_labeller.model` takes the registered name of an encoder pair, which labels regions. The
+    package contains only `demo`: a detector and a pair for the synthetic scenes.
 
       ldo models add nano yolox_nano.onnx
       ldo run SOURCE --out DIR --set detector.model=nano
@@ -123,7 +123,7 @@ def models(verb: Verb) -> None:
 
 
 def add(verb: AddModel) -> None:
-    """Register a detector or an encoder pair and print its facts.
+    """Register a detector or an encoder pair, and print its layout and classes.
 
     Raises:
         ConfigError: If a file cannot be used.
@@ -181,7 +181,7 @@ def show(console: Console) -> None:
     console.print(f"{demo_networks.NAME}, a detector and a pair, comes with the package.")
     if damaged:
         raise LdoError(
-            f"{damaged} of the networks above are damaged: remove them and add them again."
+            f"{damaged} of the networks above are damaged. Remove them and add them again."
         )
 
 

@@ -22,7 +22,7 @@ LINES = 10  # Lines of progress per command if the output is no terminal.
 
 
 def argument(**properties: Any) -> Any:
-    """Describe an argument as `tyro.conf.arg` does; the help omits the defaults in NO_DEFAULTS."""
+    """Describe an argument as `tyro.conf.arg` does, but omit defaults in NO_DEFAULTS from help."""
     return tyro.conf.arg(help_behavior_hint=_default_hint, **properties)
 
 
@@ -39,7 +39,7 @@ Settings = Annotated[
     tyro.conf.arg(
         name="set",
         metavar="SECTION.FIELD=VALUE",
-        help="change one setting; may be repeated. `ldo config` lists them",
+        help="change one setting; may be repeated. `ldo config` lists the settings",
     ),
 ]
 Source = Annotated[

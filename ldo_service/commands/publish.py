@@ -61,8 +61,7 @@ def publish(
     restamp: Annotated[
         bool,
         argument(
-            help="stamp frames with the time of sending, not of recording, for example to send a "
-            "data set again"
+            help="replace each stamp by the time of sending, for example to send a data set again"
         ),
     ] = False,
     config: ConfigFile = None,
@@ -76,8 +75,7 @@ def publish(
 
     Frames keep the stamps of the source unless --restamp is given. Stamps must ascend: the service
     rejects a frame that is not later than the frame before. To send a data set again, use
-    --restamp. The age of a pose is then the difference between a subscriber's clock and the stamp
-    of the pose.
+    --restamp: the age of a pose is then the clock of a subscriber minus the stamp of the pose.
 
       ldo publish ~/data/rgbd_dataset_freiburg1_desk --rate 15
       ldo publish ~/data/rgbd_dataset_freiburg1_desk --restamp
@@ -123,8 +121,8 @@ def publish(
 class SequencePublisher:
     """Publisher of the frames of a sequence.
 
-    The publisher notifies the user of the first unreadable frame, and each time the topic has lost
-    its last subscriber.
+    The publisher notifies the user of the first unreadable frame, and each time the last subscriber
+    disconnects.
     """
 
     def __init__(
@@ -163,11 +161,11 @@ class SequencePublisher:
 
 
 def paced(sequence: Sequence, indices: range, rate: float | None) -> Iterator[int]:
-    """Yield each index at the time when it must be sent.
+    """Yield the index of each frame at the time when the frame must be sent.
 
     Args:
         sequence: The sequence.
-        indices: Frames to send.
+        indices: Indices of the frames to send.
         rate: Frames per second; None keeps the intervals of the recorded stamps.
     """
     started_s = time.monotonic()

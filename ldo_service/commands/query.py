@@ -45,16 +45,16 @@ def query(
         str,
         argument(
             metavar="NAME",
-            help="encoder pair that compares TEXT with the labels if no label has the same "
-            "meaning; default for a run: the labeller of the run",
+            help="encoder pair that compares TEXT with the names of the objects if none matches; "
+            "default for a run: the labeller of the run",
         ),
     ] = "",
     json_: Annotated[Json, argument(name="json")] = False,
 ) -> None:
     """Find objects by name: print their boxes in the map, best match first.
 
-    TEXT also finds synonyms, broader and narrower terms: "sofa" finds couches. If there is an
-    encoder pair, its text encoder compares other words with the object names.
+    TEXT also finds synonyms, broader and narrower terms: "sofa" finds couches. If no object
+    matches, the text encoder of an encoder pair compares TEXT with the names of the objects.
 
       ldo query DIR "potted plant"
       ldo query live chair --json
@@ -99,16 +99,16 @@ def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.
 def _texts_of(model: str, run: Path | None) -> Encode:
     """Return a function that encodes texts with an encoder pair.
 
-    The pair is opened at the call of that function, because the labeller of a run may no longer
-    exist and most queries do not need it.
+    The returned function opens the pair when it is called, because most queries do not need the
+    pair, and the labeller of a run may no longer exist.
 
     Args:
-        model: Name of the encoder pair; empty for the labeller of the run.
+        model: Name of the encoder pair; empty to use the labeller of the run.
         run: Folder of the run; None for a live service.
 
     Returns:
-        The function. The function raises ConfigError if the named pair cannot be opened, and
-        TextComparisonError if no pair is named and the run has no pair that can be opened.
+        The function. It raises ConfigError if `model` cannot be opened. It raises
+        TextComparisonError if `model` is empty and the run has no pair that can be opened.
     """
 
     def encode(texts: Sequence[str]) -> np.ndarray:
@@ -126,7 +126,7 @@ def _texts_of(model: str, run: Path | None) -> Encode:
 
 
 def _labeller_of(run: Path) -> VlmLabellerConfig | None:
-    """Return the settings of the run's labeller; None if the labeller was no encoder pair.
+    """Return the settings of the run's labeller; None if the run had no encoder pair.
 
     Raises:
         TextComparisonError: If the configuration of the run cannot be read, or is of an earlier

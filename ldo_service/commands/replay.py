@@ -25,8 +25,8 @@ def replay(
 ) -> None:
     """Replay a recording with new actors, and compare their outputs with the recorded outputs.
 
-    The replay also repeats restarts, failures and the recorded send credit at each step. Nothing is
-    published. Without --verify, differences are printed, and the exit code is still 0.
+    The replay also repeats restarts, failures and the recorded send credit at each step. It
+    publishes nothing. Without --verify, it prints differences, and the exit code is still 0.
 
       ldo replay recordings/desk --verify
     """

@@ -44,7 +44,7 @@ def run(
     stride: Stride = 1,
     hold_out_every: Annotated[
         int | None,
-        argument(metavar="N", help="track every N-th frame but never map it; 0: map all"),
+        argument(metavar="N", help="track every N-th frame but do not map it; 0: map all frames"),
     ] = None,
     threads: Annotated[
         int | None,
@@ -57,7 +57,8 @@ def run(
     refine_iterations: Annotated[
         int,
         argument(
-            metavar="N", help="optimize the map for N more iterations at the end, into DIR/refined"
+            metavar="N",
+            help="optimize the map for N more iterations at the end, saved in DIR/refined",
         ),
     ] = 0,
     localize: Localize = None,
@@ -66,7 +67,7 @@ def run(
         argument(
             metavar="FILE",
             help="poses of the robot's base from another odometry, in the TUM format, as initial "
-            "guess for the tracker; tracker.T_base_camera is the camera pose on the base",
+            "guess for the tracker; tracker.T_base_camera must be the camera pose on the base",
         ),
     ] = None,
     keep_front_end: Annotated[
@@ -79,12 +80,12 @@ def run(
         Path | None,
         argument(
             metavar="RUN",
-            help="take the outputs of tracker and detector from this run over the same frames, and "
-            "run only the other actors, to compare their settings with equal poses",
+            help="use the recorded outputs of tracker and detector of an earlier RUN over the same "
+            "frames, to compare settings of the other actors on equal poses",
         ),
     ] = None,
     realtime: Annotated[
-        bool, argument(help="pace by stamps and drop late frames, as the service does")
+        bool, argument(help="send frames at the times of their stamps, and drop late ones")
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -170,15 +171,17 @@ def kept_front_end(
     if run is None:
         return None
     if run.expanduser().resolve() == out.expanduser().resolve():
-        raise ConfigError(f"--out {out} would replace the front end: choose another folder.")
+        raise ConfigError(
+            f"--out {out} would replace the front end that the run reads. Choose another --out."
+        )
     return FrontEnd.open(run, settings, sequence, selection)
 
 
 def format_unmerged(gaussians: int) -> str:
     """Return a note on the Gaussians of submaps that were never merged with the map."""
     return (
-        f"map.ply lacks {gaussians:,} Gaussians: tracking was lost, and the submaps after it were "
-        "never merged with the map, so the poses of these Gaussians in the map are unknown."
+        f"map.ply lacks {gaussians:,} Gaussians: tracking was lost, and the submaps after the loss "
+        "were never merged with the map. Their poses in the map are unknown."
     )
 
 
@@ -189,7 +192,7 @@ def format_localization(statuses: dict[str, int], folder: Path) -> str:
             f"No frame was localized. Check that {folder} is a map of this place, made from "
             "similar heights and with a camera of a similar field of view."
         )
-    return f"The map is that of {folder}, unchanged."
+    return f"The run localized in the map of {folder}, which is unchanged."
 
 
 def with_options(config: Config, hold_out: int | None, threads: int | None) -> Config:
@@ -206,15 +209,15 @@ def with_options(config: Config, hold_out: int | None, threads: int | None) -> C
 
 
 def require_none_of(option: str, is_given: object, others: Mapping[str, object]) -> None:
-    """Check that no option is given that would have no effect with another one.
+    """Check that an option is not given together with an option that it excludes.
 
     Args:
         option: Name of the option.
         is_given: Value of the option; a true value means that the option is given.
-        others: Values of the options that have no effect with `option`, by name.
+        others: Values of the options that `option` excludes, by name.
 
     Raises:
-        ConfigError: If the option and one of the others are given.
+        ConfigError: If the option and one of `others` are given.
     """
     wrong = [name for name, value in others.items() if value]
     if is_given and wrong:
@@ -228,24 +231,24 @@ def require_separate(localize: Path | None, out: Path, refine: int) -> None:
         ConfigError: If the run would refine or replace that map.
     """
     if localize and refine:
-        raise ConfigError("--localize does not change the map. Remove --refine-iterations.")
+        raise ConfigError("--localize never changes the map. Remove --refine-iterations.")
     if localize and localize.expanduser().resolve() == out.expanduser().resolve():
-        raise ConfigError(f"--out {out} would replace the map to localize in: choose another.")
+        raise ConfigError(f"--out {out} would replace the map of --localize. Choose another --out.")
 
 
 def require_held_out(stride: int, hold_out: int) -> None:
-    """Check that the stride reaches the frames that are held out.
+    """Check that the run reads the frames that are held out.
 
-    Every `hold_out`-th frame of the whole sequence is held out, counted before the stride. If both
-    numbers had a common factor, some held-out frames would never be read.
+    Every `hold_out`-th frame of the whole sequence is held out, counted before the stride selects
+    frames. If both numbers have a common factor, the stride skips all held-out frames.
 
     Raises:
         ConfigError: If both numbers have a common factor.
     """
     if hold_out and gcd(stride, hold_out) > 1:
         raise ConfigError(
-            f"--stride {stride} and --hold-out-every {hold_out} have a common factor, so other "
-            "frames would be held out than requested. Choose numbers without a common factor."
+            f"--stride {stride} and --hold-out-every {hold_out} have a common factor, so "
+            "the stride would skip all held-out frames. Choose numbers without a common factor."
         )
 
 

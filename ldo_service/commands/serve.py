@@ -26,14 +26,14 @@ from .options import (
 )
 
 Insecure = Annotated[
-    bool, argument(help="listen on the network without keys: anyone there may do anything")
+    bool, argument(help="listen on the network without keys: anyone there can control the service")
 ]
 Client = Annotated[bool, argument(help="connect to the router at ADDRESS instead of opening one")]
 MetricsPort = Annotated[
     int | None,
     argument(
         metavar="PORT",
-        help="serve Prometheus metrics of every actor on PORT of service.metrics_address",
+        help="serve the metrics of every actor for Prometheus on PORT of service.metrics_address",
     ),
 ]
 
@@ -55,7 +55,7 @@ def serve(
     client: Client = False,
     metrics_port: MetricsPort = None,
 ) -> None:
-    """Run the service: camera frames in on camera/rgbd; poses, map and health out.
+    """Run the service: receive frames on camera/rgbd; publish poses, map, objects and health.
 
     Ctrl-C stops the service after each actor has finished its pending work. A second Ctrl-C stops
     the service at once.
@@ -103,7 +103,7 @@ def record(
 ) -> None:
     """Run the service as `ldo serve` does, and record the inputs of every actor.
 
-    A running service cannot start a recording, because the recording would lack the state of its
+    You cannot record a service that already runs, because the recording would lack the state of its
     actors. Stop the service, then run `ldo record` with the same --state folder to keep the map.
 
     A recording of 640x480 pixels at 30 Hz takes 100 MB per second; recording.max_gb limits the

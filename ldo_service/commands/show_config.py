@@ -11,13 +11,13 @@ def show_config(
     config: ConfigFile = None,
     set: Settings = (),
     all_: Annotated[
-        bool, argument(name="all", help="print advanced settings too; they may change")
+        bool, argument(name="all", help="print all advanced settings too; releases may change them")
     ] = False,
 ) -> None:
     """Print the effective configuration as YAML, with a comment on each setting.
 
-    Without --all the output has the public settings, and the advanced ones that differ from their
-    defaults.
+    Without --all, the command prints all public settings, and only those advanced settings that
+    differ from their defaults. --config reads back what the command prints.
 
       ldo config > my.yaml            then delete what you do not change
       ldo run SOURCE --out DIR --config my.yaml

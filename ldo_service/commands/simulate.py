@@ -39,7 +39,7 @@ def simulate(
     """Run all actors on a logical clock, and print a digest of each actor's outputs.
 
     The digests depend only on the frames, the configuration and the instruction set, not on the
-    number of threads or the load of the machine. Nothing is written.
+    number of threads or the load of the machine. The command writes no files.
 
       ldo simulate synthetic:room --max-frames 60 --json
     """

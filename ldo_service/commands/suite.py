@@ -21,20 +21,20 @@ def suite(
         tyro.conf.Positional,
         argument(metavar="SUITE", help="YAML file, or the name of a built-in suite"),
     ],
-    out: Annotated[Path, argument(metavar="DIR", help="folder for the runs and the table")],
+    out: Annotated[Path, argument(metavar="DIR", help="folder for the runs and the tables")],
     data: Annotated[
         Path, argument(metavar="DIR", help="folder with the data sets of the suite")
     ] = Path(),
     set: Settings = (),
     overwrite: Overwrite = False,
 ) -> None:
-    """Run and evaluate a list of sequences and variants; print one table with mean and spread.
+    """Run and evaluate several sequences and variants; print tables with mean and spread.
 
-    The command prints the table in Markdown and writes it to DIR/table.md. An interrupted suite
-    resumes where it stopped: finished runs are not repeated. A sequence without data is skipped,
-    and the table names it. The built-in suites are the tables of the paper, its sensitivity
-    analysis and its ablation. `--set` changes a setting in all runs; the suite defines the settings
-    of each variant.
+    The command prints the tables in Markdown and writes them to DIR/table.md. If you repeat an
+    interrupted command, finished runs are not repeated. A sequence without data is skipped and
+    marked in the tables. The built-in suites give the tables of the paper, its sensitivity analysis
+    and its ablation. `--set` changes a setting in all runs; the suite defines the settings of each
+    variant.
 
       ldo suite table-1 --data ~/data --out suites/table-1
       ldo suite table-9 --data ~/data --out suites/ablation --set detector.model=nano

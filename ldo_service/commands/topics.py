@@ -21,7 +21,7 @@ def topics(
         bool,
         argument(name="json-schema", help="print the JSON Schema of every message"),
     ] = False,
-    markdown: Annotated[bool, argument(help="print the table of the documentation")] = False,
+    markdown: Annotated[bool, argument(help="print the table of docs/topics.md")] = False,
     mermaid: Annotated[bool, argument(help="print the diagram in Mermaid")] = False,
 ) -> None:
     """List every topic: its key, message, producer, consumers and their policies.

@@ -37,8 +37,8 @@ def view(
 ) -> None:
     """Show a map in a browser: Gaussians, paths, keyframes, objects, loops, and a search box.
 
-    For a run in progress, the window shows the files written so far and updates as more are
-    written. By default only browsers on this machine can open the window; see docs/viewer.md.
+    For a run in progress, the window shows the files written so far, and adds others when they
+    appear. By default only browsers on this machine can open the window; see docs/viewer.md.
     Ctrl-C ends the command.
 
       ldo view runs/desk

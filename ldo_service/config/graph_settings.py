@@ -20,14 +20,15 @@ class RetrievalSettings:
     """Search for subgraphs of keyframes that look like the newest subgraph."""
 
     # Comparison of subgraphs: by labels and images (two_stage), by labels alone (semantic), or by
-    # images alone (geometric). The latter two serve for evaluation.
+    # images alone (geometric). The modes semantic and geometric serve for evaluation.
     mode: Literal["two_stage", "semantic", "geometric"] = "two_stage"
     # Minimum number of camera frames between the two subgraphs of a loop closure (III.C).
     min_gap_frames: NonNegativeInt = 100
-    # Maximum number of subgraphs, of up to 5 keyframes each, in the place database. Beyond it,
-    # subgraphs are removed evenly along the path.
+    # Maximum number of subgraphs, of up to 5 keyframes each, in the place database. Beyond this
+    # number, subgraphs are removed evenly along the path.
     max_subgraphs: Annotated[int, Meta(ge=3)] = 1000
-    # Maximum number of subgraphs that are verified, the most similar ones. This is K (III.C).
+    # Maximum number of similar subgraphs that are verified, the most similar ones first. This is K
+    # (III.C).
     max_candidates: PositiveInt = advanced(5)
     # Minimum similarity of the labels of two subgraphs. This is theta_loop (III.C).
     min_similarity: Ratio = advanced(0.75)
@@ -92,8 +93,8 @@ class LoopClosureSettings:
     # Maximum residual of an accepted loop closure, in standard deviations, as
     # RGBD/OptimizeMaxError of RTAB-Map.
     max_residual_sigmas: PositiveFloat = advanced(3.0)
-    # Maximum number of loop closures in the pose graph, 1 kB each. Beyond it, the most redundant
-    # one is removed.
+    # Maximum number of loop closures in the pose graph, 1 kB each. Beyond this number, the most
+    # redundant loop closure is removed.
     max_closures: PositiveInt = advanced(500)
 
 
@@ -103,8 +104,8 @@ class LandmarkSettings:
 
     # True adds objects to the pose graph. False omits them, to measure their contribution.
     enabled: bool = True
-    # Maximum number of landmarks in the pose graph. Beyond it, those not observed for the longest
-    # time are removed.
+    # Maximum number of landmarks in the pose graph. Beyond this number, the landmarks that were not
+    # observed for the longest time are removed.
     max_landmarks: PositiveInt = 1000
     # Time at which object observations are added to the pose graph: when enough of them are pending
     # (adaptive), or at every keyframe (fixed).

@@ -94,7 +94,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _apply(tree: dict[str, Any], setting: str) -> None:
     name, equals, value = setting.partition("=")
     if not equals or "." not in name:
-        raise ConfigError(f"--set {setting}: write it as section.field=value.")
+        raise ConfigError(f"--set {setting}: write the setting as section.field=value.")
     *sections, last = name.strip().split(".")
     for section in sections:
         tree = tree.setdefault(section, {})
@@ -121,7 +121,7 @@ def _check_names(tree: Any, schema: type, prefix: str) -> None:
 
 def _hint(path: str, prefix: str, names: list[str]) -> str:
     if was_section(path):
-        return "Its settings have moved: docs/configuration.md lists the current ones."
+        return "Its settings have moved: docs/configuration.md lists the current settings."
     known = f"Known: {', '.join(names)}."
     return did_you_mean(path.removeprefix(prefix), names, known, prefix)
 

@@ -25,10 +25,10 @@ class DensifySettings:
     """Addition of new Gaussians."""
 
     # Maximum side of an image cell that gets one Gaussian, pixels. Flat surfaces have cells of this
-    # size. 2 gains 0.4 dB with twice as many Gaussians.
+    # size. A value of 2 improves PSNR by 0.4 dB and makes twice as many Gaussians.
     max_cell_px: PositiveInt = 4
-    # Transmittance above which a pixel gets a new Gaussian. 0.5 costs 0.5 dB and saves 4 % of the
-    # Gaussians.
+    # Transmittance above which a pixel gets a new Gaussian. A value of 0.5 lowers PSNR by 0.5 dB
+    # and saves 4 % of the Gaussians.
     max_transmittance: OpenRatio = advanced(0.3)
 
     def __post_init__(self) -> None:
@@ -53,8 +53,8 @@ class LearningRateSettings:
     opacity_logit: NonNegativeFloat = advanced(0.1)
     # Learning rate of a color in 0..1.
     color: NonNegativeFloat = advanced(0.01)
-    # Learning rate of keyframe rotations, radians. 0 does not change the rotations. 2e-4 gains 0.3
-    # dB and adds 1 mm of noise to exact poses.
+    # Learning rate of keyframe rotations, radians. 0 does not change the rotations. A value of 2e-4
+    # improves PSNR by 0.3 dB and adds 1 mm of noise to exact poses.
     pose_rotation_rad: NonNegativeFloat = advanced(0.0)
     # Learning rate of keyframe positions, meters. 0 does not change the positions.
     pose_translation_m: NonNegativeFloat = advanced(0.0)
@@ -71,7 +71,7 @@ class LossSettings:
     # Weight of the depth error per meter.
     depth: NonNegativeFloat = advanced(0.5)
     # Maximum standard deviation of a Gaussian in the image, pixels. Without a limit, one Gaussian
-    # could cover a whole wall. 10 costs 0.6 dB.
+    # could cover a whole wall. A limit of 10 lowers PSNR by 0.6 dB.
     max_sigma_px: PositiveFloat = advanced(20.0)
 
 
@@ -79,7 +79,8 @@ class LossSettings:
 class PruneSettings:
     """Removal of Gaussians."""
 
-    # Minimum opacity. Gaussians below it are removed, as in 3DGS (Kerbl et al. 2023, section 5.2).
+    # Minimum opacity. Gaussians with a lower opacity are removed, as in 3DGS (Kerbl et al. 2023,
+    # section 5.2).
     min_opacity: Annotated[float, Meta(ge=0, lt=1)] = advanced(0.005)
     # Number of keyframes between prunings of the map.
     interval_keyframes: PositiveInt = advanced(5)
@@ -92,10 +93,10 @@ class KeyframeImageSettings:
     # Maximum size of keyframe images in memory, MB. The default holds 119 keyframes of 640x480 at
     # 2.15 MB each.
     memory_mb: NonNegativeFloat = 256.0
-    # Maximum size of keyframe images on disk, MB. The default holds some 8,000 keyframes of
-    # 640x480. Beyond it, the most redundant ones are deleted.
+    # Maximum size of keyframe images on disk, MB. The default holds about 8,000 keyframes of
+    # 640x480. Beyond this size, the images of the most redundant keyframes are deleted.
     disk_mb: PositiveFloat = 4096.0
-    # Maximum number of keyframes with images on disk. Each of them takes 3 kB of memory,
+    # Maximum number of keyframes with images on disk. Each of these keyframes takes 3 kB of memory,
     # independent of the size of its image.
     max_keyframes: PositiveInt = advanced(20_000)
 
@@ -104,8 +105,8 @@ class KeyframeImageSettings:
 class OffloadSettings:
     """Offloading of Gaussians to disk."""
 
-    # Maximum number of Gaussians in memory, 300 MB with the moments of Adam. Gaussians out of view
-    # are offloaded to disk.
+    # Maximum number of Gaussians in memory. Beyond this number, Gaussians out of view are offloaded
+    # to disk. The default number takes 300 MB with the moments of Adam.
     max_resident_gaussians: PositiveInt = 1_500_000
 
 
@@ -113,8 +114,8 @@ class OffloadSettings:
 class SemanticsSettings:
     """Labels of Gaussians."""
 
-    # Minimum fraction of a Gaussian that a region must cover to label it. This is theta_IoU
-    # (III.A).
+    # Minimum fraction of a Gaussian that a region must cover to label the Gaussian. This is
+    # theta_IoU (III.A).
     min_overlap: Ratio = advanced(0.3)
     # Maximum number of names in the vocabulary. A further name becomes `other`.
     max_label_names: Annotated[int, Meta(ge=1, le=MAX_LABELS)] = advanced(MAX_LABELS)
@@ -126,10 +127,10 @@ class ObjectSettings:
 
     # Number of keyframes that must observe a candidate before it becomes an object (III.C).
     min_observations: PositiveInt = 3
-    # Maximum number of objects in the map. The default number takes 6 MB of memory, and some ms per
-    # keyframe if all objects are in view.
+    # Maximum number of objects in the map. The default number takes 6 MB of memory, and a few ms
+    # per keyframe if all objects are in view.
     max_objects: PositiveInt = 2000
-    # Minimum IoU of the boxes of a detection and an object that are associated (III.C).
+    # Minimum IoU of the boxes of a detection and an object to associate the two (III.C).
     min_iou: PositiveRatio = advanced(0.4)
     # Number of consecutive keyframes that may miss a visible object before it is removed (III.C).
     max_misses: PositiveInt = advanced(10)
@@ -139,7 +140,7 @@ class ObjectSettings:
 class OpenVocabularySettings:
     """Requests to the labeller for labels of image regions."""
 
-    # Minimum score of a detection that needs no label from the labeller (III.B).
+    # Score from which a detection needs no label from the labeller (III.B).
     confident_score: Ratio = advanced(0.6)
     # Average number of label requests per keyframe. The paper requests labels on 10 to 25 % of the
     # frames.
@@ -147,8 +148,8 @@ class OpenVocabularySettings:
     # True counts detector boxes as votes for the label of a region. False leaves the label to the
     # labeller alone.
     detector_votes: bool = advanced(True)
-    # Minimum confidence of a label result. 0.5 lowers the recall on synthetic:flat by 7 percentage
-    # points.
+    # Minimum confidence of a label result that is used. A value of 0.5 lowers the recall on
+    # synthetic:flat by 7 percentage points.
     min_confidence: Ratio = advanced(0.3)
 
 
@@ -170,11 +171,11 @@ class PublishSettings:
 class RefitSettings:
     """Refit of the map to keyframes that a correction has moved."""
 
-    # Refit iterations for each keyframe that a correction moves by more than 1 cm or 0.01 rad. Its
-    # motion counts against the oldest keyframe within a cube of 2 m.
+    # Refit iterations for each keyframe that a correction displaces by more than 1 cm or 0.01 rad
+    # relative to the oldest keyframe within the same cube of 2 m.
     iterations: NonNegativeInt = advanced(12)
     # Maximum number of pending refit iterations that run with each new keyframe, if no other
-    # keyframe is queued.
+    # keyframe is queued. The others run while no keyframe arrives.
     iterations_per_keyframe: NonNegativeInt = advanced(6)
 
 

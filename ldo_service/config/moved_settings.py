@@ -1,4 +1,4 @@
-"""Check for settings of earlier versions, with their current names."""
+"""Rejection of settings of earlier versions; the error gives their current names."""
 
 import functools
 from importlib.resources import files
@@ -16,7 +16,8 @@ def refuse_moved(tree: dict[str, Any]) -> None:
         tree: Plain values of a file or of the command line.
 
     Raises:
-        ConfigError: A setting of an earlier version is used; the message gives its new name.
+        ConfigError: A setting of an earlier version is used. The message gives the new name of the
+            setting, or the constant that replaces it.
     """
     refusals = [text for path in _leaves(tree, "") if (text := moved(path))]
     if not refusals:

@@ -24,7 +24,7 @@ class DetectorSettings:
     # Detection network: a name from `ldo models list`, or an ONNX file. Empty disables detection.
     model: str = ""
     # File with one class name per line. Empty uses the names in the file of the network, or the 80
-    # names of COCO if it has none.
+    # names of COCO if the network's file has none.
     class_names: str = ""
     # Minimum score of a detection. The default is that of YOLOv5 and YOLOX.
     min_score: Ratio = 0.25
@@ -37,7 +37,8 @@ class DetectorSettings:
     input_size_px: tuple[PositiveInt, PositiveInt] = advanced((640, 480))
     # IoU above which two boxes of one class are merged into one object, as in YOLOv5.
     nms_iou: Ratio = advanced(0.45)
-    # Maximum number of detections per image, the best ones, as in the evaluation of COCO.
+    # Maximum number of detections per image, those with the highest scores, as in the evaluation
+    # of COCO.
     max_detections: PositiveInt = advanced(100)
 
 
@@ -66,7 +67,7 @@ class EncoderSettings:
     # encoder, or the value of CLIP if the file has none.
     image_std: tuple[PositiveFloat, ...] = advanced(())
     # Factor on the similarities before the softmax over names. A larger factor sharpens the
-    # softmax. 0 uses the factor in the files of the pair, or 100 as in CLIP if they have none.
+    # softmax. 0 uses the factor in the files of the pair, or 100 as in CLIP if the files have none.
     logit_scale: NonNegativeFloat = advanced(0.0)
     # Names such as wall and floor that compete with the other names but are never reported.
     background_names: tuple[str, ...] = advanced(())
@@ -103,7 +104,7 @@ class HttpSettings:
     deadline_s: PositiveFloat = 40.0
     # Environment variable with the API key. Empty sends no key.
     api_key_variable: str = ""
-    # Maximum number of image crops of a region. Each one takes one request.
+    # Maximum number of image crops of a region. Each crop is sent in a request of its own.
     max_views: PositiveInt = advanced(2)
     # Maximum number of attempts of a request.
     max_attempts: PositiveInt = advanced(3)
@@ -126,8 +127,8 @@ class VlmLabellerSettings:
     model: str = ""
     # URL of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1. Empty uses none.
     url: str = ""
-    # File with one name per line to choose from. Empty uses the names of the encoder pair, or the
-    # 80 names of COCO if it has none.
+    # File with the names from which the labeller chooses, one per line. Empty uses the names of the
+    # encoder pair, or the 80 names of COCO if the pair has none.
     class_names: str = ""
     encoder: EncoderSettings = field(default_factory=EncoderSettings)
     http: HttpSettings = field(default_factory=HttpSettings)

@@ -61,7 +61,8 @@ class PaperSettings:
     # Fraction by which one step moves a label toward the average of its neighbors. This is 1 -
     # lambda (III.A).
     consistency_rate: Ratio = advanced(0.1)
-    # Maximum KL divergence of the classes of a detection and an object that are associated (III.C).
+    # Maximum KL divergence of the classes of a detection and an object to associate the two
+    # (III.C).
     object_max_divergence_nats: NonNegativeFloat = advanced(0.2)
     # Maximum KL divergence of the classes of matching landmarks of two subgraphs (III.C).
     loop_max_divergence_nats: PositiveFloat = advanced(0.3)
@@ -73,8 +74,8 @@ class PaperSettings:
     lambda_sem: PositiveFloat = advanced(0.5)
     # Weight of the agreement between landmarks of one class (III.C).
     w_sem: NonNegativeFloat = advanced(0.1)
-    # Interval of keyframes that stay variables of the pose graph. The others are marginalized
-    # (III.C).
+    # One keyframe per interval of this length stays a variable of the pose graph. The others are
+    # marginalized (III.C).
     marginalization_interval_keyframes: PositiveInt = advanced(10)
 
     def __post_init__(self) -> None:

@@ -63,7 +63,7 @@ from ldo_service.tracking.window import WindowConfig
 from .network_parameters import detector_parameters, labeller_parameters
 from .sections import Config
 
-FOREGROUND = ForegroundConfig()  # Foreground test of labels, regions and landmarks of loops.
+FOREGROUND = ForegroundConfig()  # Foreground test of labels, regions and loop-closure landmarks.
 
 
 def actor_parameters(config: Config) -> ActorParameters:

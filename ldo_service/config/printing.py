@@ -35,12 +35,12 @@ def config_yaml(config: Config) -> str:
 def explained_yaml(config: Config, *, with_advanced: bool = False) -> str:
     """Return the configuration as YAML with comments.
 
-    Without `with_advanced`, the text has the public settings, and the advanced settings that differ
-    from their defaults. Loading the text therefore gives the same configuration.
+    Loading the text gives the same configuration.
 
     Args:
         config: The configuration.
-        with_advanced: Print all advanced settings too, as `ldo config --all` does.
+        with_advanced: True prints all settings, as `ldo config --all` does. False omits advanced
+            settings that have their defaults.
     """
     defaults = {setting.path: setting.value for setting in settings_of(Config())}
     lines: list[str] = []
@@ -98,8 +98,8 @@ _COMMENT = re.compile(r"^ {4,}# (?P<comment>.+)$")
 def _comments(schema: type) -> dict[str, str]:
     """Return the comment of each field in the source of a dataclass.
 
-    A comment starts behind the field and continues on the lines below. A field with no comment
-    behind it takes the comment lines above it, if they begin with a capital letter.
+    A comment starts on the line of the field and continues on the lines below. A field without a
+    comment on its line takes the comment lines above it, if they begin with a capital letter.
     """
     comments: dict[str, list[str]] = {}
     last, block = "", list[str]()

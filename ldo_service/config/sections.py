@@ -46,11 +46,11 @@ class Config:
         """Check that the service waits long enough for the server of the labeller.
 
         Raises:
-            ConfigError: A label request, with one attempt as margin, may take longer than a timeout
-                of the service.
+            ConfigError: The deadline of a label request, plus one attempt as margin, is not below a
+                timeout of the service.
         """
         http = self.vlm_labeller.http
-        max_s = http.deadline_s + http.timeout_s  # Deadline of a label, with one attempt as margin.
+        max_s = http.deadline_s + http.timeout_s  # Deadline of a label, plus one attempt as margin.
         limits = {
             "supervision.backend_step_timeout_s": self.supervision.backend_step_timeout_s,
             "service.control_timeout_s": self.service.control_timeout_s,

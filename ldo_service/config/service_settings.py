@@ -83,7 +83,7 @@ class LatencySettings:
 class OfflineSettings:
     """Offline runs over a sequence (`ldo run`)."""
 
-    # Maximum fraction of frames that cannot be read. Above it, the run fails.
+    # Maximum fraction of frames that cannot be read. The run fails above this fraction.
     max_rejected_ratio: Ratio = 0.1
     latency_frames: LatencySettings = field(default_factory=LatencySettings)
 
@@ -103,11 +103,11 @@ class ServiceSettings:
     # Seconds without a heartbeat after which a process is killed and started again.
     heartbeat_timeout_s: PositiveFloat = 10.0
     # True calls fsync after each step, before the outputs of the step are published. This takes 12
-    # ms. With False, a power cut may lose the state.
+    # ms per step. With False, a power cut may lose the state.
     fsync: bool = False
     # Folder with the TLS keys that `ldo keys add` made. The option --keys overrides it.
     keys: str = ""
-    # Maximum size of a message, MB. The network drops larger ones. A 4K frame has up to 58 MB.
+    # Maximum size of a message, MB. The network drops larger messages. A 4K frame has up to 58 MB.
     max_message_mb: Annotated[int, Meta(ge=1, le=1000)] = MAX_MESSAGE_MB
     # Address on which Prometheus metrics are served. With 0.0.0.0 anyone on the network can
     # see when the robot works.
@@ -143,9 +143,9 @@ class SupervisionSettings:
     # Maximum duration of one step of the optimizer, loop closer, detector or labeller, seconds. No
     # other actor waits for these four. One optimization of a large pose graph may take minutes.
     backend_step_timeout_s: PositiveFloat = advanced(600.0)
-    # Maximum disk space, MB, for waiting messages of one topic to the optimizer, loop closer,
-    # detector or labeller. Beyond it, the oldest messages are dropped. The default holds 11 minutes
-    # of keyframes of 640x480 at 2 Hz.
+    # Maximum disk space for queued messages, MB, on each topic that the optimizer, loop closer,
+    # detector or labeller receives. Beyond this size, the oldest messages are dropped. The default
+    # holds 11 minutes of keyframes of 640x480 at 2 Hz.
     backlog_mb: PositiveFloat = 2000.0
     # Niceness of threads that may run late (Linux). The default gives them a tenth of the CPU
     # weight of the tracker.

@@ -92,22 +92,23 @@ class FeatureSettings:
 class KeyframeSettings:
     """Selection of keyframes."""
 
-    # Minimum fraction of the surface in the last keyframe that a frame shows. Below it, a keyframe
-    # is made.
+    # A new reference keyframe is made if a frame shows less than this fraction of the surface in
+    # the reference keyframe.
     min_overlap: Ratio = 0.85
-    # Maximum rotation from the last keyframe, radians. Above it, a keyframe is made. The default is
-    # 15 degrees.
+    # A new reference keyframe is made beyond this rotation from the reference keyframe, radians.
+    # The default is 15 degrees.
     max_rotation_rad: PositiveFloat = radians(15.0)
-    # Maximum translation from the last keyframe, as a fraction of the median depth. Above it, a
-    # keyframe is made.
+    # A new reference keyframe is made beyond this translation from the reference keyframe, as a
+    # fraction of the median depth.
     max_translation_ratio: PositiveFloat = 0.08
-    # Minimum number of frames between keyframes. With 1, each frame may become one. A larger number
-    # limits the load of the mapper.
+    # Minimum number of frames between reference keyframes. With 1, each frame may become a
+    # reference keyframe. A larger number limits the load of the mapper.
     min_interval_frames: PositiveInt = advanced(1)
-    # Maximum number of frames between keyframes, if the camera moved at all.
+    # Maximum number of frames between reference keyframes, if the camera moved at all.
     max_interval_frames: PositiveInt = advanced(30)
-    # Fraction of the rotation and translation limits above which a mapping keyframe is made. With a
-    # value above 1, none is made. Mapping keyframes gain 0.4 dB on the sequence kitchen.
+    # A mapping keyframe is made if the motion since the last mapped frame exceeds this fraction of
+    # the rotation or translation limit. A value above 1 makes none. Mapping keyframes improve PSNR
+    # by 0.4 dB on the sequence kitchen.
     mapping_only_ratio: PositiveFloat = advanced(0.33)
     # Number of keyframes after which the tracker searches for a known keyframe before it makes a
     # new keyframe. With fewer keyframes, every new one improves the map. 0 never searches.
@@ -134,8 +135,8 @@ class WindowSettings:
 class RelocalizationSettings:
     """Relocalization after tracking was lost."""
 
-    # Maximum number of keyframes in the keyframe database, 0.13 MB each at 640x480. Beyond it,
-    # keyframes are removed evenly along the path.
+    # Maximum number of keyframes in the keyframe database, 0.13 MB each at 640x480. Beyond this
+    # number, keyframes are removed evenly along the path.
     max_keyframes: Annotated[int, Meta(ge=3)] = 1000
     # Number of keyframes of similar appearance that a lost frame is compared with.
     appearance_candidates: NonNegativeInt = advanced(5)
@@ -157,16 +158,16 @@ class SubmapSettings:
 class QualitySettings:
     """Limits between the tracking statuses OK, WEAK and LOST."""
 
-    # Minimum fraction of the surface in the reference keyframe that a frame shows. Below it, a pose
-    # is WEAK. The default was chosen on one apartment.
+    # The pose of a frame is WEAK if the frame shows less than this fraction of the surface in the
+    # reference keyframe. The default was chosen on one apartment.
     weak_overlap: Ratio = advanced(0.15)
-    # Maximum ratio of the residual to its running median. Above it, a pose is WEAK. A pose that
-    # features confirm closely may have a ratio of up to 6, and is LOST above 15.
+    # A pose is WEAK if the ratio of its residual to the running median exceeds this value. A pose
+    # that features confirm closely is WEAK above a ratio of 6, and LOST above 15.
     weak_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(2.5)
-    # Maximum ratio of the residual to its running median. Above it, a pose is LOST.
+    # A pose is LOST if the ratio of its residual to the running median exceeds this value.
     lost_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(5.0)
-    # Minimum fraction of the surface in the reference keyframe that a frame shows. Below it, a pose
-    # is LOST.
+    # The pose of a frame is LOST if the frame shows less than this fraction of the surface in the
+    # reference keyframe.
     lost_overlap: Ratio = advanced(0.08)
 
     def __post_init__(self) -> None:
@@ -218,8 +219,8 @@ class TrackerSettings:
     quality: QualitySettings = field(default_factory=QualitySettings)
     dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
     odometry_prior: OdometryPriorSettings = field(default_factory=OdometryPriorSettings)
-    # Estimation of vignetting and smooth depth bias of the camera in the first seconds. They are
-    # corrected only if held-out frames confirm the estimate.
+    # True estimates vignetting and smooth depth bias of the camera in the first seconds. Each is
+    # corrected only if frames that the estimate did not use confirm it.
     self_calibration: bool = advanced(True)
     # Folder of a finished run, in whose map the camera is localized. The map is not changed. Empty
     # makes a new map.

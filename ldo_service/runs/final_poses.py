@@ -42,23 +42,24 @@ class MeasuredKeyframe:
 class FinalPoses:
     """Final poses T_map_camera of frames, computed from the final poses of keyframes.
 
-    A frame was aligned to keyframe r. Keyframe a is the last keyframe before the frame that was
-    also aligned to r, or r itself. Keyframe b is the first keyframe after the frame that was
-    aligned to r. Each of a and b gives a pose of the camera:
+    Each frame was aligned to a reference keyframe r. Among r and the keyframes that were aligned
+    to r, keyframe a is the last one that is not later than the frame, and keyframe b is the first
+    one that is later. With T_r_a and T_r_b as measured during the run, and the final poses T_map_a
+    and T_map_b, both keyframes give a pose of the camera:
 
         T_a = T_map_a T_r_a^-1 T_r_camera,    T_b = T_map_b T_r_b^-1 T_r_camera.
 
     Both poses are equal if no correction has moved a relative to b. Otherwise the result is
-    interpolated from T_a to T_b by the time of the frame between a and b. If there is no b, the
+    interpolated between T_a and T_b by the stamps of a, the frame and b. If there is no b, the
     result is T_a.
     """
 
     def __init__(self) -> None:
-        # Keyframes by their reference, in order of time.
+        # By id of a keyframe: the keyframe itself and all that were aligned to it, by time.
         self._measured: dict[int, list[MeasuredKeyframe]] = {}
 
     def add(self, measured: MeasuredKeyframe, reference: int | None) -> None:
-        """Add a keyframe, which must be later than all earlier ones.
+        """Add a keyframe. Keyframes must be added in order of time.
 
         Args:
             measured: The keyframe.

@@ -1,6 +1,6 @@
 """Reading of the folder of a finished run. The module `runs.folder` lists its files.
 
-Every function raises DataError for a file that is missing or has an invalid format.
+A function raises DataError if a file that it needs is missing or has an invalid format.
 """
 
 import csv
@@ -49,7 +49,7 @@ def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
 
 
 def vlm_calls(folder: Path) -> int | None:
-    """Return the number of requests to the labeller; None if summary.json does not contain it."""
+    """Return the number of requests to the labeller; None if summary.json does not state it."""
     path = folder / "summary.json"
     try:
         found = json.loads(path.read_text())["labeller_requests"] if path.is_file() else None
@@ -59,15 +59,15 @@ def vlm_calls(folder: Path) -> int | None:
 
 
 def newest_map(folder: Path) -> "MapFolder":
-    """Return the refined map of a run, or the map at the end of the stream if there is none."""
+    """Return the refined map of a run, or without one the map at the end of the stream."""
     return MapFolder(folder / REFINED if has_refined(folder) else folder)
 
 
 def has_refined(folder: Path) -> bool:
     """Return whether the run has a refined map.
 
-    A refinement writes map.ply after the trajectory and the keyframes. If map.ply exists, these two
-    files are therefore complete.
+    A refinement writes trajectory.txt and keyframes.json before map.ply. If map.ply exists, these
+    two files are therefore complete.
     """
     return (folder / REFINED / "map.ply").is_file()
 
@@ -87,7 +87,7 @@ def require_file(folder: Path, name: str) -> Path:
 class MapFolder:
     """Folder with map.ply, trajectory.txt and keyframes.json of a run or of its refinement.
 
-    Only the map must exist. Each file is read when its content is requested.
+    Only map.ply must exist. Each file is read when its content is requested.
     """
 
     folder: Path
@@ -123,7 +123,7 @@ class MapFolder:
         return list(read_viewpoints(self.folder).values())
 
     def exposures(self) -> Exposures:
-        """Return the exposures in keyframes.json, which older versions did not write."""
+        """Return the exposures of the keyframes; empty if an older version wrote the run."""
         with _keyframes(self.folder) as (_, keyframes):
             exposed = [keyframe for keyframe in keyframes if "exposure" in keyframe]
             stamps_ns = np.array([int(keyframe["stamp_ns"]) for keyframe in exposed], np.int64)
@@ -131,7 +131,7 @@ class MapFolder:
             return Exposures(stamps_ns, matrices.reshape(-1, 2, 3))
 
     def keyframes(self) -> dict[int, int]:
-        """Return the frame index of each keyframe, by its id."""
+        """Return the frame index of each keyframe, by keyframe id."""
         with _keyframes(self.folder) as (_, keyframes):
             return {int(k["keyframe"]): int(k["frame_index"]) for k in keyframes}
 
@@ -150,7 +150,7 @@ class MapFolder:
 def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:
     """Return the viewpoints of all keyframes that are in the frame of the map, by keyframe id.
 
-    The folder must contain keyframes.json and needs no map.
+    The folder needs keyframes.json, but no map.
     """
     with _keyframes(folder) as (path, keyframes):
         mapped = [k for k in keyframes if _submap(k) == 0]
@@ -169,8 +169,7 @@ def _submap(keyframe: dict[str, Any]) -> int:
 def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
     """Open a context that provides the path and the content of keyframes.json.
 
-    Errors of the code inside the context, which interprets the content, are reported as errors of
-    the file.
+    If the code inside the context fails to interpret the content, the error names the file.
 
     Raises:
         DataError: The file cannot be read, or its content is invalid.
@@ -206,7 +205,9 @@ def _frames(path: Path) -> tuple[RunFrame, ...]:
         with path.open(newline="") as file:
             return tuple(_frame(row) for row in csv.DictReader(file))
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise DataError(f"{path} cannot be read: {error!r}.") from error
+        raise DataError(
+            f"{path} cannot be read: {error!r}. Give the folder of a finished `ldo run`."
+        ) from error
 
 
 def _frame(row: dict[str, str]) -> RunFrame:

@@ -1,8 +1,9 @@
 """Folder that a run writes.
 
-trajectory_online.txt      published poses of the frames of the first submap that are not LOST
-trajectory.txt             poses after the last correction, also of submaps merged with the first
-frames.csv                 status, residuals, milliseconds and submap of every frame
+trajectory_online.txt      poses of the first submap as published; LOST frames are omitted
+trajectory.txt             poses of the first submap and of those merged with it, after the last
+                           correction; LOST frames are omitted
+frames.csv                 status, residuals, tracking time (ms) and submap of every frame
 keyframes.json             id, frame, stamp, camera and pose of every keyframe
 map.ply                    Gaussians anchored to keyframes in the frame of the map
 semantics.npz              labels of these Gaussians: `semantics.semantics_file`
@@ -18,8 +19,8 @@ Submaps that were never merged with the first one are not in the frame of the ma
 not in the trajectories, and their Gaussians and objects are not in the map. semantics.npz and
 objects.json exist only if a detector ran, front_end.mcap and refined/ only if they were requested.
 
-A run with `--localize` makes no map. Its keyframes.json, map.ply and keyframe_database.msgpack are
-in the folder that config.yaml names in tracker.localization_map.
+A run with `--localize` makes no map. The map that it used, with keyframes.json, map.ply and
+keyframe_database.msgpack, is in the folder named by tracker.localization_map in config.yaml.
 """
 
 import csv
@@ -71,7 +72,7 @@ from .records import LOOPS, OBJECTS, LoopRecord, write_objects
 
 MAP_FILES = ("map.ply", "trajectory.txt", "keyframes.json")
 SEMANTICS = "semantics.npz"
-REFINED = "refined"  # Subfolder with the files of the refined map, which have the same names.
+REFINED = "refined"  # Subfolder of the refined map; its files have the names of MAP_FILES.
 EXPORTED = {  # Files of `ldo export` for each format.
     "ply": ("gaussians.ply",),
     "splat": ("gaussians.splat",),
@@ -111,7 +112,7 @@ COLUMNS = (
 class DatabaseWriter:
     """Writer of the keyframe database of a run.
 
-    It keeps at most `keyframe_database.count` keyframe records in memory, 0.13 MB each.
+    The writer keeps at most `keyframe_database.count` keyframe records in memory, 0.13 MB each.
     """
 
     def __init__(self, config: OdometryConfig) -> None:
@@ -134,7 +135,7 @@ class DatabaseWriter:
         Args:
             path: File to write.
             poses: Final poses T_map_keyframe, which replace T_odom_keyframe.
-            merged: For each merged submap, the older submap that it was merged with.
+            merged: For each merged submap, the older submap that it is now part of.
         """
         records = [
             replace(record, submap=0, T_odom_keyframe=np.array(poses[record.id]))
@@ -149,8 +150,8 @@ def prepare(folder: Path, overwrite: bool) -> None:
 
     Args:
         folder: The folder.
-        overwrite: True to delete the files of an earlier run first. If the folder has other files
-            too, nothing is deleted and ConfigError is raised. False if the folder must be empty.
+        overwrite: False if the folder must be empty. True to delete the files of an earlier run
+            first; if the folder has other files too, nothing is deleted and ConfigError is raised.
 
     Raises:
         ConfigError: The folder is not empty or cannot be written.
@@ -170,7 +171,9 @@ def prepare(folder: Path, overwrite: bool) -> None:
         for path in found:
             path.unlink()
     except OSError as error:
-        raise ConfigError(f"{folder} cannot be written: {error.strerror}.") from error
+        raise ConfigError(
+            f"{folder} cannot be written: {error.strerror}. Choose another folder."
+        ) from error
 
 
 class RunWriter:
@@ -190,14 +193,14 @@ class RunWriter:
         self._csv.writerow(COLUMNS)
         self._tracked: list[FramePose] = []
         self._poses, self._final_poses = KeyframePoses(), FinalPoses()
-        self._merged_submaps: dict[int, int] = {}  # Older submap of each merged submap.
+        self._merged_submaps: dict[int, int] = {}  # By merged submap: the submap it is now part of.
         self._keyframes: dict[int, dict[str, Any]] = {}
         self.replica = MapReplica()
         self._objects: MapObjects | None = None
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.loops = LoopRecord()
         self.boxes = 0  # Number of detections.
-        self.labeller_calls = 0  # Number of label results that a labeller gave.
+        self.labeller_calls = 0  # Number of label results that name a labeller.
         self.newest_stamp_ns = 0
         self.summary: dict[str, Any] = {}
 
@@ -291,7 +294,7 @@ class RunWriter:
         write_json(self.folder / "summary.json", summary)
 
     def in_map(self) -> np.ndarray:
-        """Return which Gaussians, [N] bool, are anchored to keyframes in the frame of the map."""
+        """Return a mask, [N] bool, of the Gaussians whose anchor keyframe has a pose in the map."""
         placed = [k for k, facts in self._keyframes.items() if self._root(facts["submap"]) == 0]
         return np.isin(self.replica.map.anchors, placed)
 
@@ -330,21 +333,21 @@ class RunWriter:
         self._database.save(self.folder / DATABASE_FILE, self._poses, self._merged_submaps)
 
     def online(self) -> Trajectory:
-        """Return the published T_map_camera of each frame of the first submap that is not LOST."""
+        """Return the published T_map_camera of the first submap's frames, without LOST frames."""
         frames = [frame for frame in self._tracked if frame.submap == 0]
         return _trajectory(frames, [frame.T_map_camera_online for frame in frames])
 
     def final(self) -> Trajectory:
         """Return T_map_camera of each frame, computed from final keyframe poses (`FinalPoses`).
 
-        Frames that were LOST or are not in the frame of the map are omitted.
+        LOST frames, and frames of submaps that were never merged with the map, are omitted.
         """
         frames = [frame for frame in self._tracked if self._root(frame.submap) == 0]
         T_map = {keyframe: self._poses[keyframe] for keyframe in self._poses}
         return _trajectory(frames, self._final_poses.of(frames, T_map))
 
     def _root(self, submap: int) -> int:
-        """Return the oldest submap merged with `submap`, or `submap` itself if there is none."""
+        """Return the submap that `submap` was merged into; `submap` itself if it was not merged."""
         return self._merged_submaps.get(submap, submap)
 
     def _placed_keyframes(self) -> list[dict[str, Any]]:
@@ -359,7 +362,7 @@ class RunWriter:
         ]
 
     def _placed_objects(self, found: MapObjects) -> MapObjects:
-        """Return the objects whose first observing keyframe is in the frame of the map."""
+        """Return the objects whose first observing keyframe has a pose in the map."""
         keyframes = self._keyframes
         placed = tuple(
             one for one in found.objects if self._root(keyframes[one.first_keyframe]["submap"]) == 0

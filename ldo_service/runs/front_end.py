@@ -2,8 +2,9 @@
 
 The front end consists of the actors that process every frame: frame source, tracker and detector. A
 run can replace them by their recorded outputs. Each output is replayed at its original tick of the
-logical clock. With the same settings, the other actors then reproduce the recorded run bit by bit.
-With different settings, the results show the effect of these settings with equal odometry.
+logical clock. With the same settings, the other actors then reproduce the recorded run bit for bit.
+With different settings of the other actors, the odometry is still the same, so differences between
+the runs come from these settings alone.
 
 The recorded tracker received the pose-graph corrections of its own run. Therefore the published
 poses and the reused keyframes remain those of the recorded run, even if the new run corrects
@@ -140,9 +141,7 @@ class FrontEnd:
         """
         path = run.expanduser() / FRONT_END
         if not path.is_file():
-            raise DataError(
-                f"{run} has no {FRONT_END}: `ldo run --keep-front-end` records one in its folder."
-            )
+            raise DataError(f"{run} has no {FRONT_END}. Make that run again with --keep-front-end.")
         index = McapIndex(path)
         if not index.is_whole:
             raise DataError(
@@ -165,9 +164,9 @@ class FrontEnd:
         return cls(frames - len(stamps_ns), index)
 
     def __iter__(self) -> Iterator[tuple[Message, ...]]:
-        """Yield the messages of each tick of the logical clock, up to the last recorded message.
+        """Yield a tuple of the messages of each tick of the logical clock.
 
-        The tuple of a tick without messages is empty.
+        The tuple is empty for a tick without messages. The iteration ends at the last message.
         """
         tick = 0
         for number, locations in groupby(self._index.locations, lambda place: place.number):
@@ -221,5 +220,5 @@ def _require_settings(path: Path, about: Mapping[str, str], config: Config) -> N
             raise ConfigError(
                 f"{name}={value} was {was[name]} when {path} was recorded. With "
                 "--reuse-front-end it must be the same, since the front end does not run again. "
-                "Restore that value, or remove --reuse-front-end."
+                "Set the recorded value, or remove --reuse-front-end."
             )

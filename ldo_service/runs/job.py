@@ -42,7 +42,7 @@ class RunOptions:
             is no other odometry.
         front_end: Recorded outputs that replace frame source, tracker and detector; None to run
             these actors.
-        keep_front_end: Record the front end of this run.
+        keep_front_end: True to record the front end of this run.
     """
 
     sequence: Sequence

@@ -19,8 +19,8 @@ from .job import REFINE_ITERATIONS, Advance, RunOptions, requests
 from .source import FrameReader, interleave_prior
 from .summary import Percentiles, Usage, percentiles, summarize
 
-# Learning rates at the end of a refinement, as a fraction of those at the start. They decay so that
-# the map converges.
+# Learning rates at the end of a refinement, as a fraction of those at its start. The rates decay so
+# that the map converges.
 LAST_RATE = 0.05
 
 

@@ -1,4 +1,4 @@
-"""Records of a run: its loops and objects as JSON.
+"""Records of the loop closures and the objects of a run, as JSON files.
 
 loops.json has every loop candidate that was compared, and the loop closures.
 
@@ -11,10 +11,13 @@ closures     fields of `loop/closure`: keyframe, reference, T_reference_keyframe
 objects.json has the objects of the map, in its frame. It is the message `map/objects` as JSON,
 whose `objects` is a list of
 
-    id, name, confidence      id is constant during a run; most probable class, its probability
-    centroid, covariance      of the Gaussians, m, and m^2 (9 numbers, row by row)
+    id                        constant during a run
+    name, confidence          most probable class except background, and its probability
+    centroid, covariance      mean position of the object's Gaussians, m, and covariance of their
+                              positions, m^2 (9 numbers, row by row)
     T_map_object, size        box: center and axes (quaternion wxyz), and extents, m
-    distribution, entropy     [name, probability] of the most probable classes; nats
+    distribution              [name, probability] of each of the most probable classes
+    entropy                   entropy over all classes, nats
     observation_count         keyframes that observed the object
     miss_count                keyframes that should have observed it and did not
     first_keyframe, last_keyframe   first and last keyframe that observed it
@@ -43,8 +46,8 @@ class LoopRecord:
     """Record of loop candidates, loop closures and their acceptance."""
 
     def __init__(self) -> None:
-        # Candidates, each with the duration in milliseconds of the step that compared it. One step
-        # may compare several candidates.
+        # Each candidate with the duration of the step that compared it, milliseconds. One step may
+        # compare several candidates.
         self._candidates: list[tuple[LoopCandidate, float]] = []
         self._closures: list[LoopClosure] = []
         # Reference and keyframe of each closure that the pose graph rejected.
@@ -71,7 +74,7 @@ class LoopRecord:
 
     @property
     def accepted(self) -> int:
-        """Number of loop closures that the pose graph accepts after the last correction."""
+        """Number of loop closures that the pose graph accepts as of the last correction."""
         return sum(map(self._is_accepted, self._closures))
 
     @property
@@ -170,7 +173,7 @@ def refuse_state(folder: Path) -> None:
     if (folder / "state").is_dir():
         raise DataError(
             f"{folder} holds the state of a service, not a run. Resume the service by "
-            f"`ldo serve --resume {folder}`, and give `live` instead of the folder."
+            f"`ldo serve --state {folder}`, and give `live` instead of the folder."
         )
 
 

@@ -22,7 +22,7 @@ from ldo_service.storage.yaml_io import load_yaml
 
 @dataclass(frozen=True, slots=True)
 class RecordedActor:
-    """Recording of one actor: one journal for each process in which the actor ran."""
+    """Recording of one actor: one file for each process in which the actor ran."""
 
     name: str
     files: tuple[JournalFile, ...]
@@ -58,7 +58,7 @@ class RecordedActor:
         return replayed
 
     def _make(self, folder: Path, about: Mapping[str, str]) -> Actor:
-        """Return a new actor with the recorded configuration and its files in `folder`."""
+        """Return a new actor with the recorded configuration, which keeps its files in `folder`."""
         make = actor_spec(self.name).make
         assert make is not None
         config = _config_of(about)
@@ -111,7 +111,10 @@ def _caveats(about: Mapping[str, str]) -> list[str]:
     now = versions()
     for name, version in _versions_of(about).items():
         if now.get(name) != version:
-            lines.append(f"recorded with {name} {version}, replayed with {now.get(name)}.")
+            lines.append(
+                f"recorded with {name} {version}, replayed with {now.get(name)}: the results may "
+                "differ."
+            )
     return lines
 
 
@@ -132,7 +135,9 @@ def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedAct
         raise DataError(f"{folder} holds no recording. `ldo record {folder}` makes one.")
     unknown = [name for name in only if name not in found]
     if unknown:
-        raise ConfigError(f"{folder} has no actor {unknown[0]!r}, only {', '.join(found)}.")
+        raise ConfigError(
+            f"{folder} has no recording of actor {unknown[0]!r}. It has: {', '.join(found)}."
+        )
     actors = [
         RecordedActor(name, tuple(JournalFile(path) for path in paths))
         for name, paths in found.items()

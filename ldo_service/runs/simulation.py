@@ -1,4 +1,4 @@
-"""Run of all actors on the logical clock, which computes a digest of each actor's outputs."""
+"""Run of all actors on the logical clock, to compute a digest of each actor's outputs."""
 
 import hashlib
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Digests:
         self._states[actor].update(digest(encode(message)).encode())
 
     def made(self) -> dict[str, ActorDigest]:
-        """Return the digest of each actor by its name."""
+        """Return the digest of each actor, by name."""
         return {
             actor: ActorDigest(count, self._states[actor].hexdigest())
             for actor, count in self._counts.items()
@@ -68,5 +68,7 @@ def simulate_graph(
         clock.finish()
     made = digests.made()
     if not any(entry.messages for entry in made.values()):
-        raise DataError(f"{sequence.name}: no frame of the selection could be used.")
+        raise DataError(
+            f"{sequence.name}: none of the selected frames could be used. Check the data."
+        )
     return made

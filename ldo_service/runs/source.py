@@ -29,7 +29,7 @@ from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, Message, O
 from ldo_service.schemas.message import LAST_INTEGER
 from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD
 
-# Frames that are decoded in advance: one in decoding, one queued and one in reserve.
+# Frames that are decoded in advance: one is being decoded, one is queued, and one is in reserve.
 READ_AHEAD = 3
 
 M = TypeVar("M", bound=Message)
@@ -56,11 +56,11 @@ class Selection:
         """Return the indices of the selected frames.
 
         Raises:
-            DataError: No frame is selected.
+            DataError: The sequence has no frames.
         """
         chosen = range(0, len(sequence), self.stride)[: self.max_frames]
         if not chosen:
-            raise DataError(f"{sequence.name}: --stride and --max-frames select no frame.")
+            raise DataError(f"{sequence.name} has no frames. Give another source.")
         return chosen
 
 
@@ -100,8 +100,8 @@ def interleave_prior(
 ) -> Iterator[tuple[Message, ...]]:
     """Yield each frame with the poses of the odometry prior that precede it.
 
-    A live service would receive these poses before the frame: all remaining poses up to and
-    including the first pose that is not older than the frame.
+    These are the poses that a live service would receive before the frame: all remaining poses, up
+    to and including the first one that is not older than the frame.
 
     Args:
         frames: The frames.
@@ -169,7 +169,9 @@ class RecordedMessage:
         try:
             return decode(self.file.body(self.place), kind)
         except msgspec.DecodeError as error:
-            raise FrameError(f"{self.file.path}, frame {index}: {error}.") from error
+            raise FrameError(
+                f"{self.file.path}, frame {index} cannot be decoded: {error}."
+            ) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +228,9 @@ class RecordingSequence(Sequence):
         for index, frame in enumerate(self._frames):
             with suppress(FrameError):
                 return camera_from_message(frame.message(index).camera)
-        raise DataError(f"{folder}: none of its {len(self._frames)} frames can be read.")
+        raise DataError(
+            f"{folder}: none of its {len(self._frames)} frames can be read. Record again."
+        )
 
     def read(self, index: int) -> RawFrame:
         return self._frames[index].read(index)
@@ -251,6 +255,6 @@ def _frames(messages: Iterator[RecordedMessage]) -> Iterator[RecordedFrame]:
                 case CAMERA_DEPTH.name:
                     yield from (RecordedFrame(*pair) for pair in pairing.add_b(stored))
         except FrameError:
-            # The stamp is not later than the previous one: the frame was received again after a
-            # crash.
+            # The stamp is not later than that of the previous image: the image was received again
+            # after a crash.
             continue

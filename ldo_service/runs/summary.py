@@ -42,8 +42,8 @@ def summarize(
 ) -> dict[str, Any]:
     """Return the summary of a finished run.
 
-    The frame rate (FPS) is the number of frames divided by the time from the first read to the last
-    step. This time includes the refit at the end and the first, slower frames.
+    The frame rate (FPS) is the number of frames that were not rejected, divided by the time from
+    the first read to the last step. This time includes the refit at the end.
 
     Args:
         record: The finished run.
@@ -61,8 +61,8 @@ def summarize(
         "status": record.statuses,
         "keyframes": record.keyframes,
         "gaussians": int(in_map.sum()),
-        "gaussians_unmerged": int((~in_map).sum()),  # Gaussians of unmerged submaps, in no file.
-        "gaussians_labelled": record.labelled(),  # Labels other than background.
+        "gaussians_unmerged": int((~in_map).sum()),  # Unmerged submaps are in no file.
+        "gaussians_labelled": record.labelled(),  # Gaussians not labelled background.
         "boxes": record.boxes,
         "objects": len(record.objects()),
         "fps": round((frames - rejected) / used.wall_s, 3),
@@ -75,7 +75,7 @@ def summarize(
         "loops_rejected": record.loops.rejected,
         "labeller_requests": record.labeller_calls,
         "optimizations": int(facts.get("optimizations", 0)),
-        # Keyframes at which the optimization for landmark observations was postponed.
+        # Keyframes at which landmark observations were not yet added to the pose graph.
         "optimizations_skipped": int(facts.get("optimizations_skipped", 0)),
         "iterations": int(facts.get("iterations", 0)),  # Iterations of the Gaussian optimizer.
         # Refit iterations still pending.

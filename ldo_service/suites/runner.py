@@ -48,7 +48,7 @@ class SuiteRunner:
         data: Folder with the sources.
         out: Folder for the runs.
         settings: Settings of all runs; the settings of a variant override these.
-        overwrite: True repeats finished runs too.
+        overwrite: True to repeat finished runs too.
     """
 
     suite: Suite
@@ -121,7 +121,7 @@ class SuiteRunner:
             run += ("--reuse-front-end", str(self.out / entry.front_end_folder))
         elif self.suite.front_end:
             run += ("--keep-front-end",)
-        for name in (ENTRY, RESULTS):  # `ldo run` replaces only its own files.
+        for name in (ENTRY, RESULTS):  # `ldo run --overwrite` refuses files that it did not write.
             (folder / name).unlink(missing_ok=True)
         done = _ldo(*run, *settings)
         if done.returncode:
@@ -139,7 +139,7 @@ def read_evaluated_run(folder: Path) -> EvaluatedRun:
     """Return the results of a finished run.
 
     Raises:
-        ConfigError: A file cannot be read.
+        ConfigError: A file with results cannot be read.
     """
     try:
         texts = [(folder / name).read_text() for name in ("summary.json", RESULTS)]

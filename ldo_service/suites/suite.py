@@ -13,7 +13,7 @@ from msgspec import field
 from ldo_service.errors import ConfigError
 from ldo_service.storage.yaml_io import load_yaml
 
-# Names of the protocols of rendering in the output of `ldo eval --json`.
+# Names of the rendering protocols in the output of `ldo eval --json`.
 HELD_OUT, TRAINING = "A held out", "B training"
 
 HERE = Path(__file__).parent
@@ -45,8 +45,8 @@ class EvaluatedRun:
         Args:
             protocol: Protocol of the evaluation, HELD_OUT or TRAINING.
             figure: Name of the metric.
-            newest: True uses the refined map if there is one. False uses the map at the end of the
-                stream.
+            newest: True to use the refined map if there is one; False to use the map at the end of
+                the stream.
 
         Returns:
             The mean in the unit of the metric; None if the metric has no value.
@@ -73,8 +73,8 @@ class Score:
     Attributes:
         title: Title of the column.
         form: Format specification of the value, such as ".2f".
-        read: Returns the value from the results. Without a value it returns None or raises
-            KeyError, IndexError or TypeError.
+        read: Function that returns the value of a run. If the run has none, it returns None or
+            raises KeyError, IndexError or TypeError.
     """
 
     title: str
@@ -144,7 +144,7 @@ class SuiteRun:
     settings: tuple[str, ...]
     seed: int | None  # Seed of a synthetic source, else None.
     # Variant whose recorded front end (outputs of tracker and detector) the run reuses; None if the
-    # run has its own.
+    # run makes its own.
     front_end: str | None = None
 
     @property
@@ -166,8 +166,8 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Content of a suite file.
 
     Raises:
-        ConfigError: A name of a sequence or variant is not usable as a folder name, or a metric is
-            unknown, or `front_end` is invalid.
+        ConfigError: A required list is empty, a name of a sequence or variant is not usable as a
+            folder name, a metric is unknown, or `front_end` is invalid.
     """
 
     title: str
@@ -181,7 +181,7 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     # the recorded outputs of its tracker and detector, so that all poses are equal. None: each
     # variant runs its own front end.
     front_end: str | None = None
-    # Seeds of synthetic sources. A data set needs no seed, because its runs are identical.
+    # Seeds of synthetic sources. A data set needs no seed, because all its runs are identical.
     seeds: tuple[int, ...] = (0,)
     # Options of `ldo run`: --hold-out-every, --refine-iterations, --stride and --max-frames.
     hold_out: int = 0
@@ -216,7 +216,7 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         of_front_end = sorted(OF_FRONT_END.intersection(self.figures))
         if self.front_end and of_front_end:
             raise ConfigError(
-                f"{of_front_end[0]} depends on the front end, and all variants use the one of "
+                f"{of_front_end[0]} depends on the front end, which all variants reuse from "
                 f"{self.front_end!r}. Remove {of_front_end[0]} from figures, or remove front_end."
             )
 
@@ -238,7 +238,7 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                     yield SuiteRun(sequence, variant, where, settings, seed, front_end)
 
     def front_end_settings(self) -> tuple[str, ...] | None:
-        """Return the settings of the variant whose front end the others reuse; None without one."""
+        """Return the settings of the variant `front_end`; None if `front_end` is None."""
         return None if self.front_end is None else self.variants[self.front_end]
 
     def options(self) -> list[str]:

@@ -9,7 +9,7 @@ from ldo_service.schemas import MapObject
 
 FILLS = 0.4  # Size of an object as a fraction of the height of the picture.
 NEAREST_M = 0.4  # Minimum distance to the center of an object.
-TILT = 0.05  # Weight of a camera's tilt in `estimate_up`; its roll has the weight 1.
+TILT = 0.05  # Weight of the cameras' tilt in `estimate_up`; their roll has the weight 1.
 HALF_VIEW_RAD = (
     0.65  # Half the vertical field of view of the browser, which is 75 degrees in viser.
 )
@@ -31,8 +31,8 @@ class CameraView:
 def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray) -> CameraView:
     """Return a close view of a whole object, from a direction where nothing hides the object.
 
-    The object is viewed from the side of the keyframe that shows it best, among those with a known
-    pose. If there is no such keyframe, the object is viewed from the side of `eye`.
+    The view is from the direction of the keyframe that shows the object best, among the keyframes
+    with a known pose. If there is no such keyframe, the view is from the direction of `eye`.
 
     Args:
         one: The object.
@@ -70,8 +70,8 @@ def estimate_up(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
 
         mean (x . u)^2 + TILT (1 - mean (y . u)^2)
 
-    and points opposite to y on average. Without keyframes, up is -y of the map, which is up for the
-    first camera if that was level.
+    and points opposite to y on average. Without keyframes, up is -y of the map, which is right if
+    the camera was level at the start.
 
     Args:
         keyframes: T_map_camera of each keyframe, [4, 4], by id.
@@ -86,7 +86,7 @@ def estimate_up(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
 
 
 def interpolate_views(start: CameraView, end: CameraView, steps: int) -> Iterator[CameraView]:
-    """Yield `steps` views of a motion from start to end, slow at both; the last view is `end`."""
+    """Yield `steps` views of a motion from start to end, slow at both ends; the last is `end`."""
     for step in range(1, steps + 1):
         t = step / steps
         share = t * t * (3 - 2 * t)

@@ -17,11 +17,11 @@ from .scene import ObjectBox
 
 Color = tuple[int, int, int]  # RGB, 0..255.
 
-# Limits of a jump: so long a step between two poses means that tracking was lost in between.
+# A step between two poses is a jump if it reaches both limits; tracking was lost in between.
 JUMP_M = 1.0  # Minimum length of a jump.
-JUMPS = 10.0  # Length of a jump as a multiple of the median step.
+JUMPS = 10.0  # Minimum length of a jump as a multiple of the median step.
 FRUSTUM_M = 0.12  # Distance from a keyframe's camera center to the drawn outline of its image.
-MAX_SIGHTS = 8  # Maximum detections drawn per keyframe; more would hide each other.
+MAX_SIGHTS = 8  # Maximum number of detections drawn per keyframe; more would hide each other.
 # Intrinsics for drawing keyframes until their own intrinsics are known.
 UNKNOWN_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 
@@ -60,8 +60,8 @@ class Lines:
 def path_lines(positions: np.ndarray, color: Color) -> Lines:
     """Return the path through camera positions, with gaps where the position jumps.
 
-    A jump is a step that is much longer than most steps. The limit is relative to the other steps,
-    because a long path is drawn with fewer positions.
+    A jump is a step that is much longer than most steps. The limit is relative to the median step,
+    since a long path is drawn with only some of its positions.
 
     Args:
         positions: Positions of the camera, [K, 3], meters; NaN where unknown.
@@ -160,7 +160,7 @@ def color_of(name: str) -> Color:
 
 
 def _outlines(camera: Camera, boxes_px: np.ndarray) -> np.ndarray:
-    """Return the sides of image boxes as lines in space, FRUSTUM_M in front of the camera.
+    """Return the sides of image boxes as lines in space, at depth FRUSTUM_M.
 
     Args:
         camera: Intrinsics.

@@ -40,16 +40,16 @@ from .live_poses import LiveKeyframes, LivePath, T_map_camera_of
 from .scene import Layer, ObjectBox, Scene, sights_of
 from .view_config import ViewerConfig
 
-# Maximum actors in the panel. The names come from messages, so their number must be limited.
+# Maximum number of actors in the panel. Without a limit, messages could add names without end.
 MAX_ACTORS = 64
-# Maximum received loop closures that are kept, the newest. A correction also lists all closures
-# that the pose graph accepts.
+# Maximum number of received loop closures that are kept; the oldest are dropped. The accepted ones
+# are also in each correction.
 MAX_LOOPS = 4096
 TEXT_INTERVAL_S = 1.0  # Interval between changes of the panel's text, so that it can be read.
 
-KEPT: dict[Topic, int] = {  # Maximum messages kept between two updates; the oldest are dropped.
+KEPT: dict[Topic, int] = {  # Maximum messages held between two updates; the oldest are dropped.
     POSE_TRACKED: 256,  # 8 s at 30 Hz.
-    GRAPH_CORRECTION: 1,  # The newest correction is complete.
+    GRAPH_CORRECTION: 1,  # Each correction has all poses, so the newest suffices.
     MAP_OBJECTS: 1,
     DETECTION_BOXES: 64,
     LOOP_CLOSURE: 64,
@@ -63,9 +63,8 @@ STATES = (MAP_SNAPSHOT, GRAPH_CORRECTION, MAP_OBJECTS, POSE_TRACKED)
 RESTARTED_TOGETHER = (
     "tracker",
     "mapper",
-)  # If both have restarted, the map is new or is published again.
-# If these actors restart within this time, the whole service was restarted or reset. If more time
-# passes between their restarts, each actor restarted alone.
+)  # If both restart within TOGETHER_S, the whole service was restarted or reset.
+# If more time passes between their restarts, each actor was restarted alone.
 TOGETHER_S = 30.0
 
 
@@ -88,7 +87,7 @@ class LiveScene:
         self._gaussians = MapReplica(self._config.max_gaussians)
         self.scene = Scene(camera=self.scene.camera)
         self._keyframes, self._path = LiveKeyframes(), LivePath(self._config.max_poses)
-        self._loops: dict[tuple[int, int], None] = {}  # Received loop closures, in order.
+        self._loops: dict[tuple[int, int], None] = {}  # Loop closures in order of receipt.
         self._correction: GraphCorrection | None = None
         self._pose: panel.HeardPose | None = None
         self._changed: set[Layer] = set(get_args(Layer)) - {"facts"}
@@ -134,15 +133,15 @@ class LiveScene:
         if self._correction and correction.graph_version <= self._correction.graph_version:
             return
         self._correction = correction
-        # The correction lists only the newest rejected closures. Older ones have been removed at
-        # earlier corrections.
+        # The correction lists only the newest rejected closures. Those rejected before have been
+        # removed by earlier corrections.
         for loop in correction.rejected_closures:
             self._loops.pop(loop, None)
         self._keyframes.correct(correction)
         self._changed |= {"keyframes", "final", "loops"}
 
     def _take_objects(self, objects: MapObjects) -> None:
-        if self.scene.objects is None:  # This adds detections from before this viewer subscribed.
+        if self.scene.objects is None:  # Add detections from before the viewer subscribed.
             sights = sights_of(objects)
             newest = sorted(sights)[-self._config.max_keyframes :]
             self.scene.sights = {k: sights[k] for k in newest} | self.scene.sights
@@ -236,7 +235,7 @@ class LiveSource:
     def __init__(self, service: Client, config: ViewerConfig, stack: ExitStack) -> None:
         self._service = service
         self._epochs: dict[str, int] = {}  # Epochs of the actors in RESTARTED_TOGETHER.
-        self._began_s: dict[str, float] = {}  # Time at which a new epoch was first received.
+        self._began_s: dict[str, float] = {}  # By actor: time at which its new epoch was noticed.
         self._live = LiveScene(config, time.monotonic)
         self._inboxes = [
             stack.enter_context(service.poller(topic.subscription_key, topic.message, keep))
@@ -278,8 +277,8 @@ class LiveSource:
     def _note_epoch(self, health: Health) -> None:
         """Reset the scene if the service was restarted or reset.
 
-        The versions in the service's messages may then restart at zero, so they cannot be compared
-        with earlier versions.
+        The versions in its messages may then start at zero again, so they cannot be compared with
+        earlier versions.
         """
         if health.actor not in RESTARTED_TOGETHER:
             return
@@ -304,6 +303,6 @@ class LiveSource:
 
 @contextmanager
 def live(service: Client, config: ViewerConfig) -> Iterator[LiveSource]:
-    """Open a context with the scene source of a service, subscribed to all topics it needs."""
+    """Open a context with the source of a service's scene, subscribed to all needed topics."""
     with ExitStack() as stack:
         yield LiveSource(service, config, stack)

@@ -44,7 +44,7 @@ class LivePath:
     """Positions of the camera, as published and after pose-graph corrections.
 
     A corrected position moves with the reference keyframe of its frame. Each time there are more
-    than `most` positions, every second position is dropped. From then on, only half as many of the
+    than `most` positions, every second one is dropped, and from then on only half as many of the
     new positions are stored as before.
     """
 

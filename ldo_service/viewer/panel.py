@@ -23,7 +23,7 @@ def escaped(text: str) -> str:
 
 # --- of a run -------------------------------------------------------------------------------------
 def of_summary(summary: Mapping[str, Any]) -> str:
-    """Return those values of summary.json that are present and valid as text."""
+    """Return as text the values of summary.json that are present and valid."""
     counts = [
         f"{summary[name]:,} {says}"
         for name, says in (
@@ -54,7 +54,7 @@ def under_way(frames: int) -> str:
 
 
 def share_shown(shown: int, there: int) -> str:
-    """Return a text with the number of drawn Gaussians; empty if all are drawn."""
+    """Return how many Gaussians of how many are drawn, as text; empty if all are drawn."""
     return f"{shown:,} of {there:,} Gaussians are drawn" if shown < there else ""
 
 
@@ -113,7 +113,7 @@ def of_health(heard: Iterable[HeartbeatRecord], now_s: float) -> str:
     """Return a table with state, step rate, step time, drops and memory of each actor."""
     rows = [_row(one, now_s) for one in sorted(heard, key=lambda one: one.health.actor)]
     if not rows:
-        return "No actor reports. Check the robot name, and run `ldo doctor`."
+        return "No heartbeat yet. Check the robot name, and run `ldo doctor`."
     return "\n".join(
         ("| actor | | /s | ms | p95 | drops | MB |\n|---|---|---|---|---|---|---|", *rows)
     )

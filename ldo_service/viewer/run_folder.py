@@ -45,7 +45,7 @@ class RunFolder:
         if not any(_signature(folder / name) for name in ("config.yaml", *PARTS)):
             raise DataError(
                 f"{folder} holds nothing that `ldo run` writes, such as map.ply or trajectory.txt. "
-                "Give the folder that was its --out."
+                "Give the folder that was the --out of a run."
             )
 
     def _begin(self) -> None:
@@ -88,7 +88,7 @@ class RunFolder:
         return True
 
     def _path(self, name: str) -> Path:
-        """Return the path of a file of the run, in the folder of the refined map if it is there."""
+        """Return the path of a file in the folder of the refined map, else in the run folder."""
         refined = self._folder / REFINED / name
         return refined if has_refined(self._folder) and refined.is_file() else self._folder / name
 

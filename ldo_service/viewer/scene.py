@@ -1,6 +1,6 @@
 """Scene of map and camera, and conversion of its Gaussians for the browser.
 
-The conventions are those of `ldo_service.geometry`.
+Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass, field
@@ -48,7 +48,7 @@ class Scene:
     sights: dict[int, tuple[ObjectBox, ...]] = field(default_factory=dict)
     objects: MapObjects | None = None
     loops: tuple[tuple[int, int], ...] = ()  # Ids of reference and keyframe of each loop closure.
-    # Pose of the camera, [4, 4], current or at the end of the run; None until it is known.
+    # Current pose of the camera, or the pose at the end of a run, [4, 4]; None until it is known.
     T_map_camera: np.ndarray | None = None
     facts: str = ""  # Text of the panel, Markdown.
 

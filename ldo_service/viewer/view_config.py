@@ -16,11 +16,12 @@ class ViewerConfig:
     # Maximum number of drawn Gaussians, 32 bytes each; those with the largest weight are drawn.
     # While a map grows, up to a quarter more are drawn.
     max_gaussians: int = 300_000
-    # Maximum poses of a path, 11 minutes at 30 Hz; of a longer path, fewer poses are drawn.
+    # Maximum number of poses of a path, 11 minutes at 30 Hz. A longer path is thinned evenly.
     max_poses: int = 20_000
-    # Maximum drawn keyframes; if there are more, only every second, third, ... is drawn.
+    # Maximum number of drawn keyframes. If there are more, every second, third, ... is drawn.
     max_keyframes: int = 2_000
-    # Maximum drawn objects, those with the most observations; more names would hide each other.
+    # Maximum number of drawn objects, which are those with the most observations. More names would
+    # hide each other.
     max_objects: int = 200
     update_s: float = 0.2  # Interval between updates; the camera thus moves at 5 Hz.
     lines_s: float = 1.0  # Interval between drawings of paths, keyframes and boxes, at most 4 MB.

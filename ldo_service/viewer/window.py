@@ -72,7 +72,7 @@ class Window:
         self._drawn_s: dict[Layer, float] = {}
         self._begin()
         self._nodes: dict[str, Any] = {}  # Nodes of viser, by name.
-        self._names: dict[int, Any] = {}  # Labels, by object.
+        self._names: dict[int, Any] = {}  # Labels of viser, by object id.
         server.scene.set_up_direction(estimate_up({}))
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._build_panel(title)
@@ -82,7 +82,7 @@ class Window:
         self._shown = self._scene
         # Number of keyframes that the up direction was estimated from; 0 before the first estimate.
         self._leveled_by = 0
-        self._found: int | None = None  # Object that was searched for.
+        self._found: int | None = None  # Id of the object that the last search found.
 
     @property
     def url(self) -> str:
@@ -104,7 +104,7 @@ class Window:
         gui.set_panel_label(title)
         self._facts = gui.add_markdown("")
         with gui.add_form("Where is ...") as form:
-            self._text = gui.add_text("name", "", hint="Press Enter to fly to it")
+            self._text = gui.add_text("name", "", hint="Press Enter to move the view to the object")
             form.on_submit(self._fly_to_answer)
         self._answers = gui.add_markdown("")
         with gui.add_folder("Show"):
@@ -121,7 +121,7 @@ class Window:
             if node is not None:
                 node.visible = is_visible
 
-    # --- what is new ------------------------------------------------------------------------------
+    # --- drawing ----------------------------------------------------------------------------------
     def show(self, changed: set[Layer]) -> None:
         """Draw the changed layers, each at most once in its minimum interval.
 
@@ -255,10 +255,10 @@ class Window:
 
     # --- camera of the browser --------------------------------------------------------------------
     def _level(self) -> None:
-        """Set the up direction of the browser, estimated from the keyframes so far.
+        """Estimate the up direction from the keyframes so far, and set it in the browser.
 
-        The direction is estimated again when the number of keyframes has doubled, because the first
-        keyframe alone may be tilted.
+        The direction is estimated again each time the number of keyframes has doubled, because the
+        first keyframes alone may be tilted.
         """
         self._leveled_by = max(1, len(self._scene.keyframes))
         self._server.scene.set_up_direction(estimate_up(self._scene.keyframes))
@@ -277,7 +277,7 @@ class Window:
         return [CameraView(camera.position, camera.look_at) for camera in cameras]
 
     def _fly_to_answer(self, event: viser.GuiEvent[Any]) -> None:
-        """Search for the object that the user typed, and move the browser's camera to it.
+        """Search for the name that the user typed, and move the browser's camera to the best match.
 
         Viser calls this method in its own thread.
         """
@@ -321,7 +321,7 @@ def _line(one: ObjectMatch) -> str:
 def _require_own(address: str) -> None:
     """Check that an address belongs to this machine.
 
-    With another address, viser would try one port after the other without end.
+    With the address of another machine, viser would try one port after the other without end.
 
     Raises:
         ConfigError: If the machine does not have the address.
@@ -333,7 +333,7 @@ def _require_own(address: str) -> None:
     except OSError as error:
         raise ConfigError(
             f"viewer.address={address} must be an address of this machine, such as {LOOPBACK}, or "
-            f"0.0.0.0 for all of them: {error.strerror}."
+            f"0.0.0.0 for all its addresses: {error.strerror}."
         ) from error
 
 

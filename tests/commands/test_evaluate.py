@@ -61,7 +61,7 @@ def test_localization_run_without_a_map_has_its_trajectory_evaluated(
         *(capsys, "run", room_folder, "--out", again, "--localize", run, "--max-frames", "6")
     )
     assert code == 0
-    assert f"The map is that of {run}" in " ".join(out.split())
+    assert f"The run localized in the map of {run}" in " ".join(out.split())
     assert not {path.name for path in again.iterdir()} & {
         "map.ply",
         "keyframes.json",

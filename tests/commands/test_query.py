@@ -110,7 +110,7 @@ def test_synonym_finds_the_object_and_prints_a_table(capsys, folder: Path) -> No
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
-    [("chiar", "Did you mean chair?"), ("piano", "There is chair, couch.")],
+    [("chiar", "Did you mean chair?"), ("piano", "The names in the map are chair, couch.")],
 )
 def test_query_without_a_match_names_the_known_labels(
     capsys, folder: Path, text: str, complaint: str

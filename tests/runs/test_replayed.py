@@ -163,7 +163,7 @@ def test_a_recording_of_another_version_is_refused(
     code, _, err = ldo(capsys, "replay", recording)
     assert code == DataError.exit_code
     assert_one_paragraph(err)
-    assert "has version=3, but must have version=4" in err
+    assert "has recording version 3, but this service replays only version 4" in err
 
 
 def test_selected_actors_are_opened_and_unknown_ones_refused(

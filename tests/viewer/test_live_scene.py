@@ -289,4 +289,4 @@ def test_number_of_actors_in_the_facts_is_bounded(live: LiveScene, clock: Clock)
 def test_facts_report_missing_health_messages(live: LiveScene, clock: Clock) -> None:
     clock.now_s += TEXT_INTERVAL_S
     live.update()
-    assert "No actor reports" in live.scene.facts
+    assert "No heartbeat yet" in live.scene.facts
