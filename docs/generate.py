@@ -1,4 +1,4 @@
-"""Generator of the parts of the pages that are taken from the code.
+"""Generator of those parts of the pages whose text comes from the code.
 
 `python docs/generate.py` replaces the text between `<!-- NAME -->` and `<!-- end -->` in each page
 and draws `docs/actors.svg`. With `--check` it changes nothing and exits with 1 if a file would
@@ -89,7 +89,7 @@ def _unit(path: str) -> str:
 
 
 def messages() -> str:
-    """Return Markdown: every message and every record in one, with a table of its fields."""
+    """Return Markdown: each message, and each record in a message, with a table of its fields."""
     topics: dict[str, list[str]] = {}
     for topic in TOPICS:
         for message in filter(None, (topic.message, topic.answer)):
@@ -110,7 +110,7 @@ def messages() -> str:
 
 
 def types() -> str:
-    """Return Markdown: a table of the type names of fields that are no records."""
+    """Return Markdown: a table of the type names in messages that are not names of records."""
     rows = dict[str, str]()
     for path in sorted((ROOT / "schemas").glob("*.py")):
         comments = _comments(path)
@@ -157,7 +157,7 @@ def _fields_of(name: str, node: ast.ClassDef, path: Path, topics: list[str]) -> 
 
 
 def _comments(path: Path) -> dict[int, tuple[str, bool]]:
-    """Return the comments of a file by line, each with whether it stands on a line of its own."""
+    """Return each comment of a file, by line, with True if it stands on a line of its own."""
     with path.open("rb") as file:
         return {
             token.start[0]: (token.string.lstrip("# "), token.line.strip().startswith("#"))
@@ -205,7 +205,7 @@ def _arguments(verb: Callable[..., Any]) -> list[str]:
 
 
 def _rows(verb: Callable[..., Any]) -> Iterator[tuple[str, str, str]]:
-    """Yield a row for each argument; those of a dataclass follow in its place."""
+    """Yield a row for each argument; for a dataclass, a row for each of its fields instead."""
     owner = verb.__init__ if inspect.isclass(verb) else verb
     hints = typing.get_type_hints(owner, include_extras=True)
     for name, parameter in inspect.signature(verb).parameters.items():
@@ -247,7 +247,7 @@ def _subcommands(verb: Callable[..., Any]) -> Iterator[tuple[str, Callable[..., 
 
 
 def _annotation(hint: Any) -> tuple[Any, list[Any]]:
-    """Return a type without its annotations and without None, and the annotations."""
+    """Return the type without its annotations and without None, and the list of annotations."""
     marks = list[Any]()
     while typing.get_origin(hint) is typing.Annotated:
         hint, *more = typing.get_args(hint)
@@ -275,7 +275,7 @@ WIDTH_PX, HEIGHT_PX, COLUMN_PX, ROW_PX = 120, 34, 170, 62
 
 
 def drawing() -> str:
-    """Return an SVG of the actors: solid arrows are lossless, dashed ones keep the latest."""
+    """Return an SVG of the actors: solid arrows are lossless, dashed ones keep only the newest."""
     arrows = dict[tuple[str, str], bool]()
     for line in mermaid_diagram().splitlines():
         if found := re.match(r"\s+(\w+) (-->|-\.->)\|[^|]+\| (\w+)", line):
@@ -311,7 +311,7 @@ def _box(name: str, text: str, fill: str) -> str:
 
 
 def _arrow(maker: str, taker: str, solid: bool) -> str:
-    """Return a line between two boxes, moved to its right so that both directions show."""
+    """Return an arrow between two boxes, shifted to its right to separate both directions."""
     (x0, y0), (x1, y1) = _center(maker), _center(taker)
     length = ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
     right_x, right_y = -(y1 - y0) / length * 7, (x1 - x0) / length * 7
@@ -324,7 +324,7 @@ def _arrow(maker: str, taker: str, solid: bool) -> str:
 
 
 def _leave(name: str, x0: float, y0: float, x1: float, y1: float) -> tuple[float, float]:
-    """Return the point where a line from inside a box leaves it."""
+    """Return the point where a line that starts inside a box leaves the box."""
     x, y = _center(name)
     steps = [1.0]
     if x1 != x0:
@@ -349,7 +349,11 @@ BLOCKS: dict[str, Callable[[], str]] = {
 
 
 def generated(page: str) -> str:
-    """Return the page with every block as the code has it. Raises KeyError for an unknown block."""
+    """Return the page with the text of each block replaced by the output of its function.
+
+    Raises:
+        KeyError: The page has an unknown block.
+    """
     return BLOCK.sub(
         lambda found: f"{found[1]}{_escaped(BLOCKS[found['name']]())}\n{found[3]}", page
     )
@@ -370,7 +374,7 @@ def main() -> None:
     stale = [path for path, text in outputs() if not path.exists() or path.read_text() != text]
     if "--check" in sys.argv[1:]:
         names = ", ".join(str(path.relative_to(ROOT)) for path in stale)
-        sys.exit(f"{names} must be generated again: python docs/generate.py" if stale else 0)
+        sys.exit(f"{names}: out of date. Run python docs/generate.py" if stale else 0)
     for path, text in outputs():
         path.write_text(text)
 
