@@ -92,7 +92,7 @@ def object_labels(map_names: Sequence[str]) -> np.ndarray:
 
 
 def is_void(name: str) -> bool:
-    """Return whether a name of a data set means that its pixels are not labelled."""
+    """Return whether a class name of a data set marks pixels without a label, such as `void`."""
     return normalized(name) in VOID_NAMES
 
 

@@ -17,7 +17,7 @@ from .object_points import DetectionPoints, SubgraphLandmarks
 
 @dataclass(frozen=True, slots=True)
 class SubgraphConfig:
-    """Limits of subgraphs; III.C is a section of the paper."""
+    """Limits of subgraphs. III.C names the section of the LDO-SLAM paper that gives the value."""
 
     min_keyframes: int = 3  # Minimum keyframes (III.C).
     max_keyframes: int = 5  # Maximum keyframes (III.C).

@@ -107,7 +107,7 @@ class CommandReceiver:
 
 
 class CommandSender:
-    """Sender of commands in the service."""
+    """Client that a running service uses to send commands to the stages of its actors."""
 
     def __init__(self, transport: Transport) -> None:
         self._loop = asyncio.get_running_loop()

@@ -61,7 +61,7 @@ def test_added_label_is_used_for_later_regions(tmp_path: Path, room: Sequence) -
         service.client.poller("map/delta", MapDelta) as deltas,
     ):
         service.wait_for_actors()
-        with pytest.raises(ConfigError, match=r"no objects yet\. Objects need a keyframe"):
+        with pytest.raises(ConfigError, match=r"no objects yet\. Objects appear with"):
             service.client.objects(timeout_s=1)
         assert "fire hydrant" in service.client.add_label("fire hydrant")
         received_labels: set[str] = set()

@@ -226,8 +226,9 @@ class HttpLabeller:
             )
         if not self._names:
             raise ConfigError(
-                f"the labeller {self.identity} has no list of names and may answer {name!r} "
-                "already: set vlm_labeller.class_names to let it choose from a list."
+                f"the name {name!r} cannot be added: the labeller {self.identity} has no list of "
+                "names, so it can already answer with any name. Set vlm_labeller.class_names to "
+                "let it choose from a list."
             )
         if canonical(name) not in self._names:
             self._names.append(canonical(name))
