@@ -54,7 +54,9 @@ class SelfCalibrationConfig:
 
     def __post_init__(self) -> None:
         if any(n < 2 for n in self.views) or list(self.views) != sorted(set(self.views)):
-            raise ConfigError(named(self, "views") + " must ascend, and each number must be at least 2.")
+            raise ConfigError(
+                named(self, "views") + " must ascend, and each number must be at least 2."
+            )
         if not self.view_motion > 0 or min(self.lost_frames, self.min_pairs) < 1:
             raise ConfigError(
                 named(self, "view_motion", "lost_frames", "min_pairs")

@@ -120,7 +120,9 @@ def _texts_of(model: str, run: Path | None) -> Encode:
         try:
             return open_labeller(had.model, had.dual_encoder).texts.encode(texts)
         except ConfigError as error:
-            raise TextComparisonError(f"{error} Choose another encoder pair with `--model NAME`.") from error
+            raise TextComparisonError(
+                f"{error} Choose another encoder pair with `--model NAME`."
+            ) from error
 
     return encode
 
