@@ -83,7 +83,7 @@ class RestartsExhausted(StageError):
 
 
 class StageStalled(StageError):
-    """Step of an actor that exceeds its time limit; a step is the handling of one message."""
+    """An actor exceeded the time limit of a step; a step is the handling of one message."""
 
     def __init__(self, actor: str, age_s: float, setting: str) -> None:
         super().__init__(

@@ -68,8 +68,8 @@ class LoopCandidate(Message, frozen=True, kw_only=True):
             )
         if not self.rejected_reason and not self.evidence:
             raise ValueError(
-                "evidence and rejected_reason are both empty: a candidate without a pose must have "
-                "a rejected_reason"
+                "evidence and rejected_reason are both empty: a candidate without evidence has no "
+                "pose and must have a rejected_reason"
             )
 
 

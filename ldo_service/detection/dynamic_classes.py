@@ -49,7 +49,7 @@ class Box:
     bottom: float
 
     def in_smaller(self, times: float) -> "Box":
-        """Scale the box to the image after division of the image's width and height by `times`."""
+        """Return the box in an image whose width and height are smaller by the factor `times`."""
         edges = (self.left, self.top, self.right, self.bottom)
         return Box(self.label, *(edge / times for edge in edges))
 

@@ -135,7 +135,7 @@ class StreamPairer(Generic[A, B]):
         self.pairs = 0
 
     def add_a(self, half: A) -> Iterator[tuple[A, B]]:
-        """Add a half of the first stream, and return the pairs that it completes.
+        """Add an item of the first stream, and return the pairs that it completes.
 
         Raises:
             FrameError: The stamp is not later than the last stamp of the stream.
@@ -144,7 +144,7 @@ class StreamPairer(Generic[A, B]):
         return self._decided()
 
     def add_b(self, half: B) -> Iterator[tuple[A, B]]:
-        """Add a half of the second stream, and return the pairs that it completes.
+        """Add an item of the second stream, and return the pairs that it completes.
 
         Raises:
             FrameError: The stamp is not later than the last stamp of the stream.

@@ -117,7 +117,7 @@ class ConsistencyChecker:
         return proposal
 
     def reject_aliased(self, proposals: Sequence[LoopHypothesis]) -> list[LoopHypothesis]:
-        """Return all hypotheses of a new subgraph, with the ambiguous ones rejected.
+        """Return all hypotheses of a new subgraph; the ambiguous ones are marked as rejected.
 
         A hypothesis is ambiguous if another one has enough inliers (`ambiguous_inlier_ratio`) and
         gives the new keyframe a pose that differs by more than `ambiguous_rad`.

@@ -23,8 +23,8 @@ is above 0.5 nats, else 1. The entropy of p_l is not used, since the weights wou
 the solution. In the paper, the similarity has a direction from landmark i to landmark j. Here a
 pair has no direction, so the cost contains both directions with half the weight each.
 
-No term contains both a p and a T or mu. Therefore the sum of all costs is minimal if these two
-parts are minimal; projections is the first term of the observations:
+No term contains both a p and a T or mu. The sum of all costs therefore has two parts, F and G, that
+can be minimized separately (projections is the first term of the observations):
 
     F(T, mu) = odometry + loops + projections      and
     G(p)     = lambda sum w KL(p_l || q_kl) + similarity

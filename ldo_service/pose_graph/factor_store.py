@@ -238,7 +238,11 @@ class FactorStore:
         )
 
     def between_variables(self, m: RelativePose) -> RelativePose:
-        """Return a measurement transferred to variables; unchanged if a and b are variables."""
+        """Return a measurement between two keyframes as one between variables of the graph.
+
+        Each condensed keyframe is replaced by the variable that it is attached to. If both
+        keyframes are variables, the measurement is returned unchanged.
+        """
         (a, T_a), (b, T_b) = self.ends(m)
         if (a, b) == (m.a, m.b):
             return m

@@ -119,7 +119,7 @@ class MapFolder:
         return Trajectory.load(require_file(self.folder, "trajectory.txt"))
 
     def viewpoints(self) -> list[Viewpoint]:
-        """Return the viewpoints of all keyframes that are in the frame of the map."""
+        """Return the viewpoints of all keyframes that have a pose in the map."""
         return list(read_viewpoints(self.folder).values())
 
     def exposures(self) -> Exposures:
@@ -148,7 +148,7 @@ class MapFolder:
 
 
 def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:
-    """Return the viewpoints of all keyframes that are in the frame of the map, by keyframe id.
+    """Return the viewpoints of all keyframes that have a pose in the map, by keyframe id.
 
     The folder needs keyframes.json, but no map.
     """

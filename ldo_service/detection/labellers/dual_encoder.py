@@ -79,7 +79,8 @@ class DualEncoderConfig:
 class EncoderFiles:
     """Files of a pair of encoders.
 
-    The text encoder and its vocabulary are given together. Without them, embeddings are required.
+    The text encoder and its vocabulary are given together. Without them, embeddings of
+    the names are required.
     """
 
     image: Path  # Image encoder, ONNX.
