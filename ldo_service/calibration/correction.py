@@ -25,8 +25,8 @@ MIN_TRANSMISSION = 0.3  # Darker corners would be amplified together with their 
 class CameraCorrection:
     """Vignetting and depth bias of a camera, in its rectified image.
 
-    With x = (u - cu) / (w/2), y = (v - cv) / (w/2) around the image center, and r = 1 in the
-    corners:
+    With x = (u - cu) / (w/2) and y = (v - cv) / (w/2) around the image center, and the distance r
+    from the center, scaled to 1 in the corners:
 
         1 / z_true = 1 / z_measured + b1 x^2 + b2 x y + b3 y^2
         color_measured = V(r) color_true,  log V = a1 r^2 + a2 r^4 + a3 r^6 per channel

@@ -46,8 +46,8 @@ class Config:
         """Check that the service waits long enough for the server of the labeller.
 
         Raises:
-            ConfigError: The deadline of a label request, plus one attempt as margin, is not below a
-                timeout of the service.
+            ConfigError: A timeout of the service is too short. Each must be longer than the
+                deadline of a label request plus the time of one attempt, which is the margin.
         """
         http = self.vlm_labeller.http
         max_s = http.deadline_s + http.timeout_s  # Deadline of a label, plus one attempt as margin.

@@ -102,7 +102,7 @@ class LoopErrors:
 
     @property
     def recall(self) -> float | None:
-        """Fraction of the queries that a closure connects to an older subgraph of a true pair."""
+        """Fraction of the queries with a closure to an older subgraph that truly overlaps."""
         return self.closed_queries / self.queries if self.queries else None
 
 

@@ -88,7 +88,7 @@ class Recorder(Journal):
 
     # --- called by the stage ----------------------------------------------------------------------
     def record_files(self) -> None:
-        """Record the current files of the actor, which a start with a saved state needs."""
+        """Record the files of the actor, without which a replay cannot start from a saved state."""
         if self._files is None or not self._file.is_open:
             return
         try:

@@ -7,10 +7,10 @@ boxes and from label results. The label of the region is the label with the most
 
 An object may be segmented differently in each keyframe, so several regions may show the same
 object. To decide the label of a region, the votes of overlapping labelled regions are therefore
-added, weighted by the overlap. A region that stands on another object and the region of that object
-do not add their votes to each other.
+added, weighted by the overlap. If an object stands on another one, the votes of their regions are
+not added.
 
-The tracker requests a label for a region when no better view was found for some keyframes. The
+The tracker requests a label for a region when several keyframes in a row show no better view. The
 request contains the best views. Most regions show only parts or shadows of objects. The number of
 requests is therefore limited, and regions with the best views come first.
 """

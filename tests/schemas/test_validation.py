@@ -449,7 +449,7 @@ def test_invalid_object_is_rejected(fields: dict, error: str) -> None:
         (
             "loop_candidate",
             {"rejected_reason": "", "evidence": ""},
-            "a candidate without a pose must have a rejected_reason",
+            "a candidate without evidence has no pose and must have a rejected_reason",
         ),
     ],
 )
