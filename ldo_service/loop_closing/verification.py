@@ -53,8 +53,7 @@ class VerificationConfig:
 
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     fit: DepthConsistencyConfig = field(default_factory=DepthConsistencyConfig)
-    # Minimum feature inliers of the best pair of keyframes. A confirming keyframe of the new
-    # subgraph only needs `features.min_inliers`.
+    # Minimum feature inliers of the best pair; a confirming pair needs `features.min_inliers`.
     min_inliers: int = 20
     # Minimum number of matching landmarks that confirm a pose from features, if no second keyframe
     # gives the same pose.
@@ -131,8 +130,7 @@ class VerificationResult:
 class Verifier:
     """Verifier of loop candidates.
 
-    Equal subgraphs give bitwise equal results. The verifier caches the keyframes that were
-    decompressed most recently.
+    Equal subgraphs give bitwise equal results. Recently decompressed keyframes are cached.
     """
 
     def __init__(
@@ -202,8 +200,7 @@ class Verifier:
     ) -> bool:
         """Return whether a hypothesis in `found` for another new keyframe confirms `best`.
 
-        It confirms `best` if the two poses differ by less than `within_rad`, rotation plus
-        parallax.
+        It does if the two poses differ by less than `within_rad`, rotation plus parallax.
         """
         return any(
             image_motion_rad(se3.inverse(best.T_old_new) @ _as_seen_by(best, other), _depth(best))
@@ -238,18 +235,13 @@ class Verifier:
         """Return a pose from the map, refined on images, if two new keyframes give the same pose.
 
         Up to `map_pairs` pairs of keyframes are aligned, the nearest ones first. The alignment
-        starts at the relative pose of the pair in the map. A refined pose is returned as soon as it
+        starts at their pose in the map, `T_old_new`. A refined pose is returned as soon as it
         differs by less than `map_confirmation_rad` from the refined pose of an earlier pair with
         another new keyframe. Otherwise, a rejected hypothesis is returned.
 
         Images of a place from different viewpoints have few features in common, and this method
         needs none. It finds loop closures between nearby keyframes before they drift apart, but
         finds none after a large drift.
-
-        Args:
-            old: Old subgraph.
-            new: New subgraph.
-            T_old_new: Function that returns the relative pose of two keyframes in the map, or None.
         """
         found: list[LoopHypothesis] = []
         for a, b, T in islice(_nearest_pairs(old, new, T_old_new), self._config.map_pairs):
@@ -357,10 +349,7 @@ class Verifier:
 def _likely_pairs(
     old: Subgraph, new: Subgraph
 ) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe]]:
-    """Iterate over all pairs of an old and a new keyframe.
-
-    The pairs with the most visual words in common come first.
-    """
+    """Iterate over all pairs (old, new); pairs with the most visual words in common come first."""
     pairs = list(product(old.views, new.views))
     shared = [float(np.minimum(a.words, b.words).sum()) for a, b in pairs]
     return (pairs[index] for index in np.argsort(-np.array(shared), kind="stable"))
@@ -393,10 +382,7 @@ def _between(
 
 
 def _odometry_frames(proposal: LoopHypothesis) -> np.ndarray:
-    """Return T_oldodom_newodom [4, 4], the transform that a hypothesis implies.
-
-    It maps the odometry frame of the new subgraph to that of the old subgraph.
-    """
+    """Return T_oldodom_newodom [4, 4] of the odometry frames, as a hypothesis implies it."""
     T_odom_old = proposal.old.place.T_odom_keyframe
     return T_odom_old @ proposal.T_old_new @ se3.inverse(proposal.new.place.T_odom_keyframe)
 

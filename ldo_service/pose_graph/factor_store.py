@@ -104,8 +104,7 @@ class FactorStore:
     def _in_head_of_b(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> np.ndarray:
         """Return T_head_b [4, 4] according to a measurement of keyframe b from keyframe a.
 
-        If a and b have different heads, the pose of a relative to the head of b is computed from
-        the current poses in the map.
+        If a and b have different heads, the current poses in the map relate a to the head of b.
         """
         (head_a, T_a), (head_b, _) = self.relative_to_start(m.a), self.relative_to_start(m.b)
         if head_a == head_b:
@@ -168,8 +167,7 @@ class FactorStore:
     def interpolation_error_sigmas(self, keyframe: int, variables: Variables) -> float:
         """Return the difference between two estimates of the pose of a condensed keyframe.
 
-        The first estimate is T_map_head T_head_keyframe, and the second one is T_map_tail
-        T_tail_keyframe, with the measured relative poses.
+        One estimate follows from the pose of the head, the other one from the pose of the tail.
 
         Returns:
             The largest absolute value of the six components of the difference, in standard
@@ -191,10 +189,7 @@ class FactorStore:
         return min(share, 1 - share) * float((off / sigmas).max())
 
     def relative(self, without: Pair | None = None) -> Iterable[RelativePose]:
-        """Yield all measurements except loop closures and the bridge edge `without`.
-
-        Each measurement is between two variables; bridge edges are transferred to variables.
-        """
+        """Yield measurements between variables, except closures and the bridge edge `without`."""
         yield from self.odometry.values()
         yield from self.condensed.values()
         bridges = (m for pair, m in self.bridges.items() if pair != without)
@@ -202,20 +197,16 @@ class FactorStore:
 
     # --- condensed keyframes ----------------------------------------------------------------------
     def relative_to_start(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """Return the head of a condensed keyframe and T_head_keyframe [4, 4].
-
-        For a keyframe that is a variable, return the keyframe itself and the identity.
-        """
+        """Return the head of a keyframe and T_head_keyframe [4, 4]; a variable is its own head."""
         row = self.rows.get(keyframe)
         if row is None:
             return keyframe, np.eye(4)
         return int(self.interpolated.start_variables[row]), self.interpolated.T_head[row]
 
     def relative_to_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """Return the head or the tail of a condensed keyframe, and T_variable_keyframe [4, 4].
+        """Return the nearer one of head and tail of a keyframe, and T_variable_keyframe [4, 4].
 
-        The nearer one of the two is returned. For a keyframe that is a variable, return the
-        keyframe itself and the identity.
+        A keyframe that is a variable is its own head and tail.
         """
         row = self.rows.get(keyframe)
         if row is None or self.interpolated.fractions[row] <= 0.5:
@@ -226,8 +217,7 @@ class FactorStore:
         """Return the two variables to which the keyframes a and b of a measurement are transferred.
 
         Each keyframe is transferred to the nearer one of its head and its tail. If this gives the
-        same variable for a and b, both keyframes are transferred to their heads instead. A keyframe
-        that is a variable is not transferred.
+        same variable for a and b, both keyframes are transferred to their heads instead.
 
         Returns:
             For a, then for b: the id of the variable, and T_variable_keyframe [4, 4].
@@ -240,8 +230,7 @@ class FactorStore:
     def between_variables(self, m: RelativePose) -> RelativePose:
         """Return a measurement between two keyframes as one between variables of the graph.
 
-        Each condensed keyframe is replaced by the variable that it is attached to. If both
-        keyframes are variables, the measurement is returned unchanged.
+        If both keyframes are variables, the measurement is returned unchanged.
         """
         (a, T_a), (b, T_b) = self.ends(m)
         if (a, b) == (m.a, m.b):
@@ -319,12 +308,7 @@ class FactorStore:
         return [*others, *(self._closure_factor(closure, 0.0) for closure in closures)]
 
     def closure_sigmas(self, variables: Variables, closure: RelativePose) -> float:
-        """Return the largest absolute value of the six whitened residuals of a closure, in sigmas.
-
-        Args:
-            variables: Values at which the residuals are computed.
-            closure: The closure.
-        """
+        """Return the largest of the six absolute whitened residuals of a closure, in sigmas."""
         m = self._closure(closure)
         residual = closure_residual(variables[m.a], variables[m.b], m)
         return float(np.abs(np.linalg.cholesky(m.information).T @ residual).max())
@@ -345,9 +329,7 @@ class FactorStore:
     def move_component(
         self, younger: int, older: int, T_new_old: np.ndarray, variables: Variables
     ) -> Variables:
-        """Merge the younger of two components into the older one.
-
-        The keyframes and landmarks of the younger component move.
+        """Move the keyframes and landmarks of a component, and merge it into an older one.
 
         Args:
             younger: First keyframe of the younger component.

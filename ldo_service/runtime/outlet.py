@@ -49,8 +49,7 @@ class Outlet:
     # Time after which a message counts as lost, seconds: half a credit period. A shorter time would
     # retransmit messages that are still on their way.
     REPEAT_AFTER_S = 0.25
-    # Maximum time to wait at the end for consumers with policy `Backlog`, seconds: two credit
-    # periods.
+    # Maximum wait of `flush` for consumers with policy `Backlog`, seconds: two credit periods.
     FLUSH_BACKLOG_S = 1.0
 
     def __init__(
@@ -120,8 +119,7 @@ class Outlet:
         """Return the number of messages that may be sent now; 0 while staged messages wait.
 
         If the port is nonblocking and all required consumers have policy `Backlog`, the credit is
-        the room in the windows of the consumers. The actor then sends no more messages than the
-        consumers can queue, so that no backlog grows.
+        the room in the windows of the consumers, so that no backlog grows.
         """
         if self._unsent:
             return 0
@@ -184,8 +182,7 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until every lossless consumer has received all messages.
 
-        The wait for consumers with policy `Backlog`, which may have stopped, ends after
-        `FLUSH_BACKLOG_S`.
+        It waits at most `FLUSH_BACKLOG_S` for consumers with policy `Backlog`; they may be stopped.
         """
         self._post_hellos()  # Each consumer replies with its credit at once.
         while not self._consumers.all_received(self._seq, awaited_only=True):
@@ -314,8 +311,7 @@ class Outlet:
     def _retransmit(self, consumer: Consumer, gap: bool) -> None:
         """Retransmit the messages that a consumer has not received.
 
-        If the consumer reports no gap, the messages may still be on their way. The outlet then
-        retransmits them only after `REPEAT_AFTER_S`.
+        Without a gap, the outlet waits `REPEAT_AFTER_S` for messages that are still on their way.
         """
         now = self._loop.time()
         recently = now - consumer.repeated_at_s < self.REPEAT_AFTER_S
@@ -363,10 +359,7 @@ class Outlet:
             self._changed.set()
 
     def evict_stalled(self) -> None:
-        """Evict connected consumers whose window has been full for over `evict_after_s`.
-
-        The stage calls this method with every heartbeat.
-        """
+        """Evict connected consumers whose window has been full for over `evict_after_s`."""
         overdue = self._consumers.stalled(self._loop.time(), self._evict_after_s, self._next)
         for name in overdue:
             log.error(

@@ -91,9 +91,6 @@ class Objects:
                 candidate gains an observation only if the keyframe is before its first or after its
                 last observation.
 
-        Returns:
-            The changes of the objects.
-
         Raises:
             ValueError: If the shapes of the arrays do not fit.
         """
@@ -195,10 +192,7 @@ class Objects:
         ]
 
     def _lacks(self, which: np.ndarray, keyframe: int) -> np.ndarray:
-        """Return which landmarks are candidates that lack observations around a keyframe, [K] bool.
-
-        Such a candidate was first observed after the keyframe, or last observed before it.
-        """
+        """Return a mask [K] of the candidates observed only before or only after a keyframe."""
         table = self._table[which]
         is_within = (table["first"] <= keyframe) & (keyframe <= table["last"])
         return (table["id"] == CANDIDATE) & ~is_within
@@ -307,10 +301,7 @@ class Objects:
 
     # --- candidates -------------------------------------------------------------------------------
     def _begin(self, view: MapView, regions: RegionStatistics, left: np.ndarray) -> None:
-        """Create candidates for the regions `left`.
-
-        If there are too many candidates, those observed longest ago are dropped.
-        """
+        """Create candidates for the regions `left`, and keep at most `max_candidates` in total."""
         new = new_landmarks(len(left), view.keyframe)
         new["members"], new["seen"] = regions.members[left], 1
         new["votes"] = one_each(new["members"])
@@ -321,8 +312,8 @@ class Objects:
         candidates = np.flatnonzero(self._table["id"] == CANDIDATE)
         excess = len(candidates) - self.config.max_candidates
         if excess > 0:
-            # New candidates are at the end of the table. They are dropped last, because a late
-            # label may have an old keyframe.
+            # Candidates observed longest ago are dropped first. New ones, at the end of the table,
+            # are dropped last, because a late label may have an old keyframe.
             is_new = candidates >= len(self._table) - len(new)
             oldest = np.lexsort((self._table["last"][candidates], is_new))[:excess]
             self._table = np.delete(self._table, candidates[oldest])

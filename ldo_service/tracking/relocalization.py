@@ -316,11 +316,7 @@ class ReusedKeyframe:
     candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
     def measures(self, keyframe: int) -> RelativePose:
-        """Return the measured pose of a new keyframe relative to this one.
-
-        Args:
-            keyframe: Id of the new keyframe, which is made of the aligned frame.
-        """
+        """Return the pose, in this keyframe, of the new keyframe that the aligned frame becomes."""
         seen = self.candidate.alignment
         return RelativePose(self.record.id, keyframe, seen.T_reference_camera, seen.information)
 
