@@ -230,7 +230,7 @@ def test_unavailable_provider_is_skipped_with_a_warning(tmp_path, caplog) -> Non
     )
     assert detector.providers == ["CPUExecutionProvider"]
     (record,) = caplog.records
-    assert "RknpuExecutionProvider is not in this onnxruntime" in record.getMessage()
+    assert "RknpuExecutionProvider is missing from the installed onnxruntime" in record.getMessage()
 
 
 # --- real networks --------------------------------------------------------------------------------

@@ -91,7 +91,7 @@ def test_depth_loss_of_some_tiles_is_their_mean() -> None:
 
 @pytest.mark.parametrize(
     ("tiles", "message"),
-    [(np.ones((3, 5), np.uint8), r"shape"), (np.zeros((4, 5), np.uint8), "not 0")],
+    [(np.ones((3, 5), np.uint8), r"shape"), (np.zeros((4, 5), np.uint8), "not all be 0")],
 )
 def test_senseless_tiles_are_refused(tiles: np.ndarray, message: str) -> None:
     planes = np.zeros((5, 50, 75), np.float32)

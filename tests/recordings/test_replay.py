@@ -227,7 +227,7 @@ def test_recording_that_ended_at_its_limit_replays(
 def test_missing_message_raises_data_error(tmp_path: Path) -> None:
     path = recorded(tmp_path, VALUES)
     rewrite(path, CompressionType.NONE, leave_out=(NUMBERS.name, 3))
-    with pytest.raises(DataError, match="message of step 3 is missing"):
+    with pytest.raises(DataError, match="input of step 3 is missing"):
         replayed(tmp_path)
 
 

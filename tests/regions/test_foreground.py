@@ -105,7 +105,7 @@ def test_mismatched_surfaces_and_images_raise() -> None:
     with pytest.raises(ValueError, match="shape"):
         foreground(box, depth_m[:-1], edges_only(depth_m), CAMERA, CONFIG)
     unknown = SmoothSurfaces(np.full(depth_m.shape, 7, np.int32), np.array([depth_m.size]))
-    with pytest.raises(ValueError, match="labels"):
+    with pytest.raises(ValueError, match="each label must be"):
         foreground(box, depth_m, unknown, CAMERA, CONFIG)
 
 

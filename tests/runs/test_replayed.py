@@ -170,7 +170,7 @@ def test_selected_actors_are_opened_and_unknown_ones_refused(
     recording: Path, tmp_path: Path
 ) -> None:
     assert [actor.name for actor in open_recording(recording, ("tracker",))] == ["tracker"]
-    with pytest.raises(ConfigError, match="no actor 'nobody'"):
+    with pytest.raises(ConfigError, match="no recording of actor 'nobody'"):
         open_recording(recording, ("nobody",))
     with pytest.raises(DataError, match="ldo record"):
         open_recording(tmp_path)

@@ -403,7 +403,7 @@ def test_boxes_without_the_name_of_a_network_are_rejected() -> None:
         ({"box_px": (NAN, 0.0, 1.0, 1.0)}, "NaN"),
         ({"entropy": NAN}, "entropy"),
         ({"entropy": -0.1}, "entropy"),
-        ({"distribution": ()}, "over 0 classes"),
+        ({"distribution": ()}, "has 0 classes"),
         ({"distribution": (("cup", 0.7), ("cup", 0.3))}, "twice"),
         ({"distribution": (("cup", 0.7), ("vase", 0.5))}, "more than 1"),
         ({"distribution": (("cup", -0.1),)}, "negative"),
