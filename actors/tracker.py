@@ -18,7 +18,7 @@ does not change. Subscribers receive the same pose messages in both cases.
 import logging
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -182,7 +182,8 @@ class Tracker(Actor):
     def _track(self, raw: RgbdFrame) -> Iterator[TrackedPose | Keyframe | KeyframeMeasurements]:
         """Track a frame; if it becomes a keyframe, yield the keyframe first, then the pose.
 
-        The keyframe has the color and the depth that the self-calibration has corrected.
+        The keyframe has the color and the depth that the self-calibration has corrected, and in
+        which the motion during the frame is compensated.
         """
         correction = self._calibration.correction
         frame = correction.applied(raw)
@@ -192,13 +193,17 @@ class Tracker(Actor):
         result = self._odometry.process(frame, self._prior, may_map=may_map)
         self._count(frame, result, is_held_out)
         is_lost = result.status is TrackingStatus.LOST
-        change = self._calibration.observe(raw, None if is_lost else result.T_odom_camera)
+        T_odom_camera, motion = None if is_lost else result.T_odom_camera, result.motion
+        change = self._calibration.observe(raw, T_odom_camera, motion)
         if change is not None:
             self._odometry.recorrect(change)
         if result.awaits_mapping:
             return  # Odometry starts with a later frame that may be mapped.
         if result.keyframe is not None:
             mapped = correction.applied(raw, keeps_clipped=False)
+            if motion is not None:
+                mapped = motion.compensated(mapped)
+                correction = replace(correction, timing=motion.timing)
             keyframe = keyframe_message(mapped, result, result.keyframe, correction)
             yield keyframe
             yield keyframe_measurements_message(keyframe)
@@ -305,6 +310,7 @@ class Tracker(Actor):
             "prior_rejected": refused,
             "prior_restarts": restarts,
             **self._calibration.metrics(),
+            **self._odometry.metrics(),
         }
 
 
@@ -316,7 +322,10 @@ def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry
     """
     if not config.localize:
         return Odometry(config.odometry, T_base_camera)
-    return Localizer(load_keyframe_database(Path(config.localize)), config.odometry, T_base_camera)
+    folder = Path(config.localize)
+    shutter = replace(config.odometry.shutter, initial=read_corrections(folder).last.timing)
+    odometry = replace(config.odometry, shutter=shutter)
+    return Localizer(load_keyframe_database(folder), odometry, T_base_camera)
 
 
 def _make_calibration(config: TrackerConfig) -> SelfCalibration:

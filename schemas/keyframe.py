@@ -47,9 +47,14 @@ class CameraCorrection(msgspec.Struct, frozen=True, kw_only=True):
     depth_bias: Terms = NO_TERMS  # b1, b2, b3 in 1/m.
     # a1, a2, a3 of red, green and blue.
     vignetting: tuple[Terms, Terms, Terms] = (NO_TERMS, NO_TERMS, NO_TERMS)
+    # Times at which the parts of a frame were recorded. The images are as if recorded at once.
+    readout_s: float = 0.0  # First to last row of the color image.
+    depth_readout_s: float = 0.0  # First to last row of depth.
+    depth_delay_s: float = 0.0  # Color to depth, middle rows; negative if depth is earlier.
 
     def __post_init__(self) -> None:
         require_finite("depth_bias", self.depth_bias)
+        require_finite("timing", (self.readout_s, self.depth_readout_s, self.depth_delay_s))
         for channel in self.vignetting:
             require_finite("vignetting", channel)
 

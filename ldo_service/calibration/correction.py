@@ -3,7 +3,7 @@
 import json
 from bisect import bisect_right
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,8 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, RgbdFrame
+
+from .shutter import ShutterTiming
 
 BIAS_TERMS = 3  # x^2, x y, y^2.
 VIGNETTING_TERMS = 3  # r^2, r^4, r^6.
@@ -38,12 +40,17 @@ class CameraCorrection:
     depth_bias: tuple[float, ...] = (0.0,) * BIAS_TERMS  # b1, b2, b3 in 1/m.
     # a1, a2, a3 of red, green and blue.
     vignetting: tuple[tuple[float, ...], ...] = ((0.0,) * VIGNETTING_TERMS,) * 3
+    # Times of the shutter. `applied` does not use them, because they need the motion of a frame:
+    # see `FrameMotion.compensated`.
+    timing: ShutterTiming = field(default_factory=ShutterTiming)
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> "CameraCorrection":
         """Restore a correction from its fields by name; they may be lists."""
         return CameraCorrection(
-            tuple(values["depth_bias"]), tuple(tuple(a) for a in values["vignetting"])
+            tuple(values["depth_bias"]),
+            tuple(tuple(a) for a in values["vignetting"]),
+            ShutterTiming.of(values),
         )
 
     def pack(self) -> dict[str, Any]:
@@ -51,6 +58,7 @@ class CameraCorrection:
         return {
             "depth_bias": list(self.depth_bias),
             "vignetting": [list(channel) for channel in self.vignetting],
+            **self.timing.pack(),
         }
 
     @property

@@ -4,7 +4,7 @@
     for raw in frames:
         frame = calibration.correction.applied(raw)
         ...  # Track the frame.
-        change = calibration.observe(raw, T_odom_camera)
+        change = calibration.observe(raw, T_odom_camera, motion)
 
 Each call of `observe` does a bounded part of the work. An estimate is used only if held-out pairs
 of views confirm it: the correction must reduce their residuals clearly. After the estimate from the
@@ -24,11 +24,14 @@ from ldo_service.geometry import RgbdFrame, se3
 
 from .correction import BIAS_TERMS, VIGNETTING_TERMS, CameraCorrection, CorrectionChange
 from .estimation import Estimate, estimate
+from .shutter import FrameMotion, ShutterTiming
 from .views import CalibrationView, ViewMaker, ViewPair, pair_of
 
 log = logging.getLogger(__name__)
 
 DEPTH_STRIDE = 8  # The median depth uses every eighth pixel along each axis.
+# Change of the timing beyond which the views are made again: 0.6 degrees at 60 degrees/s.
+MAX_TIMING_CHANGE_S = 0.01
 PAIR_DISTANCES = (1, 2, 3, 5, 8)  # A new view is paired with the views this many views before it.
 
 
@@ -90,6 +93,8 @@ class SelfCalibration:
         self._vignetting = np.zeros((3, VIGNETTING_TERMS))
         # Packed parts of the state; a part that has not changed stays the same object.
         self._packed: dict[str, dict[str, Any]] = {"maker": self._maker.pack()}
+        self._timing = ShutterTiming()  # Timing that the views compensate.
+        self._is_renewed = False  # True after the views were made again with another timing.
         self._stage = 0  # Index into `config.views` of the next estimate.
         # Running estimate, the number of views that it uses, and the number of its parts done.
         self._running: Generator[None, None, Estimate] | None = None
@@ -102,23 +107,31 @@ class SelfCalibration:
         calibration.correction = correction
         return calibration
 
-    def observe(self, raw: RgbdFrame, T_odom_camera: np.ndarray | None) -> CorrectionChange | None:
+    def observe(
+        self,
+        raw: RgbdFrame,
+        T_odom_camera: np.ndarray | None,
+        motion: FrameMotion | None = None,
+    ) -> CorrectionChange | None:
         """Make a view from a frame if the camera has moved, and do one part of a running estimate.
 
         Args:
             raw: The frame without correction.
             T_odom_camera: Pose of the frame, [4, 4], which shows how far the camera has moved since
                 the last view; None while tracking is LOST.
+            motion: Motion during the frame, which a view compensates; None if unknown.
 
         Returns:
             The change of the correction, which applies from the next frame on; None if the
             correction does not change.
         """
+        if motion is not None and motion.timing.differs(self._timing, MAX_TIMING_CHANGE_S):
+            self._renew(motion.timing)
         if self.is_finished:
             return None
         self._frames_since_view += 1
         if self._is_view_due(raw, T_odom_camera):
-            self._take_view(raw, T_odom_camera)
+            self._take_view(raw if motion is None else motion.compensated(raw), T_odom_camera)
         if self._running is None and len(self._views) >= self.config.views[self._stage]:
             self._start(len(self._views))
         return None if self._running is None else self._continue()
@@ -147,6 +160,18 @@ class SelfCalibration:
             if pair is not None:
                 self._pairs.append(pair)
         self._pairs.sort(key=lambda pair: (pair.first, pair.second))
+
+    def _renew(self, timing: ShutterTiming) -> None:
+        """Begin again with views that compensate another timing, if a depth bias is corrected.
+
+        Views of a moving camera with a rolling shutter are distorted, so their bias is wrong by
+        some tens of percent. The correction stays until held-out views confirm a new estimate.
+        """
+        self._timing = timing
+        if self.config.views and self.correction.has_depth_bias:
+            self._forget()
+            self.is_finished, self._is_renewed = False, True
+            self._stage = len(self.config.views) - 1
 
     def _forget(self) -> None:
         self._maker, self._views, self._pairs = ViewMaker(), {}, []
@@ -190,9 +215,10 @@ class SelfCalibration:
     def _confirmed(self, found: Estimate) -> CameraCorrection:
         """Return the correction that has only the confirmed parts of an estimate.
 
-        Held-out pairs confirm the depth bias and the vignetting separately.
+        Held-out pairs confirm the depth bias and the vignetting separately. A part that is not
+        confirmed is 0; in a renewed calibration, whose views may show people, it stays.
         """
-        nothing = CameraCorrection()
+        nothing = self.correction if self._is_renewed else CameraCorrection()
         has_bias = found.depth_ratio <= self.config.max_depth_ratio
         has_vignetting = found.color_ratio <= self.config.max_color_ratio
         return CameraCorrection(
@@ -231,6 +257,8 @@ class SelfCalibration:
             "T_last_view": self._T_last_view,
             "frames_since_view": self._frames_since_view,
             "stage": self._stage,
+            "timing": self._timing.pack(),
+            "is_renewed": self._is_renewed,
             "is_running": self._running is not None,
             "views_used": self._views_used,
             "parts_done": self._parts_done,
@@ -260,6 +288,8 @@ class SelfCalibration:
             assert pair is not None
             self._pairs.append(pair.at(T_second_first))
         self._running, self._stage = None, int(now["stage"])
+        self._timing = ShutterTiming.of(now.get("timing", {}))
+        self._is_renewed = bool(now.get("is_renewed", False))
         self._views_used = int(now["views_used"])
         if now["is_running"]:
             self._start(self._views_used)

@@ -56,6 +56,7 @@ from ldo_service.tracking.odometry_config import OdometryConfig
 from ldo_service.tracking.odometry_prior import PriorConfig
 from ldo_service.tracking.pyramid import DepthNoise, PyramidConfig
 from ldo_service.tracking.relocalization import KeyframeReuseConfig, RelocalizationConfig
+from ldo_service.tracking.shutter import ShutterConfig
 from ldo_service.tracking.submaps import SubmapConfig
 from ldo_service.tracking.tracking_quality import TrackingQualityConfig
 from ldo_service.tracking.window import WindowConfig
@@ -169,6 +170,7 @@ def _tracker(config: Config) -> TrackerConfig:
                 max_gap_s=tracker.odometry_prior.max_gap_s,
                 max_dead_reckoning_s=tracker.odometry_prior.max_dead_reckoning_s,
             ),
+            shutter=ShutterConfig(is_on=tracker.self_calibration),
         ),
         calibration=SelfCalibrationConfig()
         if tracker.self_calibration

@@ -219,8 +219,9 @@ class TrackerSettings:
     quality: QualitySettings = field(default_factory=QualitySettings)
     dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
     odometry_prior: OdometryPriorSettings = field(default_factory=OdometryPriorSettings)
-    # True estimates vignetting and smooth depth bias of the camera in the first seconds. Each is
-    # corrected only if frames that the estimate did not use confirm it.
+    # True estimates vignetting, depth bias and the timing of the shutter in the first seconds with
+    # motion. The timing is the readout of color and depth, and the delay between them. Only
+    # significant errors are corrected.
     self_calibration: bool = advanced(True)
     # Folder of a finished run, in whose map the camera is localized. The map is not changed. Empty
     # makes a new map.

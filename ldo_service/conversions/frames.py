@@ -142,8 +142,7 @@ def keyframe_message(
 
 def camera_correction_to_message(correction: CameraCorrection) -> schemas.CameraCorrection:
     """Convert a correction of the camera to its message."""
-    values = {"depth_bias": correction.depth_bias, "vignetting": correction.vignetting}
-    return msgspec.convert(values, schemas.CameraCorrection)
+    return msgspec.convert(correction.pack(), schemas.CameraCorrection)
 
 
 def keyframe_measurements_message(keyframe: Keyframe) -> KeyframeMeasurements:

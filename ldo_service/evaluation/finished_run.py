@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.calibration.correction import CorrectionHistory
+from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.errors import DataError
 from ldo_service.gaussians.exposure import Exposure
-from ldo_service.geometry import Trajectory
+from ldo_service.geometry import Trajectory, se3
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.semantics.semantics_file import SavedSemantics
 
@@ -17,6 +18,8 @@ from .loops import FoundLoops
 
 # Stamps that differ less are equal: float64 seconds cannot represent the nanoseconds of the files.
 STAMP_TOLERANCE_S = 1e-6
+# Maximum time from the frame before to the frame after one whose motion they tell.
+MAX_MOTION_INTERVAL_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +117,24 @@ class PosedMap:
                 f"{frame.status} in frames.csv: the folder is incomplete. Repeat the run."
             )
         return self.trajectory.T_world_camera[gaps_s.argmin()]
+
+    def motion(self, frame: RunFrame) -> FrameMotion | None:
+        """Return the motion of the camera during a frame, by the frames before and after it.
+
+        The result is None if a neighbor is missing, or if the camera has no timing to compensate.
+        """
+        timing = self.corrections.at(frame.stamp_ns).timing
+        stamps_s = self.trajectory.stamps_s
+        if not timing or len(stamps_s) < 3:
+            return None
+        index = int(np.abs(stamps_s - frame.stamp_ns * 1e-9).argmin())
+        if not 0 < index < len(stamps_s) - 1:
+            return None
+        interval_s = float(stamps_s[index + 1] - stamps_s[index - 1])
+        if not 0 < interval_s <= MAX_MOTION_INTERVAL_S:
+            return None
+        before, after = self.trajectory.T_world_camera[[index - 1, index + 1]]
+        return FrameMotion(se3.log(se3.inverse(before) @ after) / interval_s, timing)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from ldo_service.calibration.correction import CameraCorrection
+from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.gaussians.exposure import Exposure, fit_exposure
 from ldo_service.gaussians.renderer import Rendering, render
 from ldo_service.geometry import RgbdFrame, se3, valid_pixels
@@ -32,9 +33,9 @@ the fraction of the measured pixels that are compared. Table cells: mean / media
 online: the map at the end of the stream, refitted after loop closures. refined: the map after the
 further iterations of --refine-iterations.
 A: held-out frames, which are tracked and never mapped, without the black rim of rectification. The
-exposure of the camera changes, that of the map does not: the rendering gets gain and bias per
-channel, interpolated between the keyframes before and after the frame. A, exposure fitted: gain and
-bias are fitted to the evaluated frame by least squares. A, no exposure: the rendering is unchanged.
+rendering gets the vignetting and the rolling shutter that the run has estimated for the camera, and
+a gain and bias per channel, interpolated between the keyframes before and after. A, exposure
+fitted: gain and bias are fitted to the evaluated frame by least squares. A, no exposure: neither.
 B: as in the literature, every fifth training frame; pixels without depth are black in both images.
 LOST frames have no pose and are only counted; WEAK frames are evaluated."""
 
@@ -150,9 +151,9 @@ class RenderedView:
     exposure: Exposure = field(default_factory=Exposure)
     # Pixels that show the camera image, not the rim of rectification, [H, W] bool; None for all.
     valid: np.ndarray | None = None
-    # Correction of the camera at the time of the frame. `shown` has the vignetting of this
-    # correction.
+    # Correction of the camera at the time of the frame; `shown` has its vignetting and shutter.
     correction: CameraCorrection = field(default_factory=CameraCorrection)
+    motion: FrameMotion | None = None  # Motion of the camera during the frame; None if unknown.
 
     @property
     def seen(self) -> np.ndarray:
@@ -162,13 +163,20 @@ class RenderedView:
     @property
     def shown(self) -> np.ndarray:
         """Rendering at the exposure of the frame, [H, W, 3] float32, 0..1."""
-        return self.vignetted(self.exposure.applied(self.rendering.color))
+        return self.recorded(self.exposure.applied(self.rendering.color))
 
-    def vignetted(self, color: np.ndarray) -> np.ndarray:
-        """Return an image [H, W, 3] of the map as the camera with its vignetting would see it."""
+    def recorded(self, color: np.ndarray) -> np.ndarray:
+        """Return an image [H, W, 3] of the map as the camera would record it.
+
+        The image gets the vignetting of the camera, and the distortion that its rolling shutter
+        causes in motion.
+        """
+        camera = self.frame.camera
+        if self.motion is not None:
+            color = self.motion.recorded(color, self.rendering.depth_m, camera)
         if not self.correction.has_vignetting:
             return color
-        return (color / self.correction.gain(self.frame.camera)).clip(0, 1)
+        return (color / self.correction.gain(camera)).clip(0, 1)
 
     @property
     def picture(self) -> np.ndarray:
@@ -232,14 +240,14 @@ def every_pixel(view: RenderedView) -> Images:
 
 def exposure_fitted(view: RenderedView) -> Images:
     """Return camera image and rendering, with the exposure fitted to the camera image."""
-    shown, seen = view.vignetted(view.rendering.color), view.seen
+    shown, seen = view.recorded(view.rendering.color), view.seen
     fitted = fit_exposure(shown, seen, view.valid)
     return seen, fitted.applied(shown)
 
 
 def map_as_it_is(view: RenderedView) -> Images:
     """Return camera image and rendering; the rendering has the exposure of the map."""
-    return view.seen, view.vignetted(view.rendering.color.clip(0, 1))
+    return view.seen, view.recorded(view.rendering.color.clip(0, 1))
 
 
 def measured_pixels(view: RenderedView) -> Images:
@@ -313,8 +321,12 @@ def view_of(
     rendering = render(posed.rows, image.camera, T_camera_map, threads=threads)
     correction = posed.corrections.at(frame.stamp_ns)
     depth_m = correction.corrected_depth(image.depth_m, image.camera)
+    motion = posed.motion(frame)
+    if motion is not None:
+        _, depth_m = motion.warped(image.color, depth_m, image.camera)
     exposure = posed.exposures.at(frame.stamp_ns)
-    return RenderedView(replace(image, depth_m=depth_m), rendering, exposure, valid, correction)
+    seen = replace(image, depth_m=depth_m)
+    return RenderedView(seen, rendering, exposure, valid, correction, motion)
 
 
 def evaluate_rendering(

@@ -12,9 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.geometry import RgbdFrame, se3
 
 from .alignment import Alignment
+from .frame_compensation import FrameCompensator
 from .keyframe_database import KeyframeDatabase, make_thumbnail
 from .keyframes import ReferenceKeyframe, needs_keyframe, needs_mapping_keyframe
 from .motion import ConstantVelocity
@@ -22,8 +24,9 @@ from .motion_segmentation import grow_mask, segment_motion
 from .odometry_config import OdometryConfig
 from .odometry_prior import DeadReckoningStart, PriorPose
 from .pose_candidates import InitialGuessAligner, PoseHypothesis
-from .pyramid import Pyramid, pyramid_of
+from .pyramid import Pyramid
 from .relocalization import Relocalizer
+from .shutter import ShutterState
 from .state import KeyframeOrigin, OdometryState
 from .submaps import SubmapMatch, SubmapMeasurement
 from .tracking_quality import ResidualHistory, TrackingStatus, classify_tracking
@@ -41,7 +44,7 @@ class FrameTracker:
 
     def __init__(self, config: OdometryConfig) -> None:
         self.config = config
-        self.state = OdometryState()
+        self.state = OdometryState(shutter=ShutterState(config.shutter.initial))
         self._relocalizer = Relocalizer(
             config.pyramid,
             config.align,
@@ -56,7 +59,7 @@ class FrameTracker:
             config.candidates,
             config.large_motion,
         )
-        self._view: tuple[RgbdFrame, Pyramid] | None = None  # The last frame and its pyramid.
+        self._compensator = FrameCompensator(config, self._guesses)
         self._prior: PriorPose | None = None  # Prior of the last frame.
 
     @property
@@ -73,7 +76,7 @@ class FrameTracker:
                 additional initial guess and the start pose of a new submap after a loss. A frame is
                 OK only if its images confirm the resulting pose.
         """
-        view, keyframe = self.view(frame), self.state.keyframe
+        view, keyframe = self._compensator.expect(frame, self.state), self.state.keyframe
         self._prior = prior
         if keyframe is None:
             return self._first_result(view)
@@ -97,8 +100,12 @@ class FrameTracker:
                 self.state, history=ResidualHistory(), motion_evidence=None, origin=origin
             )
         # Motion, dynamic mask, need of a keyframe, and search of other submaps.
+        candidate, shutter = self._compensator.measure(
+            frame, keyframe, candidate, status, self.state
+        )
+        self.state = replace(self.state, shutter=shutter)
         tracked = self._accepted_result(frame, keyframe, candidate, status)
-        return self._search_other_submaps(tracked, keyframe, view)
+        return self._search_other_submaps(tracked, keyframe, self.view(frame))
 
     def start_submap(self, frame: RgbdFrame) -> TrackedFrame:
         """Return the LOST frame just tracked as the first frame of a new submap.
@@ -147,13 +154,17 @@ class FrameTracker:
 
     def view(self, frame: RgbdFrame) -> Pyramid:
         """Return the image pyramid of a frame; the pyramid of the last frame is cached."""
-        if self._view is None or self._view[0] is not frame:
-            self._view = (frame, pyramid_of(frame, self.config.pyramid))
-        return self._view[1]
+        return self._compensator.view(frame)
+
+    @property
+    def motion(self) -> FrameMotion | None:
+        """Motion of the camera during the last frame, which is compensated; None if unknown."""
+        return self._compensator.motion
 
     def restore(self, state: OdometryState) -> None:
         """Continue tracking from a saved state."""
-        self.state, self._view = state, None
+        self.state = state
+        self._compensator.forget()
 
     # --- initial guesses and the tracking status --------------------------------------------------
     def _first_result(self, view: Pyramid) -> TrackedFrame:
@@ -233,14 +244,6 @@ class FrameTracker:
             view, database, state.relocalization_count, state.history, is_lost=is_lost
         )
 
-    def _records_of_other_submaps(self, submap: int) -> KeyframeDatabase:
-        """Return the keyframe records of all submaps that are not merged with the given one."""
-        state = self.state
-        are_merged = state.submaps.are_merged
-        return KeyframeDatabase(
-            tuple(p for p in state.database.all if not are_merged(p.submap, submap))
-        )
-
     def _search_other_submaps(
         self, tracked: TrackedFrame, keyframe: ReferenceKeyframe, view: Pyramid
     ) -> TrackedFrame:
@@ -252,7 +255,7 @@ class FrameTracker:
         before, config = self.state.submaps, self.config.submaps
         if tracked.status is not TrackingStatus.OK or not before.is_search_due(config):
             return tracked
-        database = self._records_of_other_submaps(keyframe.submap)
+        database = self.state.records_of_other_submaps(keyframe.submap)
         found = self._relocalize(view, database, is_lost=False)
         look = measurement = None
         if found is not None:
@@ -367,8 +370,7 @@ class FrameTracker:
             self.state, dynamic_mask=seen.dynamic_mask, motion_evidence=seen.suspicion
         )
         if seen.has_large_change(keyframe.moved_mask, config):
-            ignore_mask = grow_mask(seen.moved_mask, keyframe.view, config)
-            renewed = replace(keyframe, moved_mask=seen.moved_mask, ignore_mask=ignore_mask)
+            renewed = keyframe.with_moved(seen.moved_mask, config)
             self.state = replace(self.state, keyframe=renewed)
         return grow_mask(seen.dynamic_mask, view, config)
 

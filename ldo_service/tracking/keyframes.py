@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from ldo_service.calibration.correction import CorrectionChange
+from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.detection.dynamic_classes import Box, DynamicClassConfig, dynamic_class_mask
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
 
 from .features import FeatureConfig, Features, detect
+from .motion_segmentation import MotionSegmentationConfig, grow_mask
 from .pyramid import Pyramid, PyramidConfig, ReferencePoints, build_pyramid, build_reference
 
 
@@ -128,6 +130,7 @@ class ReferenceKeyframe:
     stored_features: Features | None = None
     # Pose of the relay relative to the keyframe `id`, if `view` is a relay; None for a keyframe.
     relay: Relay | None = None
+    motion: FrameMotion | None = None  # Motion of the camera during the frame; None if unknown.
 
     @cached_property
     def reference(self) -> ReferencePoints:
@@ -146,6 +149,18 @@ class ReferenceKeyframe:
         if "_features" not in self.__dict__:
             self.__dict__["_features"] = detect(self.view, config)
         return self.__dict__["_features"]
+
+    def with_moved(
+        self, moved_mask: np.ndarray, config: MotionSegmentationConfig
+    ) -> "ReferenceKeyframe":
+        """Return the keyframe without the surface that has moved, [H, W] bool.
+
+        What is ignored already stays ignored, such as people who stood still in the keyframe.
+        """
+        ignore_mask = grow_mask(moved_mask, self.view, config)
+        if self.ignore_mask is not None:
+            ignore_mask = ignore_mask | self.ignore_mask
+        return replace(self, moved_mask=moved_mask, ignore_mask=ignore_mask)
 
     def recorrected(self, change: CorrectionChange, config: PyramidConfig) -> "ReferenceKeyframe":
         """Return the keyframe with images and features converted to a new camera correction."""
@@ -179,6 +194,7 @@ class ReferenceKeyframe:
             "movable": self.dynamic_class_mask,
             "features": None if features is None else asdict(features),
             "relay": None if self.relay is None else asdict(self.relay),
+            "motion": None if self.motion is None else self.motion.pack(),
         }
 
     @staticmethod
@@ -196,6 +212,7 @@ class ReferenceKeyframe:
             kept["movable"],
             features,
             Relay(**kept["relay"]) if kept.get("relay") else None,
+            FrameMotion.unpack(kept["motion"]) if kept.get("motion") else None,
         )
 
 

@@ -206,6 +206,34 @@ def segment_motion(
     )
 
 
+def foreground_mask(
+    view: Pyramid,
+    keyframe: Pyramid,
+    T_keyframe_camera: np.ndarray,
+    noise_scale: float,
+    config: MotionSegmentationConfig,
+    noise: DepthNoise,
+) -> np.ndarray:
+    """Return the pixels of a frame in front of the surface that a keyframe measured.
+
+    Args:
+        view: Pyramid of the frame.
+        keyframe: Pyramid of the keyframe.
+        T_keyframe_camera: Pose of the frame in the keyframe, [4, 4].
+        noise_scale: Factor on the depth noise, as estimated by alignment.
+        config: Settings.
+        noise: Depth noise of the camera.
+
+    Returns:
+        [H, W] bool at working resolution.
+    """
+    now, then = _level(view, config), _level(keyframe, config)
+    pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)
+    ahead_m = depth_gap_m(now, then, T_keyframe_camera, config)
+    pieces = _in_pieces(ahead_m > pair.limit_m(now), None, config)
+    return resized(pieces, view.levels[0].depth_m.shape)
+
+
 def grow_mask(
     dynamic_mask: np.ndarray, view: Pyramid, config: MotionSegmentationConfig
 ) -> np.ndarray:

@@ -34,6 +34,7 @@ from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .alignment import BrightnessModel
+from .background import with_foreground
 from .frame_tracking import FrameTracker
 from .keyframe_database import KeyframeRecord, make_keyframe_record
 from .keyframes import ReferenceKeyframe, keyframe_dynamic_class_mask, limit_ratios
@@ -119,11 +120,14 @@ class Odometry:
         # Make a keyframe with its relative-pose measurements; it may merge two submaps.
         keyframe = None
         if needed is not None and may_map:
+            records = self._frames.state.database.in_submap(tracked.submap)
+            view = self._frames.view(frame)
+            tracked = with_foreground(tracked, view, records, self.config)
             keyframe = self._make_keyframe(frame, tracked, needed, known)
         elif needed is KeyframeKind.REFERENCE and self._has_left_keyframe(tracked):
             view, T_odom_camera = self._frames.view(frame), tracked.T_odom_camera
             self._frames.state = self._frames.state.with_relay(
-                view, T_odom_camera, tracked.relay(), tracked.dynamic_mask
+                view, T_odom_camera, tracked.relay(), tracked.dynamic_mask, self._frames.motion
             )
         # Return T_map_odom of the reference with the pose.
         reference = tracked.reference
@@ -137,6 +141,7 @@ class Odometry:
             self._map.root_of(tracked.submap),
             reference,
             has_prior=reading is not None,
+            motion=self._frames.motion,
             keyframe=keyframe,
             reused_keyframe=reused,
             denied_keyframe=denied,
@@ -184,6 +189,10 @@ class Odometry:
         """Id of the reference keyframe of the next frame; None before the first keyframe."""
         keyframe = self._frames.state.keyframe
         return None if keyframe is None else keyframe.id
+
+    def metrics(self) -> dict[str, float]:
+        """Return the times of the camera's shutter that are compensated, ms."""
+        return self._frames.state.shutter.timing.metrics()
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state that the next results depend on, except for the last correction.
@@ -381,6 +390,7 @@ class Odometry:
             tracked.submap,
             moved_mask=self._frames.state.dynamic_mask,
             ignore_mask=tracked.dynamic_mask,
+            motion=self._frames.motion,
         )
 
     def _record_of(self, keyframe: ReferenceKeyframe) -> KeyframeRecord:

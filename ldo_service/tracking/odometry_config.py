@@ -14,6 +14,7 @@ from .odometry_prior import PriorConfig
 from .pose_candidates import PoseHypothesisConfig
 from .pyramid import PyramidConfig
 from .relocalization import KeyframeReuseConfig, RelocalizationConfig
+from .shutter import ShutterConfig
 from .submaps import SubmapConfig
 from .tracking_quality import TrackingQualityConfig
 from .window import WindowConfig
@@ -38,6 +39,7 @@ class OdometryConfig:
     moving: MotionSegmentationConfig = field(default_factory=MotionSegmentationConfig)
     movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
+    shutter: ShutterConfig = field(default_factory=ShutterConfig)
     # Image motion, in image widths per frame, above which all initial guesses are tried. The
     # default is 2 pixels of the coarsest pyramid level.
     large_motion: float = 0.05

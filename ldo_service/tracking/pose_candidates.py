@@ -20,6 +20,7 @@ from .pyramid import Pyramid
 
 # Weight of visible points relative to points that are also paired with a measured depth.
 PHOTOMETRIC_ONLY_WEIGHT = 0.05
+REALIGNED_LEVELS = 2  # Finest pyramid levels to which a frame is aligned again.
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,6 +222,15 @@ class InitialGuessAligner:
             hypothesis_distance_rad(chosen, T_keyframe_reckoned) < self.candidates.agreement_rad
         )
         return replace(chosen, agrees_with_prior=is_expected)
+
+    def align_again(
+        self, keyframe: ReferenceKeyframe, view: Pyramid, candidate: PoseHypothesis
+    ) -> PoseHypothesis:
+        """Align a frame whose images changed a little, from its pose; only the finest levels."""
+        finest = replace(keyframe.reference, points=keyframe.reference.points[:REALIGNED_LEVELS])
+        guess = se3.inverse(candidate.alignment.T_reference_camera)
+        start = replace(self.align, start=candidate.alignment.appearance)
+        return replace(candidate, alignment=align(finest, view, guess, start))
 
     def is_large_step(
         self, candidate: PoseHypothesis, T_keyframe_previous: np.ndarray, view: Pyramid

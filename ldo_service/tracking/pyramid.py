@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame
 from ldo_service.kernels import _align
@@ -154,11 +155,20 @@ def build_pyramid(
     return Pyramid(gray, depth_m, camera, tuple(levels))
 
 
-def pyramid_of(frame: RgbdFrame, config: PyramidConfig) -> Pyramid:
-    """Build the pyramid of a frame from its luminance and depth."""
-    return build_pyramid(
-        cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), frame.depth_m, frame.camera, config
-    )
+def pyramid_of(
+    frame: RgbdFrame, config: PyramidConfig, motion: FrameMotion | None = None
+) -> Pyramid:
+    """Build the pyramid of a frame from its luminance and depth.
+
+    Args:
+        frame: The frame.
+        config: Settings.
+        motion: Motion during the frame that is compensated; None without compensation.
+    """
+    gray, depth_m = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), frame.depth_m
+    if motion is not None and motion.timing:
+        gray, depth_m = motion.warped(gray, depth_m, frame.camera)
+    return build_pyramid(gray, depth_m, frame.camera, config)
 
 
 @dataclass(frozen=True, slots=True)

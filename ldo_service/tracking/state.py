@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.calibration.correction import CorrectionChange
+from ldo_service.calibration.shutter import FrameMotion
 
 from .keyframe_database import KeyframeDatabase, KeyframeDatabaseConfig, KeyframeRecord
 from .keyframes import ReferenceKeyframe, Relay
@@ -14,6 +15,7 @@ from .motion import ConstantVelocity
 from .motion_segmentation import MotionEvidence
 from .odometry_prior import DeadReckoningStart
 from .pyramid import Pyramid, PyramidConfig
+from .shutter import ShutterState
 from .submaps import Submaps
 from .tracking_quality import ResidualHistory, TrackingStatus
 
@@ -52,11 +54,19 @@ class OdometryState:
     motion_evidence: MotionEvidence | None = None
     # Poses of the last OK frame; None if the odometry prior had no pose at the time of that frame.
     dead_reckoning_start: DeadReckoningStart | None = None
+    shutter: ShutterState = field(default_factory=ShutterState)
 
     @property
     def is_relayed(self) -> bool:
         """True if the reference is a relay, which is no keyframe."""
         return self.keyframe is not None and self.keyframe.relay is not None
+
+    def records_of_other_submaps(self, submap: int) -> KeyframeDatabase:
+        """Return the keyframe records of all submaps that are not merged with the given one."""
+        are_merged = self.submaps.are_merged
+        return KeyframeDatabase(
+            tuple(p for p in self.database.all if not are_merged(p.submap, submap))
+        )
 
     def with_new(
         self,
@@ -104,6 +114,7 @@ class OdometryState:
         T_odom_camera: np.ndarray,
         relay: Relay,
         ignore_mask: np.ndarray | None,
+        motion: FrameMotion | None,
     ) -> "OdometryState":
         """Return the state with the frame just tracked as a reference that is no keyframe.
 
@@ -112,6 +123,7 @@ class OdometryState:
             T_odom_camera: Pose of the frame, [4, 4].
             relay: Pose of the frame relative to the last keyframe.
             ignore_mask: Dynamic pixels of the frame, [H, W] bool at working resolution.
+            motion: Motion of the camera during the frame; None if unknown.
         """
         assert self.keyframe is not None
         reference = ReferenceKeyframe(
@@ -122,9 +134,11 @@ class OdometryState:
             moved_mask=self.dynamic_mask,
             ignore_mask=ignore_mask,
             relay=relay,
+            motion=motion,
         )
         evidence = self.motion_evidence and self.motion_evidence.of_new_keyframe()
-        return replace(self, keyframe=reference, motion_evidence=evidence)
+        shutter = self.shutter.with_new_reference()
+        return replace(self, keyframe=reference, motion_evidence=evidence, shutter=shutter)
 
     def recorrected(self, change: CorrectionChange, config: PyramidConfig) -> "OdometryState":
         """Return the state with all keyframes and records converted to a new camera correction.
@@ -138,6 +152,7 @@ class OdometryState:
             keyframe=None if keyframe is None else keyframe.recorrected(change, config),
             mapping_keyframe=None if mapped is None else mapped.recorrected(change),
             history=ResidualHistory(),
+            shutter=self.shutter.recorrected(),
         )
 
     def _against(self, keyframe: ReferenceKeyframe, T_odom_mapped: np.ndarray) -> "OdometryState":
@@ -148,6 +163,7 @@ class OdometryState:
             frames_since_keyframe=0,
             T_odom_last_mapped=T_odom_mapped,
             motion_evidence=self.motion_evidence and self.motion_evidence.of_new_keyframe(),
+            shutter=self.shutter.with_new_reference(),
         )
 
 
@@ -174,6 +190,7 @@ def pack(state: OdometryState) -> dict[str, Any]:
         "suspicion": state.motion_evidence
         and (_bits(state.motion_evidence.contradicts), state.motion_evidence.gone),
         "anchor": state.dead_reckoning_start and state.dead_reckoning_start.pack(),
+        "shutter": state.shutter.pack(),
     }
 
 
@@ -210,6 +227,8 @@ def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
         if evidence is None
         else MotionEvidence(_mask(evidence[0]), evidence[1]),
         dead_reckoning_start=None if anchor is None else DeadReckoningStart.unpack(anchor),
+        # A state of an earlier version has no shutter.
+        shutter=ShutterState.unpack(values["shutter"]) if "shutter" in values else ShutterState(),
     )
 
 

@@ -5,6 +5,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
@@ -149,6 +150,8 @@ class TrackingResult:
     # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
     dynamic_mask: np.ndarray | None
     has_prior: bool  # True if the odometry prior covers the time of the frame.
+    # Motion of the camera during the frame, which is compensated; None if unknown.
+    motion: FrameMotion | None = None
     # Keyframes.
     keyframe: NewKeyframe | None = None  # Keyframe made of the frame; None if none was made.
     # Id of a known keyframe that is the reference from now on; None if none is reused.
@@ -168,6 +171,7 @@ def make_tracking_result(
     reference: int | None,
     *,
     has_prior: bool,
+    motion: FrameMotion | None = None,
     keyframe: NewKeyframe | None = None,
     reused_keyframe: int | None = None,
     denied_keyframe: KeyframeKind | None = None,
@@ -182,6 +186,7 @@ def make_tracking_result(
         submap: The oldest submap that the pose graph has merged with the frame's submap.
         reference: Id of the keyframe that the pose refers to; None before any keyframe.
         has_prior: True if the odometry prior covers the time of the frame.
+        motion: Motion of the camera during the frame; None if unknown.
         keyframe: The new keyframe made of the frame; None if none was made.
         reused_keyframe: Id of the known keyframe that is the reference from now on; None if none.
         denied_keyframe: Kind of keyframe that was needed but not allowed by `may_map`, or None.
@@ -206,6 +211,7 @@ def make_tracking_result(
         hypothesis_spread_rad=tracked.hypothesis_spread_rad,
         dynamic_mask=tracked.dynamic_mask,
         has_prior=has_prior,
+        motion=motion,
         keyframe=keyframe,
         reused_keyframe=reused_keyframe,
         denied_keyframe=denied_keyframe,

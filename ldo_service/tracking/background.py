@@ -1,0 +1,60 @@
+"""Foreground of a new keyframe, in front of the background that older keyframes measured.
+
+A person who stands still for a while looks static beside the last frames. Older keyframes that show
+the wall behind the person contradict it. Conventions: `ldo_service.geometry`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ldo_service.geometry import se3
+
+from .keyframe_database import KeyframeRecord
+from .motion import image_motions_rad
+from .motion_segmentation import foreground_mask, grow_mask
+from .odometry_config import OdometryConfig
+from .pyramid import Pyramid
+from .tracking_result import TrackedFrame
+
+# Fraction of the pixels that must move before the foreground is masked. Without motion, what stands
+# in front of the background is a new object, and must be mapped.
+MIN_DYNAMIC_RATIO = 0.01
+# Older keyframes that are compared: those of the view before the motion began.
+MAX_RECORDS = 3
+# Image motion from an older keyframe to the frame, within which they share most of their view.
+MAX_MOTION_RAD = 0.4
+
+
+def with_foreground(
+    tracked: TrackedFrame,
+    view: Pyramid,
+    records: Sequence[KeyframeRecord],
+    config: OdometryConfig,
+) -> TrackedFrame:
+    """Add to the dynamic mask of a frame what stands in front of the background.
+
+    Without a moving object in the frame, the mask stays.
+
+    Args:
+        tracked: The frame, which becomes a keyframe.
+        view: Its pyramid.
+        records: Keyframe records of its submap, in any order.
+        config: Settings.
+    """
+    known = tracked.dynamic_mask
+    if known is None or np.mean(known) < MIN_DYNAMIC_RATIO or not records:
+        return tracked
+    T_keyframe_odom = se3.inverse(np.array([record.T_odom_keyframe for record in records]))
+    T_keyframe_camera = T_keyframe_odom @ tracked.T_odom_camera
+    depths_m = np.array([record.median_depth_m for record in records])
+    is_near = image_motions_rad(T_keyframe_camera, depths_m) < MAX_MOTION_RAD
+    oldest_first = sorted(np.flatnonzero(is_near).tolist(), key=lambda i: records[i].id)
+    noise, mask = config.align.residuals.noise, np.zeros_like(known)
+    for i in oldest_first[:MAX_RECORDS]:
+        older = records[i].keyframe(config.pyramid).view
+        mask |= foreground_mask(
+            view, older, T_keyframe_camera[i], tracked.depth_noise_scale, config.moving, noise
+        )
+    return replace(tracked, dynamic_mask=known | grow_mask(mask, view, config.moving))

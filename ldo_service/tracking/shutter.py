@@ -1,0 +1,210 @@
+"""Motion of the camera while it records a frame, and its compensation during tracking.
+
+The velocity comes from the poses of the last frames. A frame is compensated with the velocity that
+is expected before it is tracked, and again if its pose shows another velocity.
+Conventions: `ldo_service.geometry`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ldo_service.calibration.shutter import FrameMotion, ShutterTiming, displacement_rad
+from ldo_service.errors import ConfigError, named
+from ldo_service.geometry import se3
+
+from .motion import ConstantVelocity
+from .shutter_timing import BandEquations, TimingEvidence
+
+# Weight of evidence from before a large change of the timing, or of the correction of the images.
+EARLIER_WEIGHT = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class ShutterConfig:
+    """Settings of the estimation and compensation of the shutter's timing."""
+
+    is_on: bool = True
+    # Timing to start with, such as that of the map in which the camera is localized.
+    initial: ShutterTiming = field(default_factory=ShutterTiming)
+    # Maximum interval between two frames whose mean velocity is used. A hand shakes with periods of
+    # 0.2 s.
+    max_interval_s: float = 0.1
+    # The times are compensated if one of them exceeds this multiple of its standard deviation, and
+    # min_s. Below min_s, a turn of 60 degrees/s moves the image by less than 1.7 of 640 pixels.
+    sigmas: float = 4.0
+    # Fraction of the residuals that count as independent: see `AlignConfig`.
+    independent_fraction: float = 2e-3
+    min_s: float = 0.003
+    max_s: float = 0.05  # Larger estimates are not believed: a frame lasts 33 ms.
+    update_frames: int = 3  # Measurements from one estimate to the next.
+    # Change of a time beyond which the evidence before it counts less: its equations are linear
+    # approximations, and give too small times for large displacements.
+    relinearized_s: float = 0.004
+    max_frames: int = 300  # Measurements after which the estimate is final.
+    # Change of the expected velocity by the measured pose beyond which the frame is compensated and
+    # aligned again: largest displacement of the image, fraction of the image width.
+    realign_ratio: float = 0.3 / 640
+
+    def __post_init__(self) -> None:
+        if min(self.update_frames, self.max_frames) < 1:
+            raise ConfigError(named(self, "update_frames", "max_frames") + " must be at least 1.")
+        if not min(self.max_interval_s, self.sigmas, self.max_s, self.realign_ratio) > 0:
+            raise ConfigError(
+                named(self, "max_interval_s", "sigmas", "max_s", "realign_ratio")
+                + " must be positive."
+            )
+        if not self.min_s >= 0:
+            raise ConfigError(named(self, "min_s") + " must be at least 0.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ShutterState:
+    """State of the compensation between frames."""
+
+    timing: ShutterTiming = field(default_factory=ShutterTiming)
+    evidence: TimingEvidence = field(default_factory=TimingEvidence)
+    # Mean velocity between the last two frames that have a pose, [6] per second; None if unknown.
+    mean_velocity: np.ndarray | None = None
+    # Velocity at the reference keyframe, [6] per second: the mean of the velocities before and
+    # after it. None if unknown, and at the frame after a new reference.
+    reference_velocity: np.ndarray | None = None
+    has_new_reference: bool = False  # True if the last frame became the reference.
+    # Equations of the last frame, until the next frame tells its velocity.
+    pending: BandEquations | None = None
+
+    def expected_motion(
+        self, before: ConstantVelocity, stamp_ns: int, config: ShutterConfig
+    ) -> FrameMotion | None:
+        """Return the motion during a frame before it is tracked; None if unknown."""
+        if self.mean_velocity is None or _interval_s(before, stamp_ns, config) is None:
+            return None
+        return FrameMotion(self.mean_velocity, self.timing)
+
+    def moved(
+        self,
+        before: ConstantVelocity,
+        T_odom_camera: np.ndarray,
+        stamp_ns: int,
+        config: ShutterConfig,
+    ) -> tuple["ShutterState", FrameMotion | None]:
+        """Return the state after a frame with a known pose, and the motion during this frame.
+
+        The motion is the mean velocity since the last frame. An extrapolation to the frame would
+        amplify the noise of the poses. This noise would then also enter the next equations with
+        more weight than in their own velocities, so that the estimated times would grow without
+        bound. The pending equations of the last frame are evaluated.
+
+        Args:
+            before: Pose and time of the last frame that has a pose.
+            T_odom_camera: Pose of the frame, [4, 4].
+            stamp_ns: Time of the frame.
+            config: Settings.
+        """
+        interval_s = _interval_s(before, stamp_ns, config)
+        if interval_s is None:
+            return self.interrupted(), None
+        mean = se3.log(se3.inverse(before.T_odom_camera) @ T_odom_camera) / interval_s
+        earlier, state = self.mean_velocity, self
+        if earlier is not None:
+            at_last_frame = 0.5 * (mean + earlier)
+            if self.pending is not None:
+                state = self._with_equations(self.pending.timing_equations(at_last_frame), config)
+            if self.has_new_reference:
+                state = replace(state, reference_velocity=at_last_frame)
+        return replace(
+            state, mean_velocity=mean, has_new_reference=False, pending=None
+        ), FrameMotion(mean, self.timing)
+
+    def interrupted(self) -> "ShutterState":
+        """Return the state after a frame whose motion is unknown."""
+        return replace(self, mean_velocity=None, has_new_reference=False, pending=None)
+
+    def with_new_reference(self) -> "ShutterState":
+        """Return the state after the last frame has become the reference."""
+        return replace(self, reference_velocity=None, has_new_reference=True)
+
+    def recorrected(self) -> "ShutterState":
+        """Return the state after another correction of the images; earlier evidence counts less."""
+        return replace(self, evidence=self.evidence.scaled(EARLIER_WEIGHT), pending=None)
+
+    def _with_equations(self, equations: np.ndarray, config: ShutterConfig) -> "ShutterState":
+        evidence = self.evidence.extended(equations)
+        if evidence.count % config.update_frames:
+            return replace(self, evidence=evidence)
+        timing = _updated(self.timing, evidence, config)
+        if timing.differs(self.timing, config.relinearized_s):
+            evidence = evidence.scaled(EARLIER_WEIGHT)
+        return replace(self, evidence=evidence, timing=timing)
+
+    def pack(self) -> dict[str, Any]:
+        """Return the state as arrays and plain values."""
+        return {
+            "timing": self.timing.pack(),
+            "evidence": self.evidence.pack(),
+            "mean_velocity": self.mean_velocity,
+            "reference_velocity": self.reference_velocity,
+            "has_new_reference": self.has_new_reference,
+            "pending": None if self.pending is None else self.pending.pack(),
+        }
+
+    @staticmethod
+    def unpack(kept: Mapping[str, Any]) -> "ShutterState":
+        """Return the state from its packed form."""
+        pending = kept["pending"]
+        return ShutterState(
+            ShutterTiming.of(kept["timing"]),
+            TimingEvidence.unpack(kept["evidence"]),
+            kept["mean_velocity"],
+            kept["reference_velocity"],
+            bool(kept["has_new_reference"]),
+            None if pending is None else BandEquations.unpack(pending),
+        )
+
+
+def needs_realignment(
+    expected: FrameMotion | None,
+    measured: FrameMotion,
+    median_depth_m: float,
+    focal_ratio: float,
+    config: ShutterConfig,
+) -> bool:
+    """Return whether a frame must be compensated again, because its motion was not as expected.
+
+    Args:
+        expected: Motion that the frame was compensated with; None without compensation.
+        measured: Motion by the pose of the frame.
+        median_depth_m: Median depth of the scene.
+        focal_ratio: Focal length divided by the image width.
+        config: Settings.
+    """
+    velocity = measured.velocity - (0.0 if expected is None else expected.velocity)
+    moved = displacement_rad(velocity, measured.timing, median_depth_m) * focal_ratio
+    return moved > config.realign_ratio
+
+
+def _updated(
+    timing: ShutterTiming, evidence: TimingEvidence, config: ShutterConfig
+) -> ShutterTiming:
+    """Return the times that are compensated from now on.
+
+    All times are replaced by their estimates if one is significant: color and depth would no longer
+    fit each other if one of them was compensated alone. Otherwise they stay.
+    """
+    found = evidence.estimate(config.independent_fraction)
+    if found is None:
+        return timing
+    times_s, sigmas_s = found
+    is_significant = np.abs(times_s) > np.maximum(config.sigmas * sigmas_s, config.min_s)
+    is_possible = np.abs(times_s) < config.max_s
+    if not (is_significant.any() and is_possible.all()):
+        return timing
+    return ShutterTiming(*times_s.tolist())
+
+
+def _interval_s(before: ConstantVelocity, stamp_ns: int, config: ShutterConfig) -> float | None:
+    """Return the time since the last pose; None if it is too long or not positive."""
+    interval_s = 1e-9 * (stamp_ns - before.stamp_ns)
+    return interval_s if 0 < interval_s <= config.max_interval_s else None

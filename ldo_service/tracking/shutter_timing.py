@@ -1,0 +1,254 @@
+"""Estimation of the times at which a camera records the rows of color and depth.
+
+A rolling shutter and a delay between color and depth displace the parts of a frame in proportion to
+the velocity of the camera. The displacement of a row is a twist: the velocity times the time at
+which the row was recorded. The times are thus three more unknowns of the normal equations of
+alignment, and common to all frames. `BandEquations` are the normal equations of one frame by bands
+of rows. Their `timing_equations` are those for the times, after elimination of pose and exposure.
+`TimingEvidence` adds up the equations of many frames. The velocity changes its direction over time,
+so the static errors of a camera, such as a depth bias, average out.
+Conventions: `ldo_service.geometry`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ldo_service.calibration.shutter import FrameMotion, ShutterTiming
+from ldo_service.geometry import se3
+
+from .alignment import BRIGHTNESS_PRIOR, POSE, BrightnessModel, ResidualConfig, normal_equations
+from .pyramid import Level, Pyramid, ReferencePoints
+
+OWN = slice(0, 8)  # Unknowns of a frame: pose increment [6], gain, bias.
+SHARED = slice(8, 11)  # Unknowns of the camera: readout of color, readout and delay of depth.
+# Pyramid level of the equations: 160 pixels wide. Displacements of several pixels at 640 are small
+# enough there for a linear model.
+LEVEL = 1
+BANDS = 6  # Bands of rows that are displaced as a whole.
+MIN_BAND_POINTS = 50  # Points; a band with fewer is left out.
+# Noise of the equations as a multiple of that of alignment. The rows far from the middle tell the
+# readout, and are outliers of the alignment as long as the readout is not compensated.
+NOISE_RATIO = 3.0
+# Noise that removes one kind of residuals from the normal equations: gray levels, or a multiple of
+# `DepthNoise`.
+NO_WEIGHT = 1e5
+PRIOR = np.eye(3) / 0.02**2  # Information of a prior with a standard deviation of 20 ms.
+MIN_GROUPS, MAX_GROUPS = 12, 24  # Groups of the jackknife; two are merged beyond the maximum.
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BandEquations:
+    """Normal equations of a frame at its pose, by band of rows, apart for color and depth."""
+
+    hessian: np.ndarray  # [B, 2, 8, 8] for color and depth.
+    gradient: np.ndarray  # [B, 2, 8]
+    rows: np.ndarray  # [B, 2] mean row in the reference and in the frame, -0.5..0.5.
+    T_camera_reference: np.ndarray  # [4, 4]
+    at_reference: FrameMotion  # Motion that is compensated in the reference.
+    at_frame: FrameMotion  # Motion that is compensated in the frame.
+    reference_velocity: np.ndarray  # [6] best estimate of the velocity at the reference.
+
+    def pack(self) -> dict[str, Any]:
+        """Return the equations as arrays and plain values."""
+        return {
+            "hessian": self.hessian,
+            "gradient": self.gradient,
+            "rows": self.rows,
+            "T_camera_reference": self.T_camera_reference,
+            "at_reference": self.at_reference.pack(),
+            "at_frame": self.at_frame.pack(),
+            "reference_velocity": self.reference_velocity,
+        }
+
+    @staticmethod
+    def unpack(kept: Mapping[str, Any]) -> "BandEquations":
+        """Return the equations from their packed form."""
+        motions = {name: FrameMotion.unpack(kept[name]) for name in ("at_reference", "at_frame")}
+        return BandEquations(**{**kept, **motions})
+
+    def timing_equations(self, velocity: np.ndarray) -> np.ndarray:
+        """Return the normal equations for the times.
+
+        Args:
+            velocity: Best estimate of the velocity at the frame, [6] per second.
+
+        Returns:
+            Information and right side, [3, 4], of the times in the order of `ShutterTiming`. Their
+            solution includes the times that are already compensated.
+        """
+        # Velocities of the reference in the camera frame. All twists change T_reference_camera.
+        to_camera = se3.adjoint(self.T_camera_reference)
+        velocity_there = to_camera @ self.reference_velocity
+        used_there = replace(self.at_reference, velocity=to_camera @ self.at_reference.velocity)
+        A, b, nothing = np.zeros((11, 11)), np.zeros(11), np.zeros(6)
+        for (there, here), hessians, gradients in zip(
+            self.rows.tolist(), self.hessian, self.gradient, strict=True
+        ):
+            by_readout, by_delay = (
+                here * velocity - there * velocity_there,
+                velocity - velocity_there,
+            )
+            for is_color, hessian, gradient in zip((True, False), hessians, gradients, strict=True):
+                done = np.zeros(8)
+                done[POSE] = _compensated(self.at_frame, here, is_color=is_color)
+                done[POSE] -= _compensated(used_there, there, is_color=is_color)
+                J = np.eye(11, 8)
+                J[SHARED, POSE] = (
+                    (by_readout, nothing, nothing) if is_color else (nothing, by_readout, by_delay)
+                )
+                A += J @ hessian @ J.T
+                b += J @ (hessian @ done - gradient)
+        A[OWN, OWN] += np.diag(np.r_[np.full(6, 1e-6), BRIGHTNESS_PRIOR])
+        eliminated = np.linalg.solve(A[OWN, OWN], np.c_[A[OWN, SHARED], b[OWN]])
+        return np.c_[A[SHARED, SHARED], b[SHARED]] - A[SHARED, OWN] @ eliminated
+
+
+def band_equations(
+    reference: ReferencePoints,
+    frame: Pyramid,
+    T_camera_reference: np.ndarray,
+    brightness: BrightnessModel,
+    config: ResidualConfig,
+    at_reference: FrameMotion,
+    at_frame: FrameMotion,
+    reference_velocity: np.ndarray,
+) -> BandEquations:
+    """Linearize the residuals of a frame at its pose, by band of rows.
+
+    Args:
+        reference: Surface points of the reference keyframe.
+        frame: Pyramid of the frame.
+        T_camera_reference: Pose by alignment, [4, 4].
+        brightness: Exposure and noise by alignment.
+        config: Settings of the residuals.
+        at_reference: Motion that is compensated in the reference.
+        at_frame: Motion that is compensated in the frame.
+        reference_velocity: Best estimate of the velocity at the reference, [6] per second.
+    """
+    index = min(LEVEL, len(frame.levels) - 1, len(reference.points) - 1)
+    points, level = reference.points[index], frame.levels[index]
+    row_there, row_here = _rows(points, level, T_camera_reference)
+    color = replace(
+        brightness,
+        intensity_sigma=NOISE_RATIO * brightness.intensity_sigma,
+        depth_noise_scale=NO_WEIGHT,
+    )
+    depth = replace(
+        brightness,
+        intensity_sigma=NO_WEIGHT,
+        depth_noise_scale=NOISE_RATIO * brightness.depth_noise_scale,
+    )
+    hessians, gradients, rows = [], [], []
+    for low, high in pairwise(np.linspace(-0.5, 0.5, BANDS + 1).tolist()):
+        chosen = (row_there >= low) & (row_there < high) & (np.abs(row_here) <= 0.5)
+        if np.count_nonzero(chosen) < MIN_BAND_POINTS:
+            continue
+        band = np.ascontiguousarray(points[:, chosen])
+        equations = [
+            normal_equations(band, level, T_camera_reference, noise, config)
+            for noise in (color, depth)
+        ]
+        hessians.append([e.hessian for e in equations])
+        gradients.append([e.gradient for e in equations])
+        rows.append((row_there[chosen].mean(), row_here[chosen].mean()))
+    return BandEquations(
+        np.array(hessians).reshape(-1, 2, 8, 8),
+        np.array(gradients).reshape(-1, 2, 8),
+        np.array(rows, float).reshape(-1, 2),
+        T_camera_reference,
+        at_reference,
+        at_frame,
+        reference_velocity,
+    )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TimingEvidence:
+    """Sum of the equations of many frames for readout and delay, in groups of equal size."""
+
+    groups: tuple[np.ndarray, ...] = ()  # [3, 4] each: information | right side, in order of time.
+    size: int = 1  # Measurements per complete group.
+    in_last: int = 0  # Measurements in the last group.
+    count: int = 0
+
+    def extended(self, measurement: np.ndarray) -> "TimingEvidence":
+        """Return the evidence with one more measurement [3, 4]."""
+        groups, size, in_last = list(self.groups), self.size, self.in_last
+        if groups and in_last < size:
+            groups[-1] = groups[-1] + measurement
+        else:
+            groups, in_last = [*groups, measurement], 0
+            if len(groups) > MAX_GROUPS:
+                last = groups.pop()
+                groups = [a + b for a, b in zip(groups[::2], groups[1::2], strict=True)]
+                groups, size = [*groups, last], 2 * size
+        return TimingEvidence(tuple(groups), size, in_last + 1, self.count + 1)
+
+    def estimate(self, independent_fraction: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the times [3] of the shutter in seconds, and their standard deviations [3].
+
+        A prior holds times that the frames do not tell near 0. The standard deviations combine two
+        estimates: a jackknife over the groups, because the errors of neighboring frames are alike,
+        and the information of the equations, because a jackknife over few groups may be small by
+        chance. The result is None if there are too few groups.
+
+        Args:
+            independent_fraction: Fraction of the residuals that are independent.
+        """
+        if len(self.groups) < MIN_GROUPS:
+            return None
+        groups = np.array(self.groups) * (independent_fraction * NOISE_RATIO**2)
+        total = groups.sum(axis=0)
+        parts = np.array([_solved(total - group) for group in groups])
+        jackknife = (len(parts) - 1) * np.var(parts, axis=0)
+        by_information = np.diag(np.linalg.inv(total[:, :3] + PRIOR))
+        return _solved(total), np.sqrt(jackknife + by_information)
+
+    def scaled(self, weight: float) -> "TimingEvidence":
+        """Return the evidence with another weight."""
+        return replace(self, groups=tuple(weight * group for group in self.groups))
+
+    def pack(self) -> dict[str, Any]:
+        """Return the evidence as arrays and plain values."""
+        return {
+            "groups": list(self.groups),
+            "size": self.size,
+            "in_last": self.in_last,
+            "count": self.count,
+        }
+
+    @staticmethod
+    def unpack(kept: Mapping[str, Any]) -> "TimingEvidence":
+        """Return the evidence from its packed form."""
+        return TimingEvidence(
+            tuple(kept["groups"]), int(kept["size"]), int(kept["in_last"]), int(kept["count"])
+        )
+
+
+def _compensated(motion: FrameMotion, row: float, *, is_color: bool) -> np.ndarray:
+    """Return the twist [6] by which a row, -0.5..0.5, of color or depth was moved."""
+    timing: ShutterTiming = motion.timing
+    if is_color:
+        return timing.readout_s * row * motion.velocity
+    return (timing.depth_readout_s * row + timing.depth_delay_s) * motion.velocity
+
+
+def _rows(
+    points: np.ndarray, level: Level, T_camera_reference: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows [N] of points [7, N] in the reference and in the frame, -0.5..0.5."""
+    camera = level.camera
+    R, t = T_camera_reference[:3, :3], T_camera_reference[:3, 3]
+    moved = R[1:] @ points[:3] + t[1:, None]
+    depth_m = np.maximum(moved[1], 1e-3)
+    middle, height = (camera.height - 1) / 2, camera.height
+    row_there = (points[1] / points[2] * camera.fy + camera.cy - middle) / height
+    return row_there, (moved[0] / depth_m * camera.fy + camera.cy - middle) / height
+
+
+def _solved(equations: np.ndarray) -> np.ndarray:
+    return np.linalg.solve(equations[:, :3] + PRIOR, equations[:, 3])

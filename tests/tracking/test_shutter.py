@@ -1,0 +1,126 @@
+"""Estimation of the timing of a shutter while tracking, from frames with a known timing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ldo_service.calibration.shutter import ShutterTiming
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import RgbdFrame
+from ldo_service.storage.state_codec import decode_state, encode_state
+from ldo_service.tracking import Odometry, OdometryConfig
+from ldo_service.tracking.shutter import ShutterConfig, ShutterState
+from ldo_service.tracking.shutter_timing import MIN_GROUPS, TimingEvidence
+from tests.moving_camera import MovingCamera
+
+TIMING = ShutterTiming(0.024, 0.012, 0.010)
+RATE_HZ, COUNT = 30, 70
+CONFIG = OdometryConfig()
+OFF = replace(CONFIG, shutter=ShutterConfig(is_on=False))
+
+
+@pytest.fixture(scope="module")
+def camera() -> MovingCamera:
+    return MovingCamera()
+
+
+@pytest.fixture(scope="module")
+def frames(camera: MovingCamera) -> list[RgbdFrame]:
+    return [camera.frame(index / RATE_HZ, TIMING, index) for index in range(COUNT)]
+
+
+def tracked(frames: list[RgbdFrame], config: OdometryConfig) -> tuple[Odometry, list[str]]:
+    odometry = Odometry(config)
+    return odometry, [str(odometry.process(frame).status) for frame in frames]
+
+
+def timing_of(odometry: Odometry) -> ShutterTiming:
+    return ShutterTiming.of(odometry.snapshot()["shutter"]["timing"])
+
+
+def test_estimated_timing_is_that_of_the_camera_and_keeps_the_track(
+    frames: list[RgbdFrame],
+) -> None:
+    odometry, statuses = tracked(frames, CONFIG)
+    found = timing_of(odometry)
+    assert found.readout_s == pytest.approx(TIMING.readout_s, abs=0.002)
+    assert found.depth_readout_s == pytest.approx(TIMING.depth_readout_s, abs=0.004)
+    assert found.depth_delay_s == pytest.approx(TIMING.depth_delay_s, abs=0.002)
+    assert statuses == ["OK"] * COUNT
+    assert "LOST" in tracked(frames, OFF)[1]  # The frames are hard without compensation.
+
+
+def test_known_timing_is_used_from_the_first_motion_on(
+    camera: MovingCamera, frames: list[RgbdFrame]
+) -> None:
+    known = replace(CONFIG, shutter=ShutterConfig(initial=TIMING))
+    odometry = Odometry(known)
+    motions = [odometry.process(frame).motion for frame in frames[:10]]
+    assert motions[0] is None
+    used = motions[9]
+    assert used is not None
+    assert used.timing == TIMING
+    # The mean velocity since the frame before, half a frame earlier.
+    expected = camera.velocity((9 - 0.5) / RATE_HZ)
+    assert np.linalg.norm((used.velocity - expected)[:3]) < 0.05 * np.linalg.norm(expected[:3])
+
+
+def test_camera_that_records_at_once_is_not_compensated(camera: MovingCamera) -> None:
+    at_once = [camera.frame(i / RATE_HZ, ShutterTiming(), i) for i in range(COUNT)]
+    odometry, poses = tracked(at_once, CONFIG)
+    assert not timing_of(odometry)
+    off = replace(CONFIG, shutter=ShutterConfig(is_on=False))
+    assert np.array_equal(poses, tracked(at_once, off)[1])
+
+
+def test_restored_odometry_continues_bit_for_bit(frames: list[RgbdFrame]) -> None:
+    odometry = Odometry(CONFIG)
+    for frame in frames[:30]:
+        odometry.process(frame)
+    assert timing_of(odometry)
+    saved = decode_state(encode_state(odometry.snapshot()))
+    restored = Odometry(CONFIG)
+    restored.restore(saved)
+    for frame in frames[30:45]:
+        a, b = odometry.process(frame), restored.process(frame)
+        assert np.array_equal(a.T_odom_camera, b.T_odom_camera)
+        assert a.motion is not None
+        assert b.motion is not None
+        assert np.array_equal(a.motion.velocity, b.motion.velocity)
+    assert timing_of(odometry) == timing_of(restored)
+
+
+def test_frames_at_2_hz_have_no_known_motion(camera: MovingCamera) -> None:
+    odometry = Odometry(CONFIG)
+    slow = [replace(camera.frame(i / RATE_HZ, TIMING, i), stamp_ns=i * 500_000_000) for i in (0, 1)]
+    assert [odometry.process(frame).motion for frame in slow] == [None, None]
+
+
+def test_evidence_keeps_its_sum_when_groups_are_merged() -> None:
+    rng = np.random.default_rng(0)
+    measurements = rng.random((100, 3, 4))
+    evidence = TimingEvidence()
+    for measurement in measurements:
+        evidence = evidence.extended(measurement)
+    assert evidence.count == 100
+    assert MIN_GROUPS <= len(evidence.groups) <= 24
+    assert np.allclose(np.sum(evidence.groups, axis=0), measurements.sum(axis=0))
+
+
+def test_uncertain_time_is_not_compensated() -> None:
+    """Evidence whose groups contradict each other."""
+    evidence = TimingEvidence()
+    for sign in (1, -1) * 20:
+        evidence = evidence.extended(np.c_[1e6 * np.eye(3), sign * 1e6 * 0.02 * np.ones(3)])
+    found = evidence.estimate(2e-3)
+    assert found is not None
+    times_s, sigmas_s = found
+    assert (np.abs(times_s) < 4 * sigmas_s).all()
+    assert ShutterState(evidence=evidence).timing == ShutterTiming()
+
+
+@pytest.mark.parametrize("name", ["sigmas", "max_s", "max_interval_s", "update_frames"])
+def test_config_rejects_zero(name: str) -> None:
+    with pytest.raises(ConfigError, match=name):
+        ShutterConfig(**{name: 0})
