@@ -171,8 +171,8 @@ class PublishSettings:
 class RefitSettings:
     """Refit of the map to keyframes that a correction has moved."""
 
-    # Refit iterations for each keyframe that a correction displaces by more than 1 cm or 0.01 rad
-    # relative to the oldest keyframe within the same cube of 2 m.
+    # Refit iterations for each keyframe that a correction displaces by more than 1 cm or 0.01 rad.
+    # The displacement is relative to the oldest keyframe within the same cube of 2 m.
     iterations: NonNegativeInt = advanced(12)
     # Maximum number of pending refit iterations that run with each new keyframe, if no other
     # keyframe is queued. The others run while no keyframe arrives.
