@@ -94,6 +94,7 @@ class SelfCalibration:
         # Packed parts of the state; a part that has not changed stays the same object.
         self._packed: dict[str, dict[str, Any]] = {"maker": self._maker.pack()}
         self._timing = ShutterTiming()  # Timing that the views compensate.
+        self._has_estimate = False  # True after the first estimate, used or not.
         self._is_renewed = False  # True after the views were made again with another timing.
         self._stage = 0  # Index into `config.views` of the next estimate.
         # Running estimate, the number of views that it uses, and the number of its parts done.
@@ -106,6 +107,11 @@ class SelfCalibration:
         calibration = SelfCalibration(SelfCalibrationConfig(views=()))
         calibration.correction = correction
         return calibration
+
+    @property
+    def is_undecided(self) -> bool:
+        """True until the first estimate tells whether there is a depth bias."""
+        return not (self.is_finished or self._has_estimate)
 
     def observe(
         self,
@@ -198,7 +204,7 @@ class SelfCalibration:
             return None
         except StopIteration as done:
             found: Estimate = done.value
-        self._running, self._parts_done = None, 0
+        self._running, self._parts_done, self._has_estimate = None, 0, True
         if not found.is_finite:
             self._end_stage()
             return None
@@ -258,6 +264,7 @@ class SelfCalibration:
             "frames_since_view": self._frames_since_view,
             "stage": self._stage,
             "timing": self._timing.pack(),
+            "has_estimate": self._has_estimate,
             "is_renewed": self._is_renewed,
             "is_running": self._running is not None,
             "views_used": self._views_used,
@@ -289,6 +296,7 @@ class SelfCalibration:
             self._pairs.append(pair.at(T_second_first))
         self._running, self._stage = None, int(now["stage"])
         self._timing = ShutterTiming.of(now.get("timing", {}))
+        self._has_estimate = bool(now.get("has_estimate", True))
         self._is_renewed = bool(now.get("is_renewed", False))
         self._views_used = int(now["views_used"])
         if now["is_running"]:

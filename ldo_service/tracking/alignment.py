@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.kernels import _align
 
@@ -162,6 +162,15 @@ class AlignConfig:
     # frame to frame and 3e-5 over half a second. The default lies between these values and is not
     # validated.
     independent_fraction: float = 2e-3
+    # Lower bound of the geometric noise while the depth may have a smooth bias, as a multiple of
+    # `DepthNoise`. A bias shows no noise, so its residuals would weigh as much as exact ones. With
+    # 5, the ATE of tour-handheld falls from 1.6 to 1.1 cm; without a bias, no sequence changes by
+    # more than 0.04 cm.
+    biased_depth_noise_scale: float = 5.0
+
+    def with_bias(self) -> "AlignConfig":
+        """Return the settings for depth that may have a smooth bias."""
+        return replace(self, min_depth_noise_scale=self.biased_depth_noise_scale)
 
     def __post_init__(self) -> None:
         if not self.iterations or min(self.iterations) < 1:
@@ -174,11 +183,9 @@ class AlignConfig:
                 f"AlignConfig.stop_px={self.stop_px:g}, max_step={self.max_step:g} and "
                 f"independent_fraction={self.independent_fraction:g} must be positive."
             )
-        if min(self.min_intensity_sigma, self.min_depth_noise_scale) <= 0:
-            raise ConfigError(
-                f"AlignConfig.min_intensity_sigma={self.min_intensity_sigma:g} and "
-                f"min_depth_noise_scale={self.min_depth_noise_scale:g} must be positive."
-            )
+        noises = "min_intensity_sigma", "min_depth_noise_scale", "biased_depth_noise_scale"
+        if min(getattr(self, name) for name in noises) <= 0:
+            raise ConfigError(named(self, *noises) + " must be positive.")
 
 
 @dataclass(frozen=True, slots=True)

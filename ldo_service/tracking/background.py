@@ -4,14 +4,13 @@ A person who stands still for a while looks static beside the last frames. Older
 the wall behind the person contradict it. Conventions: `ldo_service.geometry`.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ldo_service.geometry import se3
 
-from .keyframe_database import KeyframeRecord
+from .keyframe_database import KeyframeDatabase
 from .motion import image_motions_rad
 from .motion_segmentation import foreground_mask, grow_mask
 from .odometry_config import OdometryConfig
@@ -30,7 +29,7 @@ MAX_MOTION_RAD = 0.4
 def with_foreground(
     tracked: TrackedFrame,
     view: Pyramid,
-    records: Sequence[KeyframeRecord],
+    database: KeyframeDatabase,
     config: OdometryConfig,
 ) -> TrackedFrame:
     """Add to the dynamic mask of a frame what stands in front of the background.
@@ -40,10 +39,10 @@ def with_foreground(
     Args:
         tracked: The frame, which becomes a keyframe.
         view: Its pyramid.
-        records: Keyframe records of its submap, in any order.
+        database: Records of earlier keyframes.
         config: Settings.
     """
-    known = tracked.dynamic_mask
+    known, records = tracked.dynamic_mask, database.in_submap(tracked.submap)
     if known is None or np.mean(known) < MIN_DYNAMIC_RATIO or not records:
         return tracked
     T_keyframe_odom = se3.inverse(np.array([record.T_odom_keyframe for record in records]))

@@ -23,7 +23,7 @@ class FrameCompensator:
 
     def __init__(self, config: OdometryConfig, guesses: InitialGuessAligner) -> None:
         self.config = config
-        self._guesses = guesses
+        self.guesses = guesses
         self._view: tuple[RgbdFrame, Pyramid] | None = None  # The last frame and its pyramid.
         # Motion that the last pyramid compensates; None if the motion of the frame is unknown.
         self.motion: FrameMotion | None = None
@@ -75,7 +75,7 @@ class FrameCompensator:
         focal_ratio, depth_m = frame.camera.fx / frame.camera.width, candidate.median_depth_m
         if needs_realignment(self.motion, motion, depth_m, focal_ratio, config):
             view = self._compensated(frame, motion)
-            candidate = self._guesses.align_again(keyframe, view, candidate)
+            candidate = self.guesses.align_again(keyframe, view, candidate)
         elif self.motion is None:
             self.motion = motion  # Too slow to matter.
         if is_ok:

@@ -18,7 +18,7 @@ from ldo_service.geometry import RgbdFrame, se3
 from .alignment import Alignment
 from .frame_compensation import FrameCompensator
 from .keyframe_database import KeyframeDatabase, make_thumbnail
-from .keyframes import ReferenceKeyframe, needs_keyframe, needs_mapping_keyframe
+from .keyframes import ReferenceKeyframe
 from .motion import ConstantVelocity
 from .motion_segmentation import grow_mask, segment_motion
 from .odometry_config import OdometryConfig
@@ -160,6 +160,12 @@ class FrameTracker:
     def motion(self) -> FrameMotion | None:
         """Motion of the camera during the last frame, which is compensated; None if unknown."""
         return self._compensator.motion
+
+    def expect_bias(self, is_expected: bool) -> None:
+        """Set whether the depth of the next frames may have a smooth bias that is not corrected."""
+        align = self.config.align.with_bias() if is_expected else self.config.align
+        self._guesses = replace(self._guesses, align=align)
+        self._compensator.guesses = self._guesses
 
     def restore(self, state: OdometryState) -> None:
         """Continue tracking from a saved state."""
@@ -315,9 +321,10 @@ class FrameTracker:
             # stands still.
             dynamic_mask = None
             self.state = replace(self.state, dynamic_mask=None)
-        needed = (
-            self._needed_keyframe(T_odom_camera, candidate) if status is TrackingStatus.OK else None
-        )
+        needed = None
+        if status is TrackingStatus.OK:
+            depth_m = candidate.median_depth_m
+            needed = self.state.needed_keyframe(T_odom_camera, alignment, depth_m, config.keyframes)
         return TrackedFrame.of(
             alignment,
             T_odom_camera,
@@ -328,23 +335,6 @@ class FrameTracker:
             hypothesis_spread_rad=candidate.hypothesis_spread_rad,
             dynamic_mask=dynamic_mask,
         )
-
-    def _needed_keyframe(
-        self, T_odom_camera: np.ndarray, candidate: PoseHypothesis
-    ) -> KeyframeKind | None:
-        """Return the kind of keyframe that an OK frame should become, or None."""
-        config, frames = self.config.keyframes, self.state.frames_since_keyframe
-        is_known = self.state.origin is KeyframeOrigin.KNOWN
-        if is_known:  # The number of frames does not limit the use of a known keyframe.
-            frames = min(frames, config.max_frames - 1)
-        a, depth_m = candidate.alignment, candidate.median_depth_m
-        left = needs_keyframe(a.T_reference_camera, a.overlap, depth_m, frames, config)
-        if left or self.state.is_relayed:
-            return KeyframeKind.REFERENCE
-        T_mapped_camera = se3.inverse(self.state.T_odom_last_mapped) @ T_odom_camera
-        if not is_known and needs_mapping_keyframe(T_mapped_camera, depth_m, config):
-            return KeyframeKind.MAPPING
-        return None
 
     def _segment_motion(
         self, keyframe: ReferenceKeyframe, view: Pyramid, alignment: Alignment

@@ -16,10 +16,9 @@
    two submaps if a match between them is confirmed.
 5. Compute T_map_odom from the last correction of the pose graph (`MapFrame`).
 
-The caller decides with `may_map` whether step 4 may make a keyframe. The caller passes False while
-the mapper is too busy for another keyframe. Tracking then continues against the same reference
-keyframe. If the camera leaves the view of that keyframe, a frame becomes the reference without
-being a keyframe (`Relay`). Conventions: `ldo_service.geometry`.
+With `may_map=False`, while the mapper is busy, step 4 makes no keyframe. If the camera then leaves
+the view of its reference, a frame becomes the reference without being a keyframe (`Relay`).
+Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -120,9 +119,8 @@ class Odometry:
         # Make a keyframe with its relative-pose measurements; it may merge two submaps.
         keyframe = None
         if needed is not None and may_map:
-            records = self._frames.state.database.in_submap(tracked.submap)
-            view = self._frames.view(frame)
-            tracked = with_foreground(tracked, view, records, self.config)
+            database, view = self._frames.state.database, self._frames.view(frame)
+            tracked = with_foreground(tracked, view, database, self.config)
             keyframe = self._make_keyframe(frame, tracked, needed, known)
         elif needed is KeyframeKind.REFERENCE and self._has_left_keyframe(tracked):
             view, T_odom_camera = self._frames.view(frame), tracked.T_odom_camera
@@ -157,12 +155,13 @@ class Odometry:
         return self._map.correct(correction)
 
     def recorrect(self, change: CorrectionChange) -> None:
-        """Convert all keyframes to a new camera correction, which applies to the next frames.
-
-        The poses of the keyframes do not change.
-        """
+        """Convert all keyframes to the camera correction of the next frames; their poses stay."""
         state = self._frames.state
         self._frames.restore(state.recorrected(change, self.config.pyramid))
+
+    def expect_bias(self, is_expected: bool) -> None:
+        """Set whether the depth of the next frames may have a smooth bias that is not corrected."""
+        self._frames.expect_bias(is_expected)
 
     def mask_dynamic_objects(self, keyframe: int, boxes: Sequence[Box]) -> None:
         """Mask objects of dynamic classes in the reference keyframe and in its record.

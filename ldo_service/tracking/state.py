@@ -8,9 +8,17 @@ import numpy as np
 
 from ldo_service.calibration.correction import CorrectionChange
 from ldo_service.calibration.shutter import FrameMotion
+from ldo_service.geometry import se3
 
+from .alignment import Alignment
 from .keyframe_database import KeyframeDatabase, KeyframeDatabaseConfig, KeyframeRecord
-from .keyframes import ReferenceKeyframe, Relay
+from .keyframes import (
+    KeyframeConfig,
+    ReferenceKeyframe,
+    Relay,
+    needs_keyframe,
+    needs_mapping_keyframe,
+)
 from .motion import ConstantVelocity
 from .motion_segmentation import MotionEvidence
 from .odometry_prior import DeadReckoningStart
@@ -18,6 +26,7 @@ from .pyramid import Pyramid, PyramidConfig
 from .shutter import ShutterState
 from .submaps import Submaps
 from .tracking_quality import ResidualHistory, TrackingStatus
+from .tracking_result import KeyframeKind
 
 
 class KeyframeOrigin(StrEnum):
@@ -67,6 +76,33 @@ class OdometryState:
         return KeyframeDatabase(
             tuple(p for p in self.database.all if not are_merged(p.submap, submap))
         )
+
+    def needed_keyframe(
+        self,
+        T_odom_camera: np.ndarray,
+        alignment: Alignment,
+        median_depth_m: float,
+        config: KeyframeConfig,
+    ) -> KeyframeKind | None:
+        """Return the kind of keyframe that an OK frame should become, or None.
+
+        Args:
+            T_odom_camera: Pose of the frame, [4, 4].
+            alignment: Its alignment to the reference keyframe.
+            median_depth_m: Median depth of the reference keyframe.
+            config: Settings.
+        """
+        is_known, frames = self.origin is KeyframeOrigin.KNOWN, self.frames_since_keyframe
+        if is_known:  # The number of frames does not limit the use of a known keyframe.
+            frames = min(frames, config.max_frames - 1)
+        T_reference_camera, overlap = alignment.T_reference_camera, alignment.overlap
+        left = needs_keyframe(T_reference_camera, overlap, median_depth_m, frames, config)
+        if left or self.is_relayed:
+            return KeyframeKind.REFERENCE
+        T_mapped_camera = se3.inverse(self.T_odom_last_mapped) @ T_odom_camera
+        if not is_known and needs_mapping_keyframe(T_mapped_camera, median_depth_m, config):
+            return KeyframeKind.MAPPING
+        return None
 
     def with_new(
         self,

@@ -53,6 +53,7 @@ def tracked(
     for index in range(min(count, len(sequence))):
         raw = sequence[index]
         start_s = time.process_time()
+        odometry.expect_bias(calibration.is_undecided)
         tracked = odometry.process(result.calibration.correction.applied(raw))
         middle_s = time.process_time()
         T_odom_camera = None if tracked.status == "LOST" else tracked.T_odom_camera

@@ -17,6 +17,7 @@ from ldo_service.calibration.self_calibration import (
     SelfCalibration,
     SelfCalibrationConfig,
 )
+from ldo_service.calibration.shutter import FrameMotion, ShutterTiming
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
 from ldo_service.geometry import RgbdFrame
@@ -175,3 +176,42 @@ def test_calibration_switched_off_keeps_the_correction_of_a_saved_state(
 def test_depth_near_the_camera_and_far_away_is_unchanged_without_a_bias() -> None:
     depth_m = np.array([[0.0, 0.05, 1.0, 20.0]], np.float32)
     np.testing.assert_allclose(unbiased_depth(depth_m, np.zeros((1, 4))), depth_m, rtol=1e-6)
+
+
+def test_bias_is_undecided_until_the_first_estimate(
+    room: Sequence, frames: list[RgbdFrame]
+) -> None:
+    calibration, moved = SelfCalibration(CONFIG), poses(room)
+    assert calibration.is_undecided
+    undecided = []
+    for frame, T in zip(frames, moved, strict=True):
+        calibration.observe(frame, T)
+        undecided.append(calibration.is_undecided)
+    assert undecided[0]
+    assert not undecided[-1]
+    assert not SelfCalibration(SelfCalibrationConfig(views=())).is_undecided
+    restored = SelfCalibration(CONFIG)
+    restored.restore(decode_state(encode_state(calibration.snapshot())))
+    assert not restored.is_undecided
+
+
+def test_new_timing_renews_a_confirmed_bias_and_keeps_it_meanwhile(
+    room: Sequence, frames: list[RgbdFrame]
+) -> None:
+    calibration, moved = SelfCalibration(CONFIG), poses(room)
+    changes_of(calibration, [measured(frame, TRUE) for frame in frames], moved)
+    before = calibration.correction
+    assert before.has_depth_bias
+    assert calibration.is_finished
+    motion = FrameMotion(np.zeros(6), ShutterTiming(0.02))
+    assert calibration.observe(measured(frames[0], TRUE), moved[0], motion) is None
+    assert not calibration.is_finished
+    assert calibration.correction == before
+
+
+def test_new_timing_renews_nothing_without_a_bias(room: Sequence, frames: list[RgbdFrame]) -> None:
+    calibration = SelfCalibration(CONFIG)
+    changes_of(calibration, frames, poses(room))
+    assert calibration.is_finished
+    calibration.observe(frames[0], poses(room)[0], FrameMotion(np.zeros(6), ShutterTiming(0.02)))
+    assert calibration.is_finished

@@ -115,9 +115,7 @@ def test_lists_out_of_order_are_sorted_by_stamp(tum_folder: Writer) -> None:
 
 
 def test_no_pair_at_all_is_a_data_error(tum_folder: Writer) -> None:
-    with pytest.raises(
-        DataError, match="none of the 1 color images is within 20 ms"
-    ):
+    with pytest.raises(DataError, match="none of the 1 color images is within 20 ms"):
         open_sequence(str(tum_folder(["1"], ["2"])))
 
 

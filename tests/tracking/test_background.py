@@ -9,7 +9,11 @@ from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.background import with_foreground
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.keyframe_database import KeyframeDatabaseConfig, make_keyframe_record
+from ldo_service.tracking.keyframe_database import (
+    KeyframeDatabase,
+    KeyframeDatabaseConfig,
+    make_keyframe_record,
+)
 from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.pyramid import Pyramid, pyramid_of
 from ldo_service.tracking.tracking_quality import TrackingStatus
@@ -54,7 +58,9 @@ def test_person_who_stands_still_is_masked_while_another_one_walks() -> None:
     view = view_of(STANDING, WALKING)
     empty = record_of(view_of(), 0, np.eye(4))
     recent = record_of(view_of(STANDING), 7, np.eye(4))
-    tracked = with_foreground(frame_with(mask_of(WALKING)), view, [recent, empty], CONFIG)
+    tracked = with_foreground(
+        frame_with(mask_of(WALKING)), view, KeyframeDatabase((recent, empty)), CONFIG
+    )
     assert tracked.dynamic_mask is not None
     people = mask_of(STANDING, WALKING)
     assert tracked.dynamic_mask[people].mean() > 0.95
@@ -64,7 +70,7 @@ def test_person_who_stands_still_is_masked_while_another_one_walks() -> None:
 def test_standing_object_is_mapped_if_nothing_moves() -> None:
     empty = record_of(view_of(), 0, np.eye(4))
     still = frame_with(mask_of())
-    assert with_foreground(still, view_of(STANDING), [empty], CONFIG) is still
+    assert with_foreground(still, view_of(STANDING), KeyframeDatabase((empty,)), CONFIG) is still
 
 
 @pytest.mark.parametrize("known", ["no record", "a far record", "the same people"])
@@ -76,7 +82,9 @@ def test_mask_stays_without_a_background(known: str) -> None:
         "the same people": [record_of(view_of(STANDING, WALKING), 0, np.eye(4))],
     }[known]
     tracked = frame_with(mask_of(WALKING))
-    found = with_foreground(tracked, view_of(STANDING, WALKING), records, CONFIG)
+    found = with_foreground(
+        tracked, view_of(STANDING, WALKING), KeyframeDatabase(tuple(records)), CONFIG
+    )
     assert found.dynamic_mask is not None
     assert np.array_equal(found.dynamic_mask, mask_of(WALKING))
 
