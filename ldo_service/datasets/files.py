@@ -217,7 +217,7 @@ class NumberedFrames:
 
     @property
     def stamps_ns(self) -> np.ndarray:
-        """Stamps [N] int64; a gap in the numbers is a gap in time."""
+        """Stamps [N] int64 from the frame numbers; a missing number is a gap in time."""
         return self.numbers * 10**9 // FRAME_RATE_HZ
 
 

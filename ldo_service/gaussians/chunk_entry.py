@@ -1,4 +1,4 @@
-"""Records in memory of chunks whose Gaussians are on disk or lost."""
+"""In-memory records of the chunks whose Gaussians are on disk or lost."""
 
 from dataclasses import dataclass, replace
 

@@ -140,9 +140,10 @@ class Actor:
         self.situation = FlowStatus()
 
     def has_credit(self, topic: Topic) -> bool:
-        """Return whether a message of the topic may be sent without waiting.
+        """Return whether a message of the topic may be sent now.
 
-        The result is always True for an output without `Out.is_nonblocking`.
+        Only an output with `Out.is_nonblocking` needs this check. For any other output, the result
+        is True, because the runtime itself waits until the message can be sent.
         """
         return self.situation.credits.get(topic, UNLIMITED) > 0
 
