@@ -47,7 +47,7 @@ def register_depth(
     if depth_m.shape != (depth_camera.height, depth_camera.width):
         raise FrameError(
             f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} pixels and its camera "
-            f"{depth_camera.width}x{depth_camera.height}. Use intrinsics for the size of the image."
+            f"{depth_camera.width}x{depth_camera.height}. Give the intrinsics for this image size."
         )
     depth_m = np.asarray(depth_m, np.float32)
     x, y, z = _points(depth_m, depth_camera, T_color_depth)
@@ -195,7 +195,7 @@ def resample_color(
     if color.shape[:2] != (color_camera.height, color_camera.width):
         raise FrameError(
             f"color is {color.shape[1]}x{color.shape[0]} pixels and its camera "
-            f"{color_camera.width}x{color_camera.height}. Use intrinsics for the size of the image."
+            f"{color_camera.width}x{color_camera.height}. Give the intrinsics for this image size."
         )
     while min(color_camera.fx / depth_camera.fx, color_camera.fy / depth_camera.fy) > 1.5:
         color, color_camera = _halved(color), color_camera.halved()

@@ -99,7 +99,7 @@ def reverse_overlap(
 ) -> float:
     """Return the fraction of an observation's points that lie in the mask of a known region.
 
-    The points are projected into the keyframe of the region's stored observation, `region.shape`.
+    `region.shape` is the stored observation of the region. The points are projected into its keyframe.
     Points outside of that image are not counted. Points that were occluded in that keyframe count
     as outside of the mask and lower the fraction. An object that was mostly occluded in the stored
     observation and is fully visible now therefore becomes a new region.

@@ -36,7 +36,7 @@ def kinect_depth(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
     Args:
         depth_m: Exact depth [H, W], meters.
-        rng: Source of the matching noise.
+        rng: Source of the noise of the pattern matching.
 
     Returns:
         Measured depth [H, W], meters; 0 outside the range and in the projector's shadow.

@@ -38,7 +38,7 @@ class ViewerConfig:
 
 
 def viewer_config(settings: ViewerSettings) -> ViewerConfig:
-    """Return the limits of the window, from the section `viewer` of the configuration."""
+    """Return the address, the number of Gaussians and the update interval of the viewer."""
     return ViewerConfig(
         address=settings.address,
         port=settings.port,
