@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.calibration.correction import read_corrections
+from ldo_service.calibration.correction import CameraCorrection, read_corrections
 from ldo_service.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
 from ldo_service.conversions.frames import (
     frame_from_message,
@@ -118,6 +118,9 @@ class TrackerConfig:
     # Folder of a finished run. The tracker localizes in the map of this run, which does not change.
     # Empty: the tracker makes keyframes for a new map.
     localize: str = ""
+    # Folder of a finished run of the same camera, whose calibration this run starts with. Empty:
+    # the camera is unknown.
+    calibration_run: str = ""
     hold_out: int = 0  # Every n-th frame is tracked but not mapped, to evaluate the map; 0: none.
 
     def __post_init__(self) -> None:
@@ -321,23 +324,31 @@ def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry
     Raises:
         DataError: The folder of the run has no usable keyframe database.
     """
+    timing = _known_correction(config).timing
+    odometry = replace(config.odometry, shutter=replace(config.odometry.shutter, initial=timing))
     if not config.localize:
-        return Odometry(config.odometry, T_base_camera)
-    folder = Path(config.localize)
-    shutter = replace(config.odometry.shutter, initial=read_corrections(folder).last.timing)
-    odometry = replace(config.odometry, shutter=shutter)
-    return Localizer(load_keyframe_database(folder), odometry, T_base_camera)
+        return Odometry(odometry, T_base_camera)
+    return Localizer(load_keyframe_database(Path(config.localize)), odometry, T_base_camera)
 
 
 def _make_calibration(config: TrackerConfig) -> SelfCalibration:
-    """Return a new self-calibration; for localization, the final one of the finished run.
+    """Return the self-calibration, which starts with the correction of a finished run, if any.
 
     Raises:
         DataError: The folder of the run has no usable keyframes.json.
     """
-    if not config.localize:
-        return SelfCalibration(config.calibration)
-    return SelfCalibration.finished(read_corrections(Path(config.localize)).last)
+    correction = _known_correction(config)
+    if config.localize:
+        return SelfCalibration.finished(correction)
+    if config.calibration_run:
+        return SelfCalibration.continued(correction, config.calibration)
+    return SelfCalibration(config.calibration)
+
+
+def _known_correction(config: TrackerConfig) -> CameraCorrection:
+    """Return the last correction of the finished run that the configuration names, if any."""
+    folder = config.localize or config.calibration_run
+    return read_corrections(Path(folder)).last if folder else CameraCorrection()
 
 
 def _box(detection: Detection) -> Box:

@@ -13,7 +13,7 @@ largest number of views, the calibration is finished and costs nothing more.
 
 import logging
 from collections.abc import Generator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
@@ -95,7 +95,9 @@ class SelfCalibration:
         self._packed: dict[str, dict[str, Any]] = {"maker": self._maker.pack()}
         self._timing = ShutterTiming()  # Timing that the views compensate.
         self._has_estimate = False  # True after the first estimate, used or not.
-        self._is_renewed = False  # True after the views were made again with another timing.
+        # True if only an estimate from the largest number of views may change the correction: after
+        # the views were made again with another timing, or if the correction is of an earlier run.
+        self._is_renewed = False
         self._stage = 0  # Index into `config.views` of the next estimate.
         # Running estimate, the number of views that it uses, and the number of its parts done.
         self._running: Generator[None, None, Estimate] | None = None
@@ -106,6 +108,24 @@ class SelfCalibration:
         """Return a finished calibration, whose correction is known and never changes."""
         calibration = SelfCalibration(SelfCalibrationConfig(views=()))
         calibration.correction = correction
+        return calibration
+
+    @staticmethod
+    def continued(
+        correction: CameraCorrection, config: SelfCalibrationConfig | None = None
+    ) -> "SelfCalibration":
+        """Return a calibration of a camera whose correction is known from an earlier run.
+
+        The correction is used from the first frame on. A part of it changes only if held-out views
+        confirm an estimate from the largest number of views.
+        """
+        calibration = SelfCalibration(config)
+        calibration.correction = replace(correction, timing=ShutterTiming())
+        calibration._timing = correction.timing
+        calibration._depth_bias = np.array(correction.depth_bias)
+        calibration._vignetting = np.array(correction.vignetting)
+        calibration._has_estimate = calibration._is_renewed = True
+        calibration._stage = max(len(calibration.config.views) - 1, 0)
         return calibration
 
     @property

@@ -176,6 +176,7 @@ def _tracker(config: Config) -> TrackerConfig:
         if tracker.self_calibration
         else SelfCalibrationConfig(views=()),
         localize=tracker.localization_map,
+        calibration_run=tracker.calibration_run,
         hold_out=tracker.hold_out,
     )
 

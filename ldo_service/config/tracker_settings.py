@@ -223,6 +223,9 @@ class TrackerSettings:
     # motion. The timing is the readout of color and depth, and the delay between them. Only
     # significant errors are corrected.
     self_calibration: bool = advanced(True)
+    # Folder of a finished run of the same camera, whose calibration this run starts with. Empty
+    # starts with an unknown camera.
+    calibration_run: str = ""
     # Folder of a finished run, in whose map the camera is localized. The map is not changed. Empty
     # makes a new map.
     localization_map: str = ""

@@ -99,10 +99,11 @@ def reverse_overlap(
 ) -> float:
     """Return the fraction of an observation's points that lie in the mask of a known region.
 
-    `region.shape` is the stored observation of the region. The points are projected into its keyframe.
-    Points outside of that image are not counted. Points that were occluded in that keyframe count
-    as outside of the mask and lower the fraction. An object that was mostly occluded in the stored
-    observation and is fully visible now therefore becomes a new region.
+    `region.shape` is the stored observation of the region. The points are projected into the
+    keyframe of this observation. Points outside of that image are not counted. Points that were
+    occluded in that keyframe count as outside of the mask and lower the fraction. An object that
+    was mostly occluded in the stored observation and is fully visible now therefore becomes a new
+    region.
 
     Args:
         seen: The new observation.

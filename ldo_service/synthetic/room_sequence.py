@@ -31,8 +31,8 @@ PATHS = {"look_around": path.LOOK_AROUND, "tour": path.TOUR, "linger": path.LING
 def kinect_depth(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return depth with the errors of a Kinect.
 
-    Depth has steps that grow with the square of depth: 3 mm at 1 m, 26 mm at 3 m. The matching
-    noise is half a step.
+    Depth has steps that grow with the square of depth: 3 mm at 1 m, 26 mm at 3 m. The noise
+    of the pattern matching is half a step.
 
     Args:
         depth_m: Exact depth [H, W], meters.

@@ -215,3 +215,26 @@ def test_new_timing_renews_nothing_without_a_bias(room: Sequence, frames: list[R
     assert calibration.is_finished
     calibration.observe(frames[0], poses(room)[0], FrameMotion(np.zeros(6), ShutterTiming(0.02)))
     assert calibration.is_finished
+
+
+def test_known_calibration_is_used_from_the_first_frame_on_and_stays_if_it_fits(
+    room: Sequence, frames: list[RgbdFrame]
+) -> None:
+    known = replace(TRUE, timing=ShutterTiming(0.02))
+    calibration = SelfCalibration.continued(known, CONFIG)
+    assert calibration.correction.depth_bias == TRUE.depth_bias
+    assert calibration.correction.vignetting == TRUE.vignetting
+    assert not calibration.is_undecided
+    seen = [measured(frame, TRUE) for frame in frames]
+    changes = changes_of(calibration, seen, poses(room))
+    assert len(changes) <= 1  # Only the estimate from the largest number of views may change it.
+    assert np.allclose(calibration.correction.depth_bias, TRUE.depth_bias, atol=0.003)
+
+
+def test_known_calibration_stays_where_no_estimate_confirms_another(
+    room: Sequence, frames: list[RgbdFrame]
+) -> None:
+    """The frames are exact, so no estimate has a clearly smaller residual."""
+    calibration = SelfCalibration.continued(TRUE, CONFIG)
+    assert not changes_of(calibration, frames, poses(room))
+    assert calibration.correction == TRUE

@@ -34,7 +34,7 @@ def test_default_print_has_public_and_changed_settings_only() -> None:
     settings = settings_of(Config())
     lines = explained_yaml(Config()).splitlines()
     printed = [line for line in lines if "  # " in line]
-    assert len(printed) == sum(setting.is_public for setting in settings) == 64
+    assert len(printed) == sum(setting.is_public for setting in settings) == 65
     all_lines = explained_yaml(Config(), with_advanced=True).splitlines()
     assert len([line for line in all_lines if "  # " in line]) == len(settings)
     assert "pyramid_levels" not in explained_yaml(Config())
