@@ -207,7 +207,7 @@ class Tracker(Actor):
             mapped = correction.applied(raw, keeps_clipped=False)
             if motion is not None:
                 mapped = motion.compensated(mapped)
-                correction = replace(correction, timing=motion.timing)
+            correction = replace(correction, timing=self._odometry.timing)
             keyframe = keyframe_message(mapped, result, result.keyframe, correction)
             yield keyframe
             yield keyframe_measurements_message(keyframe)
@@ -314,7 +314,7 @@ class Tracker(Actor):
             "prior_rejected": refused,
             "prior_restarts": restarts,
             **self._calibration.metrics(),
-            **self._odometry.metrics(),
+            **self._odometry.timing.metrics(),
         }
 
 
@@ -324,8 +324,10 @@ def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry
     Raises:
         DataError: The folder of the run has no usable keyframe database.
     """
-    timing = _known_correction(config).timing
-    odometry = replace(config.odometry, shutter=replace(config.odometry.shutter, initial=timing))
+    shutter = config.odometry.shutter
+    if shutter.is_on:
+        shutter = replace(shutter, initial=_known_correction(config).timing)
+    odometry = replace(config.odometry, shutter=shutter)
     if not config.localize:
         return Odometry(odometry, T_base_camera)
     return Localizer(load_keyframe_database(Path(config.localize)), odometry, T_base_camera)

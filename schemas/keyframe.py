@@ -42,12 +42,14 @@ class CameraCorrection(msgspec.Struct, frozen=True, kw_only=True):
     1/z_measured + b1 x^2 + b2 x y + b3 y^2. The vignetting V of a channel is given by log V =
     a1 r^2 + a2 r^4 + a3 r^6. The corrected color is the measured color times V_min / V. V_min is
     the smallest V of the channel in the image, so the correction clips no color.
+
+    The three times are those of the camera's shutter, 0 until they are estimated. Color and depth
+    are as if recorded at once, unless the motion of the camera was unknown.
     """
 
     depth_bias: Terms = NO_TERMS  # b1, b2, b3 in 1/m.
     # a1, a2, a3 of red, green and blue.
     vignetting: tuple[Terms, Terms, Terms] = (NO_TERMS, NO_TERMS, NO_TERMS)
-    # Times at which the parts of a frame were recorded. The images are as if recorded at once.
     readout_s: float = 0.0  # First to last row of the color image.
     depth_readout_s: float = 0.0  # First to last row of depth.
     depth_delay_s: float = 0.0  # Color to depth, middle rows; negative if depth is earlier.

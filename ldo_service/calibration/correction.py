@@ -1,4 +1,4 @@
-"""Correction of a frame for vignetting and for the smooth bias of the depth sensor."""
+"""Correction of a frame for vignetting and depth bias, with the timing of the shutter."""
 
 import json
 from bisect import bisect_right

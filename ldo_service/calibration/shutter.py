@@ -14,10 +14,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ldo_service.geometry import Camera, RgbdFrame
+from ldo_service.geometry import Camera, RgbdFrame, se3
 
 # Pixels per cell of the grid on which the image motion is computed; it is smooth between them.
 CELL_PX = 8
+# Shortest interval between two frames from which a velocity is computed: 100 Hz.
+MIN_INTERVAL_S = 0.01
+# Fastest motion of a camera: 570 degrees/s, of which a rolling shutter leaves no image.
+MAX_RAD_PER_S, MAX_M_PER_S = 10.0, 10.0
 MAX_ROW_SHIFT = 0.5  # Image motion in rows per row of the readout; the image would fold beyond 1.
 
 
@@ -66,6 +70,21 @@ class FrameMotion:
     velocity: np.ndarray
     timing: ShutterTiming
 
+    @staticmethod
+    def between(
+        T_before: np.ndarray, T_after: np.ndarray, interval_s: float, timing: ShutterTiming
+    ) -> "FrameMotion | None":
+        """Return the mean motion between two camera poses [4, 4]; None if it is implausible.
+
+        A wrong stamp or a jump of the pose would give a velocity that no camera has.
+        """
+        if interval_s < MIN_INTERVAL_S:
+            return None
+        velocity = se3.log(se3.inverse(T_before) @ T_after) / interval_s
+        is_slow = np.linalg.norm(velocity[:3]) < MAX_RAD_PER_S
+        is_slow &= np.linalg.norm(velocity[3:]) < MAX_M_PER_S
+        return FrameMotion(velocity, timing) if is_slow else None
+
     def pack(self) -> dict[str, Any]:
         """Return the motion as arrays and plain values."""
         return {"velocity": self.velocity, "timing": self.timing.pack()}
@@ -101,7 +120,13 @@ class FrameMotion:
             return u + _enlarged(shift_px[0], size), v + _enlarged(shift_px[1], size)
 
         color_s = _row_times_s(flow[1], self.timing.readout_s, 0.0, camera)
-        moved = cv2.remap(image, *place(flow * color_s), cv2.INTER_LINEAR)
+        color_place = place(flow * color_s)
+        moved = cv2.remap(image, *color_place, cv2.INTER_LINEAR)
+        # A pixel that mixes with an invalid one, which is black, is invalid.
+        is_valid = (image if image.ndim == 2 else image.max(axis=2)) > 0
+        if not is_valid.all():
+            share = cv2.remap(is_valid.astype(np.uint8) * 255, *color_place, cv2.INTER_LINEAR)
+            moved[share < 255] = 0
         timing = self.timing
         depth_s = _row_times_s(flow[1], timing.depth_readout_s, timing.depth_delay_s, camera)
         nearest = cv2.remap(depth_m, *place(flow * depth_s), cv2.INTER_NEAREST)

@@ -10,7 +10,7 @@ from ldo_service.calibration.correction import CorrectionHistory
 from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.errors import DataError
 from ldo_service.gaussians.exposure import Exposure
-from ldo_service.geometry import Trajectory, se3
+from ldo_service.geometry import Trajectory
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.semantics.semantics_file import SavedSemantics
 
@@ -19,7 +19,7 @@ from .loops import FoundLoops
 # Stamps that differ less are equal: float64 seconds cannot represent the nanoseconds of the files.
 STAMP_TOLERANCE_S = 1e-6
 # Maximum time from the frame before to the frame after one whose motion they tell.
-MAX_MOTION_INTERVAL_S = 0.2
+MAX_MOTION_INTERVAL_S = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +131,10 @@ class PosedMap:
         if not 0 < index < len(stamps_s) - 1:
             return None
         interval_s = float(stamps_s[index + 1] - stamps_s[index - 1])
-        if not 0 < interval_s <= MAX_MOTION_INTERVAL_S:
+        if interval_s > MAX_MOTION_INTERVAL_S:
             return None
         before, after = self.trajectory.T_world_camera[[index - 1, index + 1]]
-        return FrameMotion(se3.log(se3.inverse(before) @ after) / interval_s, timing)
+        return FrameMotion.between(before, after, interval_s, timing)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

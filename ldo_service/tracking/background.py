@@ -52,8 +52,8 @@ def with_foreground(
     oldest_first = sorted(np.flatnonzero(is_near).tolist(), key=lambda i: records[i].id)
     noise, mask = config.align.residuals.noise, np.zeros_like(known)
     for i in oldest_first[:MAX_RECORDS]:
-        older = records[i].keyframe(config.pyramid).view
-        mask |= foreground_mask(
-            view, older, T_keyframe_camera[i], tracked.depth_noise_scale, config.moving, noise
-        )
+        older, T = records[i].keyframe(config.pyramid).view, T_keyframe_camera[i]
+        scale = tracked.depth_noise_scale
+        found = foreground_mask(view, older, T, scale, config.moving, noise, known)
+        mask |= mask if found is None else found
     return replace(tracked, dynamic_mask=known | grow_mask(mask, view, config.moving))

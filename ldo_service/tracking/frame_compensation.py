@@ -5,7 +5,9 @@ Conventions: `ldo_service.geometry`.
 
 from dataclasses import replace
 
-from ldo_service.calibration.shutter import FrameMotion
+import numpy as np
+
+from ldo_service.calibration.shutter import FrameMotion, ShutterTiming, displacement_rad
 from ldo_service.geometry import RgbdFrame, se3
 
 from .keyframes import ReferenceKeyframe
@@ -17,9 +19,13 @@ from .shutter_timing import band_equations
 from .state import OdometryState
 from .tracking_quality import TrackingStatus
 
+# Timing by which the velocity of a frame is judged.
+TEN_MS = ShutterTiming(depth_delay_s=0.01)
+MAX_DYNAMIC_RATIO = 0.01  # Fraction of the pixels that may move in a frame that is evidence.
+
 
 class FrameCompensator:
-    """Compensation of the motion during each frame, without state from one frame to the next."""
+    """Pyramid of the current frame; nothing but a cache is kept from one frame to the next."""
 
     def __init__(self, config: OdometryConfig, guesses: InitialGuessAligner) -> None:
         self.config = config
@@ -61,26 +67,48 @@ class FrameCompensator:
         Returns:
             The pose of the compensated frame, and the next state of the compensation.
         """
-        config = self.config.shutter
-        if not config.is_on or state.status is TrackingStatus.LOST:
-            self.motion = None
-            return candidate, state.shutter.interrupted()
-        T_odom_camera = keyframe.T_odom_keyframe @ candidate.alignment.T_reference_camera
-        shutter, is_ok = state.shutter, status is TrackingStatus.OK
+        config, shutter = self.config.shutter, state.shutter
+        is_jump = state.status is TrackingStatus.LOST or candidate.pose_source == "relocalized"
+        if not config.is_on or is_jump:
+            return candidate, self._interrupted(frame, shutter)
+        is_ok = status is TrackingStatus.OK
         if not is_ok:
             shutter = replace(shutter, pending=None)
-        shutter, motion = shutter.moved(state.motion, T_odom_camera, frame.stamp_ns, config)
+        moved, motion = self._moved(shutter, frame, keyframe, candidate, state)
         if motion is None:
-            return candidate, shutter
+            return candidate, self._interrupted(frame, moved)
         focal_ratio, depth_m = frame.camera.fx / frame.camera.width, candidate.median_depth_m
         if needs_realignment(self.motion, motion, depth_m, focal_ratio, config):
+            before = self._view, self.motion
             view = self._compensated(frame, motion)
-            candidate = self.guesses.align_again(keyframe, view, candidate)
+            again = self.guesses.align_again(keyframe, view, candidate)
+            if _is_worse(again, candidate):
+                self._view, self.motion = before
+            else:
+                candidate = again
+                moved = self._moved(shutter, frame, keyframe, candidate, state)[0]
         elif self.motion is None:
             self.motion = motion  # Too slow to matter.
-        if is_ok:
-            shutter = self._with_pending(shutter, frame, keyframe, candidate)
-        return candidate, shutter
+        if is_ok and not _is_dynamic(state):
+            moved = self._with_pending(moved, frame, keyframe, candidate)
+        return candidate, moved
+
+    def _moved(
+        self,
+        shutter: ShutterState,
+        frame: RgbdFrame,
+        keyframe: ReferenceKeyframe,
+        candidate: PoseHypothesis,
+        state: OdometryState,
+    ) -> tuple[ShutterState, FrameMotion | None]:
+        T_odom_camera = keyframe.T_odom_keyframe @ candidate.alignment.T_reference_camera
+        return shutter.moved(state.motion, T_odom_camera, frame.stamp_ns, self.config.shutter)
+
+    def _interrupted(self, frame: RgbdFrame, shutter: ShutterState) -> ShutterState:
+        """Compensate nothing in a frame whose motion is unknown."""
+        if self.motion is not None:
+            self._compensated(frame, None)
+        return shutter.interrupted()
 
     def forget(self) -> None:
         """Drop the last frame."""
@@ -100,8 +128,12 @@ class FrameCompensator:
     ) -> ShutterState:
         """Add the equations of a frame for the times of the shutter, while they are estimated."""
         velocity_there, motion = shutter.reference_velocity, self.motion
-        is_due = shutter.evidence.count < self.config.shutter.max_frames
-        if not is_due or velocity_there is None or keyframe.motion is None or motion is None:
+        if velocity_there is None or keyframe.motion is None or motion is None:
+            return shutter
+        config = self.config.shutter
+        speed_rad = displacement_rad(motion.velocity, TEN_MS, candidate.median_depth_m)
+        is_due = shutter.evidence.count < config.max_frames and speed_rad > config.min_motion_rad
+        if not is_due or keyframe.view.camera != frame.camera:
             return shutter
         equations = band_equations(
             keyframe.reference,
@@ -113,4 +145,19 @@ class FrameCompensator:
             motion,
             velocity_there,
         )
-        return replace(shutter, pending=equations)
+        return replace(shutter, pending=equations if len(equations.rows) else None)
+
+
+def _is_worse(again: PoseHypothesis, before: PoseHypothesis) -> bool:
+    """Return whether a frame that was aligned again has clearly less overlap or more noise."""
+    a, b = again.alignment, before.alignment
+    return (
+        a.overlap < 0.8 * b.overlap
+        or a.intensity_sigma > 1.5 * b.intensity_sigma
+        or a.depth_noise_scale > 1.5 * b.depth_noise_scale
+    )
+
+
+def _is_dynamic(state: OdometryState) -> bool:
+    """Return whether something moved in the last frame; its points would be false evidence."""
+    return state.dynamic_mask is not None and bool(np.mean(state.dynamic_mask) > MAX_DYNAMIC_RATIO)

@@ -138,6 +138,7 @@ class FrameTracker:
             dynamic_mask=None,
             motion_evidence=None,
             dead_reckoning_start=self._prior and DeadReckoningStart(T_odom_camera, self._prior),
+            shutter=self.state.shutter.interrupted(),
         )
 
     def relocalize_in(

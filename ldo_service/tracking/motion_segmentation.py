@@ -22,6 +22,8 @@ from ldo_service.geometry import Camera, se3
 
 from .pyramid import DepthNoise, Level, Pyramid
 
+# Largest median depth difference of a keyframe with a right pose, fraction of the limit.
+MAX_MEDIAN_RATIO = 1.0
 NOTHING_M = 1e4  # Depth of an unmeasured pixel in the computation of minima, meters.
 
 
@@ -213,7 +215,8 @@ def foreground_mask(
     noise_scale: float,
     config: MotionSegmentationConfig,
     noise: DepthNoise,
-) -> np.ndarray:
+    dynamic_mask: np.ndarray,
+) -> np.ndarray | None:
     """Return the pixels of a frame in front of the surface that a keyframe measured.
 
     Args:
@@ -223,14 +226,20 @@ def foreground_mask(
         noise_scale: Factor on the depth noise, as estimated by alignment.
         config: Settings.
         noise: Depth noise of the camera.
+        dynamic_mask: Dynamic pixels of the frame, [H, W] bool at working resolution.
 
     Returns:
-        [H, W] bool at working resolution.
+        [H, W] bool at working resolution; None if the median of the other pixels does not agree
+        with the keyframe, because its pose is wrong or it shows another surface.
     """
     now, then = _level(view, config), _level(keyframe, config)
     pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)
     ahead_m = depth_gap_m(now, then, T_keyframe_camera, config)
-    pieces = _in_pieces(ahead_m > pair.limit_m(now), None, config)
+    limit_m = pair.limit_m(now)
+    still = ~resized(dynamic_mask, ahead_m.shape) & np.isfinite(ahead_m)
+    if not still.any() or np.median(np.abs(ahead_m[still]) / limit_m[still]) > MAX_MEDIAN_RATIO:
+        return None
+    pieces = _in_pieces(ahead_m > limit_m, None, config)
     return resized(pieces, view.levels[0].depth_m.shape)
 
 

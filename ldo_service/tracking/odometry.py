@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.calibration.correction import CorrectionChange
+from ldo_service.calibration.shutter import ShutterTiming
 from ldo_service.detection.dynamic_classes import Box
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
@@ -118,15 +119,13 @@ class Odometry:
             needed, reused, known = None, known.record.id, None
         # Make a keyframe with its relative-pose measurements; it may merge two submaps.
         keyframe = None
+        view, state = self._frames.view(frame), self._frames.state
+        if needed is not None:
+            tracked = with_foreground(tracked, view, state.database, self.config)
         if needed is not None and may_map:
-            database, view = self._frames.state.database, self._frames.view(frame)
-            tracked = with_foreground(tracked, view, database, self.config)
             keyframe = self._make_keyframe(frame, tracked, needed, known)
         elif needed is KeyframeKind.REFERENCE and self._has_left_keyframe(tracked):
-            view, T_odom_camera = self._frames.view(frame), tracked.T_odom_camera
-            self._frames.state = self._frames.state.with_relay(
-                view, T_odom_camera, tracked.relay(), tracked.dynamic_mask, self._frames.motion
-            )
+            self._frames.state = state.with_relay(view, tracked, self._frames.motion)
         # Return T_map_odom of the reference with the pose.
         reference = tracked.reference
         if reference is None and keyframe is not None:
@@ -189,9 +188,10 @@ class Odometry:
         keyframe = self._frames.state.keyframe
         return None if keyframe is None else keyframe.id
 
-    def metrics(self) -> dict[str, float]:
-        """Return the times of the camera's shutter that are compensated, ms."""
-        return self._frames.state.shutter.timing.metrics()
+    @property
+    def timing(self) -> ShutterTiming:
+        """Timing of the camera's shutter that is compensated."""
+        return self._frames.state.shutter.timing
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state that the next results depend on, except for the last correction.

@@ -13,7 +13,6 @@ import numpy as np
 
 from ldo_service.calibration.shutter import FrameMotion, ShutterTiming, displacement_rad
 from ldo_service.errors import ConfigError, named
-from ldo_service.geometry import se3
 
 from .motion import ConstantVelocity
 from .shutter_timing import BandEquations, TimingEvidence
@@ -31,33 +30,36 @@ class ShutterConfig:
     initial: ShutterTiming = field(default_factory=ShutterTiming)
     # Maximum interval between two frames whose mean velocity is used. A hand shakes with periods of
     # 0.2 s.
-    max_interval_s: float = 0.1
+    max_interval_s: float = 0.15
     # The times are compensated if one of them exceeds this multiple of its standard deviation, and
     # min_s. Below min_s, a turn of 60 degrees/s moves the image by less than 1.7 of 640 pixels.
     sigmas: float = 4.0
-    # Fraction of the residuals that count as independent: see `AlignConfig`.
-    independent_fraction: float = 2e-3
     min_s: float = 0.003
     max_s: float = 0.05  # Larger estimates are not believed: a frame lasts 33 ms.
+    # Largest standard deviation of a time. All times are compensated together, the uncertain ones
+    # too.
+    max_sigma_s: float = 0.015
     update_frames: int = 3  # Measurements from one estimate to the next.
     # Change of a time beyond which the evidence before it counts less: its equations are linear
     # approximations, and give too small times for large displacements.
     relinearized_s: float = 0.004
     max_frames: int = 300  # Measurements after which the estimate is final.
+    # Least velocity of a measurement: image motion in 10 ms, rad. Slower frames tell nothing.
+    min_motion_rad: float = 0.003
     # Change of the expected velocity by the measured pose beyond which the frame is compensated and
     # aligned again: largest displacement of the image, fraction of the image width.
-    realign_ratio: float = 0.3 / 640
+    realign_ratio: float = 0.75 / 640
 
     def __post_init__(self) -> None:
         if min(self.update_frames, self.max_frames) < 1:
             raise ConfigError(named(self, "update_frames", "max_frames") + " must be at least 1.")
-        if not min(self.max_interval_s, self.sigmas, self.max_s, self.realign_ratio) > 0:
+        positive = "max_interval_s", "sigmas", "max_s", "max_sigma_s", "realign_ratio"
+        if not min(getattr(self, name) for name in positive) > 0:
+            raise ConfigError(named(self, *positive) + " must be positive.")
+        if not min(self.min_s, self.relinearized_s, self.min_motion_rad) >= 0:
             raise ConfigError(
-                named(self, "max_interval_s", "sigmas", "max_s", "realign_ratio")
-                + " must be positive."
+                named(self, "min_s", "relinearized_s", "min_motion_rad") + " must be at least 0."
             )
-        if not self.min_s >= 0:
-            raise ConfigError(named(self, "min_s") + " must be at least 0.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -106,17 +108,18 @@ class ShutterState:
         interval_s = _interval_s(before, stamp_ns, config)
         if interval_s is None:
             return self.interrupted(), None
-        mean = se3.log(se3.inverse(before.T_odom_camera) @ T_odom_camera) / interval_s
-        earlier, state = self.mean_velocity, self
+        motion = FrameMotion.between(before.T_odom_camera, T_odom_camera, interval_s, self.timing)
+        if motion is None:
+            return self.interrupted(), None
+        mean, earlier, state = motion.velocity, self.mean_velocity, self
         if earlier is not None:
             at_last_frame = 0.5 * (mean + earlier)
             if self.pending is not None:
                 state = self._with_equations(self.pending.timing_equations(at_last_frame), config)
             if self.has_new_reference:
                 state = replace(state, reference_velocity=at_last_frame)
-        return replace(
-            state, mean_velocity=mean, has_new_reference=False, pending=None
-        ), FrameMotion(mean, self.timing)
+        state = replace(state, mean_velocity=mean, has_new_reference=False, pending=None)
+        return state, motion
 
     def interrupted(self) -> "ShutterState":
         """Return the state after a frame whose motion is unknown."""
@@ -190,15 +193,16 @@ def _updated(
 ) -> ShutterTiming:
     """Return the times that are compensated from now on.
 
-    All times are replaced by their estimates if one is significant: color and depth would no longer
-    fit each other if one of them was compensated alone. Otherwise they stay.
+    All times are replaced by their estimates if one is significant and none is uncertain. If one of
+    color and depth was compensated alone, they would no longer fit each other. Otherwise, the times
+    stay.
     """
-    found = evidence.estimate(config.independent_fraction)
+    found = evidence.estimate()
     if found is None:
         return timing
     times_s, sigmas_s = found
     is_significant = np.abs(times_s) > np.maximum(config.sigmas * sigmas_s, config.min_s)
-    is_possible = np.abs(times_s) < config.max_s
+    is_possible = (np.abs(times_s) < config.max_s) & (sigmas_s < config.max_sigma_s)
     if not (is_significant.any() and is_possible.all()):
         return timing
     return ShutterTiming(*times_s.tolist())

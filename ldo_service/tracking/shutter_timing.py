@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.calibration.shutter import FrameMotion, ShutterTiming
+from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.geometry import se3
 
 from .alignment import BRIGHTNESS_PRIOR, POSE, BrightnessModel, ResidualConfig, normal_equations
@@ -33,6 +33,7 @@ MIN_BAND_POINTS = 50  # Points; a band with fewer is left out.
 # Noise of the equations as a multiple of that of alignment. The rows far from the middle tell the
 # readout, and are outliers of the alignment as long as the readout is not compensated.
 NOISE_RATIO = 3.0
+INDEPENDENT_FRACTION = 2e-3  # Of the residuals; see `AlignConfig.independent_fraction`.
 # Noise that removes one kind of residuals from the normal equations: gray levels, or a multiple of
 # `DepthNoise`.
 NO_WEIGHT = 1e5
@@ -94,8 +95,8 @@ class BandEquations:
             )
             for is_color, hessian, gradient in zip((True, False), hessians, gradients, strict=True):
                 done = np.zeros(8)
-                done[POSE] = _compensated(self.at_frame, here, is_color=is_color)
-                done[POSE] -= _compensated(used_there, there, is_color=is_color)
+                done[POSE] = _row_twist(self.at_frame, here, is_color=is_color)
+                done[POSE] -= _row_twist(used_there, there, is_color=is_color)
                 J = np.eye(11, 8)
                 J[SHARED, POSE] = (
                     (by_readout, nothing, nothing) if is_color else (nothing, by_readout, by_delay)
@@ -188,20 +189,17 @@ class TimingEvidence:
                 groups, size = [*groups, last], 2 * size
         return TimingEvidence(tuple(groups), size, in_last + 1, self.count + 1)
 
-    def estimate(self, independent_fraction: float) -> tuple[np.ndarray, np.ndarray] | None:
+    def estimate(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the times [3] of the shutter in seconds, and their standard deviations [3].
 
         A prior holds times that the frames do not tell near 0. The standard deviations combine two
         estimates: a jackknife over the groups, because the errors of neighboring frames are alike,
         and the information of the equations, because a jackknife over few groups may be small by
         chance. The result is None if there are too few groups.
-
-        Args:
-            independent_fraction: Fraction of the residuals that are independent.
         """
         if len(self.groups) < MIN_GROUPS:
             return None
-        groups = np.array(self.groups) * (independent_fraction * NOISE_RATIO**2)
+        groups = np.array(self.groups) * (INDEPENDENT_FRACTION * NOISE_RATIO**2)
         total = groups.sum(axis=0)
         parts = np.array([_solved(total - group) for group in groups])
         jackknife = (len(parts) - 1) * np.var(parts, axis=0)
@@ -229,9 +227,9 @@ class TimingEvidence:
         )
 
 
-def _compensated(motion: FrameMotion, row: float, *, is_color: bool) -> np.ndarray:
+def _row_twist(motion: FrameMotion, row: float, *, is_color: bool) -> np.ndarray:
     """Return the twist [6] by which a row, -0.5..0.5, of color or depth was moved."""
-    timing: ShutterTiming = motion.timing
+    timing = motion.timing
     if is_color:
         return timing.readout_s * row * motion.velocity
     return (timing.depth_readout_s * row + timing.depth_delay_s) * motion.velocity

@@ -15,7 +15,6 @@ from .keyframe_database import KeyframeDatabase, KeyframeDatabaseConfig, Keyfram
 from .keyframes import (
     KeyframeConfig,
     ReferenceKeyframe,
-    Relay,
     needs_keyframe,
     needs_mapping_keyframe,
 )
@@ -26,7 +25,7 @@ from .pyramid import Pyramid, PyramidConfig
 from .shutter import ShutterState
 from .submaps import Submaps
 from .tracking_quality import ResidualHistory, TrackingStatus
-from .tracking_result import KeyframeKind
+from .tracking_result import KeyframeKind, TrackedFrame
 
 
 class KeyframeOrigin(StrEnum):
@@ -145,31 +144,24 @@ class OdometryState:
         )
 
     def with_relay(
-        self,
-        view: Pyramid,
-        T_odom_camera: np.ndarray,
-        relay: Relay,
-        ignore_mask: np.ndarray | None,
-        motion: FrameMotion | None,
+        self, view: Pyramid, tracked: TrackedFrame, motion: FrameMotion | None
     ) -> "OdometryState":
         """Return the state with the frame just tracked as a reference that is no keyframe.
 
         Args:
             view: Pyramid of the frame.
-            T_odom_camera: Pose of the frame, [4, 4].
-            relay: Pose of the frame relative to the last keyframe.
-            ignore_mask: Dynamic pixels of the frame, [H, W] bool at working resolution.
+            tracked: Pose and dynamic mask of the frame.
             motion: Motion of the camera during the frame; None if unknown.
         """
         assert self.keyframe is not None
         reference = ReferenceKeyframe(
             replace(view, depth_m=view.depth_m.copy()),  # A camera may reuse its buffer.
-            T_odom_camera,
+            tracked.T_odom_camera,
             self.keyframe.id,
             self.keyframe.submap,
             moved_mask=self.dynamic_mask,
-            ignore_mask=ignore_mask,
-            relay=relay,
+            ignore_mask=tracked.dynamic_mask,
+            relay=tracked.relay(),
             motion=motion,
         )
         evidence = self.motion_evidence and self.motion_evidence.of_new_keyframe()

@@ -4,9 +4,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ldo_service.calibration.correction import CameraCorrection, CorrectionHistory
+from ldo_service.calibration.shutter import ShutterTiming
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.errors import DataError
-from ldo_service.evaluation.finished_run import FinishedRun, FrameCounts, RunFrame, at_stamps
+from ldo_service.evaluation.finished_run import (
+    Exposures,
+    FinishedRun,
+    FrameCounts,
+    PosedMap,
+    RunFrame,
+    at_stamps,
+)
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import read_run
 
@@ -50,3 +59,30 @@ def test_counts_leave_out_frames_without_a_pose_in_the_map() -> None:
     run = FinishedRun(Path("run"), frames, {"final": posed}, ())
     assert run.counts() == FrameCounts(frames=5, with_pose=3, ok=2)
     assert str(run.counts()).startswith("3 of 5 frames have a pose (60.0%). Of these, 2 have")
+
+
+def moving_map(timing: ShutterTiming, jump_m: float = 0.0) -> PosedMap:
+    """Return a map whose camera moves by 1 cm along x per frame at 30 Hz."""
+    T = np.tile(np.eye(4), (5, 1, 1))
+    T[:, 0, 3] = 0.01 * np.arange(5)
+    T[3:, 0, 3] += jump_m
+    corrections = CorrectionHistory((0,), (CameraCorrection(timing=timing),))
+    trajectory = Trajectory(np.arange(5) / 30, T)
+    empty = Exposures(np.zeros(0, np.int64), np.zeros((0, 2, 3)))
+    return PosedMap("online", np.zeros((0, 16)), trajectory, empty, corrections=corrections)
+
+
+def test_motion_of_a_frame_comes_from_its_neighbors() -> None:
+    timing = ShutterTiming(0.02)
+    motion = moving_map(timing).motion(RunFrame(2, round(1e9 * 2 / 30), "OK", True))
+    assert motion is not None
+    assert motion.timing == timing
+    assert motion.velocity == pytest.approx([0, 0, 0, 0.3, 0, 0])
+
+
+def test_motion_is_unknown_at_the_end_without_timing_and_at_a_jump() -> None:
+    timing = ShutterTiming(0.02)
+    last, middle = (RunFrame(i, round(1e9 * i / 30), "OK", True) for i in (4, 2))
+    assert moving_map(timing).motion(last) is None
+    assert moving_map(ShutterTiming()).motion(middle) is None
+    assert moving_map(timing, jump_m=2.0).motion(middle) is None
