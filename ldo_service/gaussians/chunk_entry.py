@@ -1,4 +1,4 @@
-"""In-memory records of the chunks whose Gaussians are on disk or lost."""
+"""Memory-resident records of the chunks whose Gaussians are on disk or lost."""
 
 from dataclasses import dataclass, replace
 

@@ -33,7 +33,7 @@ MIN_BAND_POINTS = 50  # Points; a band with fewer is left out.
 # Noise of the equations as a multiple of that of alignment. The rows far from the middle tell the
 # readout, and are outliers of the alignment as long as the readout is not compensated.
 NOISE_RATIO = 3.0
-INDEPENDENT_FRACTION = 2e-3  # Of the residuals; see `AlignConfig.independent_fraction`.
+INDEPENDENT_FRACTION = 2e-3  # See `AlignConfig.independent_fraction`.
 # Noise that removes one kind of residuals from the normal equations: gray levels, or a multiple of
 # `DepthNoise`.
 NO_WEIGHT = 1e5
