@@ -227,7 +227,7 @@ def test_known_calibration_is_used_from_the_first_frame_on_and_stays_if_it_fits(
     assert not calibration.is_undecided
     seen = [measured(frame, TRUE) for frame in frames]
     changes = changes_of(calibration, seen, poses(room))
-    assert len(changes) <= 1  # From the largest number of views.
+    assert len(changes) <= 1  # It uses the largest number of views.
     assert np.allclose(calibration.correction.depth_bias, TRUE.depth_bias, atol=0.003)
 
 
