@@ -89,7 +89,7 @@ def _why_not_connected(network: Endpoint) -> str:
         )
     return (
         f"no service replies on {network.endpoint}: start `ldo serve`, "
-        "or give the address of a running service with --endpoint."
+        "or give the address of a running service: --endpoint, or connect(robot, endpoint)."
     )
 
 
