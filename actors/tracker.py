@@ -26,6 +26,7 @@ import numpy as np
 
 from ldo_service.calibration.correction import CameraCorrection, read_corrections
 from ldo_service.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
+from ldo_service.calibration.shutter import ShutterTiming
 from ldo_service.conversions.frames import (
     frame_from_message,
     keyframe_measurements_message,
@@ -154,6 +155,7 @@ class Tracker(Actor):
         self._T_base_camera = self.config.T_base_camera.matrix()
         self._odometry = _make_odometry(self.config, self._T_base_camera)
         self._calibration = _make_calibration(self.config)
+        self._timing = ShutterTiming()  # Timing of the shutter at the last frame.
         self._correction = b""  # The last correction, encoded.
         self._prior = OdometryPriorBuffer()
         # Numbers of keyframes that were made, not made for lack of credit, and reused.
@@ -193,8 +195,11 @@ class Tracker(Actor):
         hold_out = self.config.hold_out
         is_held_out = hold_out > 0 and frame.index % hold_out == hold_out - 1
         may_map = not is_held_out and self.has_credit(KEYFRAME_NEW)
-        self._odometry.expect_bias(self._calibration.is_undecided)
-        result = self._odometry.process(frame, self._prior, may_map=may_map)
+        may_be_biased = self._calibration.is_undecided
+        result = self._odometry.process(
+            frame, self._prior, may_map=may_map, may_be_biased=may_be_biased
+        )
+        self._timing = result.timing
         self._count(frame, result, is_held_out)
         is_lost = result.status is TrackingStatus.LOST
         T_odom_camera, motion = None if is_lost else result.T_odom_camera, result.motion
@@ -207,7 +212,7 @@ class Tracker(Actor):
             mapped = correction.applied(raw, keeps_clipped=False)
             if motion is not None:
                 mapped = motion.compensated(mapped)
-            correction = replace(correction, timing=self._odometry.timing)
+            correction = replace(correction, timing=result.timing)
             keyframe = keyframe_message(mapped, result, result.keyframe, correction)
             yield keyframe
             yield keyframe_measurements_message(keyframe)
@@ -314,7 +319,7 @@ class Tracker(Actor):
             "prior_rejected": refused,
             "prior_restarts": restarts,
             **self._calibration.metrics(),
-            **self._odometry.timing.metrics(),
+            **self._timing.metrics(),
         }
 
 

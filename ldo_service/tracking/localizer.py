@@ -104,6 +104,7 @@ class Localizer(Odometry):
         prior: OdometryPriorBuffer | None = None,
         *,
         may_map: bool = True,  # noqa: ARG002
+        may_be_biased: bool = False,
     ) -> TrackingResult:
         """Track a frame and localize it in the map.
 
@@ -111,6 +112,7 @@ class Localizer(Odometry):
             frame: The frame.
             prior: The last poses of another odometry, such as wheels.
             may_map: Unused, since nothing is mapped.
+            may_be_biased: True if depth may have a smooth bias that is not corrected.
 
         Returns:
             The pose of the frame in odometry and in the map. The status is LOST until the camera is
@@ -118,6 +120,7 @@ class Localizer(Odometry):
         """
         # Track the frame in odometry, against keyframes that are not in the map.
         reading = self._read(prior, frame)
+        self._frames.expect_bias(may_be_biased)
         tracked = self._frames.track(frame, reading)
         if tracked.should_start_submap:
             tracked = self._frames.start_submap(frame)
@@ -137,6 +140,8 @@ class Localizer(Odometry):
             submap=0,
             reference=None,
             has_prior=reading is not None,
+            motion=self._frames.motion,
+            timing=self._frames.state.shutter.timing,
         )
 
     def snapshot(self) -> dict[str, Any]:

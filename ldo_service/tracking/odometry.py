@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 
 from ldo_service.calibration.correction import CorrectionChange
-from ldo_service.calibration.shutter import ShutterTiming
 from ldo_service.detection.dynamic_classes import Box
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
@@ -84,7 +83,12 @@ class Odometry:
         self._earlier = RecentKeyframeCache(self.config.pyramid)
 
     def process(
-        self, frame: RgbdFrame, prior: OdometryPriorBuffer | None = None, *, may_map: bool = True
+        self,
+        frame: RgbdFrame,
+        prior: OdometryPriorBuffer | None = None,
+        *,
+        may_map: bool = True,
+        may_be_biased: bool = False,
     ) -> TrackingResult:
         """Track a frame, and make a keyframe of it if one is needed.
 
@@ -96,12 +100,14 @@ class Odometry:
                 images: a frame is OK only if its images confirm the pose.
             may_map: True allows a new keyframe or submap. If it is False and a keyframe is needed,
                 `TrackingResult.denied_keyframe` names the kind of keyframe.
+            may_be_biased: True if depth may have a smooth bias that is not corrected.
 
         Returns:
             The pose of the frame, and the keyframe that was made of it, if any.
         """
         # Track against the reference keyframe; relocalization may find another reference.
         reading = self._read(prior, frame)
+        self._frames.expect_bias(may_be_biased)
         tracked = self._frames.track(frame, reading)
         if tracked.pose_source == "relocalized" and tracked.reference not in self._map:
             self._map.place_reference(tracked)
@@ -139,6 +145,7 @@ class Odometry:
             reference,
             has_prior=reading is not None,
             motion=self._frames.motion,
+            timing=self._frames.state.shutter.timing,
             keyframe=keyframe,
             reused_keyframe=reused,
             denied_keyframe=denied,
@@ -157,10 +164,6 @@ class Odometry:
         """Convert all keyframes to the camera correction of the next frames; their poses stay."""
         state = self._frames.state
         self._frames.restore(state.recorrected(change, self.config.pyramid))
-
-    def expect_bias(self, is_expected: bool) -> None:
-        """Set whether the depth of the next frames may have a smooth bias that is not corrected."""
-        self._frames.expect_bias(is_expected)
 
     def mask_dynamic_objects(self, keyframe: int, boxes: Sequence[Box]) -> None:
         """Mask objects of dynamic classes in the reference keyframe and in its record.
@@ -187,11 +190,6 @@ class Odometry:
         """Id of the reference keyframe of the next frame; None before the first keyframe."""
         keyframe = self._frames.state.keyframe
         return None if keyframe is None else keyframe.id
-
-    @property
-    def timing(self) -> ShutterTiming:
-        """Timing of the camera's shutter that is compensated."""
-        return self._frames.state.shutter.timing
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state that the next results depend on, except for the last correction.

@@ -37,7 +37,8 @@ INDEPENDENT_FRACTION = 2e-3  # See `AlignConfig.independent_fraction`.
 # Noise that removes one kind of residuals from the normal equations: gray levels, or a multiple of
 # `DepthNoise`.
 NO_WEIGHT = 1e5
-PRIOR = np.eye(3) / 0.02**2  # Information of a prior with a standard deviation of 20 ms.
+# Information of a prior: readouts of 0 to 20 ms and delays of 0 to 10 ms are usual.
+PRIOR = np.diag([0.02**-2, 0.02**-2, 0.01**-2])
 MIN_GROUPS, MAX_GROUPS = 12, 24  # Groups of the jackknife; two are merged beyond the maximum.
 
 

@@ -53,8 +53,8 @@ def tracked(
     for index in range(min(count, len(sequence))):
         raw = sequence[index]
         start_s = time.process_time()
-        odometry.expect_bias(calibration.is_undecided)
-        tracked = odometry.process(result.calibration.correction.applied(raw))
+        corrected = result.calibration.correction.applied(raw)
+        tracked = odometry.process(corrected, may_be_biased=calibration.is_undecided)
         middle_s = time.process_time()
         T_odom_camera = None if tracked.status == "LOST" else tracked.T_odom_camera
         change = result.calibration.observe(raw, T_odom_camera, tracked.motion)
