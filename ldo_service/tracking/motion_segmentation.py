@@ -22,8 +22,9 @@ from ldo_service.geometry import Camera, se3
 
 from .pyramid import DepthNoise, Level, Pyramid
 
-# Largest median depth difference of a keyframe with a right pose, fraction of the limit.
-MAX_MEDIAN_RATIO = 1.0
+# Least fraction of the pixels without motion that agree with a keyframe whose pose is right. The
+# others may show people who stand still.
+MIN_AGREEING_RATIO = 0.3
 NOTHING_M = 1e4  # Depth of an unmeasured pixel in the computation of minima, meters.
 
 
@@ -229,15 +230,15 @@ def foreground_mask(
         dynamic_mask: Dynamic pixels of the frame, [H, W] bool at working resolution.
 
     Returns:
-        [H, W] bool at working resolution; None if the median of the other pixels does not agree
-        with the keyframe, because its pose is wrong or it shows another surface.
+        [H, W] bool at working resolution; None if too few of the other pixels agree with the
+        keyframe, because its pose is wrong or it shows another surface.
     """
     now, then = _level(view, config), _level(keyframe, config)
     pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)
     ahead_m = depth_gap_m(now, then, T_keyframe_camera, config)
     limit_m = pair.limit_m(now)
     still = ~resized(dynamic_mask, ahead_m.shape) & np.isfinite(ahead_m)
-    if not still.any() or np.median(np.abs(ahead_m[still]) / limit_m[still]) > MAX_MEDIAN_RATIO:
+    if not still.any() or np.mean(np.abs(ahead_m) < limit_m, where=still) < MIN_AGREEING_RATIO:
         return None
     pieces = _in_pieces(ahead_m > limit_m, None, config)
     return resized(pieces, view.levels[0].depth_m.shape)
