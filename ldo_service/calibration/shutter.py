@@ -144,9 +144,8 @@ class FrameMotion:
             camera: Camera of the image.
         """
         flow, _ = self._image_motion(depth_m, camera)
-        row_s = self.timing.readout_s / max(camera.height - 1, 1)
-        _, v = _cells(camera)
-        shift_px = flow * ((v - np.float32((camera.height - 1) / 2)) * np.float32(row_s))
+        # The time is that of the pixel's own row.
+        shift_px = flow * _row_times_s(np.float32(0.0), self.timing.readout_s, 0.0, camera)
         size = camera.width, camera.height
         grid_u, grid_v = _grid(camera)
         place = grid_u - _enlarged(shift_px[0], size), grid_v - _enlarged(shift_px[1], size)
@@ -172,7 +171,7 @@ class FrameMotion:
 
 
 def _row_times_s(
-    flow_v: np.ndarray, readout_s: float, delay_s: float, camera: Camera
+    flow_v: np.ndarray | np.float32, readout_s: float, delay_s: float, camera: Camera
 ) -> np.ndarray:
     """Return when the surface points of the cells were recorded, [h, w] seconds.
 
@@ -180,7 +179,7 @@ def _row_times_s(
     middle of the frame, and the row is recorded later in turn.
 
     Args:
-        flow_v: Image motion of the points in v, [h, w] pixels per second.
+        flow_v: Image motion of the points in v, [h, w] or scalar, pixels per second.
         readout_s: Time from the first to the last row.
         delay_s: Time of the middle row.
         camera: Camera of the image.

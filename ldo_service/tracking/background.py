@@ -12,14 +12,11 @@ from ldo_service.geometry import se3
 
 from .keyframe_database import KeyframeDatabase
 from .motion import image_motions_rad
-from .motion_segmentation import foreground_mask, grow_mask
+from .motion_segmentation import foreground_mask, grow_mask, shows_motion
 from .odometry_config import OdometryConfig
 from .pyramid import Pyramid
 from .tracking_result import TrackedFrame
 
-# Fraction of the pixels that must move before the foreground is masked. Without motion, what stands
-# in front of the background is a new object, and must be mapped.
-MIN_DYNAMIC_RATIO = 0.01
 # Older keyframes that are compared: those of the view before the motion began.
 MAX_RECORDS = 3
 # Image motion from an older keyframe to the frame, within which they share most of their view.
@@ -34,7 +31,8 @@ def with_foreground(
 ) -> TrackedFrame:
     """Add to the dynamic mask of a frame what stands in front of the background.
 
-    Without a moving object in the frame, the mask stays.
+    Without a moving object in the frame, the mask stays: what stands in front of the background is
+    then a new object, and must be mapped.
 
     Args:
         tracked: The frame, which becomes a keyframe.
@@ -43,7 +41,7 @@ def with_foreground(
         config: Settings.
     """
     known, records = tracked.dynamic_mask, database.in_submap(tracked.submap)
-    if known is None or np.mean(known) < MIN_DYNAMIC_RATIO or not records:
+    if known is None or not shows_motion(known) or not records:
         return tracked
     T_keyframe_odom = se3.inverse(np.array([record.T_odom_keyframe for record in records]))
     T_keyframe_camera = T_keyframe_odom @ tracked.T_odom_camera

@@ -5,12 +5,11 @@ Conventions: `ldo_service.geometry`.
 
 from dataclasses import replace
 
-import numpy as np
-
 from ldo_service.calibration.shutter import FrameMotion, ShutterTiming, displacement_rad
 from ldo_service.geometry import RgbdFrame, se3
 
 from .keyframes import ReferenceKeyframe
+from .motion_segmentation import shows_motion
 from .odometry_config import OdometryConfig
 from .pose_candidates import InitialGuessAligner, PoseHypothesis
 from .pyramid import Pyramid, pyramid_of
@@ -21,7 +20,9 @@ from .tracking_quality import TrackingStatus
 
 # Timing by which the velocity of a frame is judged.
 TEN_MS = ShutterTiming(depth_delay_s=0.01)
-MAX_DYNAMIC_RATIO = 0.01  # Fraction of the pixels that may move in a frame that is evidence.
+# A frame that is aligned again is worse below this ratio of the overlap before, or above this ratio
+# of the noise. A compensation with a right motion increases the overlap and lowers the noise.
+WORSE_OVERLAP, WORSE_NOISE = 0.8, 1.5
 
 
 class FrameCompensator:
@@ -89,7 +90,7 @@ class FrameCompensator:
                 moved = self._moved(shutter, frame, keyframe, candidate, state)[0]
         elif self.motion is None:
             self.motion = motion  # Too slow to matter.
-        if is_ok and not _is_dynamic(state):
+        if is_ok and not shows_motion(state.dynamic_mask):  # Moving points are false evidence.
             moved = self._with_pending(moved, frame, keyframe, candidate)
         return candidate, moved
 
@@ -152,12 +153,7 @@ def _is_worse(again: PoseHypothesis, before: PoseHypothesis) -> bool:
     """Return whether a frame that was aligned again has clearly less overlap or more noise."""
     a, b = again.alignment, before.alignment
     return (
-        a.overlap < 0.8 * b.overlap
-        or a.intensity_sigma > 1.5 * b.intensity_sigma
-        or a.depth_noise_scale > 1.5 * b.depth_noise_scale
+        a.overlap < WORSE_OVERLAP * b.overlap
+        or a.intensity_sigma > WORSE_NOISE * b.intensity_sigma
+        or a.depth_noise_scale > WORSE_NOISE * b.depth_noise_scale
     )
-
-
-def _is_dynamic(state: OdometryState) -> bool:
-    """Return whether something moved in the last frame; its points would be false evidence."""
-    return state.dynamic_mask is not None and bool(np.mean(state.dynamic_mask) > MAX_DYNAMIC_RATIO)

@@ -25,6 +25,8 @@ from .pyramid import DepthNoise, Level, Pyramid
 # Least fraction of the pixels without motion that agree with a keyframe whose pose is right. The
 # others may show people who stand still.
 MIN_AGREEING_RATIO = 0.3
+# Fraction of the pixels from which a dynamic mask shows a moving object, and not noise.
+MIN_DYNAMIC_RATIO = 0.01
 NOTHING_M = 1e4  # Depth of an unmeasured pixel in the computation of minima, meters.
 
 
@@ -207,6 +209,11 @@ def segment_motion(
         resized(known, keyframe.levels[0].depth_m.shape),
         MotionEvidence(came, gone),
     )
+
+
+def shows_motion(dynamic_mask: np.ndarray | None) -> bool:
+    """Return whether a dynamic mask [H, W] bool shows a moving object; None shows nothing."""
+    return dynamic_mask is not None and bool(np.mean(dynamic_mask) > MIN_DYNAMIC_RATIO)
 
 
 def foreground_mask(

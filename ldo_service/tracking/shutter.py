@@ -95,9 +95,9 @@ class ShutterState:
         """Return the state after a frame with a known pose, and the motion during this frame.
 
         The motion is the mean velocity since the last frame. An extrapolation to the frame would
-        amplify the noise of the poses. This noise would then also enter the next equations with
-        more weight than in their own velocities, so that the estimated times would grow without
-        bound. The pending equations of the last frame are evaluated.
+        amplify the noise of the poses. The noise would enter the compensation more strongly than
+        the equations, and the estimated times would grow without bound. The pending equations of
+        the last frame are evaluated.
 
         Args:
             before: Pose and time of the last frame that has a pose.

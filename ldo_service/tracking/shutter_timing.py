@@ -90,10 +90,8 @@ class BandEquations:
         for (there, here), hessians, gradients in zip(
             self.rows.tolist(), self.hessian, self.gradient, strict=True
         ):
-            by_readout, by_delay = (
-                here * velocity - there * velocity_there,
-                velocity - velocity_there,
-            )
+            by_readout = here * velocity - there * velocity_there
+            by_delay = velocity - velocity_there
             for is_color, hessian, gradient in zip((True, False), hessians, gradients, strict=True):
                 done = np.zeros(8)
                 done[POSE] = _row_twist(self.at_frame, here, is_color=is_color)
