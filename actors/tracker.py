@@ -35,7 +35,7 @@ from ldo_service.conversions.frames import (
 )
 from ldo_service.conversions.poses import map_correction_of, pose_from_message
 from ldo_service.detection.dynamic_classes import Box
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import (
@@ -355,7 +355,16 @@ def _make_calibration(config: TrackerConfig) -> SelfCalibration:
 def _known_correction(config: TrackerConfig) -> CameraCorrection:
     """Return the last correction of the finished run that the configuration names, if any."""
     folder = config.localize or config.calibration_run
-    return read_corrections(Path(folder)).last if folder else CameraCorrection()
+    if not folder:
+        return CameraCorrection()
+    try:
+        return read_corrections(Path(folder)).last
+    except DataError as error:
+        if config.localize:
+            raise
+        raise DataError(
+            f"tracker.calibration_run={folder}: {error} Choose the folder of a finished `ldo run`."
+        ) from error
 
 
 def _box(detection: Detection) -> Box:

@@ -34,5 +34,7 @@ def test_first_keyframe_has_the_correction_of_the_earlier_run(tmp_path: Path, fr
 
 
 def test_folder_without_a_run_raises_data_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"keyframes\.json cannot be read"):
+    with pytest.raises(
+        DataError, match=r"tracker\.calibration_run=.*keyframes\.json cannot be read"
+    ):
         Tracker(TrackerConfig(calibration_run=str(tmp_path)))
