@@ -31,6 +31,9 @@ def points(texels: Image, normals: Image, intrinsics: Intrinsics) -> Image: ...
 # `noise` is (floor, growth, nearest) of the depth noise: sigma = floor + growth (z - nearest)^2, in
 # meters. `gate` is the largest depth difference between a point and the target surface. A point is
 # hidden if it lies more than `occlusion` behind that surface. Both are fractions of the depth.
+# `cells` has a cell number of 0..63 for each point, [N]. The last result, [64, 2, 8], is then the
+# gradient of the photometric and of the geometric residuals by cell; without `cells`, it is empty.
+# Strips of 64 consecutive points are added to one cell, that of their middle point.
 def normal_equations(
     points: Image,
     texels: Image,
@@ -43,8 +46,10 @@ def normal_equations(
     noise: tuple[float, float, float],
     gate: float,
     occlusion: float,
+    cells: NDArray[np.uint8] | None = None,
 ) -> tuple[
     NDArray[np.float64],
     NDArray[np.float64],
     tuple[float, float, float, float, float, float, float],
+    NDArray[np.float64],
 ]: ...

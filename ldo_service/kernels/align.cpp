@@ -302,7 +302,22 @@ void accumulate(const Block& b, Equations& e) {
   e.geometric_square += sum(b.geometric[2]);
 }
 
-Equations normal_equations(const Problem& problem) {
+// Add the gradients of the block that starts at point `first` to the cells of its strips.
+void add_to_cells(const Problem& p, const Block& b, std::int64_t first, const std::uint8_t* cells,
+                  double* sums) {
+  for (int strip = 0; strip < kBlock && first + strip < p.count; strip += kStrip) {
+    const std::int64_t last = p.count - 1, middle = first + strip + kStrip / 2;
+    double* photometric = sums + 2 * kUnknowns * cells[middle < last ? middle : last];
+    double* geometric = photometric + kUnknowns;
+    for (int k = 0; k < kUnknowns; ++k) {
+      const float *row = b.rows[k] + strip, *residual = b.rows[kUnknowns] + strip;
+      photometric[k] += dot(row, residual, kStrip);
+      if (k < 6) geometric[k] += dot(row + kBlock, residual + kBlock, kStrip);
+    }
+  }
+}
+
+Equations normal_equations(const Problem& problem, const std::uint8_t* cells, double* sums) {
   Equations e{};
   Block block;
   for (std::int64_t first = 0; first < problem.count; first += kBlock) {
@@ -312,6 +327,7 @@ Equations normal_equations(const Problem& problem) {
     weigh_photometric(problem, block);
     weigh_geometric(problem, block);
     accumulate(block, e);
+    if (cells) add_to_cells(problem, block, first, cells, sums);
   }
   for (int r = 0; r < kUnknowns; ++r)
     for (int c = 0; c < r; ++c) e.hessian[r * kUnknowns + c] = e.hessian[c * kUnknowns + r];

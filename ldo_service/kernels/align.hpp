@@ -40,6 +40,8 @@ struct Problem {
 };
 
 constexpr int kUnknowns = 8;  // Rotation, translation, gain, bias.
+constexpr int kStrip = 64;    // Consecutive points that are added to the same cell.
+constexpr int kCells = 64;    // Maximum number of cells.
 
 struct Equations {
   double hessian[kUnknowns * kUnknowns];  // Sum of w J^T J.
@@ -65,7 +67,10 @@ struct Kernels {
   // Fill `points` [kPointRows, capacity] with the pixels that have depth. Return their number.
   std::int64_t (*points)(const float* texels, const float* normals, int width, int height,
                          const Pinhole& camera, std::int64_t capacity, float* points);
-  Equations (*normal_equations)(const Problem& problem);
+  // Compute the equations of all points. If `cells` is not null, it has a cell number below kCells
+  // for each point. The gradients of the photometric and of the geometric residuals of each strip are
+  // then added to `sums` [kCells, 2, kUnknowns] at the cell of the strip's middle point.
+  Equations (*normal_equations)(const Problem& problem, const std::uint8_t* cells, double* sums);
 };
 
 const Kernels& baseline();

@@ -1,12 +1,14 @@
 // Python binding of the alignment kernels (ldo_service.kernels._align). It checks every argument.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 
 #include <algorithm>
 #include <cmath>
 #include <memory>
+#include <optional>
 #include <string>
 #include <tuple>
 
@@ -21,6 +23,7 @@ namespace {
 template <int Dimensions>
 using Input = nb::ndarray<const float, nb::ndim<Dimensions>, nb::c_contig, nb::device::cpu>;
 using Output = nb::ndarray<nb::numpy, float>;
+using Cells = nb::ndarray<const std::uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Pose = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
 using Intrinsics = std::tuple<double, double, double, double>;
 
@@ -174,8 +177,8 @@ void require_rigid(const Pose& T) {
 nb::tuple normal_equations(Input<2> points, Input<3> texels, const Intrinsics& intrinsics,
                            Pose T_camera_reference, double gain, double bias,
                            double intensity_sigma, double depth_noise_scale,
-                           std::tuple<double, double, double> noise, double gate,
-                           double occlusion) {
+                           std::tuple<double, double, double> noise, double gate, double occlusion,
+                           const std::optional<Cells>& cells) {
   require(points.shape(0) == kPointRows, "points must be [7, N], as points() returns them");
   require_texels(texels);
   require_rigid(T_camera_reference);
@@ -198,10 +201,18 @@ nb::tuple normal_equations(Input<2> points, Input<3> texels, const Intrinsics& i
                    finite(noise_nearest, "noise nearest")};
   problem.gate = positive(gate, "gate");
   problem.occlusion = positive(occlusion, "occlusion");
+  const std::size_t cell_count = cells ? kCells : 0;
+  std::unique_ptr<double[]> sums(new double[cell_count * 2 * kUnknowns]());
+  if (cells) {
+    require(cells->shape(0) == points.shape(1), "cells must have a number for each point");
+    const std::uint8_t* numbers = cells->data();
+    require(std::all_of(numbers, numbers + problem.count, [](auto n) { return n < kCells; }),
+            "cells must be below 64");
+  }
   Equations e;
   {
     nb::gil_scoped_release release;
-    e = chosen->normal_equations(problem);
+    e = chosen->normal_equations(problem, cells ? cells->data() : nullptr, sums.get());
   }
   std::unique_ptr<double[]> hessian(new double[64]), gradient(new double[8]);
   std::copy_n(e.hessian, 64, hessian.get());
@@ -209,7 +220,8 @@ nb::tuple normal_equations(Input<2> points, Input<3> texels, const Intrinsics& i
   return nb::make_tuple(
       owned(std::move(hessian), {8, 8}), owned(std::move(gradient), {8}),
       nb::make_tuple(e.visible, e.photometric_count, e.photometric_inliers, e.photometric_square,
-                     e.geometric_count, e.geometric_inliers, e.geometric_square));
+                     e.geometric_count, e.geometric_inliers, e.geometric_square),
+      owned(std::move(sums), {cell_count, 2, kUnknowns}));
 }
 
 }  // namespace
@@ -225,5 +237,5 @@ NB_MODULE(_align, m) {
   m.def("points", &points, "texels"_a.noconvert(), "normals"_a.noconvert(), "intrinsics"_a);
   m.def("normal_equations", &normal_equations, "points"_a.noconvert(), "texels"_a.noconvert(),
         "intrinsics"_a, "T_camera_reference"_a.noconvert(), "gain"_a, "bias"_a, "intensity_sigma"_a,
-        "depth_noise_scale"_a, "noise"_a, "gate"_a, "occlusion"_a);
+        "depth_noise_scale"_a, "noise"_a, "gate"_a, "occlusion"_a, "cells"_a = nb::none());
 }

@@ -24,14 +24,18 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.kernels import _align
 
+from .pose_covariance import (
+    BRIGHTNESS,
+    BRIGHTNESS_PRIOR,
+    POSE,
+    CovarianceConfig,
+    pose_covariance,
+    without_brightness,
+)
 from .pyramid import DepthNoise, Level, Pyramid, ReferencePoints
 
 DEGREES_OF_FREEDOM = 5.0  # Kerl et al. 2013, III.B; the kernel uses the same value.
 INLIER_SIGMA = 3.0
-
-POSE, BRIGHTNESS = slice(0, 6), slice(6, 8)
-# Prior of gain and bias as inverse variances: standard deviations of 3 % and of 3 gray levels.
-BRIGHTNESS_PRIOR = np.array([1e3, 0.1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +96,9 @@ class NormalEquations:
     visible: float  # Number of points inside the image and not hidden.
     photometric: ResidualStatistics
     geometric: ResidualStatistics
+    # Gradients of the photometric and of the geometric residuals by cell, [C, 2, 8]; empty if the
+    # equations were computed without cells.
+    cells: np.ndarray
 
 
 def normal_equations(
@@ -100,6 +107,7 @@ def normal_equations(
     T_camera_reference: np.ndarray,
     appearance: BrightnessModel,
     config: ResidualConfig,
+    cells: np.ndarray | None = None,
 ) -> NormalEquations:
     """Linearize the residuals of reference points in one pyramid level of a frame.
 
@@ -111,11 +119,13 @@ def normal_equations(
         T_camera_reference: Pose at which the residuals are linearized, [4, 4].
         appearance: Brightness change and noise.
         config: Settings of the residuals.
+        cells: Number of the cell of each point, [N] uint8 below 64; None computes no gradients by
+            cell.
 
     Raises:
         ValueError: An array has a wrong shape, or the transform is not rigid.
     """
-    hessian, gradient, counts = _align.normal_equations(
+    hessian, gradient, counts, by_cell = _align.normal_equations(
         points,
         target.texels,
         target.intrinsics,
@@ -127,6 +137,7 @@ def normal_equations(
         config.noise.coefficients,
         config.gate,
         config.occlusion,
+        cells,
     )
     return NormalEquations(
         hessian,
@@ -134,6 +145,7 @@ def normal_equations(
         counts[0],
         ResidualStatistics(*counts[1:4]),
         ResidualStatistics(*counts[4:7]),
+        by_cell,
     )
 
 
@@ -156,21 +168,24 @@ class AlignConfig:
     # Lower bound of the geometric noise as a multiple of `DepthNoise`: 0.24 mm at short range,
     # where `DepthNoise` is 1.2 mm. It covers depth that is rounded to millimeters.
     min_depth_noise_scale: float = 0.2
-    # Fraction of the residuals that count as independent, because the errors of neighboring
-    # residuals are correlated. Pose errors measured on exact renders fit a fraction of 0.1. Pose
-    # errors of a Kinect, measured against KinectFusion and thus including its error, fit 1e-4 from
-    # frame to frame and 3e-5 over half a second. The default lies between these values and is not
-    # validated.
-    independent_fraction: float = 2e-3
+    covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     # Lower bound of the geometric noise while the depth may have a smooth bias, as a multiple of
     # `DepthNoise`. A bias shows no noise, so its residuals would weigh as much as exact ones. With
     # 5, the ATE of tour-handheld falls from 1.6 to 1.1 cm; without a bias, no sequence changes by
     # more than 0.04 cm.
     biased_depth_noise_scale: float = 5.0
+    # Factor on the covariance while the depth may have a smooth bias. The squared errors of the
+    # first 20 frames of two simulated cameras are ten times those of the later frames.
+    biased_covariance_scale: float = 10.0
 
     def with_bias(self) -> "AlignConfig":
         """Return the settings for depth that may have a smooth bias."""
-        return replace(self, min_depth_noise_scale=self.biased_depth_noise_scale)
+        scale = self.covariance.scale * self.biased_covariance_scale
+        return replace(
+            self,
+            min_depth_noise_scale=self.biased_depth_noise_scale,
+            covariance=replace(self.covariance, scale=scale),
+        )
 
     def __post_init__(self) -> None:
         if not self.iterations or min(self.iterations) < 1:
@@ -178,14 +193,12 @@ class AlignConfig:
                 f"AlignConfig.iterations={self.iterations} must have at least 1 iteration for each "
                 "level."
             )
-        if min(self.stop_px, self.max_step, self.independent_fraction) <= 0:
-            raise ConfigError(
-                f"AlignConfig.stop_px={self.stop_px:g}, max_step={self.max_step:g} and "
-                f"independent_fraction={self.independent_fraction:g} must be positive."
-            )
-        noises = "min_intensity_sigma", "min_depth_noise_scale", "biased_depth_noise_scale"
-        if min(getattr(self, name) for name in noises) <= 0:
-            raise ConfigError(named(self, *noises) + " must be positive.")
+        names = (
+            *("stop_px", "max_step", "min_intensity_sigma", "min_depth_noise_scale"),
+            *("biased_depth_noise_scale", "biased_covariance_scale"),
+        )
+        if min(getattr(self, name) for name in names) <= 0:
+            raise ConfigError(named(self, *names) + " must be positive.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +219,7 @@ class Alignment:
     bias: float  # Gray levels.
     iterations: int  # Sum over all levels.
     converged: bool  # The last step on the finest level was below stop_px.
-    # Condition number of the information, with translation in median depths; inf if singular.
+    # Condition number of the Hessian, with translation in median depths; inf if singular.
     condition: float
 
     @property
@@ -275,12 +288,13 @@ def evaluate(
     """
     T = se3.orthonormalize(T_camera_reference)
     points = reference.points[0]
-    e = normal_equations(points, frame.levels[0], T, appearance, config.residuals)
-    information = _pose_information(e) * config.independent_fraction
+    cells = reference.cells
+    e = normal_equations(points, frame.levels[0], T, appearance, config.residuals, cells)
+    covariance = pose_covariance(e.hessian, e.cells.reshape(-1, 8), config.covariance)
     total = max(points.shape[1], 1)
     return Alignment(
         T_reference_camera=se3.inverse(T),
-        information=information,
+        information=np.linalg.inv(covariance),
         photometric_inliers=e.photometric.inlier_fraction,
         geometric_inliers=e.geometric.inlier_fraction,
         intensity_sigma=appearance.intensity_sigma,
@@ -291,7 +305,7 @@ def evaluate(
         bias=appearance.bias,
         iterations=iterations,
         converged=converged,
-        condition=_condition(information, reference.median_depth_m),
+        condition=_condition(without_brightness(e.hessian), reference.median_depth_m),
     )
 
 
@@ -329,16 +343,8 @@ def _image_motion_px(step: np.ndarray, target: Level, reference: ReferencePoints
     return float(angle * target.camera.fx)
 
 
-def _pose_information(equations: NormalEquations) -> np.ndarray:
-    """Return the information [6, 6] of the pose; a Schur complement marginalizes gain and bias."""
-    hessian = equations.hessian
-    brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
-    cross = hessian[POSE, BRIGHTNESS]
-    return hessian[POSE, POSE] - cross @ np.linalg.solve(brightness, cross.T)
-
-
-def _condition(information: np.ndarray, median_depth_m: float) -> float:
+def _condition(hessian: np.ndarray, median_depth_m: float) -> float:
     units = np.repeat([1.0, median_depth_m], 3)
-    eigenvalues = np.linalg.eigvalsh(information * np.outer(units, units))
+    eigenvalues = np.linalg.eigvalsh(hessian * np.outer(units, units))
     smallest, largest = eigenvalues[0], eigenvalues[-1]
     return float(largest / smallest) if smallest > 1e-12 * largest > 0 else float("inf")

@@ -20,6 +20,7 @@ from ldo_service.kernels import _align
 # Gray level from which a pixel counts as overexposed: at least one color channel is saturated, and
 # the others nearly are.
 CLIPPED = 250
+CELLS = 8, 6  # Columns and rows of the cells of an image.
 ANY_DIFFERENCE = 1e3  # Relative tolerance that excludes no value.
 
 
@@ -208,6 +209,9 @@ class ReferencePoints:
     # camera, gray level, and a normal (0 0 0 if unknown).
     points: tuple[np.ndarray, ...]
     median_depth_m: float  # Scale of the scene; 1 without any measured depth.
+    # Cell of the image in which each point of the finest level lies, [N] uint8: number in a grid of
+    # `CELLS`, by rows. Points of one cell have correlated errors.
+    cells: np.ndarray
 
 
 def build_reference(pyramid: Pyramid, ignore_mask: np.ndarray | None = None) -> ReferencePoints:
@@ -220,7 +224,18 @@ def build_reference(pyramid: Pyramid, ignore_mask: np.ndarray | None = None) -> 
     levels = (_without(level, ignore_mask) for level in pyramid.levels)
     points = tuple(_level_points(level, i) for i, level in enumerate(levels))
     depth_m = points[0][2]
-    return ReferencePoints(points, float(np.median(depth_m)) if depth_m.size else 1.0)
+    median_depth_m = float(np.median(depth_m)) if depth_m.size else 1.0
+    return ReferencePoints(points, median_depth_m, _cells_of(points[0], pyramid.levels[0].camera))
+
+
+def _cells_of(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the cell of the image in which each point [7, N] lies, [N] uint8."""
+    columns, rows = CELLS
+    u = (camera.fx * points[0] / points[2] + camera.cx) * (columns / camera.width)
+    v = (camera.fy * points[1] / points[2] + camera.cy) * (rows / camera.height)
+    column = np.clip(u.astype(np.int32), 0, columns - 1)
+    row = np.clip(v.astype(np.int32), 0, rows - 1)
+    return (columns * row + column).astype(np.uint8)
 
 
 def _without(level: Level, ignore_mask: np.ndarray | None) -> Level:

@@ -92,7 +92,7 @@ def test_points_are_the_measured_pixels_back_projected() -> None:
 
 
 def test_equations_of_no_points_are_zero() -> None:
-    hessian, gradient, counts = _align.normal_equations(
+    hessian, gradient, counts, _ = _align.normal_equations(
         **{**problem(), "points": np.zeros((7, 0), np.float32)}
     )
     assert not hessian.any()
@@ -103,7 +103,7 @@ def test_equations_of_no_points_are_zero() -> None:
 def test_equations_do_not_depend_on_how_points_fill_the_last_block() -> None:
     given = problem()
     points = given["points"]
-    whole, _, counts = _align.normal_equations(**given)
+    whole, _, counts, _ = _align.normal_equations(**given)
     parts = [
         _align.normal_equations(**{**given, "points": np.ascontiguousarray(part)})
         for part in (points[:, :301], points[:, 301:])
@@ -119,17 +119,43 @@ def test_equations_are_symmetric_and_bitwise_reproducible() -> None:
     assert first[1].tobytes() == second[1].tobytes()
 
 
+def test_gradients_by_cell_are_those_of_the_points_in_the_cell() -> None:
+    given = problem()
+    points = given["points"]
+    cells = (np.arange(points.shape[1]) // 64 % 5).astype(np.uint8)
+    *_, by_cell = _align.normal_equations(**given, cells=cells)
+    assert by_cell.shape == (64, 2, 8)
+    assert not by_cell[5:].any()
+    without_gray = given["texels"].copy()
+    without_gray[..., 0] = 0
+    for cell in range(5):
+        given["points"] = np.ascontiguousarray(points[:, cells == cell])
+        _, both, _, _ = _align.normal_equations(**given)
+        _, geometric, _, _ = _align.normal_equations(**{**given, "texels": without_gray})
+        np.testing.assert_allclose(by_cell[cell].sum(axis=0), both, rtol=1e-4, atol=1e-2)
+        np.testing.assert_allclose(by_cell[cell, 1], geometric, rtol=1e-4, atol=1e-2)
+
+
+def test_cells_do_not_change_the_equations() -> None:
+    given = problem()
+    cells = np.zeros(given["points"].shape[1], np.uint8)
+    without, with_cells = (_align.normal_equations(**given, cells=c) for c in (None, cells))
+    assert without[3].size == 0
+    for a, b in zip(without[:2], with_cells[:2], strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
 @pytest.mark.parametrize("size", [(2, 2), (2, 9), (3, 3)])
 def test_smallest_images_are_handled(size: tuple[int, int]) -> None:
     texels = _align.pack(np.ones(size, np.float32), np.ones(size, np.float32), 9.0)
-    hessian, _, _ = _align.normal_equations(**{**problem(), "texels": texels})
+    hessian, *_ = _align.normal_equations(**{**problem(), "texels": texels})
     assert np.isfinite(hessian).all()
 
 
 def test_not_a_number_in_points_is_not_seen() -> None:
     given = problem()
     given["points"][0] = np.nan
-    hessian, _, counts = _align.normal_equations(**given)
+    hessian, _, counts, _ = _align.normal_equations(**given)
     assert counts[0] == 0
     assert hessian.shape == (8, 8)
 
@@ -183,6 +209,8 @@ def test_bad_images_are_refused(call, message: str) -> None:
         ({"noise": (0.1, -1.0, 1.0)}, "growth"),
         ({"gate": 0.0}, "gate"),
         ({"occlusion": float("nan")}, "occlusion"),
+        ({"cells": np.zeros(3, np.uint8)}, "for each point"),
+        ({"cells": np.full(problem()["points"].shape[1], 64, np.uint8)}, "below 64"),
     ],
 )
 def test_bad_equations_are_refused(changed: dict, message: str) -> None:
@@ -214,14 +242,14 @@ def test_baseline_instructions_give_the_same_to_rounding() -> None:
         "import sys, importlib.util as u, numpy as np\n"
         f"s = u.spec_from_file_location('test_align', {__file__!r})\n"
         "m = u.module_from_spec(s); s.loader.exec_module(m)\n"
-        "H, g, c = m._align.normal_equations(**m.problem())\n"
+        "H, g, c, _ = m._align.normal_equations(**m.problem())\n"
         "print(m._align.isa, *H.ravel(), *g, *c)"
     )
     done = run_with("baseline", program)
     assert done.returncode == 0, done.stderr
     isa, *numbers = done.stdout.split()
     assert isa == "baseline"
-    hessian, gradient, counts = _align.normal_equations(**problem())
+    hessian, gradient, counts, _ = _align.normal_equations(**problem())
     expected = np.array([*hessian.ravel(), *gradient, *counts])
     scale = np.abs(hessian).max() * 1e-5
     np.testing.assert_allclose(np.array(numbers, float), expected, rtol=1e-3, atol=scale)

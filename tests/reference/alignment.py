@@ -49,7 +49,9 @@ def normal_equations(
     r, J = geometric(p[paired], n[paired], q[paired])
     sigma_m = appearance.depth_noise_scale * config.noise.sigma_m(p[paired, 2])
     H_depth, g_depth, depths = _weighted(r, J, sigma_m)
-    return NormalEquations(H_color + H_depth, g_color + g_depth, float(len(p)), color, depths)
+    return NormalEquations(
+        H_color + H_depth, g_color + g_depth, float(len(p)), color, depths, np.zeros((0, 2, 8))
+    )
 
 
 def photometric(

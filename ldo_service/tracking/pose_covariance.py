@@ -1,0 +1,78 @@
+"""Covariance of the pose that alignment estimates.
+
+The residuals of neighboring points have correlated errors: a reflection, a blurred edge or a bias of
+the depth shifts many of them alike. The inverse Hessian of the normal equations takes the residuals
+as independent, so it is too small by a factor that depends on the sensor. The covariance here is a
+sandwich H^-1 S H^-1 instead. S is the sum of g g^T over the cells of the image, and g is the
+gradient of the residuals of one cell at the pose (Liang and Zeger, "Longitudinal data analysis using
+generalized linear models", 1986). Where cells, or color and depth, demand different poses, their
+gradients are large, and the covariance grows.
+Conventions: `ldo_service.geometry`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.errors import ConfigError, named
+
+POSE, BRIGHTNESS = slice(0, 6), slice(6, 8)
+# Prior of gain and bias as inverse variances: standard deviations of 3 % and of 3 gray levels.
+BRIGHTNESS_PRIOR = np.array([1e3, 0.1])
+
+
+@dataclass(frozen=True, slots=True)
+class CovarianceConfig:
+    """Settings of the covariance of a pose.
+
+    They were chosen so that the mean normalized estimation error squared is near 6, its expected
+    value, over seven sequences with exact truth: docs/benchmarks/covariance.md.
+    """
+
+    scale: float = 5.0  # Factor on the sandwich and on the scaled inverse Hessian.
+    # Standard deviations that are added, because linear interpolation of images has errors of its
+    # own.
+    floor_rad: float = 3e-5
+    floor_m: float = 5e-5
+
+    def __post_init__(self) -> None:
+        names = "scale", "floor_rad", "floor_m"
+        if min(getattr(self, name) for name in names) <= 0:
+            raise ConfigError(named(self, *names) + " must be positive.")
+
+
+def without_brightness(hessian: np.ndarray) -> np.ndarray:
+    """Return the Hessian [6, 6] of the pose; a Schur complement marginalizes gain and bias.
+
+    Args:
+        hessian: Hessian of pose, gain and bias, [8, 8].
+    """
+    brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
+    cross = hessian[POSE, BRIGHTNESS]
+    return hessian[POSE, POSE] - cross @ np.linalg.solve(brightness, cross.T)
+
+
+def pose_covariance(
+    hessian: np.ndarray, gradients: np.ndarray, config: CovarianceConfig
+) -> np.ndarray:
+    """Return the covariance [6, 6] of a pose, rotation first, in rad^2 and m^2.
+
+    A direction that the residuals do not constrain has a standard deviation of more than 1 rad or
+    1 m.
+
+    Args:
+        hessian: Hessian of pose, gain and bias at the pose, [8, 8].
+        gradients: Gradients of the groups of residuals whose errors are taken as independent of each
+            other, [N, 8].
+        config: Settings.
+    """
+    brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
+    by_brightness = np.linalg.solve(brightness, hessian[BRIGHTNESS, POSE])
+    g = gradients[:, POSE] - gradients[:, BRIGHTNESS] @ by_brightness
+    inverse = np.linalg.inv(without_brightness(hessian) + np.eye(6))
+    spread = g.T @ g
+    # Mean ratio of the sandwich to the inverse Hessian. The inverse Hessian at this ratio keeps the
+    # covariance from being too small in a direction in which the cells agree by chance.
+    ratio = max(float(np.trace(inverse @ spread)) / 6, 1.0)
+    floor = np.diag([config.floor_rad**2] * 3 + [config.floor_m**2] * 3)
+    return config.scale * (inverse @ spread @ inverse + ratio * inverse) + floor
