@@ -24,17 +24,16 @@ keyframe_database.msgpack, is in the folder named by tracker.localization_map in
 """
 
 import csv
+import io
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import msgspec
 import numpy as np
 
 from ldo_service.actors.tracker import TrackerConfig
-from ldo_service.conversions.frames import keyframe_from_message
 from ldo_service.conversions.poses import keyframe_poses_from_correction, pose_from_message
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.file_formats import write_ply
@@ -57,15 +56,12 @@ from ldo_service.schemas import (
 )
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantics_file import write_semantics
-from ldo_service.storage.state_codec import encode_state
-from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.keyframe_database import (
     DATABASE_FILE,
     OLD_DATABASE_FILE,
-    KeyframeDatabase,
-    make_keyframe_record,
 )
 
+from .database_writer import DatabaseWriter
 from .final_poses import FinalPoses, FramePose, MeasuredKeyframe
 from .front_end import FRONT_END
 from .records import LOOPS, OBJECTS, LoopRecord, write_objects
@@ -109,42 +105,6 @@ COLUMNS = (
 )
 
 
-class DatabaseWriter:
-    """Writer of the keyframe database of a run.
-
-    The writer keeps at most `keyframe_database.count` keyframe records in memory, 0.13 MB each.
-    """
-
-    def __init__(self, config: OdometryConfig) -> None:
-        self._config = config
-        self._database = KeyframeDatabase()
-
-    def add(self, message: Keyframe) -> None:
-        """Add the record of a keyframe."""
-        config = self._config
-        record = make_keyframe_record(
-            keyframe_from_message(message, config.pyramid),
-            config.features,
-            config.keyframe_database,
-        )
-        self._database = self._database.with_record(record, config.keyframe_database)
-
-    def save(self, path: Path, poses: KeyframePoses, merged: dict[int, int]) -> None:
-        """Write the records of all keyframes in the frame of the map.
-
-        Args:
-            path: File to write.
-            poses: Final poses T_map_keyframe, which replace T_odom_keyframe.
-            merged: For each merged submap, the older submap that it is now part of.
-        """
-        records = [
-            replace(record, submap=0, T_odom_keyframe=np.array(poses[record.id]))
-            for record in self._database.all
-            if merged.get(record.submap, record.submap) == 0
-        ]
-        path.write_bytes(encode_state({"places": [record.pack() for record in records]}))
-
-
 def prepare(folder: Path, overwrite: bool) -> None:
     """Create an empty folder for a run.
 
@@ -177,18 +137,22 @@ def prepare(folder: Path, overwrite: bool) -> None:
 
 
 class RunWriter:
-    """Writer of the folder of a run from the outputs of its actors.
+    """Record of the outputs of a run's actors, and writer of its folder.
 
-    config.yaml is written at the start and frames.csv during the run. `close` writes the map, the
-    summary and all other files.
+    With a folder, config.yaml is written at the start and frames.csv during the run. `save` writes
+    all files.
     """
 
-    def __init__(self, folder: Path, config_text: str, tracker: TrackerConfig) -> None:
-        self.folder, self._hold_out = folder, tracker.hold_out
+    def __init__(self, folder: Path | None, config_text: str, tracker: TrackerConfig) -> None:
+        """Start a record; without a folder, nothing is written before `save`."""
+        self._config_text, self._hold_out = config_text, tracker.hold_out
         self._makes_map = not tracker.localize
         self._database = DatabaseWriter(tracker.odometry)
-        (folder / "config.yaml").write_text(config_text)
-        self._csv_file = (folder / "frames.csv").open("w", newline="")
+        self._csv_file: TextIO = io.StringIO(newline="")
+        if folder is not None:
+            (folder / "config.yaml").write_text(config_text)
+            self._csv_file = (folder / "frames.csv").open("w", newline="")
+        self.folder = folder
         self._csv = csv.writer(self._csv_file)
         self._csv.writerow(COLUMNS)
         self._tracked: list[FramePose] = []
@@ -285,13 +249,21 @@ class RunWriter:
 
     # --- at the end -------------------------------------------------------------------------------
     def close(self, summary: dict[str, Any]) -> None:
-        """Write all files whose content is known only at the end of the run."""
+        """Write all files to the folder of the run."""
+        assert self.folder is not None
         self._csv_file.close()
-        self.summary = summary
-        self.online().save(self.folder / "trajectory_online.txt")
-        self._write_map(self.folder)
-        self.loops.save(self.folder)
-        write_json(self.folder / "summary.json", summary)
+        self.save(self.folder, summary)
+
+    def save(self, folder: Path, summary: dict[str, Any]) -> None:
+        """Write all files to a folder, which exists; the record may continue afterwards."""
+        self.folder, self.summary = folder, summary
+        if isinstance(self._csv_file, io.StringIO):
+            (folder / "config.yaml").write_text(self._config_text)
+            (folder / "frames.csv").write_text(self._csv_file.getvalue(), newline="")
+        self.online().save(folder / "trajectory_online.txt")
+        self._write_map(folder)
+        self.loops.save(folder)
+        write_json(folder / "summary.json", summary)
 
     def in_map(self) -> np.ndarray:
         """Return a mask, [N] bool, of the Gaussians whose anchor keyframe has a pose in the map."""
@@ -300,7 +272,8 @@ class RunWriter:
 
     def objects(self) -> tuple[MapObject, ...]:
         """Return the objects in the map; empty if no detector ran."""
-        return self._placed_objects(self._objects).objects if self._objects else ()
+        placed = self.placed_objects()
+        return placed.objects if placed else ()
 
     def labelled(self) -> int:
         """Return the number of Gaussians in the map whose best label is not background."""
@@ -312,6 +285,7 @@ class RunWriter:
         Args:
             iterations: Number of iterations of the refinement.
         """
+        assert self.folder is not None
         folder = self.folder / REFINED
         folder.mkdir(exist_ok=True)
         self._write_map(folder)
@@ -328,8 +302,9 @@ class RunWriter:
         if self.replica.label_names:
             names = self.replica.label_names
             write_semantics(folder / SEMANTICS, gaussians.labels[in_map], names)
-        if self._objects is not None:
-            write_objects(folder, self._placed_objects(self._objects))
+        if (objects := self.placed_objects()) is not None:
+            write_objects(folder, objects)
+        assert self.folder is not None
         self._database.save(self.folder / DATABASE_FILE, self._poses, self._merged_submaps)
 
     def online(self) -> Trajectory:
@@ -361,9 +336,14 @@ class RunWriter:
             for keyframe, facts in self._keyframes.items()
         ]
 
-    def _placed_objects(self, found: MapObjects) -> MapObjects:
-        """Return the objects whose first observing keyframe has a pose in the map."""
-        keyframes = self._keyframes
+    def placed_objects(self) -> MapObjects | None:
+        """Return the objects whose first observing keyframe has a pose in the map.
+
+        None: no detector ran.
+        """
+        found, keyframes = self._objects, self._keyframes
+        if found is None:
+            return None
         placed = tuple(
             one for one in found.objects if self._root(keyframes[one.first_keyframe]["submap"]) == 0
         )

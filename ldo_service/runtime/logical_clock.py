@@ -84,7 +84,7 @@ class LogicalClock:
 
     Example:
         with LogicalClock(actors, latencies) as clock:
-            for tick in clock.run(source): ...
+            for tick in clock.run(source): ...  # Or clock.tick(item) for each item.
             clock.finish()
     """
 
@@ -138,18 +138,33 @@ class LogicalClock:
             StageError: A handler raised; the error names the actor.
         """
         for item in source:
-            self._tick += 1
-            for message in item if isinstance(item, tuple) else (item,):
-                self._deliver(message, self._tick)
-            self._settle(self._tick)
-            yield self._tick
+            yield self.tick(item)
         self._settle_all()
 
-    def finish(self) -> None:
-        """Deliver the final messages of each actor, in the order of `finish_order`.
+    def tick(self, item: Message | tuple[Message, ...]) -> int:
+        """Deliver an item in a new tick, and wait for the outputs that are due by then.
 
-        `run` may be called again afterwards.
+        Args:
+            item: A message, or a tuple of messages that are delivered in the same tick.
+
+        Returns:
+            Number of the tick.
+
+        Raises:
+            StageError: A handler raised; the error names the actor.
         """
+        self._tick += 1
+        for message in item if isinstance(item, tuple) else (item,):
+            self._deliver(message, self._tick)
+        self._settle(self._tick)
+        return self._tick
+
+    def finish(self) -> None:
+        """Wait for all running steps, and deliver the final messages of each actor.
+
+        The order is that of `finish_order`. `run` and `tick` may be called again afterwards.
+        """
+        self._settle_all()
         threads = {thread.actor.name: thread for thread in self._threads}
         for actor in finish_order([type(thread.actor) for thread in self._threads]):
             thread = threads[actor.name]

@@ -28,10 +28,11 @@ from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.evaluation.views import EvaluatedFrames, evaluate_rendering
 from ldo_service.geometry import Trajectory
+from ldo_service.runs.actor_run import with_all_cores
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.job import RunOptions
-from ldo_service.runs.offline import run_offline, with_all_cores
+from ldo_service.runs.offline import run_offline
 from ldo_service.runs.source import Selection
 from ldo_service.runtime import Actor
 from ldo_service.schemas import GraphCorrection, Message, TrackedPose
