@@ -40,24 +40,57 @@ def find_objects(
     Raises:
         DataError: No object matches.
     """
-    objects = found.objects
-    named = [dict(one.distribution) for one in objects]
-    hits, why_not = search(text, named), ""
-    if not hits and objects and encode is not None:
-        try:
-            hits = search(text, named, encode)
-        except TextComparisonError as error:
-            why_not = f" Names of similar meaning were not searched: {error}"
+    names = [one.name for one in found.objects]
+    try:
+        hits, why_not = _ranked(text, found, encode), ""
+    except TextComparisonError as error:
+        hits = []
+        why_not = f" Names of similar meaning were not searched: {error}"
     if not hits:
-        raise DataError(_nothing(text, [one.name for one in objects]) + why_not)
-    answers = []
-    for hit in hits:
-        one = objects[hit.index]
-        center = one.T_map_object.translation
-        distance = None if eye is None else float(np.linalg.norm(eye - center))
-        about = (one.id, one.name, hit.score, center, one.size, one.T_map_object)
-        answers.append(ObjectMatch(*about, distance))
-    return sorted(answers, key=lambda one: (-one.score, one.distance or 0, one.id))
+        raise DataError(_nothing(text, names) + why_not)
+    return _sorted([_match(found, index, score, eye) for index, score in hits])
+
+
+def matching_objects(
+    text: str | None, found: MapObjects, eye: np.ndarray | None
+) -> list[ObjectMatch]:
+    """Return the objects whose name or synonym matches a text, the best match first.
+
+    Args:
+        text: Text query; None for all objects, each with the score 1.
+        found: The objects of the map.
+        eye: Camera position in the map frame, [3], meters; None if unknown.
+    """
+    if text is None:
+        hits = [(index, 1.0) for index in range(len(found.objects))]
+    else:
+        hits = _ranked(text, found, None)
+    return _sorted([_match(found, index, score, eye) for index, score in hits])
+
+
+def _ranked(text: str, found: MapObjects, encode: Encode | None) -> list[tuple[int, float]]:
+    """Return index and score of the objects that match a text.
+
+    Raises:
+        TextComparisonError: The text encoder cannot be used.
+    """
+    named = [dict(one.distribution) for one in found.objects]
+    hits = search(text, named)
+    if not hits and named and encode is not None:
+        hits = search(text, named, encode)
+    return [(hit.index, hit.score) for hit in hits]
+
+
+def _match(found: MapObjects, index: int, score: float, eye: np.ndarray | None) -> ObjectMatch:
+    one = found.objects[index]
+    center = one.T_map_object.translation
+    distance = None if eye is None else float(np.linalg.norm(eye - center))
+    about = (one.id, one.name, score, center, one.size, one.T_map_object)
+    return ObjectMatch(*about, distance)
+
+
+def _sorted(matches: list[ObjectMatch]) -> list[ObjectMatch]:
+    return sorted(matches, key=lambda one: (-one.score, one.distance or 0, one.id))
 
 
 def _nothing(text: str, names: list[str]) -> str:
