@@ -1,13 +1,12 @@
 """Covariance of the pose that alignment estimates.
 
-The residuals of neighboring points have correlated errors: a reflection, a blurred edge or a bias of
-the depth shifts many of them alike. The inverse Hessian of the normal equations takes the residuals
-as independent, so it is too small by a factor that depends on the sensor. The covariance here is a
-sandwich H^-1 S H^-1 instead. S is the sum of g g^T over the cells of the image, and g is the
-gradient of the residuals of one cell at the pose (Liang and Zeger, "Longitudinal data analysis using
-generalized linear models", 1986). Where cells, or color and depth, demand different poses, their
-gradients are large, and the covariance grows.
-Conventions: `ldo_service.geometry`.
+The residuals of neighboring points have correlated errors: a reflection, a blurred edge or a bias
+of the depth shifts many of them alike. The inverse Hessian of the normal equations takes the
+residuals as independent, so it is too small by a factor that depends on the sensor. The covariance
+here is a sandwich H^-1 S H^-1 instead. S is the sum of g g^T over the cells of the image, and g is
+the gradient of the residuals of one cell at the pose (Liang and Zeger, "Longitudinal data analysis
+using generalized linear models", 1986). Where cells, or color and depth, demand different poses,
+their gradients are large, and the covariance grows. Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
@@ -62,8 +61,8 @@ def pose_covariance(
 
     Args:
         hessian: Hessian of pose, gain and bias at the pose, [8, 8].
-        gradients: Gradients of the groups of residuals whose errors are taken as independent of each
-            other, [N, 8].
+        gradients: Gradients of the groups of residuals whose errors are taken as independent of
+            each other, [N, 8].
         config: Settings.
     """
     brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)

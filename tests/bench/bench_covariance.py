@@ -66,8 +66,9 @@ def errors_and_covariances(
         T_world_reference = T_true.get(-1 if tracked.reference is None else tracked.reference)
         if tracked.keyframe is not None:
             T_true[tracked.keyframe.id] = T_world_camera
-        is_measured = T_world_reference is not None and tracked.information.any()
-        if tracked.status is TrackingStatus.OK and is_measured:
+        if T_world_reference is None or not tracked.information.any():
+            continue
+        if tracked.status is TrackingStatus.OK:
             T_reference_camera = se3.inverse(T_world_reference) @ T_world_camera
             errors.append(se3.log(se3.inverse(tracked.T_reference_camera) @ T_reference_camera))
             covariances.append(np.linalg.inv(tracked.information))

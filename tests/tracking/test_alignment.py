@@ -13,7 +13,6 @@ from ldo_service.tracking import (
     build_reference,
     pyramid_of,
 )
-from ldo_service.tracking.alignment import normal_equations
 
 XI = np.array([0.01, -0.03, 0.02, 0.05, -0.03, 0.04])  # 2.1 degrees and 7 cm.
 T_REFERENCE_CAMERA = se3.exp(XI)
