@@ -68,8 +68,8 @@ struct Kernels {
   std::int64_t (*points)(const float* texels, const float* normals, int width, int height,
                          const Pinhole& camera, std::int64_t capacity, float* points);
   // Compute the equations of all points. If `cells` is not null, it has a cell number below kCells
-  // for each point. The gradients of the photometric and of the geometric residuals of each strip are
-  // then added to `sums` [kCells, 2, kUnknowns] at the cell of the strip's middle point.
+  // for each point. The gradients of the photometric and of the geometric residuals of each strip
+  // are then added to `sums` [kCells, 2, kUnknowns] at the cell of the strip's middle point.
   Equations (*normal_equations)(const Problem& problem, const std::uint8_t* cells, double* sums);
 };
 

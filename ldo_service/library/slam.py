@@ -359,7 +359,7 @@ def _pose(message: TrackedPose) -> Pose:
 
 @contextmanager
 def _interrupts_delayed() -> Iterator[None]:
-    """Handle Ctrl-C after the block instead of within it, so that no step is torn.
+    """Handle Ctrl-C after the block instead of within it, so that each step is complete.
 
     Only the main thread receives the interrupt, so the block does nothing in other threads.
     """

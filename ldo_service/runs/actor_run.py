@@ -1,4 +1,4 @@
-"""All actors of a run in this process, on a logical clock, and the record of their outputs."""
+"""Actors of a run in this process, on a logical clock, and the record of their outputs."""
 
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator
