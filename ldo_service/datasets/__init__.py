@@ -1,4 +1,4 @@
-"""Sequences of RGB-D frames: folders in common data-set layouts, and synthetic scenes."""
+"""Sequences of RGB-D frames: recordings in common layouts, and synthetic scenes."""
 
 from pathlib import Path
 
@@ -6,19 +6,43 @@ from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import Cached, Sequence
 from ldo_service.synthetic import SCENES, open_synthetic
 
+from .layout import Layout, registered_layouts
 from .replica import ReplicaSequence
 from .rig import SequenceOptions
 from .scannet import ScanNetSequence
 from .seven_scenes import SevenScenesSequence
 from .tum import TumSequence
 
-__all__ = ["Cached", "Sequence", "SequenceOptions", "open_sequence"]
+__all__ = ["Cached", "Layout", "Sequence", "SequenceOptions", "open_sequence"]
 
+# Layouts of this package. The first one that matches a path opens it.
 LAYOUTS = (
-    "TUM RGB-D (rgb.txt and depth.txt), Replica as NICE-SLAM lays it out (results/frame*.jpg, "
-    "results/depth*.png), ScanNet as SensReader exports it (color/*.jpg, depth/*.png, "
-    "intrinsic/), a seq-XX of 7-Scenes (frame-*.color.png, frame-*.depth.png), or a built-in "
-    f"scene synthetic:NAME, where NAME is {', '.join(SCENES)}"
+    Layout(
+        "TUM RGB-D",
+        "rgb.txt and depth.txt",
+        lambda path: (path / "rgb.txt").is_file() and (path / "depth.txt").is_file(),
+        lambda path, _options: TumSequence(path),
+    ),
+    Layout(
+        "Replica as NICE-SLAM lays it out",
+        "results/frame*.jpg and results/depth*.png",
+        lambda path: (path / "results").is_dir(),
+        lambda path, _options: ReplicaSequence(path),
+    ),
+    Layout(
+        "ScanNet as SensReader exports it",
+        "color/*.jpg, depth/*.png and intrinsic/",
+        lambda path: (path / "color").is_dir() and (path / "depth").is_dir(),
+        ScanNetSequence,
+        has_options=True,
+    ),
+    Layout(
+        "a seq-XX of 7-Scenes",
+        "frame-*.color.png and frame-*.depth.png",
+        lambda path: any(path.glob("frame-*.color.*")),
+        SevenScenesSequence,
+        has_options=True,
+    ),
 )
 
 
@@ -26,9 +50,10 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     """Open a sequence of frames.
 
     Args:
-        source: A folder, whose layout is detected, or `synthetic[:name]`.
+        source: A path, whose layout is detected, or `synthetic[:name]`. Other packages may add
+            layouts, see `Layout`.
         options: Registration of depth to color; None uses the defaults. Options other than the
-            defaults are valid for ScanNet and 7-Scenes only, which have two cameras.
+            defaults are valid only for layouts with two cameras.
 
     Raises:
         DataError: The source does not exist or has no known layout.
@@ -37,41 +62,27 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     options = options or SequenceOptions()
     scheme, _, name = source.partition(":")
     if scheme == "synthetic":
-        _refuse(options, source)
+        if not options.is_default:
+            raise ConfigError(
+                f"the depth of {source} is registered to color already. Remove the registration "
+                "options."
+            )
         return open_synthetic(name or "room")
-    folder = Path(source).expanduser()
-    if not folder.is_dir():
-        found = "is a file" if folder.exists() else "does not exist"
-        raise DataError(f"{source} {found}. Expected a folder in one of these layouts: {LAYOUTS}.")
-    return _open_folder(folder, options)
-
-
-def _open_folder(folder: Path, options: SequenceOptions) -> Sequence:
-    if (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file():
-        _refuse(options, f"{folder} (TUM RGB-D)")
-        return TumSequence(folder)
-    if (folder / "results").is_dir():
-        _refuse(options, f"{folder} (Replica)")
-        return ReplicaSequence(folder)
-    if (folder / "color").is_dir() and (folder / "depth").is_dir():
-        return ScanNetSequence(folder, options)
-    if any(folder.glob("frame-*.color.*")):
-        return SevenScenesSequence(folder, options)
-    if parts := sorted(path.parent.name for path in folder.glob("seq-*/frame-000000.color.*")):
+    path, layouts = Path(source).expanduser(), (*LAYOUTS, *registered_layouts())
+    if not path.exists():
+        raise DataError(f"{source} does not exist. Expected one of these: {_known(layouts)}.")
+    for layout in layouts:
+        if layout.matches(path):
+            return layout.open_sequence(path, options)
+    if parts := sorted(part.parent.name for part in path.glob("seq-*/frame-000000.color.*")):
         raise DataError(
-            f"{folder} contains several sequences of 7-Scenes. Give one of them, such as "
-            f"{folder / parts[0]}."
+            f"{path} contains several sequences of 7-Scenes. Give one of them, such as "
+            f"{path / parts[0]}."
         )
-    raise DataError(
-        f"{folder} has no known layout: it has neither rgb.txt with depth.txt nor a folder "
-        "results/, nor the folders color/ and depth/, nor files frame-*.color.*. Known layouts: "
-        f"{LAYOUTS}."
-    )
+    kind = "folder" if path.is_dir() else "file"
+    raise DataError(f"the {kind} {path} has no known layout. Known layouts: {_known(layouts)}.")
 
 
-def _refuse(options: SequenceOptions, source: str) -> None:
-    if not options.is_default:
-        raise ConfigError(
-            f"the depth of {source} is registered to color already. Remove the registration "
-            "options, which are for ScanNet and 7-Scenes only."
-        )
+def _known(layouts: tuple[Layout, ...]) -> str:
+    listed = "; ".join(f"{layout.name} ({layout.files})" for layout in layouts)
+    return f"{listed}; a built-in scene synthetic:NAME, where NAME is {', '.join(SCENES)}"

@@ -1,9 +1,9 @@
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from ldo_service.datasets import SequenceOptions, open_sequence
+from ldo_service.datasets import Layout, SequenceOptions, layout, open_sequence
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.synthetic import SCENES
 
@@ -50,7 +50,7 @@ def test_invalid_seed_is_rejected(seed: str) -> None:
 def test_folder_of_unknown_layout_lists_the_expected_files(tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text("")
     with pytest.raises(
-        DataError, match=r"rgb\.txt with depth\.txt.*results/.*TUM.*Replica.*ScanNet.*7-Scenes"
+        DataError, match=r"no known layout.*TUM.*depth\.txt.*Replica.*results/.*ScanNet.*7-Scenes"
     ):
         open_sequence(str(tmp_path))
 
@@ -59,7 +59,7 @@ def test_missing_folder_and_file_have_different_messages(tmp_path: Path) -> None
     with pytest.raises(DataError, match=r"does not exist.*TUM"):
         open_sequence(str(tmp_path / "nowhere"))
     (tmp_path / "a.mcap").touch()
-    with pytest.raises(DataError, match="is a file"):
+    with pytest.raises(DataError, match="the file .*no known layout"):
         open_sequence(str(tmp_path / "a.mcap"))
 
 
@@ -82,3 +82,57 @@ def test_registration_is_rejected_where_depth_is_registered_already(
     for source in (tum_folder(["1"], ["1"]), replica_folder([0]), "synthetic:room"):
         with pytest.raises(ConfigError, match="registered to color already"):
             open_sequence(str(source), SequenceOptions(register_depth=True))
+
+
+# --- layouts of other packages --------------------------------------------------------------------
+class Registered:
+    """An entry point of another package."""
+
+    name, value = "mine", "my_package:LAYOUT"
+
+    def __init__(self, loaded: object) -> None:
+        self._loaded = loaded
+
+    def load(self) -> object:
+        if isinstance(self._loaded, Exception):
+            raise self._loaded
+        return self._loaded
+
+
+@pytest.fixture
+def register(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[object], None]]:
+    """Return a function that registers an object as a layout of another package."""
+
+    def registers(loaded: object) -> None:
+        layout.registered_layouts.cache_clear()
+        points = [Registered(loaded)]
+        monkeypatch.setattr(layout, "entry_points", lambda group: points if group else [])
+
+    yield registers
+    layout.registered_layouts.cache_clear()
+
+
+def test_layout_of_another_package_opens_its_files(
+    register: Callable[[object], None], tmp_path: Path
+) -> None:
+    path = tmp_path / "desk.mine"
+    path.write_text("")
+    room = open_sequence("synthetic:room")
+    register(Layout("my rig", "*.mine", lambda path: path.suffix == ".mine", lambda *_: room))
+    assert open_sequence(str(path)) is room
+    with pytest.raises(ConfigError, match=r"my rig.*registration options"):
+        open_sequence(str(path), SequenceOptions(register_depth=True))
+    with pytest.raises(DataError, match=r"my rig \(\*\.mine\)"):
+        open_sequence(str(tmp_path / "other"))
+
+
+@pytest.mark.parametrize(
+    ("loaded", "message"),
+    [(ImportError("no module"), "cannot be loaded: ImportError: no module"), (3, "is a int")],
+)
+def test_entry_point_that_is_no_layout_is_named(
+    register: Callable[[object], None], tmp_path: Path, loaded: object, message: str
+) -> None:
+    register(loaded)
+    with pytest.raises(ConfigError, match=f"mine = my_package:LAYOUT.*{message}"):
+        open_sequence(str(tmp_path))

@@ -1,0 +1,81 @@
+"""Layouts of recordings: how a path is recognized, and how it is opened as a sequence."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry.sequence import Sequence
+
+from .rig import SequenceOptions
+
+# Entry-point group in which other packages register a `Layout`.
+ENTRY_POINTS = "ldo.sequences"
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Layout of a recording: a folder or a file.
+
+    Example of a package that adds one, in its pyproject.toml:
+
+        [project.entry-points."ldo.sequences"]
+        my_rig = "my_package:LAYOUT"
+
+    Attributes:
+        name: Name of the layout, such as "TUM RGB-D".
+        files: Files that a recording has, as a text for error messages.
+        matches: Returns whether a path, which exists, has the layout. It looks at names of files,
+            or at the first bytes of a file.
+        open: Opens a path that matches. It raises DataError for what is missing or damaged, and
+            ConfigError for options that do not fit.
+        has_options: True if `open` accepts options other than the defaults. These register the
+            depth to the color camera.
+    """
+
+    name: str
+    files: str
+    matches: Callable[[Path], bool]
+    open: Callable[[Path, SequenceOptions], Sequence]
+    has_options: bool = False
+
+    def open_sequence(self, path: Path, options: SequenceOptions) -> Sequence:
+        """Open a path that has the layout.
+
+        Raises:
+            DataError: A file is missing or damaged.
+            ConfigError: The layout does not support the options.
+        """
+        if not (self.has_options or options.is_default):
+            raise ConfigError(
+                f"the depth of {path} ({self.name}) is registered to color already. Remove the "
+                "registration options."
+            )
+        return self.open(path, options)
+
+
+@cache
+def registered_layouts() -> tuple[Layout, ...]:
+    """Return the layouts of other packages, in the order of their names.
+
+    Raises:
+        ConfigError: An entry point cannot be loaded, or is no `Layout`.
+    """
+    layouts = []
+    for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
+        try:
+            layout = point.load()
+        except Exception as error:
+            raise ConfigError(
+                f"the entry point {point.name} = {point.value} of the group {ENTRY_POINTS} cannot "
+                f"be loaded: {type(error).__name__}: {error}. Repair or remove its package."
+            ) from error
+        if not isinstance(layout, Layout):
+            raise ConfigError(
+                f"the entry point {point.name} = {point.value} of the group {ENTRY_POINTS} is a "
+                f"{type(layout).__name__}, must be an ldo_service.datasets.Layout."
+            )
+        layouts.append(layout)
+    return tuple(layouts)
