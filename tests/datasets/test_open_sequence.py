@@ -59,7 +59,7 @@ def test_missing_folder_and_file_have_different_messages(tmp_path: Path) -> None
     with pytest.raises(DataError, match=r"does not exist.*TUM"):
         open_sequence(str(tmp_path / "nowhere"))
     (tmp_path / "a.mcap").touch()
-    with pytest.raises(DataError, match="the file .*no known layout"):
+    with pytest.raises(DataError, match=r"the file .*no known layout"):
         open_sequence(str(tmp_path / "a.mcap"))
 
 
