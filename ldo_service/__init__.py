@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .config import Config, load_config
     from .geometry import Camera, Trajectory
     from .geometry import RgbdFrame as Frame
-    from .library.maps import Map, MapArrays, MapView
+    from .library.maps import FoundObject, Map, MapArrays, MapView
     from .library.run import Run
     from .library.slam import Pose, Slam
     from .runs.source import open_source as open_sequence
@@ -35,6 +35,7 @@ except PackageNotFoundError:  # A source tree that is not installed.
 __all__ = [
     "Camera",
     "Config",
+    "FoundObject",
     "Frame",
     "Map",
     "MapArrays",
@@ -53,6 +54,7 @@ __all__ = [
 LAZY = {
     "Camera": ("geometry", "Camera"),
     "Config": ("config", "Config"),
+    "FoundObject": ("library.maps", "FoundObject"),
     "Frame": ("geometry", "RgbdFrame"),
     "Map": ("library.maps", "Map"),
     "MapArrays": ("library.maps", "MapArrays"),

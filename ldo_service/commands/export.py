@@ -1,5 +1,6 @@
 """Command `ldo export`."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -56,7 +57,9 @@ def export(
     source = MapFolder(folder) if online else newest_map(folder)
     out = out or folder / EXPORTED[format][0]
     console = Console(stderr=True, highlight=False)
-    with progress(format, 1, console) as advance:
+    # Formats without keyframes finish at once and show no progress.
+    has_progress = format in ("mesh", "occupancy")
+    with progress(format, 1, console) if has_progress else nullcontext(_no_progress) as advance:
         facts = export_map(
             source,
             format,
@@ -69,3 +72,7 @@ def export(
             advance=advance,
         )
     Console(highlight=False).print(f"{out}: {facts}", soft_wrap=True)
+
+
+def _no_progress(_done: int, _total: int | None = None, /) -> None:
+    pass

@@ -1,14 +1,16 @@
 """Loading and validation of configurations: defaults, YAML files and single settings."""
 
 import dataclasses
+import os
 import re
 import typing
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isnan
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import yaml
 
 from ldo_service.errors import ConfigError, did_you_mean
@@ -27,12 +29,17 @@ KINDS = {
 }
 
 
-def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
+def load_config(
+    path: Path | None = None,
+    settings: Sequence[str] = (),
+    values: Mapping[str, object] | None = None,
+) -> Config:
     """Return the defaults, changed by a YAML file and then by single settings.
 
     Args:
         path: The YAML file; None for no file.
-        settings: Settings as `section.field=value`.
+        settings: Settings as `section.field=value`, as on the command line.
+        values: Values of settings by dotted name, such as `{"mapper.iterations": 7}`.
 
     Raises:
         ConfigError: A setting cannot be read, is unknown, has moved, or has an invalid value.
@@ -40,6 +47,8 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
     tree = _read(path) if path else {}
     for setting in settings:
         _apply(tree, setting)
+    for name, value in (values or {}).items():
+        _put(tree, name, _plain(value), name)
     return config_of(tree)
 
 
@@ -95,15 +104,30 @@ def _apply(tree: dict[str, Any], setting: str) -> None:
     name, equals, value = setting.partition("=")
     if not equals or "." not in name:
         raise ConfigError(f"--set {setting}: write the setting as section.field=value.")
-    *sections, last = name.strip().split(".")
+    try:
+        plain = load_yaml(value)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--set {setting}: the value is not valid YAML: {error}") from error
+    _put(tree, name.strip(), plain, f"--set {setting}")
+
+
+def _put(tree: dict[str, Any], name: str, value: object, shown: str) -> None:
+    """Set the value with a dotted name in a tree; `shown` names the setting in an error."""
+    if not isinstance(name, str):
+        raise ConfigError(f"the name of a setting is {name!r}, must be text such as section.field.")
+    *sections, last = name.split(".")
     for section in sections:
         tree = tree.setdefault(section, {})
         if not isinstance(tree, dict):
-            raise ConfigError(f"--set {setting}: {section} is a setting, not a section.")
-    try:
-        tree[last] = load_yaml(value)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"--set {setting}: the value is not valid YAML: {error}") from error
+            raise ConfigError(f"{shown}: {section} is a setting, not a section.")
+    tree[last] = value
+
+
+def _plain(value: object) -> object:
+    """Return a value with paths as text and NumPy scalars as numbers."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.item() if isinstance(value, np.generic) else value
 
 
 # --- checking -------------------------------------------------------------------------------------

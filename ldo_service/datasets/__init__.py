@@ -68,21 +68,25 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
                 "options."
             )
         return open_synthetic(name or "room")
-    path, layouts = Path(source).expanduser(), (*LAYOUTS, *registered_layouts())
+    path = Path(source).expanduser()
     if not path.exists():
-        raise DataError(f"{source} does not exist. Expected one of these: {_known(layouts)}.")
-    for layout in layouts:
-        if layout.matches(path):
-            return layout.open_sequence(path, options)
+        raise DataError(f"{source} does not exist. Expected one of these: {_known()}.")
+    # Other packages are loaded only if no layout of this package matches.
+    for layouts in (lambda: LAYOUTS, registered_layouts):
+        for layout in layouts():
+            if layout.matches(path):
+                return layout.open_sequence(path, options)
     if parts := sorted(part.parent.name for part in path.glob("seq-*/frame-000000.color.*")):
         raise DataError(
             f"{path} contains several sequences of 7-Scenes. Give one of them, such as "
             f"{path / parts[0]}."
         )
     kind = "folder" if path.is_dir() else "file"
-    raise DataError(f"the {kind} {path} has no known layout. Known layouts: {_known(layouts)}.")
+    raise DataError(f"the {kind} {path} has no known layout. Known layouts: {_known()}.")
 
 
-def _known(layouts: tuple[Layout, ...]) -> str:
-    listed = "; ".join(f"{layout.name} ({layout.files})" for layout in layouts)
+def _known() -> str:
+    listed = "; ".join(
+        f"{layout.name} ({layout.files})" for layout in (*LAYOUTS, *registered_layouts())
+    )
     return f"{listed}; a built-in scene synthetic:NAME, where NAME is {', '.join(SCENES)}"

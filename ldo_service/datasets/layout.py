@@ -19,6 +19,9 @@ ENTRY_POINTS = "ldo.sequences"
 class Layout:
     """Layout of a recording: a folder or a file.
 
+    Layouts of this package are tried first, and any folder with a folder results/ is taken as
+    Replica. Other packages should therefore recognize files or folders of other names.
+
     Example of a package that adds one, in its pyproject.toml:
 
         [project.entry-points."ldo.sequences"]

@@ -40,7 +40,7 @@ struct Problem {
 };
 
 constexpr int kUnknowns = 8;  // Rotation, translation, gain, bias.
-constexpr int kStrip = 64;    // Consecutive points that are added to the same cell.
+constexpr int kStrip = 16;    // Consecutive points that are added to the same cell.
 constexpr int kCells = 64;    // Maximum number of cells.
 
 struct Equations {

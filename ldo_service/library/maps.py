@@ -6,40 +6,83 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.renderer import render
 from ldo_service.geometry import Camera, se3
-from ldo_service.maps.object_search import ObjectMatch, matching_objects
+from ldo_service.maps.object_search import matching_objects
 from ldo_service.schemas import MapObjects
 from ldo_service.semantics.gaussian_labels import distribution
 from ldo_service.semantics.semantic_fusion import label_image
 
-RIGID_TOLERANCE = 1e-4  # Largest deviation of R R^T from the identity in a pose of a user.
+from .arrays import read_only_array
+
+RIGID_TOLERANCE = 1e-4  # Largest deviation of R R^T from the identity in a pose of a caller.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MapArrays:
-    """Parameters of N Gaussians in the map frame, as read-only arrays."""
+    """Parameters of N Gaussians in the map frame, as read-only float32 arrays.
 
-    means_m: np.ndarray  # [N, 3] float32, centers in meters.
-    scales_m: np.ndarray  # [N, 3] float32, standard deviations along the axes in meters.
-    quaternions: np.ndarray  # [N, 4] float32, unit quaternions wxyz that rotate the axes.
-    opacities: np.ndarray  # [N] float32, 0..1.
-    colors: np.ndarray  # [N, 3] float32, RGB, mostly within 0..1.
-    # [N, C] float32, probabilities of the C labels of `Map.label_names`; each row sums to one.
-    # Without a detector, C is 0.
+    Attributes:
+        means_m: [N, 3], centers in meters.
+        scales_m: [N, 3], standard deviations along the axes in meters.
+        quaternions: [N, 4], unit quaternions wxyz that rotate the axes.
+        opacities: [N], 0..1.
+        colors: [N, 3], RGB, mostly within 0..1.
+        label_probabilities: [N, C], probabilities of the C labels of `Map.label_names`. Each row
+            sums to one. Without a detector, C is 0.
+    """
+
+    means_m: np.ndarray
+    scales_m: np.ndarray
+    quaternions: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
     label_probabilities: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MapView:
-    """Rendering of the map at a camera pose, as read-only arrays."""
+    """Rendering of the map at a camera pose, as read-only arrays.
 
-    color: np.ndarray  # [H, W, 3] float32, RGB, 0..1.
-    depth_m: np.ndarray  # [H, W] float32, z in meters; 0 where the opacity is at most 0.5.
-    opacity: np.ndarray  # [H, W] float32, 0..1.
-    # [H, W] uint8, index into `Map.label_names`; None if no labels were requested.
+    Attributes:
+        color: [H, W, 3] float32, RGB, 0..1.
+        depth_m: [H, W] float32, z in meters; 0 where the opacity is at most 0.5.
+        opacity: [H, W] float32, 0..1.
+        labels: [H, W] uint8, index into `Map.label_names`; None if no labels were requested.
+    """
+
+    color: np.ndarray
+    depth_m: np.ndarray
+    opacity: np.ndarray
     labels: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FoundObject:
+    """An object of the map.
+
+    Attributes:
+        id: Number of the object.
+        name: Likeliest name.
+        score: Similarity of the name to the searched text, 0..1; 1 without a text.
+        T_map_object: [4, 4], center and axes of the object's box in the map.
+        size_m: [3], size of the box along its axes in meters.
+        distance_m: Distance from the last camera pose to the center in meters; None without poses.
+    """
+
+    id: int
+    name: str
+    score: float
+    T_map_object: np.ndarray
+    size_m: np.ndarray
+    distance_m: float | None
+
+    @property
+    def center_m(self) -> np.ndarray:
+        """Center of the box in the map, [3], meters."""
+        return self.T_map_object[:3, 3]
 
 
 class Map:
@@ -77,12 +120,12 @@ class Map:
         if self._labels is not None and self.label_names:
             probabilities = distribution(self._labels, len(self.label_names))
         return MapArrays(
-            _read_only(rows[:, 0:3].copy()),
-            _read_only(np.exp(rows[:, 3:6])),
-            _read_only(quaternions),
-            _read_only(1 / (1 + np.exp(-rows[:, 10]))),
-            _read_only(rows[:, 11:14].copy()),
-            _read_only(probabilities),
+            read_only_array(rows[:, 0:3].copy()),
+            read_only_array(np.exp(rows[:, 3:6])),
+            read_only_array(quaternions),
+            read_only_array(1 / (1 + np.exp(-rows[:, 10]))),
+            read_only_array(rows[:, 11:14].copy()),
+            read_only_array(probabilities),
         )
 
     def render(
@@ -103,33 +146,39 @@ class Map:
             threads: Threads of the renderer; None for all cores. The images are the same.
 
         Raises:
-            ConfigError: The pose is not rigid, or no camera is known because the map is empty.
+            ConfigError: An argument is wrong, no camera is known because the map is empty, or the
+                map has no labels.
         """
+        if not (camera is None or isinstance(camera, Camera)):
+            raise ConfigError(
+                f"camera is a {type(camera).__name__}, must be an ldo_service.Camera."
+            )
         camera = self.camera if camera is None else camera.rectified()
         if camera is None:
             raise ConfigError("the map is empty, so its camera is unknown. Give a camera.")
-        T_camera_map = se3.inverse(_require_pose("T_map_camera", T_map_camera))
+        if threads is not None and threads < 1:
+            raise ConfigError(f"threads={threads} must be at least 1, or None for all cores.")
+        if labels and self._labels is None:
+            raise ConfigError("the map has no labels, because the run had no detector.")
+        T_camera_map = se3.inverse(_rigid("T_map_camera", T_map_camera))
         count = threads or os.cpu_count() or 1
         shown = render(self._rows, camera, T_camera_map, threads=count, contributions=labels)
         label_ids = None
-        if labels:
-            if self._labels is None:
-                raise ConfigError("the map has no labels, because the run had no detector.")
-            label_ids = label_image(
-                self._rows, self._labels, shown, camera, T_camera_map, threads=count
+        if labels and self._labels is not None:
+            label_ids = read_only_array(
+                label_image(self._rows, self._labels, shown, camera, T_camera_map, threads=count)
             )
-            label_ids.flags.writeable = False
         return MapView(
-            _read_only(shown.color.clip(0, 1)),
-            _read_only(shown.depth_m.astype(np.float32)),
-            _read_only(shown.opacity),
+            read_only_array(shown.color.clip(0, 1)),
+            read_only_array(shown.depth_m.astype(np.float32)),
+            read_only_array(shown.opacity),
             label_ids,
         )
 
 
 def find(
     objects: MapObjects | None, text: str | None, T_map_camera: Sequence[np.ndarray] | np.ndarray
-) -> list[ObjectMatch]:
+) -> list[FoundObject]:
     """Return the objects that match a text, or all objects; the best match first.
 
     Args:
@@ -140,28 +189,45 @@ def find(
     if objects is None:
         return []
     eye = T_map_camera[-1][:3, 3] if len(T_map_camera) else None
-    return matching_objects(text, objects, eye)
+    return [
+        FoundObject(
+            one.id,
+            one.name,
+            one.score,
+            read_only_array(pose_from_message(one.T_map_object)),
+            read_only_array(np.array(one.size)),
+            one.distance,
+        )
+        for one in matching_objects(text, objects, eye)
+    ]
 
 
-def _require_pose(name: str, value: np.ndarray) -> np.ndarray:
-    """Return a rigid transform [4, 4] float64 of a user.
+def _rigid(name: str, value: object) -> np.ndarray:
+    """Return a pose that a caller gave, as a rigid transform [4, 4] float64.
 
     Raises:
-        ConfigError: It is not a rigid transform.
+        ConfigError: The value is no rigid transform.
     """
-    T = np.asarray(value, float)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise ConfigError(f"{name} has the shape {T.shape}, must be a finite pose of shape (4, 4).")
-    R = T[:3, :3]
-    is_rigid = np.abs(R @ R.T - np.eye(3)).max() < RIGID_TOLERANCE and np.linalg.det(R) > 0
-    if not is_rigid or not np.array_equal(T[3], (0, 0, 0, 1)):
+    if value is None:
+        raise ConfigError(f"{name} is None. A frame that is LOST has no pose in the map.")
+    try:
+        T = np.asarray(value, float)
+    except (TypeError, ValueError) as error:
         raise ConfigError(
-            f"{name} is not a rigid transform: its rotation must be orthonormal without a "
-            "reflection, and its last row 0 0 0 1."
+            f"{name} is a {type(value).__name__}, must be an array [4, 4]."
+        ) from error
+    if T.shape != (4, 4):
+        raise ConfigError(f"{name} has the shape {T.shape}, must have the shape (4, 4).")
+    R = T[:3, :3]
+    is_rigid = (
+        bool(np.isfinite(T).all())
+        and np.abs(R @ R.T - np.eye(3)).max() < RIGID_TOLERANCE
+        and np.linalg.det(R) > 0
+        and np.array_equal(T[3], (0, 0, 0, 1))
+    )
+    if not is_rigid:
+        raise ConfigError(
+            f"{name} is not a rigid transform: it must be finite, its rotation orthonormal without "
+            "a reflection, and its last row 0 0 0 1."
         )
     return se3.orthonormalize(T)
-
-
-def _read_only(array: np.ndarray) -> np.ndarray:
-    array.flags.writeable = False
-    return array

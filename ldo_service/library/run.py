@@ -1,15 +1,16 @@
 """Finished runs: the folders that `ldo run` and `Slam.save` write."""
 
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 
 from ldo_service.geometry import Camera, Trajectory
-from ldo_service.maps.object_search import ObjectMatch
 from ldo_service.runs.export import ExportFormat, Up, export_map
 from ldo_service.runs.finished import MapFolder, newest_map
 from ldo_service.runs.records import OBJECTS, read_objects
 
-from .maps import Map, find
+from .arrays import read_only
+from .maps import FoundObject, Map, find
 
 FilePath = str | PathLike[str]
 
@@ -47,9 +48,9 @@ class Run:
         viewpoints = self._source.viewpoints()
         return viewpoints[0].camera if viewpoints else None
 
-    @property
+    @cached_property
     def map(self) -> Map:
-        """The map; each access reads it again.
+        """The map, which is read at the first access and kept in memory.
 
         Raises:
             DataError: A file is damaged.
@@ -64,9 +65,9 @@ class Run:
         Raises:
             DataError: The file is damaged.
         """
-        return self._source.trajectory()
+        return read_only(self._source.trajectory())
 
-    def objects(self, text: str | None = None) -> list[ObjectMatch]:
+    def objects(self, text: str | None = None) -> list[FoundObject]:
         """Return the objects of the map.
 
         Args:

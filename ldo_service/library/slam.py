@@ -12,54 +12,66 @@ The actors are those of `ldo run`, on the same logical clock. Equal frames and s
 give the same poses and the same map, bit for bit.
 """
 
-import signal
-import threading
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from operator import index
 from os import PathLike
 from pathlib import Path
-from types import FrameType
-from typing import Any, Literal
+from typing import Literal
 
-import msgspec
 import numpy as np
 
 from ldo_service.config import Config, load_config
 from ldo_service.conversions.frames import camera_from_message, raw_frame_to_message
 from ldo_service.conversions.poses import pose_from_message
-from ldo_service.errors import ConfigError, FrameError
+from ldo_service.errors import ConfigError, FrameError, StageError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
-from ldo_service.maps.object_search import ObjectMatch
 from ldo_service.runs.actor_run import ActorRun, refinements
 from ldo_service.runs.folder import prepare
-from ldo_service.schemas import Keyframe, Message, RefineMap, TrackedPose
+from ldo_service.runs.summary import Usage
+from ldo_service.schemas import Keyframe, Message, TrackedPose
+from ldo_service.schemas.message import LAST_INTEGER
 
-from .maps import Map, find
+from .arrays import FrameArray, array_of, read_only, read_only_array
+from .interrupts import interrupts_delayed
+from .maps import FoundObject, Map, find
 
-FrameArray = Any  # An array that supports DLPack or the buffer protocol.
 FilePath = str | PathLike[str]
+DONE = object()  # Result of `next` for an iterator without further items.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pose:
-    """Pose of the camera at a frame. Arrays are float64 and read-only."""
+    """Pose of the camera at a frame. Arrays are float64 and read-only.
 
-    frame: int  # Number of the frame, from 0.
+    Attributes:
+        frame: Number of the frame, counted from 0 by the calls of `Slam.track`.
+        stamp_ns: Time of the exposure, ns.
+        status: Tracking status: OK, WEAK (uncertain, not mapped) or LOST.
+        T_map_camera: [4, 4], camera to map, with all corrections so far. None while LOST, and in a
+            submap that is not merged with the map yet.
+        T_odom_camera: [4, 4], camera to odometry. It is continuous while the status is not LOST.
+            While LOST, it is the last pose.
+        reference: Id of the keyframe that the frame was aligned to; None before the first keyframe.
+        T_reference_camera: [4, 4], camera to this keyframe.
+        covariance: [6, 6], covariance of T_reference_camera for a perturbation on the right:
+            rotation in rad, then translation in m. Zeros if unknown.
+        keyframe: Id of the keyframe that was made of the frame; None if none was made.
+        submap: Number of the submap; 0 is the map itself.
+    """
+
+    frame: int
     stamp_ns: int
     status: Literal["OK", "WEAK", "LOST"]
-    # [4, 4], camera to map. It includes the corrections so far. None while LOST, and in a submap
-    # that is not merged with the map yet.
     T_map_camera: np.ndarray | None
-    # [4, 4], camera to odometry. It is continuous while the status is not LOST; while LOST, it is
-    # the last pose.
     T_odom_camera: np.ndarray
-    # [6, 6] covariance of the pose relative to its reference keyframe, for a perturbation on the
-    # right: rotation in rad, then translation in m. Zeros if unknown.
+    reference: int | None
+    T_reference_camera: np.ndarray
     covariance: np.ndarray
-    keyframe: int | None  # Id of the keyframe that was made of the frame; None if none was made.
-    submap: int  # 0 is the map itself.
+    keyframe: int | None
+    submap: int
 
 
 class Slam:
@@ -67,8 +79,14 @@ class Slam:
 
     Use it as a context manager, or call `close`. After `close`, the map, the trajectory and the
     objects stay available. Several objects may exist side by side, but one object must not be used
-    by two threads at a time. An interrupt by Ctrl-C takes effect after the current frame, so the
-    object can be used further.
+    by two threads at a time. Ctrl-C takes effect after the current frame, so the object can be used
+    further unless a `with` block has closed it. A second Ctrl-C takes effect at once; the object
+    can then track no more frames.
+
+    Attributes:
+        camera: Camera of the frames.
+        depth_scale: Units of the depth images per meter.
+        config: Configuration in use.
     """
 
     def __init__(
@@ -96,15 +114,24 @@ class Slam:
                 f"camera is a {type(camera).__name__}, must be an ldo_service.Camera, such as "
                 "Camera(width=640, height=480, fx=525, fy=525, cx=320, cy=240)."
             )
-        self.camera, self.depth_scale = camera, depth_scale
-        self.config = _configured(config, settings or {})
+        is_number = isinstance(depth_scale, (int, float, np.number))
+        if not (is_number and np.isfinite(depth_scale) and depth_scale > 0):
+            raise ConfigError(
+                f"depth_scale={depth_scale!r} must be the positive number of depth units per "
+                "meter, such as 1000 for millimeters."
+            )
+        self.camera, self.depth_scale = camera, float(depth_scale)
+        self.config = _configured(config, settings)
         self._run = ActorRun(self.config, None, observe=self._observe)
-        self._frames = self._rejected = 0
+        self._frames = self._rejected = self._refined = 0
+        self._used = Usage(0.0, 0.0)  # Time of all steps.
         self._last_stamp_ns = -1
         self._last_pose: TrackedPose | None = None
         self._map_camera: Camera | None = None
-        self._remaining: Iterator[RefineMap | None] | None = None  # Work that `finish` has begun.
-        self._is_finished = self._is_closed = False
+        # Work that `finish` has begun: each item of an iterator is a step that is done.
+        self._steps: deque[Iterator[None]] = deque()
+        self._is_ending = self._is_closed = False
+        self._failure: str | None = None  # Failure after which no step is possible.
 
     def __enter__(self) -> "Slam":
         return self
@@ -134,21 +161,22 @@ class Slam:
         Raises:
             FrameError: An argument has a wrong type, shape or stamp. The frame is skipped, and
                 tracking continues with the next one.
+            StageError: An actor failed, now or before. The results so far stay available.
             ConfigError: `finish` or `close` was called before.
         """
-        self._require_open("track")
-        if self._is_finished or self._remaining is not None:
+        self._require_usable("track")
+        if self._is_ending:
             raise ConfigError("track was called after finish. Create another Slam for more frames.")
-        number, self._frames = self._frames, self._frames + 1
-        try:
-            frame = self._raw_frame(number, color, depth, stamp_ns)
-        except FrameError:
-            self._rejected += 1
-            raise
-        message = raw_frame_to_message(frame, compress_depth=False)
-        with _interrupts_delayed():
+        with interrupts_delayed():
+            number, self._frames = self._frames, self._frames + 1
+            try:
+                frame = self._raw_frame(number, color, depth, stamp_ns)
+            except FrameError:
+                self._rejected += 1
+                raise
             self._last_stamp_ns = frame.stamp_ns
-            self._run.tick(message)
+            with self._step():
+                self._run.tick(raw_frame_to_message(frame, compress_depth=False))
         pose = self._last_pose
         if pose is None or pose.frame != number:
             raise FrameError(
@@ -160,35 +188,38 @@ class Slam:
     def finish(self, refine_iterations: int = 0) -> None:
         """Wait for the mapping of all frames, close the last loops, and refit the moved keyframes.
 
-        After an interrupt, another call continues.
+        After an interrupt, another call continues. Further calls with iterations refine the map
+        further.
 
         Args:
             refine_iterations: Iterations that optimize the whole map further.
 
         Raises:
             ConfigError: `close` was called before, or the number is negative.
+            StageError: An actor failed, now or before. The results so far stay available.
         """
-        self._require_open("finish")
-        if refine_iterations < 0:
-            raise ConfigError(f"refine_iterations={refine_iterations} must not be negative.")
-        if self._is_finished and not refine_iterations:
-            return
-        if self._remaining is None:
-            due = 0
-            if not self._is_finished:
-                with _interrupts_delayed():
-                    self._run.end_stream()
-                due = self._run.pending_iterations
-            self._remaining = self._requests(due, refine_iterations)
-        while self._remaining is not None:
-            with _interrupts_delayed():
-                self._refine_further(self._remaining)
+        self._require_usable("finish")
+        if not isinstance(refine_iterations, int) or refine_iterations < 0:
+            raise ConfigError(
+                f"refine_iterations={refine_iterations!r} must be a number of at least 0."
+            )
+        if not self._is_ending:
+            self._is_ending = True
+            self._steps.append(self._end())
+        if refine_iterations:
+            self._refined += refine_iterations
+            self._steps.append(self._refine(refine_iterations))
+        while self._steps:
+            with interrupts_delayed(), self._step():
+                if next(self._steps[0], DONE) is DONE:
+                    self._steps.popleft()
 
     def close(self) -> None:
         """End the threads of the actors. Frames that are not mapped yet are dropped."""
         if not self._is_closed:
+            with interrupts_delayed():
+                self._run.__exit__(None, None, None)
             self._is_closed = True
-            self._run.__exit__(None, None, None)
 
     # --- results ----------------------------------------------------------------------------------
     @property
@@ -204,10 +235,10 @@ class Slam:
 
         Frames of submaps that are not merged with the map are omitted.
         """
-        return self._run.record.final()
+        return read_only(self._run.record.final())
 
-    def objects(self, text: str | None = None) -> list[ObjectMatch]:
-        """Return the objects of the map, which need a detector (`detector.model`).
+    def objects(self, text: str | None = None) -> list[FoundObject]:
+        """Return the objects of the map. Without a detector (`detector.model`), there are none.
 
         Args:
             text: Name or synonym; None for all objects.
@@ -220,6 +251,9 @@ class Slam:
     def save(self, folder: FilePath, *, overwrite: bool = False) -> Path:
         """Write the folder of a run, as `ldo run` does: docs/run-folder.md.
 
+        The map is that after all iterations of `finish`. Times and frame rate in summary.json count
+        only the steps of this object.
+
         Args:
             folder: The folder; it is created.
             overwrite: True replaces the files of an earlier run.
@@ -231,10 +265,16 @@ class Slam:
             ConfigError: The folder is not empty, or cannot be written.
         """
         path = Path(folder).expanduser()
-        prepare(path, overwrite)
-        summary = self._run.summary(self._frames, self._rejected, is_finished=self._is_finished)
+        is_finished = self._is_ending and not self._steps and self._failure is None
         try:
-            self._run.record.save(path, summary)
+            with interrupts_delayed():
+                prepare(path, overwrite)
+                summary = self._run.summary(
+                    self._frames, self._rejected, self._used, is_finished=is_finished
+                )
+                if self._refined:
+                    summary["refine_iterations"] = self._refined
+                self._run.record.save(path, summary)
         except OSError as error:
             raise ConfigError(
                 f"{path} cannot be written: {error.strerror}. Free some space, or choose another "
@@ -246,7 +286,7 @@ class Slam:
     def _raw_frame(
         self, number: int, color: FrameArray, depth: FrameArray, stamp_ns: int
     ) -> RawFrame:
-        images = _array("color", color), _array("depth", depth)
+        images = array_of("color", color), array_of("depth", depth)
         if images[1].dtype == np.uint16 and self.depth_scale == 1.0:
             raise FrameError(
                 "depth is uint16, but depth_scale is 1, so a unit would be a meter. Create "
@@ -259,31 +299,42 @@ class Slam:
                 f"stamp_ns={stamp_ns!r} must be an integer number of nanoseconds, such as "
                 "round(1e9 * seconds)."
             ) from error
-        if stamp <= self._last_stamp_ns:
+        if not self._last_stamp_ns < stamp <= LAST_INTEGER:
             raise FrameError(
                 f"stamp_ns={stamp} must be later than the stamp of the last frame, "
-                f"{self._last_stamp_ns}, and not negative."
+                f"{self._last_stamp_ns}, not negative, and at most {LAST_INTEGER}."
             )
         return RawFrame(number, stamp, *images, self.depth_scale, self.camera)
 
-    def _requests(self, due: int, refine: int) -> Iterator[RefineMap | None]:
-        """Yield the requests of each refinement, and None after its last one."""
-        stamp_ns = self._run.record.newest_stamp_ns
-        for iterations in (due, refine):
-            if iterations:
-                yield from refinements(iterations, stamp_ns)
-                yield None
+    def _end(self) -> Iterator[None]:
+        """Do the work of `finish`, one step per item: end the stream, then refit the map."""
+        self._run.end_stream()
+        yield
+        if due := self._run.pending_iterations:
+            yield from self._refine(due)
 
-    def _refine_further(self, remaining: Iterator[RefineMap | None]) -> None:
-        try:
-            request = next(remaining)
-        except StopIteration:
-            self._remaining, self._is_finished = None, True
-            return
-        if request is None:
-            self._run.finish()
-        else:
+    def _refine(self, iterations: int) -> Iterator[None]:
+        """Refine the map, one step per item."""
+        for request in refinements(iterations, self._run.record.newest_stamp_ns):
             self._run.tick(request)
+            yield
+        self._run.finish()
+        yield
+
+    @contextmanager
+    def _step(self) -> Iterator[None]:
+        """Add up the time of a step, and note a failure or a second Ctrl-C within it."""
+        started = Usage.now()
+        try:
+            yield
+        except StageError as error:
+            self._failure = str(error)
+            raise
+        except BaseException as error:
+            self._failure = f"{type(error).__name__} interrupted a step of the actors."
+            raise
+        finally:
+            self._used = self._used.plus(Usage.now().since(started))
 
     def _observe(self, message: Message, _tick: int) -> None:
         if isinstance(message, TrackedPose):
@@ -291,90 +342,48 @@ class Slam:
         elif isinstance(message, Keyframe) and self._map_camera is None:
             self._map_camera = camera_from_message(message.camera).rectified()
 
-    def _require_open(self, call: str) -> None:
+    def _require_usable(self, call: str) -> None:
         if self._is_closed:
             raise ConfigError(f"{call} was called after close. Create another Slam.")
+        if self._failure is not None:
+            raise StageError(
+                f"{call} is not possible after a failure: {self._failure} The results so far can "
+                "be saved. Create another Slam for more frames."
+            )
 
 
-def _configured(config: Config | FilePath | None, settings: Mapping[str, object]) -> Config:
+def _configured(config: Config | FilePath | None, settings: Mapping[str, object] | None) -> Config:
+    if settings is not None and not isinstance(settings, Mapping):
+        raise ConfigError(
+            f"settings is a {type(settings).__name__}, must be a mapping such as "
+            '{"mapper.iterations": 7}.'
+        )
     if isinstance(config, Config):
         if settings:
             raise ConfigError("config is a Config already; put the settings into it.")
         return config
-    given = [f"{name}={_plain(value)}" for name, value in settings.items()]
-    return load_config(None if config is None else Path(config).expanduser(), given)
-
-
-def _plain(value: object) -> str:
-    """Return a value as YAML: text stays as it is, all else is JSON, which YAML contains."""
-    return value if isinstance(value, str) else msgspec.json.encode(value).decode()
-
-
-def _array(name: str, value: FrameArray) -> np.ndarray:
-    """Return an array of a user as NumPy array, without a copy where possible.
-
-    Raises:
-        FrameError: The value is no array, or lies in the memory of a GPU.
-    """
-    try:
-        if isinstance(value, np.ndarray):
-            return value
-        if hasattr(value, "__dlpack__"):
-            return np.from_dlpack(value)
-        if not isinstance(value, (list, tuple)):
-            array = np.asarray(value)
-            if array.ndim:
-                return array
-    except (BufferError, RuntimeError, TypeError, ValueError) as error:
-        raise FrameError(
-            f"{name} is a {type(value).__name__} that cannot be read as an array: {error}. Give a "
-            "NumPy array, or a tensor on the CPU without gradient."
-        ) from error
-    raise FrameError(
-        f"{name} is a {type(value).__name__}, must be an array, such as numpy.ndarray or a tensor "
-        "on the CPU."
-    )
+    if config is not None and not isinstance(config, (str, PathLike)):
+        raise ConfigError(
+            f"config is a {type(config).__name__}, must be a Config or the path of a YAML file. "
+            "Single settings are given as settings={...}."
+        )
+    return load_config(None if config is None else Path(config).expanduser(), values=settings)
 
 
 def _pose(message: TrackedPose) -> Pose:
     T_odom_camera = pose_from_message(message.T_odom_camera)
     T_map_camera = None
     if message.status != "LOST" and message.submap == 0:
-        T_map_camera = pose_from_message(message.T_map_odom) @ T_odom_camera
-        T_map_camera.flags.writeable = False
-    T_odom_camera.flags.writeable = False
-    covariance = np.array(message.covariance).reshape(6, 6)
-    covariance.flags.writeable = False
+        T_map_camera = read_only_array(pose_from_message(message.T_map_odom) @ T_odom_camera)
     return Pose(
         message.frame,
         message.stamp_ns,
         message.status,
         T_map_camera,
-        T_odom_camera,
-        covariance,
+        read_only_array(T_odom_camera),
+        message.reference,
+        read_only_array(pose_from_message(message.T_reference_camera)),
+        read_only_array(np.array(message.covariance).reshape(6, 6)),
         message.keyframe,
         message.submap,
     )
-
-
-@contextmanager
-def _interrupts_delayed() -> Iterator[None]:
-    """Handle Ctrl-C after the block instead of within it, so that each step is complete.
-
-    Only the main thread receives the interrupt, so the block does nothing in other threads.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.getsignal(signal.SIGINT)
-    if not callable(before):  # Ctrl-C is ignored, or handled outside of Python.
-        yield
-        return
-    pressed: list[FrameType | None] = []
-    signal.signal(signal.SIGINT, lambda _number, frame: pressed.append(frame))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if pressed:
-        before(signal.SIGINT, pressed[0])

@@ -50,7 +50,6 @@ class ActorRun:
         self.record = RunWriter(folder, config_yaml(config), parameters.tracker)
         self._observe_output = observe
         self._clock = LogicalClock(actors, latency_frames(config), self._observe)
-        self._started = Usage.now()
         self._stage_ms: dict[str, Percentiles] = {}
 
     def __enter__(self) -> "ActorRun":
@@ -91,16 +90,18 @@ class ActorRun:
         """Iterations that refit the map to keyframes which corrections have moved."""
         return int(self.actors["mapper"].metrics()["iterations_pending"])
 
-    def summary(self, frames: int, rejected: int, *, is_finished: bool) -> dict[str, Any]:
+    def summary(
+        self, frames: int, rejected: int, used: Usage, *, is_finished: bool
+    ) -> dict[str, Any]:
         """Return the summary of the frames so far.
 
         Args:
             frames: Number of frames.
             rejected: Number of frames that could not be used, without those that `frame_source`
                 has rejected.
+            used: Time that the frames took.
             is_finished: False if the run was interrupted.
         """
-        used = Usage.now().since(self._started)
         facts = self.actors["optimizer"].metrics() | self.actors["mapper"].metrics()
         stage_ms = self._stage_ms or self._step_percentiles()
         if source := self.actors.get("frame_source"):

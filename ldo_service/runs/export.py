@@ -79,14 +79,21 @@ def export_map(
             f"the format {format!r} is unknown. Choose one of: {', '.join(get_args(ExportFormat))}."
         )
     if voxel_m is not None and format not in ("mesh", "occupancy"):
-        raise ConfigError(f"--voxel applies to mesh and occupancy, not to {format}. Remove it.")
+        raise ConfigError(
+            f"a voxel size (--voxel) applies to mesh and occupancy, not to {format}. Remove it."
+        )
     written = [out.with_suffix(Path(name).suffix) for name in EXPORTED[format][1:]]
+    if out in written:
+        raise ConfigError(
+            f"{out} would be replaced by the floor plan beside the grid. Choose a file named "
+            f"{out.with_suffix(Path(EXPORTED[format][0]).suffix).name}."
+        )
     require_writable((run, source.folder), [out, *written], overwrite)
     try:
         return WRITERS[format](Job(source, out, voxel_m, up, heights_m, advance))
     except OSError as error:
         raise ConfigError(
-            f"{out} cannot be written: {error.strerror}. Choose another --out."
+            f"{out} cannot be written: {error.strerror}. Choose another file (--out)."
         ) from error
 
 
@@ -106,10 +113,13 @@ def require_writable(runs: Iterable[Path], files: list[Path], overwrite: bool) -
     for file in files:
         if file.resolve() in kept:
             raise ConfigError(
-                f"{file} is an output of the run, not an export. Choose another --out."
+                f"{file} is an output of the run, not an export. Choose another file (--out)."
             )
         if file.exists() and not overwrite:
-            raise ConfigError(f"{file} exists. Choose another --out, or add --overwrite.")
+            raise ConfigError(
+                f"{file} exists. Choose another file (--out), or add --overwrite (in Python: "
+                "overwrite=True)."
+            )
 
 
 # --- writers: each returns a short description of what it wrote ---------------------------------

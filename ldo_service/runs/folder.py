@@ -120,12 +120,15 @@ def prepare(folder: Path, overwrite: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         found = sorted(path for path in folder.rglob("*") if not path.is_dir())
         if found and not overwrite:
-            raise ConfigError(f"{folder} is not empty. Choose another folder, or add --overwrite.")
+            raise ConfigError(
+                f"{folder} is not empty. Choose another folder, or add --overwrite (in Python: "
+                "overwrite=True)."
+            )
         names = [path.relative_to(folder).as_posix() for path in found]
         foreign = [name for name in names if name not in WRITTEN]
         if foreign:
             raise ConfigError(
-                f"{folder} holds {foreign[0]}, which no run wrote, so --overwrite deletes nothing. "
+                f"{folder} holds {foreign[0]}, which no run wrote, so nothing is deleted. "
                 "Choose another folder."
             )
         for path in found:
@@ -255,7 +258,10 @@ class RunWriter:
         self.save(self.folder, summary)
 
     def save(self, folder: Path, summary: dict[str, Any]) -> None:
-        """Write all files to a folder, which exists; the record may continue afterwards."""
+        """Write all files to a folder, which exists; the record may continue afterwards.
+
+        A record that was started with a folder can only be saved in this folder.
+        """
         self.folder, self.summary = folder, summary
         if isinstance(self._csv_file, io.StringIO):
             (folder / "config.yaml").write_text(self._config_text)
@@ -339,7 +345,7 @@ class RunWriter:
     def placed_objects(self) -> MapObjects | None:
         """Return the objects whose first observing keyframe has a pose in the map.
 
-        None: no detector ran.
+        The result is None if no detector ran.
         """
         found, keyframes = self._objects, self._keyframes
         if found is None:

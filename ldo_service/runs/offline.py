@@ -11,6 +11,7 @@ from .folder import RunWriter
 from .front_end import ACTORS, FrontEnd, FrontEndRecord
 from .job import Advance, RunOptions, requests
 from .source import FrameReader, interleave_prior
+from .summary import Usage
 
 
 def run_offline(job: RunOptions, advance: Advance) -> RunWriter:
@@ -55,6 +56,7 @@ class OfflineRun:
         without = ACTORS if job.front_end else ()
         self._actors = ActorRun(job.config, job.folder, without, self._keep)
         self.record = self._actors.record
+        self._started = Usage.now()
         self._is_finished = False
 
     def __enter__(self) -> "OfflineRun":
@@ -87,7 +89,12 @@ class OfflineRun:
         """Write the results and the summary of all frames processed so far."""
         front_end = self._job.front_end
         rejected = front_end.rejected if front_end else self._reader.rejected
-        summary = self._actors.summary(len(self._frames), rejected, is_finished=self._is_finished)
+        summary = self._actors.summary(
+            len(self._frames),
+            rejected,
+            Usage.now().since(self._started),
+            is_finished=self._is_finished,
+        )
         self.record.close(summary)
 
     def refine(self) -> None:

@@ -30,6 +30,9 @@ class Usage:
     def since(self, earlier: "Usage") -> "Usage":
         return replace(self, wall_s=self.wall_s - earlier.wall_s, cpu_s=self.cpu_s - earlier.cpu_s)
 
+    def plus(self, other: "Usage") -> "Usage":
+        return replace(self, wall_s=self.wall_s + other.wall_s, cpu_s=self.cpu_s + other.cpu_s)
+
 
 def summarize(
     record: RunWriter,
@@ -65,7 +68,7 @@ def summarize(
         "gaussians_labelled": record.labelled(),  # Gaussians not labelled background.
         "boxes": record.boxes,
         "objects": len(record.objects()),
-        "fps": round((frames - rejected) / used.wall_s, 3),
+        "fps": round((frames - rejected) / used.wall_s, 3) if used.wall_s > 0 else 0.0,
         "wall_s": round(used.wall_s, 3),
         "cpu_s": round(used.cpu_s, 3),
         "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),

@@ -123,8 +123,10 @@ class LogicalClock:
         return self
 
     def __exit__(self, *_exception: object) -> None:
+        for thread in self._threads:  # All threads get the request before the first is joined.
+            thread.thread.shutdown(wait=False, cancel_futures=True)
         for thread in self._threads:
-            thread.thread.shutdown(cancel_futures=True)
+            thread.thread.shutdown()
 
     def run(self, source: Iterable[Message | tuple[Message, ...]]) -> Iterator[int]:
         """Deliver each item of the source in a tick of its own, and yield the number of the tick.
@@ -207,6 +209,6 @@ def _answer(due: PendingOutput, actor: str) -> StepOutput:
         return due.answer.result()
     except Exception as error:
         raise StageError(
-            f"{actor} failed at tick {due.tick}: {type(error).__name__}: {error}. "
-            "Run with --debug to see the traceback."
+            f"{actor} failed at tick {due.tick}: {type(error).__name__}: {error}. The traceback "
+            "tells where: `ldo --debug` prints it."
         ) from error

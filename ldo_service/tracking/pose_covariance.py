@@ -1,12 +1,18 @@
 """Covariance of the pose that alignment estimates.
 
 The residuals of neighboring points have correlated errors: a reflection, a blurred edge or a bias
-of the depth shifts many of them alike. The inverse Hessian of the normal equations takes the
+of the depth shifts many of them alike. The inverse Hessian H^-1 of the normal equations takes the
 residuals as independent, so it is too small by a factor that depends on the sensor. The covariance
-here is a sandwich H^-1 S H^-1 instead. S is the sum of g g^T over the cells of the image, and g is
-the gradient of the residuals of one cell at the pose (Liang and Zeger, "Longitudinal data analysis
-using generalized linear models", 1986). Where cells, or color and depth, demand different poses,
-their gradients are large, and the covariance grows. Conventions: `ldo_service.geometry`.
+is therefore
+
+    scale (H^-1 S H^-1 + max(tr(H^-1 S) / 6, 1) H^-1) + floor,
+
+where S is the sum of g g^T, and g is the gradient of the color or of the depth residuals of one
+cell of the image at the pose. The first term is the sandwich estimator (Liang and Zeger,
+"Longitudinal data analysis using generalized linear models", 1986). It grows where cells, or color
+and depth, contradict each other. The second term has the shape of H^-1 and the mean size of the first one. It
+covers directions in which the few gradients are small by coincidence. Its factor is at least 1, the
+value for independent residuals. `PRIOR` makes H regular. Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
@@ -18,19 +24,22 @@ from ldo_service.errors import ConfigError, named
 POSE, BRIGHTNESS = slice(0, 6), slice(6, 8)
 # Prior of gain and bias as inverse variances: standard deviations of 3 % and of 3 gray levels.
 BRIGHTNESS_PRIOR = np.array([1e3, 0.1])
+# Information that is added to the Hessian of the pose: 1 rad and 1 m. It only acts in directions
+# that the residuals do not constrain.
+PRIOR = np.eye(6)
 
 
 @dataclass(frozen=True, slots=True)
 class CovarianceConfig:
     """Settings of the covariance of a pose.
 
-    They were chosen so that the mean normalized estimation error squared is near 6, its expected
-    value, over seven sequences with exact truth: docs/benchmarks/covariance.md.
+    They were chosen on seven sequences with exact truth. There the mean normalized estimation error
+    squared, whose expected value is 6, is 2 to 6 without the errors of a real camera, and 12 and 28
+    with them: docs/benchmarks/covariance.md.
     """
 
-    scale: float = 5.0  # Factor on the sandwich and on the scaled inverse Hessian.
-    # Standard deviations that are added, because linear interpolation of images has errors of its
-    # own.
+    scale: float = 5.0  # Factor on both terms; see above.
+    # Standard deviations of the floor: errors of the linear interpolation of images.
     floor_rad: float = 3e-5
     floor_m: float = 5e-5
 
@@ -56,8 +65,8 @@ def pose_covariance(
 ) -> np.ndarray:
     """Return the covariance [6, 6] of a pose, rotation first, in rad^2 and m^2.
 
-    A direction that the residuals do not constrain has a standard deviation of more than 1 rad or
-    1 m.
+    A direction that the residuals do not constrain has a standard deviation of at least
+    sqrt(config.scale) rad or m.
 
     Args:
         hessian: Hessian of pose, gain and bias at the pose, [8, 8].
@@ -68,10 +77,8 @@ def pose_covariance(
     brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
     by_brightness = np.linalg.solve(brightness, hessian[BRIGHTNESS, POSE])
     g = gradients[:, POSE] - gradients[:, BRIGHTNESS] @ by_brightness
-    inverse = np.linalg.inv(without_brightness(hessian) + np.eye(6))
+    inverse = np.linalg.inv(without_brightness(hessian) + PRIOR)
     spread = g.T @ g
-    # Mean ratio of the sandwich to the inverse Hessian. The inverse Hessian at this ratio keeps the
-    # covariance from being too small in a direction in which the cells agree by chance.
     ratio = max(float(np.trace(inverse @ spread)) / 6, 1.0)
     floor = np.diag([config.floor_rad**2] * 3 + [config.floor_m**2] * 3)
     return config.scale * (inverse @ spread @ inverse + ratio * inverse) + floor

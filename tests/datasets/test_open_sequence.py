@@ -136,3 +136,10 @@ def test_entry_point_that_is_no_layout_is_named(
     register(loaded)
     with pytest.raises(ConfigError, match=f"mine = my_package:LAYOUT.*{message}"):
         open_sequence(str(tmp_path))
+
+
+def test_broken_layout_of_another_package_does_not_hide_known_ones(
+    register: Callable[[object], None], seven_scenes_folder: Callable[..., Path]
+) -> None:
+    register(ImportError("no module"))
+    assert len(open_sequence(str(seven_scenes_folder([0, 1])))) == 2

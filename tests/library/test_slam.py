@@ -1,4 +1,5 @@
 import filecmp
+import json
 import signal
 import subprocess
 import sys
@@ -11,7 +12,8 @@ import pytest
 import ldo_service
 from ldo_service import Camera, Frame, Pose, Run, Slam, Trajectory, load_config, open_sequence
 from ldo_service.commands.cli import main
-from ldo_service.errors import ConfigError, DataError, FrameError
+from ldo_service.errors import ConfigError, DataError, FrameError, StageError
+from ldo_service.runs.summary import Usage
 
 COUNT = 12
 # Files of a run whose content does not depend on the time that the run took.
@@ -117,7 +119,7 @@ def test_objects_and_labels_of_a_run_with_a_detector(tmp_path: Path) -> None:
             frame = sequence[index]
             slam.track(frame.color, frame.depth_m, frame.stamp_ns)
         slam.finish()
-    objects = slam.objects()
+    objects, last = slam.objects(), slam.trajectory().T_world_camera[-1][:3, 3]
     assert objects
     name = objects[0].name
     assert name in [found.name for found in slam.objects(name)]
@@ -130,9 +132,11 @@ def test_objects_and_labels_of_a_run_with_a_detector(tmp_path: Path) -> None:
     assert probabilities.shape[1] == len(slam.map.label_names)
     np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
     run = Run.open(slam.save(tmp_path / "run"))
-    assert [(one.id, one.name, one.center) for one in run.objects()] == [
-        (one.id, one.name, one.center) for one in objects
-    ]
+    assert [(one.id, one.name) for one in run.objects()] == [(one.id, one.name) for one in objects]
+    for one, other in zip(run.objects(), objects, strict=True):
+        np.testing.assert_allclose(one.T_map_object, other.T_map_object, atol=1e-6)
+        np.testing.assert_array_equal(one.center_m, one.T_map_object[:3, 3])
+        assert one.distance_m == pytest.approx(np.linalg.norm(one.center_m - last), abs=1e-4)
 
 
 # --- arguments ------------------------------------------------------------------------------------
@@ -188,6 +192,7 @@ def test_buffers_may_be_reused_at_once(frames: list[Frame], finished: Slam) -> N
         ({"depth": np.zeros((240, 320), np.int32)}, "depth is int32"),
         ({"stamp_ns": 1.5}, "stamp_ns=1.5 must be an integer"),
         ({"stamp_ns": 0}, "later than the stamp of the last frame"),
+        ({"stamp_ns": 2**70}, "at most"),
     ],
 )
 def test_wrong_frame_names_the_argument_and_tracking_continues(
@@ -210,8 +215,18 @@ def test_wrong_settings_and_cameras_are_refused(tmp_path: Path) -> None:
         Slam(camera, config=tmp_path / "nothing.yaml")
     with pytest.raises(ConfigError, match="put the settings into it"):
         Slam(camera, config=load_config(), settings={"mapper.iterations": 3})
-    with pytest.raises(ConfigError, match=r"ldo_service\.Camera"):
-        Slam((640, 480))  # pyright: ignore[reportArgumentType]
+    for arguments, message in (
+        ({"camera": (640, 480)}, r"ldo_service\.Camera"),
+        ({"depth_scale": "1000"}, "depth_scale='1000'"),
+        ({"depth_scale": 0}, "depth_scale=0"),
+        ({"config": {"mapper.iterations": 3}}, "config is a dict"),
+        ({"settings": ["mapper.iterations=3"]}, "settings is a list"),
+        ({"settings": {"mapper.iterations": "7"}}, r"mapper\.iterations"),
+        ({"settings": {"mapper.iterations": 7, "mapper.iterations.x": 7}}, r"mapper\.iterations"),
+        ({"settings": {3: 7}}, "name of a setting is 3"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            Slam(**{"camera": camera, **arguments})  # pyright: ignore[reportArgumentType]
 
 
 def test_settings_may_come_from_a_file_and_a_mapping(tmp_path: Path) -> None:
@@ -221,14 +236,37 @@ def test_settings_may_come_from_a_file_and_a_mapping(tmp_path: Path) -> None:
     with Slam(camera, config=file, settings={"tracker.self_calibration": False}) as slam:
         assert slam.config.mapper.iterations == 3
         assert not slam.config.tracker.self_calibration
+    text = {"detector.model": "a: b #1", "mapper.iterations": np.int64(4)}
+    config = load_config(values=text)
+    assert (config.detector.model, config.mapper.iterations) == ("a: b #1", 4)
 
 
-def test_wrong_pose_of_a_rendering_is_refused(finished: Slam) -> None:
-    for T in (np.eye(3), 2 * np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)):
-        with pytest.raises(ConfigError, match="T_map_camera"):
-            finished.map.render(T)
-    with pytest.raises(ConfigError, match="no labels"):
-        finished.map.render(np.eye(4), labels=True)
+@pytest.mark.parametrize(
+    ("T", "message"),
+    [
+        (None, "LOST has no pose"),
+        (np.eye(3), "shape"),
+        ("x", "is a str"),
+        (2 * np.eye(4), "rigid"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "rigid"),
+        (np.full((4, 4), np.nan), "rigid"),
+    ],
+)
+def test_wrong_pose_of_a_rendering_is_refused(finished: Slam, T: object, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"T_map_camera.*{message}"):
+        finished.map.render(T)  # pyright: ignore[reportArgumentType]
+
+
+def test_wrong_options_of_a_rendering_are_refused(finished: Slam) -> None:
+    for options, message in (
+        ({"labels": True}, "no labels"),
+        ({"threads": 0}, "threads=0"),
+        ({"camera": (320, 240)}, "camera is a tuple"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            finished.map.render(np.eye(4), **options)
+    with pytest.raises(ConfigError, match="map is empty"):
+        Slam(finished.camera).map.render(np.eye(4))
 
 
 # --- life -----------------------------------------------------------------------------------------
@@ -268,38 +306,127 @@ def test_track_after_finish_is_refused(frames: list[Frame]) -> None:
             fed(slam, frames[2:3])
 
 
-def test_interrupt_takes_effect_after_the_frame(
+def interrupted(monkeypatch: pytest.MonkeyPatch, slam: Slam, name: str, times: int = 1) -> None:
+    """Let the next call of a method of the actors receive Ctrl-C before it works."""
+    method = getattr(slam._run, name)
+
+    def call(*arguments: object) -> object:
+        monkeypatch.setattr(slam._run, name, method)
+        for _ in range(times):
+            signal.raise_signal(signal.SIGINT)
+        return method(*arguments)
+
+    monkeypatch.setattr(slam._run, name, call)
+
+
+def test_results_after_interrupts_are_those_without(
     frames: list[Frame], finished: Slam, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The poses after interrupts in `track` and `finish` are the same as without."""
     with Slam(frames[0].camera) as slam:
         fed(slam, frames[:5])
-        tick, end = slam._run.tick, slam._run.end_stream
-        monkeypatch.setattr(
-            slam._run, "tick", lambda item: (signal.raise_signal(signal.SIGINT), tick(item))
-        )
+        interrupted(monkeypatch, slam, "tick")
         with pytest.raises(KeyboardInterrupt):
             fed(slam, frames[5:6])
-        monkeypatch.setattr(slam._run, "tick", tick)
         fed(slam, frames[6:])
-        monkeypatch.setattr(
-            slam._run, "end_stream", lambda: (end(), signal.raise_signal(signal.SIGINT))
-        )
+        interrupted(monkeypatch, slam, "end_stream")
         with pytest.raises(KeyboardInterrupt):
             slam.finish()
-        monkeypatch.setattr(slam._run, "end_stream", end)
+        with pytest.raises(ConfigError, match="after finish"):
+            fed(slam, frames[:1])
         slam.finish()
     require_equal(slam.trajectory(), finished.trajectory())
     assert slam.map.arrays().means_m.tobytes() == finished.map.arrays().means_m.tobytes()
 
 
-def test_refinement_changes_the_map(frames: list[Frame], finished: Slam) -> None:
+def test_interrupted_refinement_continues_with_the_next_call(
+    frames: list[Frame], finished: Slam, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    colors = []
+    for is_interrupted in (False, True):
+        with Slam(frames[0].camera) as slam:
+            fed(slam, frames)
+            slam.finish()
+            if is_interrupted:
+                interrupted(monkeypatch, slam, "tick")
+                with pytest.raises(KeyboardInterrupt):
+                    slam.finish(refine_iterations=30)
+                assert json.loads((slam.save(tmp_path / "a") / "summary.json").read_text())[
+                    "interrupted"
+                ]
+                slam.finish()
+            else:
+                slam.finish(refine_iterations=30)
+            colors.append(slam.map.arrays().colors.tobytes())
+            summary = json.loads(
+                (slam.save(tmp_path / f"{is_interrupted}") / "summary.json").read_text()
+            )
+            assert (summary["refine_iterations"], summary["interrupted"]) == (30, False)
+    assert colors[0] == colors[1] != finished.map.arrays().colors.tobytes()
+
+
+def test_second_interrupt_takes_effect_at_once_and_ends_tracking(
+    frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
     with Slam(frames[0].camera) as slam:
-        fed(slam, frames)
-        slam.finish(refine_iterations=5)
-        with pytest.raises(ConfigError, match="refine_iterations=-1"):
-            slam.finish(refine_iterations=-1)
-    assert slam.map.arrays().colors.tobytes() != finished.map.arrays().colors.tobytes()
+        fed(slam, frames[:2])
+        interrupted(monkeypatch, slam, "tick", times=2)
+        with pytest.raises(KeyboardInterrupt):
+            fed(slam, frames[2:3])
+        with pytest.raises(StageError, match="KeyboardInterrupt interrupted a step"):
+            fed(slam, frames[3:4])
+        assert len(slam.trajectory()) == 2
+
+
+def test_interrupt_while_closing_leaves_no_thread(
+    frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = set(threading.enumerate())
+    slam = Slam(frames[0].camera)
+    fed(slam, frames[:2])
+    interrupted(monkeypatch, slam, "__exit__", times=2)
+    with pytest.raises(KeyboardInterrupt):
+        slam.close()
+    slam.close()
+    assert set(threading.enumerate()) == before
+
+
+def test_failed_actor_ends_tracking_and_keeps_the_results(
+    frames: list[Frame], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with Slam(frames[0].camera) as slam:
+        fed(slam, frames[:4])
+
+        def fail(_message: object) -> object:
+            raise RuntimeError("out of ideas")
+
+        monkeypatch.setattr(slam._run.actors["tracker"], "handle", fail)
+        with pytest.raises(StageError, match="tracker failed at tick 4: RuntimeError: out of ide"):
+            fed(slam, frames[4:5])
+        for call in (slam.finish, lambda: fed(slam, frames[5:6])):
+            with pytest.raises(StageError, match="not possible after a failure: tracker failed"):
+                call()
+        assert len(slam.trajectory()) == 4
+        folder = slam.save(tmp_path / "run")
+    assert json.loads((folder / "summary.json").read_text())["interrupted"]
+
+
+def test_negative_number_of_iterations_is_refused(frames: list[Frame]) -> None:
+    with Slam(frames[0].camera) as slam:
+        for count in (-1, "5", 1.5):
+            with pytest.raises(ConfigError, match="refine_iterations"):
+                slam.finish(refine_iterations=count)  # pyright: ignore[reportArgumentType]
+
+
+def test_time_between_frames_does_not_lower_the_frame_rate(
+    frames: list[Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = iter(range(100))
+    monkeypatch.setattr(Usage, "now", staticmethod(lambda: Usage(float(next(now_s)), 0.0)))
+    with Slam(frames[0].camera) as slam:
+        fed(slam, frames[:3])  # Each step takes one tick of the clock above.
+        next(now_s)
+        folder = slam.save(tmp_path / "run")
+    assert json.loads((folder / "summary.json").read_text())["fps"] == 1.0
 
 
 # --- saved runs -----------------------------------------------------------------------------------
@@ -329,7 +456,7 @@ def test_saved_run_is_exported(saved: Path, tmp_path: Path) -> None:
 
 
 def test_folder_that_is_not_empty_is_not_overwritten(finished: Slam, saved: Path) -> None:
-    with pytest.raises(ConfigError, match="not empty"):
+    with pytest.raises(ConfigError, match=r"not empty.*overwrite=True"):
         finished.save(saved)
     finished.save(saved, overwrite=True)
 

@@ -45,3 +45,14 @@ def test_masked_pixels_have_no_points_on_any_level(room) -> None:
         u, v = (column + 0.5) * scale, (row + 0.5) * scale
         assert not ((u > 41) & (u < 90) & (v > 30) & (v < 61)).any()
         assert len(column) > 0.7 * (level.camera.width - 2) * (level.camera.height - 2)
+
+
+def test_cells_are_numbered_by_rows_of_the_image(room) -> None:
+    pyramid = pyramid_of(room.view(np.eye(4)), PyramidConfig())
+    reference, camera = build_reference(pyramid), pyramid.levels[0].camera
+    u, v = camera.project(reference.points[0][:3].T.astype(float)).round().T
+    row, column = 6 * v / camera.height, 8 * u / camera.width
+    is_inside = (row % 1 > 0.01) & (column % 1 > 0.01)  # Rounding decides at the first pixel.
+    expected = 8 * np.floor(row) + np.floor(column)
+    np.testing.assert_array_equal(reference.cells[is_inside], expected[is_inside])
+    assert reference.cells.max() == 47

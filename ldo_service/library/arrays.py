@@ -1,0 +1,49 @@
+"""Arrays that callers give, and arrays that they get."""
+
+from typing import Any
+
+import numpy as np
+
+from ldo_service.errors import FrameError
+from ldo_service.geometry import Trajectory
+
+FrameArray = Any  # An array that supports DLPack or the buffer protocol.
+
+
+def array_of(name: str, value: FrameArray) -> np.ndarray:
+    """Return an array of a caller as a NumPy array, without a copy where possible.
+
+    Raises:
+        FrameError: The value is no array, or lies in the memory of a GPU.
+    """
+    try:
+        if isinstance(value, np.ndarray):
+            return value
+        if hasattr(value, "__dlpack__"):
+            return np.from_dlpack(value)
+        if not isinstance(value, (list, tuple)):
+            array = np.asarray(value)
+            if array.ndim:
+                return array
+    except (BufferError, RuntimeError, TypeError, ValueError) as error:
+        raise FrameError(
+            f"{name} is a {type(value).__name__} that cannot be read as an array: {error}. Give a "
+            "NumPy array, or a tensor on the CPU without gradient."
+        ) from error
+    raise FrameError(
+        f"{name} is a {type(value).__name__}, must be an array, such as numpy.ndarray or a tensor "
+        "on the CPU."
+    )
+
+
+def read_only(trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory after its arrays were made read-only."""
+    read_only_array(trajectory.stamps_s)
+    read_only_array(trajectory.T_world_camera)
+    return trajectory
+
+
+def read_only_array(array: np.ndarray) -> np.ndarray:
+    """Return an array after it was made read-only."""
+    array.flags.writeable = False
+    return array
