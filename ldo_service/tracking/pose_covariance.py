@@ -10,9 +10,10 @@ is therefore
 where S is the sum of g g^T, and g is the gradient of the color or of the depth residuals of one
 cell of the image at the pose. The first term is the sandwich estimator (Liang and Zeger,
 "Longitudinal data analysis using generalized linear models", 1986). It grows where cells, or color
-and depth, contradict each other. The second term has the shape of H^-1 and the mean size of the first one. It
-covers directions in which the few gradients are small by coincidence. Its factor is at least 1, the
-value for independent residuals. `PRIOR` makes H regular. Conventions: `ldo_service.geometry`.
+and depth, contradict each other. The second term has the shape of H^-1 and the mean size of the
+first one. It covers directions in which the few gradients are small by coincidence. Its factor is
+at least 1, the value for independent residuals. `PRIOR` makes H regular. Conventions:
+`ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
