@@ -157,7 +157,7 @@ def _tracker(config: Config) -> TrackerConfig:
                 across_scales=tracker.relocalization.sift_candidates,
             ),
             keyframe_reuse=KeyframeReuseConfig(after=tracker.keyframes.reuse_after),
-            submaps=SubmapConfig(begin_after_s=tracker.submaps.start_after_lost_s),
+            submaps=SubmapConfig(begin_after_frames=tracker.submaps.start_after_lost_frames),
             tracking_quality=TrackingQualityConfig(
                 min_overlap=tracker.quality.weak_overlap,
                 weak_residual=tracker.quality.weak_residual_ratio,

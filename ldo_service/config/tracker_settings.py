@@ -149,9 +149,10 @@ class RelocalizationSettings:
 class SubmapSettings:
     """Submaps that the tracker starts after it was lost."""
 
-    # Time without a pose after which the tracker starts a new submap, seconds, as in ORB-SLAM3. 0
+    # Number of LOST frames in a row after which the tracker starts a new submap. A third of this
+    # number is enough if each frame shows another view. Frames of a covered camera do not count. 0
     # never starts one.
-    start_after_lost_s: NonNegativeFloat = 3.0
+    start_after_lost_frames: NonNegativeInt = 90
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ from .pyramid import Pyramid
 from .relocalization import Relocalizer
 from .shutter import ShutterState
 from .state import KeyframeOrigin, OdometryState
-from .submaps import SubmapMatch, SubmapMeasurement
+from .submaps import SubmapMatch, SubmapMeasurement, Submaps
 from .tracking_quality import ResidualHistory, TrackingStatus, classify_tracking
 from .tracking_result import KeyframeKind, TrackedFrame
 
@@ -290,7 +290,7 @@ class FrameTracker:
             TrackingStatus.LOST,
             "none",
         )
-        is_long_lost = self.state.submaps.should_start(frame.stamp_ns, self.config.submaps)
+        is_long_lost = self.state.submaps.should_start(self.config.submaps)
         should_start = is_long_lost and self._is_usable(self.view(frame))
         return replace(lost, should_start_submap=should_start)
 
@@ -386,5 +386,13 @@ class FrameTracker:
             history=history,
             status=status,
             frames_since_keyframe=before.frames_since_keyframe + 1,
-            submaps=before.submaps.after(status is TrackingStatus.LOST, frame.stamp_ns),
+            submaps=self._submaps_after(frame, status),
         )
+
+    def _submaps_after(self, frame: RgbdFrame, status: TrackingStatus) -> Submaps:
+        submaps = self.state.submaps
+        if status is not TrackingStatus.LOST:
+            return submaps.after_tracked()
+        view = self.view(frame)
+        thumbnail = make_thumbnail(view) if self._is_usable(view) else None
+        return submaps.after_lost(thumbnail, self.config.submaps)

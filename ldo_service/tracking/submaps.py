@@ -19,16 +19,22 @@ from .alignment import Alignment
 from .keyframes import ReferenceKeyframe
 from .motion import image_motion_rad
 
+FRAMES_PER_VIEW = 3  # A LOST frame that shows another view counts like this many frames.
+
 
 @dataclass(frozen=True, slots=True)
 class SubmapConfig:
     """Settings of submaps."""
 
-    # Time that tracking must be LOST without interruption before a new submap starts, as in
-    # ORB-SLAM3; 0: never.
-    begin_after_s: float = 3.0
-    # Frames between searches of the other submaps: twice a second at 30 Hz. A prime number, so that
-    # the searches do not coincide with the frames that are held out from mapping.
+    # Number of LOST frames in a row, each searched in vain, after which a new submap starts; 0:
+    # never. In the kitchen at 30 Hz, relocalization took up to 87 frames. A third of this number is
+    # enough if all frames show different views, as with a fast camera or few frames per second: at
+    # 2 to 5 Hz, relocalization took at most 10 frames.
+    begin_after_frames: int = 90
+    # Correlation of the thumbnails of two frames below which the frames show different views.
+    max_view_correlation: float = 0.9
+    # Frames between searches of the other submaps. A prime number, so that the searches do not
+    # coincide with the frames that are held out from mapping.
     search_interval_frames: int = 17
     confirm_after: int = 7  # Frames between searches while a match is pending.
     confirm_rad: float = 0.06  # Maximum rotation plus parallax between two consistent matches.
@@ -39,11 +45,16 @@ class SubmapConfig:
     misses: int = 3  # Number of searches in a row without a match that a pending match survives.
 
     def __post_init__(self) -> None:
-        if not self.begin_after_s >= 0 or min(self.search_interval_frames, self.confirm_after) < 1:
+        if self.begin_after_frames < 0 or min(self.search_interval_frames, self.confirm_after) < 1:
             raise ConfigError(
-                f"SubmapConfig.begin_after_s={self.begin_after_s:g} must be at least 0, "
+                f"SubmapConfig.begin_after_frames={self.begin_after_frames} must be at least 0, "
                 f"search_interval_frames={self.search_interval_frames} and "
                 f"confirm_after={self.confirm_after} at least 1."
+            )
+        if not -1 <= self.max_view_correlation <= 1:
+            raise ConfigError(
+                f"SubmapConfig.max_view_correlation={self.max_view_correlation:g} must be within "
+                "-1..1."
             )
         if not (self.confirm_rad > 0 and self.confirm_apart_rad >= 0 and self.misses >= 0):
             raise ConfigError(
@@ -128,8 +139,10 @@ class Submaps:
     # Oldest submap that each submap is merged with, by submap; the submap itself if it is not
     # merged.
     roots: tuple[int, ...] = ()
-    # Stamp of the first of the successive LOST frames; None if the last frame was not LOST.
-    lost_since_ns: int | None = None
+    lost_frames: int = 0  # LOST frames in a row that were searched in vain.
+    lost_views: int = 0  # Number of these that show another view than the last counted one.
+    # Thumbnail of the last counted view, [300] int8; None without LOST frames.
+    lost_thumbnail: np.ndarray | None = None
     frames_since_search: int = 0
     pending_match: SubmapMatch | None = None  # Match that awaits confirmation.
     missed: int = 0  # Searches in a row without a match.
@@ -138,29 +151,37 @@ class Submaps:
         """Return the state with one more submap, which is not merged with any other."""
         return Submaps((*self.roots, len(self.roots)))
 
-    def after(self, is_lost: bool, stamp_ns: int) -> "Submaps":
-        """Return the state after one more frame.
-
-        If the camera restarts while LOST, stamps may go back. The LOST time then counts from the
-        earliest stamp.
-
-        Args:
-            is_lost: True if the tracking status of the frame is LOST.
-            stamp_ns: Stamp of the frame.
-        """
-        known = self.lost_since_ns
-        since_ns = stamp_ns if known is None else min(known, stamp_ns)
+    def after_tracked(self) -> "Submaps":
+        """Return the state after a frame that is not LOST."""
+        since = self.frames_since_search + 1
         return replace(
-            self,
-            lost_since_ns=since_ns if is_lost else None,
-            frames_since_search=self.frames_since_search + 1,
+            self, lost_frames=0, lost_views=0, lost_thumbnail=None, frames_since_search=since
         )
 
-    def should_start(self, stamp_ns: int, config: SubmapConfig) -> bool:
-        """Return whether tracking has been LOST for long enough at a stamp to start a submap."""
-        if self.lost_since_ns is None or config.begin_after_s == 0:
-            return False
-        return stamp_ns - self.lost_since_ns >= 1e9 * config.begin_after_s
+    def after_lost(self, thumbnail: np.ndarray | None, config: SubmapConfig) -> "Submaps":
+        """Return the state after a LOST frame.
+
+        Args:
+            thumbnail: Thumbnail of the frame, [300] int8; None if the frame was not searched,
+                because it has too little depth.
+            config: Settings.
+        """
+        after = replace(self, frames_since_search=self.frames_since_search + 1)
+        if thumbnail is None:
+            return after
+        last = self.lost_thumbnail
+        is_view = last is None or _correlation(thumbnail, last) < config.max_view_correlation
+        return replace(
+            after,
+            lost_frames=self.lost_frames + 1,
+            lost_views=self.lost_views + is_view,
+            lost_thumbnail=thumbnail if is_view else last,
+        )
+
+    def should_start(self, config: SubmapConfig) -> bool:
+        """Return whether enough LOST frames were searched in vain to start a submap."""
+        count = max(self.lost_frames, FRAMES_PER_VIEW * self.lost_views)
+        return 0 < config.begin_after_frames <= count
 
     def is_search_due(self, config: SubmapConfig) -> bool:
         """Return whether to search the other submaps with the current frame.
@@ -229,6 +250,8 @@ class Submaps:
     def unpack(kept: dict[str, Any]) -> "Submaps":
         """Return the state from its packed form."""
         match = kept["pending_match"]
+        # A state of an earlier version has a stamp instead of counters, which start at 0.
+        kept = {name: value for name, value in kept.items() if name != "lost_since_ns"}
         return Submaps(
             **{
                 **kept,
@@ -236,3 +259,10 @@ class Submaps:
                 "pending_match": match and SubmapMatch(**match),
             }
         )
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the correlation of two thumbnails with mean 0, -1..1; 1 if one has no contrast."""
+    first, second = a.astype(float), b.astype(float)
+    scale = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return float(first @ second) / scale if scale > 0 else 1.0

@@ -247,7 +247,7 @@ def test_a_correction_before_any_frame_is_harmless() -> None:
 # --- submaps -------------------------------------------------------------------------------------
 QUICK_SUBMAPS = OdometryConfig(
     submaps=SubmapConfig(
-        begin_after_s=0.06, search_interval_frames=3, confirm_after=2, confirm_apart_rad=0.05
+        begin_after_frames=9, search_interval_frames=3, confirm_after=2, confirm_apart_rad=0.05
     )
 )
 

@@ -44,7 +44,7 @@ def test_default_print_has_public_and_changed_settings_only() -> None:
 def test_comment_is_printed_with_its_setting() -> None:
     lines = explained_yaml(Config(), with_advanced=True).splitlines()
     reasons = {key.strip(): reason for key, _, reason in (line.partition("  # ") for line in lines)}
-    assert reasons["start_after_lost_s: 3.0"].endswith("0 never starts one.")
+    assert reasons["start_after_lost_frames: 90"].endswith("0 never starts one.")
     assert reasons["pyramid_levels: 4"].startswith("Number of pyramid levels. More levels")
     assert reasons["pyramid_levels: 4"].endswith("ends at 40 pixels.")
 

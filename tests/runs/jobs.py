@@ -32,7 +32,7 @@ def job(
     return RunOptions(sequence, folder, config, Selection(max_frames=frames), warn, prior=prior)
 
 
-EARLY_SUBMAPS = ("tracker.submaps.start_after_lost_s=0.06",)
+EARLY_SUBMAPS = ("tracker.submaps.start_after_lost_frames=9",)
 # A short walk from one place to another and back.
 OUT_AND_BACK = [*range(0, 24, 2), *range(60, 66), *range(1, 23, 2)]
 SHORT_GAP = "loop_closer.retrieval.min_gap_frames=5"  # Allows loops from the end to the start.

@@ -15,9 +15,9 @@ from ldo_service.tracking.submaps import SubmapConfig
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
-def track(frames: Iterable[RgbdFrame], begin_after_s: float = 0) -> list[TrackingResult]:
-    """Track frames; a submap starts after `begin_after_s` seconds of LOST, or never if it is 0."""
-    submaps = SubmapConfig(begin_after_s=begin_after_s)
+def track(frames: Iterable[RgbdFrame], begin_after_frames: int = 0) -> list[TrackingResult]:
+    """Track frames; 0 `begin_after_frames` starts no submap."""
+    submaps = SubmapConfig(begin_after_frames=begin_after_frames)
     config = OdometryConfig(submaps=submaps, keyframes=KeyframeConfig(mapping_only_ratio=2.0))
     odometry = Odometry(config)
     return [odometry.process(frame) for frame in frames]
@@ -56,7 +56,7 @@ def test_apartment_starts_a_submap_and_the_kitchen_resumes_the_first(data: Path)
     frames = [kitchen[k] for k in range(140, 240)]
     undisturbed = track(frames)[60:]
     visit = [apartment[k] for k in range(100)]
-    results = track([*frames[:60], *visit, *frames[60:]], begin_after_s=0.63)
+    results = track([*frames[:60], *visit, *frames[60:]], begin_after_frames=60)
     elsewhere, back = results[60:160], results[160:]
     assert {r.status for r in elsewhere[:19]} == {TrackingStatus.LOST}
     second_submap = [r for r in elsewhere if r.submap > 0]

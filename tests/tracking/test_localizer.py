@@ -16,7 +16,7 @@ from ldo_service.tracking.submaps import SubmapConfig
 T_MAP_WORLD = se3.exp(np.array([0.1, -0.7, 0.2, 3.0, 1.0, -2.0]))
 T_BEHIND = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
 CONFIG = OdometryConfig(
-    submaps=SubmapConfig(begin_after_s=0.06, search_interval_frames=4, confirm_after=2)
+    submaps=SubmapConfig(begin_after_frames=9, search_interval_frames=4, confirm_after=2)
 )
 
 

@@ -266,7 +266,7 @@ def test_new_submap_starts_at_the_pose_of_the_prior(room, make_walk) -> None:
         for k, T in enumerate(truth)
     ]
     turned = CoveredWalk(frames, truth)
-    config = OdometryConfig(submaps=SubmapConfig(begin_after_s=0.3))
+    config = OdometryConfig(submaps=SubmapConfig(begin_after_frames=1))
     alone, helped = turned.track(None, config), turned.track(drifting(truth), config)
     for results in (alone, helped):
         assert {tracked.submap for tracked in results[BEFORE + COVERED :]} == {1}

@@ -3,11 +3,11 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking.submaps import SubmapConfig, SubmapMatch, Submaps
 from tests.tracking.scenes import yaw
 
-PERIOD_NS = 33_333_333
-CONFIG = SubmapConfig(begin_after_s=0.1, search_interval_frames=4, confirm_after=2)
+CONFIG = SubmapConfig(begin_after_frames=6, search_interval_frames=4, confirm_after=2)
 T_THERE_HERE = se3.exp(np.array([0.0, 0.4, 0.0, 1.0, 0.0, 2.0]))
 
 
@@ -25,41 +25,79 @@ def started_submaps(count: int) -> Submaps:
 
 
 def after_frames(submaps: Submaps, frames: int) -> Submaps:
-    for k in range(frames):
-        submaps = submaps.after(is_lost=False, stamp_ns=k * PERIOD_NS)
+    for _ in range(frames):
+        submaps = submaps.after_tracked()
     return submaps
 
 
-def submap_starts(is_lost: list[bool], stamps_ns: list[int], config: SubmapConfig) -> list[bool]:
-    """Return whether a submap may start with each frame."""
+def thumbnail(number: int) -> np.ndarray:
+    """Return a thumbnail that resembles only those of the same number."""
+    return np.random.default_rng(number).integers(-99, 99, 300).astype(np.int8)
+
+
+def submap_starts(frames: str, config: SubmapConfig = CONFIG) -> list[bool]:
+    """Return whether a submap may start with each frame.
+
+    Args:
+        frames: A character per frame: "t" is tracked, "c" is LOST and covered. A digit is LOST and
+            was searched in vain; equal digits show the same view.
+        config: Settings.
+    """
     submaps, may_start = started_submaps(1), []
-    for lost, stamp_ns in zip(is_lost, stamps_ns, strict=True):
-        submaps = submaps.after(lost, stamp_ns)
-        may_start.append(submaps.should_start(stamp_ns, config))
+    for frame in frames:
+        if frame == "t":
+            submaps = submaps.after_tracked()
+        else:
+            submaps = submaps.after_lost(None if frame == "c" else thumbnail(int(frame)), config)
+        may_start.append(submaps.should_start(config))
     return may_start
 
 
-@pytest.mark.parametrize("rate_hz", [5, 30, 200])
-def test_submap_starts_after_three_seconds_lost_at_any_frame_rate(rate_hz: int) -> None:
-    stamps_ns = [round(1e9 * k / rate_hz) for k in range(4 * rate_hz)]
-    expected = [stamp_ns >= 3_000_000_000 for stamp_ns in stamps_ns]
-    assert submap_starts([True] * len(stamps_ns), stamps_ns, SubmapConfig()) == expected
+def test_submap_starts_after_a_number_of_lost_frames() -> None:
+    assert submap_starts("t1111111") == [False] * 6 + [True] * 2
+    lost = SubmapConfig().begin_after_frames
+    assert submap_starts("1" * lost, SubmapConfig()) == [False] * (lost - 1) + [True]
 
 
-def test_tracked_frame_resets_the_time_until_a_submap_starts() -> None:
-    is_lost = [True, True, False, True, True, True, True]
-    stamps_ns = [k * 50_000_000 for k in range(7)]
-    assert submap_starts(is_lost, stamps_ns, CONFIG) == [False] * 5 + [True] * 2
+def test_a_third_of_the_frames_is_enough_if_they_show_different_views() -> None:
+    assert submap_starts("t12") == [False, False, True]
+    lost = SubmapConfig().begin_after_frames // 3
+    views = "0123456789" * lost
+    assert submap_starts(views[:lost], SubmapConfig()) == [False] * (lost - 1) + [True]
+
+
+def test_tracked_frame_resets_the_number_of_lost_frames() -> None:
+    assert submap_starts("11111t111111") == [False] * 11 + [True]
+    assert submap_starts("1t12") == [False] * 3 + [True]
+
+
+def test_frames_of_a_covered_camera_do_not_count() -> None:
+    assert submap_starts("1ccccccc1c2") == [False] * 10 + [True]
+
+
+def test_frames_without_contrast_show_the_same_view() -> None:
+    submaps = started_submaps(1)
+    for _ in range(3):
+        submaps = submaps.after_lost(np.zeros(300, np.int8), CONFIG)
+    assert (submaps.lost_frames, submaps.lost_views) == (3, 1)
 
 
 def test_no_submap_starts_when_disabled() -> None:
-    stamps_ns = [k * 10**9 for k in range(99)]
-    assert not any(submap_starts([True] * 99, stamps_ns, SubmapConfig(begin_after_s=0)))
+    assert not any(submap_starts("0123456789" * 99, SubmapConfig(begin_after_frames=0)))
 
 
-def test_lost_time_restarts_with_the_clock_of_the_camera() -> None:
-    stamps_ns = [10**18, 10**18 + 50_000_000, 0, 50_000_000, 100_000_000]
-    assert submap_starts([True] * 5, stamps_ns, CONFIG) == [False] * 4 + [True]
+def test_state_of_an_earlier_version_counts_from_zero() -> None:
+    saved = started_submaps(1).pack()
+    del saved["lost_frames"], saved["lost_views"], saved["lost_thumbnail"]
+    restored = Submaps.unpack({**saved, "lost_since_ns": 10**18})
+    assert (restored.lost_frames, restored.lost_views, restored.roots) == (0, 0, (0,))
+
+
+def test_number_of_lost_frames_survives_packing() -> None:
+    lost = started_submaps(1).after_lost(thumbnail(1), CONFIG)
+    restored = Submaps.unpack(decode_state(encode_state(lost.pack())))
+    assert restored.after_lost(thumbnail(1), CONFIG).lost_views == 1
+    assert restored.after_lost(thumbnail(2), CONFIG).should_start(CONFIG)
 
 
 def test_search_is_due_only_while_a_submap_is_not_merged() -> None:
@@ -133,8 +171,8 @@ def test_submaps_survive_packing(submaps: Submaps) -> None:
 @pytest.mark.parametrize(
     "fields",
     [
-        {"begin_after_s": -1.0},
-        {"begin_after_s": float("nan")},
+        {"begin_after_frames": -1},
+        {"max_view_correlation": 2.0},
         {"search_interval_frames": 0},
         {"confirm_after": 0},
         {"confirm_rad": 0.0},
