@@ -26,7 +26,6 @@ import numpy as np
 
 from ldo_service.calibration.correction import CameraCorrection, read_corrections
 from ldo_service.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
-from ldo_service.calibration.shutter import ShutterTiming
 from ldo_service.conversions.frames import (
     frame_from_message,
     keyframe_measurements_message,
@@ -63,6 +62,7 @@ from ldo_service.tracking.localizer import Localizer
 from ldo_service.tracking.odometry import Odometry
 from ldo_service.tracking.odometry_config import OdometryConfig
 from ldo_service.tracking.odometry_prior import OdometryPriorBuffer, PriorCheck
+from ldo_service.tracking.shutter import ShutterState
 from ldo_service.tracking.tracking_quality import TrackingStatus
 from ldo_service.tracking.tracking_result import TrackingResult
 
@@ -155,7 +155,7 @@ class Tracker(Actor):
         self._T_base_camera = self.config.T_base_camera.matrix()
         self._odometry = _make_odometry(self.config, self._T_base_camera)
         self._calibration = _make_calibration(self.config)
-        self._timing = ShutterTiming()  # Timing of the shutter at the last frame.
+        self._shutter = ShutterState()  # Timing of the shutter after the last frame.
         self._correction = b""  # The last correction, encoded.
         self._prior = OdometryPriorBuffer()
         # Numbers of keyframes that were made, not made for lack of credit, and reused.
@@ -199,7 +199,7 @@ class Tracker(Actor):
         result = self._odometry.process(
             frame, self._prior, may_map=may_map, may_be_biased=may_be_biased
         )
-        self._timing = result.timing
+        self._shutter = result.shutter
         self._count(frame, result, is_held_out)
         is_lost = result.status is TrackingStatus.LOST
         T_odom_camera, motion = None if is_lost else result.T_odom_camera, result.motion
@@ -212,7 +212,7 @@ class Tracker(Actor):
             mapped = correction.applied(raw, keeps_clipped=False)
             if motion is not None:
                 mapped = motion.compensated(mapped)
-            correction = replace(correction, timing=result.timing)
+            correction = replace(correction, timing=result.shutter.timing)
             keyframe = keyframe_message(mapped, result, result.keyframe, correction)
             yield keyframe
             yield keyframe_measurements_message(keyframe)
@@ -305,6 +305,8 @@ class Tracker(Actor):
         saved = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
         if saved:  # A state of an earlier version has no calibration.
             self._calibration.restore(saved)
+        if "shutter" in now["odometry"]:
+            self._shutter = ShutterState.unpack(now["odometry"]["shutter"])
 
     def metrics(self) -> dict[str, float]:
         """Return counters of keyframes, frames and prior poses."""
@@ -319,7 +321,12 @@ class Tracker(Actor):
             "prior_rejected": refused,
             "prior_restarts": restarts,
             **self._calibration.metrics(),
-            **self._timing.metrics(),
+            **self._shutter.metrics(),
+            # 1 if the estimate from all views is done.
+            "calibration_finished": float(self._calibration.is_finished),
+            # Held-out residuals of the last estimate, relative to those without a correction.
+            "depth_bias_residual_ratio": self._calibration.ratios[0],
+            "vignetting_residual_ratio": self._calibration.ratios[1],
         }
 
 

@@ -6,24 +6,25 @@ import platform
 import shutil
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Annotated, Literal
 
-from rich.console import Console
-from rich.markup import escape
+import tyro
 
 from ldo_service import __version__, kernels
 from ldo_service.actors.topology import GRAPH
 from ldo_service.client import connect
 from ldo_service.detection.model_registry import Models
-from ldo_service.errors import ConfigError, LdoError, ModelError, install_command
+from ldo_service.errors import ConfigError, ModelError, install_command
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH
 from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
-from .options import EndpointAddress, KeysFolder, Robot
+from .calibration_report import camera_findings
+from .findings import Finding, show
+from .options import EndpointAddress, KeysFolder, Robot, argument
 
 LIBRARIES = {  # Name on the package index: name to import.
     "numpy": "numpy",
@@ -48,45 +49,49 @@ EXTRAS = {  # Optional extra of the package: modules that it installs.
 }
 REINSTALL = "`.venv/bin/pip install -e .` in the clone of LDO-SLAM installs all libraries."
 LISTEN_S = 1.5  # Three heartbeats.
-MARKS = {
-    "ok": "[green]ok[/]     ",
-    "absent": "[dim]absent[/] ",
-    "bad": "[red]bad[/]    ",
-    "note": "[dim]note[/]   ",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Result of one check, printed as one line."""
-
-    # "ok", "absent" (an optional part is missing), "note" (information) or "bad" (needs action).
-    mark: str
-    text: str
+Check = Annotated[
+    Literal["service", "calibration"],
+    tyro.conf.Positional,
+    argument(
+        metavar="CHECK",
+        help="service: this machine and the running service; calibration: the camera of the "
+        "finished run DIR",
+    ),
+]
+Run = Annotated[
+    Path | None,
+    tyro.conf.Positional,
+    argument(metavar="DIR", help="folder of a run, for the check of the calibration"),
+]
 
 
 def doctor(
-    robot: Robot = "robot", endpoint: EndpointAddress = DEFAULT_ENDPOINT, keys: KeysFolder = None
+    check: Check = "service",
+    run: Run = None,
+    robot: Robot = "robot",
+    endpoint: EndpointAddress = DEFAULT_ENDPOINT,
+    keys: KeysFolder = None,
 ) -> None:
-    """Check this machine and a running service, and print how to fix each problem.
+    """Check this machine and a running service, or a camera, and print how to fix each problem.
 
     The exit code is 1 if a line is marked bad.
+
+    `ldo doctor calibration DIR` prints what the run in DIR has found about its camera: depth bias,
+    vignetting, and the times at which rows of color and depth are recorded. A line marked warn
+    says what a large value costs and how to avoid the cost.
+
+      ldo doctor
+      ldo doctor calibration runs/desk
     """
-    console = Console(highlight=False, soft_wrap=True)
-    bad = 0
-    for finding in (
-        *machine(),
-        *libraries(),
-        *extras(),
-        *networks(),
-        *service(robot, endpoint, keys),
-    ):
-        console.print(MARKS[finding.mark] + escape(finding.text))
-        bad += finding.mark == "bad"
-    if bad:
-        raise LdoError(
-            f"problems found: {bad}. Each line above that is marked bad says how to fix a problem."
+    if (run is not None) != (check == "calibration"):
+        raise ConfigError(
+            "`ldo doctor calibration` needs the folder of a run, as in `ldo doctor calibration "
+            "runs/desk`; `ldo doctor` takes none."
         )
+    if run is not None:
+        show(camera_findings(run))
+        return
+    show((*machine(), *libraries(), *extras(), *networks(), *service(robot, endpoint, keys)))
 
 
 def machine() -> Iterator[Finding]:

@@ -102,7 +102,8 @@ class ActorRun:
             used: Time that the frames took.
             is_finished: False if the run was interrupted.
         """
-        facts = self.actors["optimizer"].metrics() | self.actors["mapper"].metrics()
+        names = [name for name in ("tracker", "optimizer", "mapper") if name in self.actors]
+        facts = {k: v for name in names for k, v in self.actors[name].metrics().items()}
         stage_ms = self._stage_ms or self._step_percentiles()
         if source := self.actors.get("frame_source"):
             rejected += int(source.metrics()["frames_rejected"])

@@ -128,7 +128,7 @@ class _RealTimeRun:
         facts = {
             name: value
             for health in healths
-            if health.actor in ("optimizer", "mapper")
+            if health.actor in ("tracker", "optimizer", "mapper")
             for name, value in health.metrics.items()
         }
         self._record.close(summarize(self._record, used, frames, rejected, stage_ms, drops, facts))

@@ -14,6 +14,12 @@ from ldo_service import kernels, versions
 from .folder import RunWriter
 
 Percentiles = dict[str, float]  # Values of p50 and p95.
+TIMES = "readout", "depth_readout", "depth_delay"  # Times of the shutter.
+CALIBRATION = (  # Metrics of the tracker that tell how certain the calibration of the camera is.
+    *("calibration_finished", "calibration_views"),
+    *("depth_bias_residual_ratio", "vignetting_residual_ratio"),
+    *(f"{time}{kind}_ms" for time in TIMES for kind in ("", "_estimate", "_sigma")),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +61,7 @@ def summarize(
         rejected: Number of frames that could not be used.
         stage_ms: Percentiles of the step durations of each actor.
         drops: Number of dropped messages, by consumer and topic: "ACTOR TOPIC".
-        facts: Metrics of the pose-graph optimizer and the mapper.
+        facts: Metrics of the pose-graph optimizer, the mapper and the tracker.
     """
     in_map = record.in_map()
     return {
@@ -83,6 +89,8 @@ def summarize(
         "iterations": int(facts.get("iterations", 0)),  # Iterations of the Gaussian optimizer.
         # Refit iterations still pending.
         "iterations_pending": int(facts.get("iterations_pending", 0)),
+        # Evidence of the self-calibration at the end; empty if the tracker did not run.
+        "calibration": {name: facts[name] for name in CALIBRATION if name in facts},
         "isa": kernels.isa(),
         "threads": os.cpu_count(),
         "versions": versions(),

@@ -141,7 +141,7 @@ class Localizer(Odometry):
             reference=None,
             has_prior=reading is not None,
             motion=self._frames.motion,
-            timing=self._frames.state.shutter.timing,
+            shutter=self._frames.state.shutter,
         )
 
     def snapshot(self) -> dict[str, Any]:

@@ -145,7 +145,7 @@ class Odometry:
             reference,
             has_prior=reading is not None,
             motion=self._frames.motion,
-            timing=self._frames.state.shutter.timing,
+            shutter=self._frames.state.shutter,
             keyframe=keyframe,
             reused_keyframe=reused,
             denied_keyframe=denied,

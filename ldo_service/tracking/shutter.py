@@ -142,6 +142,21 @@ class ShutterState:
             evidence = evidence.scaled(EARLIER_WEIGHT)
         return replace(self, evidence=evidence, timing=timing)
 
+    def metrics(self) -> dict[str, float]:
+        """Return the times in use, and the last estimate with its standard deviation, ms.
+
+        The estimate is missing until there is enough evidence for one.
+        """
+        found = self.evidence.estimate()
+        if found is None:
+            return self.timing.metrics()
+        estimated, sigmas = (ShutterTiming(*times.tolist()).metrics() for times in found)
+        return {
+            **self.timing.metrics(),
+            **{name.replace("_ms", "_estimate_ms"): time_ms for name, time_ms in estimated.items()},
+            **{name.replace("_ms", "_sigma_ms"): time_ms for name, time_ms in sigmas.items()},
+        }
+
     def pack(self) -> dict[str, Any]:
         """Return the state as arrays and plain values."""
         return {

@@ -5,12 +5,13 @@ from enum import StrEnum
 
 import numpy as np
 
-from ldo_service.calibration.shutter import FrameMotion, ShutterTiming
+from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .alignment import Alignment
 from .keyframes import ReferenceKeyframe, Relay, covariance_of
+from .shutter import ShutterState
 from .submaps import SubmapMeasurement
 from .tracking_quality import TrackingStatus
 
@@ -152,7 +153,8 @@ class TrackingResult:
     has_prior: bool  # True if the odometry prior covers the time of the frame.
     # Motion of the camera during the frame, which is compensated; None if unknown.
     motion: FrameMotion | None = None
-    timing: ShutterTiming = field(default_factory=ShutterTiming)  # Estimated timing of the shutter.
+    # Timing of the shutter after the frame, with the evidence for it.
+    shutter: ShutterState = field(default_factory=ShutterState)
     # Keyframes.
     keyframe: NewKeyframe | None = None  # Keyframe made of the frame; None if none was made.
     # Id of a known keyframe that is the reference from now on; None if none is reused.
@@ -173,7 +175,7 @@ def make_tracking_result(
     *,
     has_prior: bool,
     motion: FrameMotion | None,
-    timing: ShutterTiming,
+    shutter: ShutterState,
     keyframe: NewKeyframe | None = None,
     reused_keyframe: int | None = None,
     denied_keyframe: KeyframeKind | None = None,
@@ -189,7 +191,7 @@ def make_tracking_result(
         reference: Id of the keyframe that the pose refers to; None before any keyframe.
         has_prior: True if the odometry prior covers the time of the frame.
         motion: Motion of the camera during the frame; None if unknown.
-        timing: Estimated timing of the shutter.
+        shutter: Timing of the shutter after the frame.
         keyframe: The new keyframe made of the frame; None if none was made.
         reused_keyframe: Id of the known keyframe that is the reference from now on; None if none.
         denied_keyframe: Kind of keyframe that was needed but not allowed by `may_map`, or None.
@@ -215,7 +217,7 @@ def make_tracking_result(
         dynamic_mask=tracked.dynamic_mask,
         has_prior=has_prior,
         motion=motion,
-        timing=timing,
+        shutter=shutter,
         keyframe=keyframe,
         reused_keyframe=reused_keyframe,
         denied_keyframe=denied_keyframe,

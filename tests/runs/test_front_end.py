@@ -80,6 +80,7 @@ def test_reused_front_end_gives_the_files_of_the_full_run(full_run: Path, reused
         assert reused[name] == full[name], name
     assert reused["frames_rejected"] == 1
     assert full["boxes"] > 0
+    assert (bool(full["calibration"]), reused["calibration"]) == (True, {})
     assert reused["stage_ms"].keys() == full["stage_ms"].keys() - {
         *("frame_source", "tracker", "detector")
     }

@@ -96,6 +96,8 @@ def test_summary_has_the_keys_that_tools_read(finished: Path) -> None:
     assert summary["gaussians"] > 1000
     assert summary["optimizations"] >= summary["keyframes"], "one per keyframe and per refinement"
     assert set(summary["stage_ms"]["tracker"]) == {"p50", "p95"}
+    calibration = {"calibration_finished", "depth_bias_residual_ratio", "readout_ms"}
+    assert calibration <= set(summary["calibration"])
 
 
 def test_the_map_is_a_ply_with_every_gaussian(finished: Path) -> None:

@@ -24,6 +24,7 @@ def test_realtime_run_takes_sequence_time_and_accounts_for_every_frame(
         "the rest came before the first keyframe"
     )
     assert summary["keyframes"] > 1
+    assert "calibration_finished" in summary["calibration"]
     truth = room.truth()
     assert truth is not None
     assert evaluate_trajectory(record.online(), truth).ate_m.rmse < 0.01

@@ -11,7 +11,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import Odometry, OdometryConfig
-from ldo_service.tracking.shutter import ShutterConfig
+from ldo_service.tracking.shutter import ShutterConfig, ShutterState
 from ldo_service.tracking.shutter_timing import MIN_GROUPS, TimingEvidence
 from tests.moving_camera import MovingCamera
 
@@ -109,6 +109,23 @@ def test_evidence_keeps_its_sum_when_groups_are_merged() -> None:
     assert evidence.count == 100
     assert MIN_GROUPS <= len(evidence.groups) <= 24
     assert np.allclose(np.sum(evidence.groups, axis=0), measurements.sum(axis=0))
+
+
+def test_metrics_have_the_estimate_with_its_standard_deviation() -> None:
+    times_s = np.array([0.02, 0.01, -0.005])
+    state = ShutterState(timing=ShutterTiming(0.019, 0.009, -0.004))
+    measurement = np.c_[1e9 * np.eye(3), 1e9 * times_s]
+    without = {"readout_ms": 19.0, "depth_readout_ms": 9.0, "depth_delay_ms": -4.0}
+    assert state.metrics() == pytest.approx(without)
+    for _ in range(MIN_GROUPS):
+        state = replace(state, evidence=state.evidence.extended(measurement))
+    estimate = state.evidence.estimate()
+    assert estimate is not None
+    found = state.metrics()
+    for k, name in enumerate(("readout", "depth_readout", "depth_delay")):
+        assert found[f"{name}_ms"] == pytest.approx(without[f"{name}_ms"])
+        assert found[f"{name}_estimate_ms"] == pytest.approx(1e3 * times_s[k], rel=1e-3)
+        assert found[f"{name}_sigma_ms"] == 1e3 * estimate[1][k] > 0
 
 
 def test_evidence_that_contradicts_itself_is_uncertain() -> None:

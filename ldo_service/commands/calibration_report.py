@@ -1,0 +1,239 @@
+"""Report on the camera of a finished run, as `ldo doctor calibration` prints it."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ldo_service.calibration.correction import (
+    CameraCorrection,
+    bias_basis,
+    read_corrections,
+    unbiased_depth,
+)
+from ldo_service.calibration.self_calibration import SelfCalibrationConfig
+from ldo_service.config import load_config
+from ldo_service.errors import DataError
+from ldo_service.geometry import Camera
+from ldo_service.runs.finished import read_viewpoints, require_file
+from ldo_service.tracking.shutter import ShutterConfig
+
+from .findings import Finding
+
+DEPTHS_M = 1.0, 3.0  # Depths at which the depth bias is stated.
+# Depth error at 3 m from which the report warns: more than the noise of a Kinect at this depth.
+LARGE_DEPTH_ERROR_MM = 30.0
+LARGE_VIGNETTING = 0.8  # Brightness of a corner, relative to the center, up to which it warns.
+# Time from which the report warns. A turn of 60 degrees/s moves the image by 6 of 640 pixels.
+LARGE_TIME_MS = 10.0
+# Held-out residual up to which an unconfirmed depth bias is probable; it was at least 0.94 with
+# cameras that have none.
+PROBABLE_RATIO = 0.94
+CHANNELS = "red", "green", "blue"
+TIMES = {  # Names in the metrics, and in the report.
+    "readout": "readout of color",
+    "depth_readout": "readout of depth",
+    "depth_delay": "delay of depth after color",
+}
+MOVE = "move the camera by half a meter and turn it by 30 degrees at the start of a run"
+
+
+def camera_findings(folder: Path) -> Iterator[Finding]:
+    """Report depth bias, vignetting and timing of the shutter of the camera of a finished run.
+
+    Args:
+        folder: Folder of the run.
+
+    Raises:
+        DataError: A file of the run is missing or invalid.
+        ConfigError: The run has settings of an earlier version.
+    """
+    tracker = load_config(require_file(folder, "config.yaml")).tracker
+    if tracker.localization_map:
+        raise DataError(
+            f"{folder} is a run with --localize, which uses the calibration of its map. Give "
+            f"{tracker.localization_map}, the run that made the map."
+        )
+    viewpoints = list(read_viewpoints(folder).values())
+    if not viewpoints:
+        raise DataError(f"{folder} has no keyframes. Give the folder of a run with a map.")
+    correction, camera = read_corrections(folder).last, viewpoints[-1].camera
+    metrics = _metrics(folder)
+    yield _progress(metrics, is_on=tracker.self_calibration, known=tracker.calibration_run)
+    yield _depth_bias(correction, camera, metrics)
+    yield _vignetting(correction, metrics)
+    for name, text in TIMES.items():
+        yield _time(name, text, correction, metrics)
+    yield from _large(folder, correction, camera)
+    yield Finding(
+        "note",
+        "scale of depth: unknown, because images do not tell it. Measure a known length in the "
+        "map, and correct depth_scale of the camera",
+    )
+    yield Finding(
+        "note",
+        "pose between depth and color camera: not estimated. Depth must be registered to color",
+    )
+
+
+def depth_errors_mm(correction: CameraCorrection, camera: Camera, depth_m: float) -> np.ndarray:
+    """Return the error of a measured depth in two corners of the image, mm.
+
+    Args:
+        correction: Correction of the camera.
+        camera: Rectified camera of the keyframes.
+        depth_m: Measured depth.
+
+    Returns:
+        Measured minus corrected depth, [2], top left and top right. The error in the center is 0,
+        and the error is equal in opposite corners.
+    """
+    u, v = np.array([0.0, camera.width - 1.0]), np.zeros(2)
+    bias = bias_basis(u, v, camera) @ np.array(correction.depth_bias)
+    return 1e3 * (depth_m - unbiased_depth(np.full(2, depth_m), bias))
+
+
+def corner_brightness(correction: CameraCorrection) -> np.ndarray:
+    """Return the brightness of the corners relative to the center, [3] for red, green and blue."""
+    return np.exp(np.array(correction.vignetting).sum(axis=1))
+
+
+def _progress(metrics: Mapping[str, float], *, is_on: bool, known: str) -> Finding:
+    start = f"started with the calibration of {known}" if known else "started without a calibration"
+    if not is_on:
+        return Finding("note", f"self-calibration: off (tracker.self_calibration=false), {start}")
+    if not metrics:
+        return Finding(
+            "note",
+            f"self-calibration: {start}. summary.json states no uncertainties, because the run "
+            "reused a front end, or an earlier version wrote it. Run `ldo run` on the sequence "
+            "again to get them",
+        )
+    if metrics["calibration_finished"]:
+        return Finding("ok", f"self-calibration: finished, {start}")
+    views = f"{metrics['calibration_views']:.0f} of {SelfCalibrationConfig().views[-1]} views"
+    return Finding(
+        "warn",
+        f"self-calibration: not finished ({views}), {start}. Vignetting and depth bias may be "
+        f"missing or change: {MOVE}",
+    )
+
+
+def _depth_bias(
+    correction: CameraCorrection, camera: Camera, metrics: Mapping[str, float]
+) -> Finding:
+    limit, ratio = SelfCalibrationConfig().max_depth_ratio, _ratio(metrics, "depth_bias")
+    evidence = _held_out(ratio, limit)
+    if correction.has_depth_bias:
+        near, far = (depth_errors_mm(correction, camera, depth_m) for depth_m in DEPTHS_M)
+        return Finding(
+            "ok",
+            f"depth bias: corrected. At {DEPTHS_M[0]:g} and {DEPTHS_M[1]:g} m, measured depth is "
+            f"wrong by 0 and 0 mm in the center, {near[0]:+.0f} and {far[0]:+.0f} mm at the top "
+            f"left and bottom right, {near[1]:+.0f} and {far[1]:+.0f} mm at the top right and "
+            f"bottom left{evidence}",
+        )
+    if ratio is not None and limit < ratio <= PROBABLE_RATIO:
+        return Finding(
+            "warn",
+            f"depth bias: probable, but not confirmed and not corrected{evidence}. Tracking may "
+            f"confuse it with rotation: {MOVE}, or set tracker.calibration_run to a run of this "
+            "camera that corrected it",
+        )
+    if ratio is None:
+        return Finding("note", f"depth bias: not corrected{evidence}")
+    return Finding("ok", f"depth bias: not corrected, none found{evidence}")
+
+
+def _vignetting(correction: CameraCorrection, metrics: Mapping[str, float]) -> Finding:
+    limit, ratio = SelfCalibrationConfig().max_color_ratio, _ratio(metrics, "vignetting")
+    evidence = _held_out(ratio, limit)
+    if not correction.has_vignetting and ratio is None:
+        return Finding("note", f"vignetting: not corrected{evidence}")
+    if not correction.has_vignetting:
+        return Finding("ok", f"vignetting: not corrected, no strong vignetting found{evidence}")
+    corners = zip(CHANNELS, corner_brightness(correction), strict=True)
+    values = ", ".join(f"{name} {value:.2f}" for name, value in corners)
+    return Finding(
+        "ok",
+        f"vignetting: corrected. Brightness of the corners relative to the center: {values}"
+        f"{evidence}",
+    )
+
+
+def _ratio(metrics: Mapping[str, float], name: str) -> float | None:
+    """Return the held-out residual of the last estimate; None if the run made no estimate."""
+    ratio = metrics.get(f"{name}_residual_ratio", 1.0)
+    return None if ratio == 1.0 else ratio
+
+
+def _held_out(ratio: float | None, limit: float) -> str:
+    if ratio is None:
+        return " (no estimate in this run)"
+    return f" (held-out residual {ratio:.2f} of that without correction; {limit:g} confirms)"
+
+
+def _time(
+    name: str, text: str, correction: CameraCorrection, metrics: Mapping[str, float]
+) -> Finding:
+    is_used, config = bool(correction.timing), ShutterConfig()
+    used_ms = metrics.get(f"{name}_ms", correction.timing.metrics()[f"{name}_ms"])
+    sigma_ms = metrics.get(f"{name}_sigma_ms")
+    if is_used:
+        sigma = "uncertainty unknown" if sigma_ms is None else f"1 sigma {sigma_ms:.1f} ms"
+        return Finding("ok", f"{text}: compensated, {used_ms:.1f} ms ({sigma})")
+    if sigma_ms is None:
+        return Finding(
+            "note",
+            f"{text}: not compensated, no estimate. It needs frames that are at most "
+            f"{config.max_interval_s:g} s apart while the camera turns",
+        )
+    return Finding(
+        "ok",
+        f"{text}: not compensated, {metrics[f'{name}_estimate_ms']:.1f} ms (1 sigma {sigma_ms:.1f} "
+        f"ms). One of the times must exceed {1e3 * config.min_s:g} ms and {config.sigmas:g} sigma",
+    )
+
+
+def _large(folder: Path, correction: CameraCorrection, camera: Camera) -> Iterator[Finding]:
+    """Warn of large errors, which a run has until it has estimated them."""
+    large: list[str] = []
+    if np.abs(depth_errors_mm(correction, camera, DEPTHS_M[-1])).max() >= LARGE_DEPTH_ERROR_MM:
+        large.append("depth bias (wrong poses and surfaces)")
+    if corner_brightness(correction).min() <= LARGE_VIGNETTING:
+        large.append("vignetting (dark colors in the map)")
+    times_ms = correction.timing.metrics()
+    if max(map(abs, times_ms.values())) >= LARGE_TIME_MS:
+        large.append("timing of the shutter (distorted frames while the camera moves)")
+    if large:
+        yield Finding(
+            "warn",
+            f"large: {', '.join(large)}. Each run has these errors until it has estimated them. "
+            "Start the next run of this camera with the result of this one: --set "
+            f"tracker.calibration_run={folder}",
+        )
+    if abs(times_ms["depth_delay_ms"]) >= LARGE_TIME_MS:
+        yield Finding(
+            "warn",
+            "depth and color are recorded at different times. If the camera has a setting that "
+            "synchronizes them, switch it on",
+        )
+
+
+def _metrics(folder: Path) -> Mapping[str, float]:
+    """Return the evidence of the calibration in summary.json; empty if there is none.
+
+    Raises:
+        DataError: The file is missing or invalid.
+    """
+    path = require_file(folder, "summary.json")
+    try:
+        metrics = json.loads(path.read_text()).get("calibration", {})
+        return {str(name): float(value) for name, value in metrics.items()}
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise DataError(
+            f"{path} is not what `ldo run` writes: {error!r}. Give the folder of a finished run."
+        ) from error
