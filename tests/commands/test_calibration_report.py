@@ -117,6 +117,14 @@ def test_large_errors_are_warned_of_with_the_setting_that_helps(capsys, handheld
     assert "synchronizes" in warnings[1]
 
 
+def test_uncertain_time_says_how_to_turn(capsys, handheld_run: Path) -> None:
+    metrics = {**METRICS, "depth_readout_sigma_ms": 7.5}
+    change(handheld_run / "summary.json", calibration=metrics)
+    (line,) = [x for x in report(capsys, handheld_run) if " readout of depth" in x]
+    assert line.startswith("warn")
+    assert "25.2 ms (1 sigma 7.5 ms), uncertain. Turn the camera" in line
+
+
 def test_times_that_are_not_significant_are_printed_with_sigma(capsys, run: Path) -> None:
     times = {f"{name}_ms": 0.0 for name in ("readout", "depth_readout", "depth_delay")}
     change(run / "summary.json", calibration={**METRICS, **times})
@@ -125,7 +133,7 @@ def test_times_that_are_not_significant_are_printed_with_sigma(capsys, run: Path
 
 
 def test_probable_depth_bias_that_is_not_confirmed_is_warned_of(capsys, run: Path) -> None:
-    change(run / "summary.json", calibration={**METRICS, "depth_bias_residual_ratio": 0.9})
+    change(run / "summary.json", calibration={**METRICS, "depth_bias_residual_ratio": 0.88})
     (line,) = [x for x in report(capsys, run) if "depth bias" in x]
     assert line.startswith("warn")
     assert "not confirmed" in line
