@@ -12,6 +12,7 @@ from ldo_service.geometry import RgbdFrame, Trajectory, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import Odometry, OdometryConfig, TrackingResult, TrackingStatus
 from ldo_service.tracking.keyframes import KeyframeConfig
+from ldo_service.tracking.submaps import SubmapConfig
 from ldo_service.tracking.tracking_result import KeyframeKind
 
 T_ELSEWHERE = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
@@ -52,6 +53,26 @@ def test_walk_is_tracked_and_keyframes_are_made(room, make_walk) -> None:
     assert last.reference is not None
     between = se3.inverse(truth[keyframes[last.reference]]) @ truth[-1]
     np.testing.assert_allclose(last.T_reference_camera, between, atol=2e-3)
+
+
+def test_wrong_stamps_do_not_decide_about_poses_and_submaps(room, make_walk) -> None:
+    config = OdometryConfig(submaps=SubmapConfig(begin_after_frames=6))
+    truth = make_walk(24)
+    truth[8:] = [T @ T_ELSEWHERE for T in truth[8:]]
+
+    def tracked(interval_ns: int) -> list[TrackingResult]:
+        stamps_ns = [k * interval_ns for k in range(len(truth))]
+        views = [
+            room.view(T, stamp_ns=s, index=k)
+            for k, (T, s) in enumerate(zip(truth, stamps_ns, strict=True))
+        ]
+        return track(Odometry(config), views)
+
+    fast, slow = tracked(1_000), tracked(2_000_000_000)
+    assert_bitwise_equal(fast, slow)
+    assert [r.submap for r in fast] == [r.submap for r in slow]
+    assert {r.status for r in fast[8:9]} == {TrackingStatus.LOST}
+    assert fast[-1].submap == 1
 
 
 def test_tracking_continues_when_no_keyframe_may_be_made(room, make_walk) -> None:
