@@ -143,17 +143,21 @@ class Outcome:
 class Step:
     k: int  # Time index.
     source: int  # Index of the frame of the sequence that was shown.
-    status: TrackingStatus
+    is_ok: bool
     T_odom_camera: np.ndarray
 
 
 def track(frames: Iterator[RgbdFrame], stamps_ns: np.ndarray) -> list[Step]:
-    """Track the frames as the service does."""
+    """Track the frames as the service does.
+
+    A frame of a new submap is not OK, since its pose relative to the first submap is unknown.
+    """
     odometry, steps = Odometry(), []
     for frame in frames:
         result = odometry.process(frame)
         k = int(np.searchsorted(stamps_ns, frame.stamp_ns))
-        steps.append(Step(k, frame.index, result.status, result.T_odom_camera))
+        is_ok = result.status is TrackingStatus.OK and result.submap == 0
+        steps.append(Step(k, frame.index, is_ok, result.T_odom_camera))
     return steps
 
 
@@ -162,16 +166,16 @@ def outcome(
 ) -> Outcome:
     """Return the OK fractions and the errors of tracked steps."""
     outside = [s for s in steps if s.k not in degraded]
-    meanwhile = [s.status is TrackingStatus.OK for s in steps if s.k in degraded]
+    meanwhile = [s.is_ok for s in steps if s.k in degraded]
     p_odom, p_true, times = ok_positions(steps, T_true)
     errors_m = np.linalg.norm(se3.transform(T_true_odom, p_odom) - p_true, axis=1)
     residuals_m = np.linalg.norm(
         se3.transform(fit_rigid_transform(p_odom, p_true), p_odom) - p_true, axis=1
     )
-    after = [s.k for s in outside if s.k >= degraded.stop and s.status is TrackingStatus.OK]
+    after = [s.k for s in outside if s.k >= degraded.stop and s.is_ok]
     worst = int(np.argmax(errors_m))
     return Outcome(
-        100 * float(np.mean([s.status is TrackingStatus.OK for s in outside])),
+        100 * float(np.mean([s.is_ok for s in outside])),
         100 * float(np.mean(meanwhile)) if meanwhile else None,
         float(errors_m[worst]),
         times[worst],
@@ -184,7 +188,7 @@ def ok_positions(
     steps: list[Step], T_true: Mapping[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """Return estimated and true positions [M, 3] of OK frames with ground truth, and their k."""
-    evaluated = [s for s in steps if s.status is TrackingStatus.OK and s.source in T_true]
+    evaluated = [s for s in steps if s.is_ok and s.source in T_true]
     p_odom = np.array([s.T_odom_camera[:3, 3] for s in evaluated])
     p_true = np.array([T_true[s.source][:3, 3] for s in evaluated])
     return p_odom, p_true, [s.k for s in evaluated]
