@@ -8,10 +8,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, RgbdFrame
+from ldo_service.geometry.frames import brightest
 
 from .shutter import ShutterTiming
 
@@ -86,8 +88,9 @@ class CameraCorrection:
         color, depth_m = frame.color, self.corrected_depth(frame.depth_m, frame.camera)
         if self.has_vignetting:
             even = (color * self.gain(frame.camera) + np.float32(0.5)).astype(np.uint8)
-            is_kept = color.max(axis=2, keepdims=True) >= CLIPPED_GRAY if keeps_clipped else False
-            color = np.where(is_kept, color, even)
+            if keeps_clipped:
+                even = np.where(brightest(color)[..., None] >= CLIPPED_GRAY, color, even)
+            color = even
         if color is frame.color and depth_m is frame.depth_m:
             return frame
         return replace(frame, color=color, depth_m=depth_m)
@@ -162,8 +165,25 @@ class CorrectionChange:
     old: CameraCorrection
     new: CameraCorrection
 
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> "CorrectionChange":
+        """Restore a change from its fields by name."""
+        return CorrectionChange(
+            CameraCorrection.of(values["old"]), CameraCorrection.of(values["new"])
+        )
+
+    def pack(self) -> dict[str, Any]:
+        """Return the fields by name, as lists of plain values."""
+        return {"old": self.old.pack(), "new": self.new.pack()}
+
+    def after(self, earlier: "CorrectionChange | None") -> "CorrectionChange":
+        """Return the change from the old correction of an earlier change to the new one of this."""
+        return self if earlier is None else replace(self, old=earlier.old)
+
     def depth_m(self, depth_m: np.ndarray, camera: Camera) -> np.ndarray:
         """Convert depth [H, W] in meters from the old correction to the new one."""
+        if self.old.depth_bias == self.new.depth_bias:
+            return depth_m
         return unbiased_depth(depth_m, self.new.bias(camera) - self.old.bias(camera))
 
     def gray(self, gray: np.ndarray, camera: Camera) -> np.ndarray:
@@ -173,7 +193,7 @@ class CorrectionChange:
         """
         if self.old.vignetting == self.new.vignetting:
             return gray
-        gain = self.new.gain(camera).mean(axis=2) / self.old.gain(camera).mean(axis=2)
+        gain = _gray_gain(self.old.vignetting, self.new.vignetting, camera)
         changed = np.clip(gray * gain + np.float32(0.5), 1, CLIPPED_GRAY - 1).astype(np.uint8)
         return np.where((gray >= CLIPPED_GRAY) | (gray == 0), gray, changed)
 
@@ -224,17 +244,36 @@ def _centered(u: np.ndarray, v: np.ndarray, camera: Camera) -> tuple[np.ndarray,
     return np.broadcast_arrays(x, y)  # type: ignore[return-value]
 
 
-def _pixels(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    return np.arange(camera.width)[None, :], np.arange(camera.height)[:, None]
-
-
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _bias_image(coefficients: tuple[float, ...], camera: Camera) -> np.ndarray:
-    return (bias_basis(*_pixels(camera), camera) @ np.array(coefficients)).astype(np.float32)
+    x, y = _image_axes(camera)
+    b1, b2, b3 = (np.float32(b) for b in coefficients)
+    return b1 * x * x + (b2 * x + b3 * y) * y
+
+
+@lru_cache(maxsize=8)
+def _gain_image(coefficients: tuple[tuple[float, ...], ...], camera: Camera) -> np.ndarray:
+    x, y = _image_axes(camera)
+    r2 = (x * x + y * y) / np.float32(1.0 + (camera.height / camera.width) ** 2)
+    gains = []
+    for a1, a2, a3 in coefficients:
+        log_V = ((np.float32(a3) * r2 + np.float32(a2)) * r2 + np.float32(a1)) * r2
+        gains.append(np.maximum(np.exp(log_V), np.float32(MIN_TRANSMISSION)))
+        np.divide(gains[-1].min(), gains[-1], out=gains[-1])
+    return np.asarray(cv2.merge(gains))
 
 
 @lru_cache(maxsize=4)
-def _gain_image(coefficients: tuple[tuple[float, ...], ...], camera: Camera) -> np.ndarray:
-    log_V = vignetting_basis(*_pixels(camera), camera) @ np.array(coefficients).T
-    V = np.maximum(np.exp(log_V), MIN_TRANSMISSION)
-    return (V.min(axis=(0, 1)) / V).astype(np.float32)
+def _gray_gain(
+    old: tuple[tuple[float, ...], ...], new: tuple[tuple[float, ...], ...], camera: Camera
+) -> np.ndarray:
+    """Return the factors [H, W] that convert a gray image from the old vignetting to the new."""
+    old_sum, new_sum = (sum(cv2.split(_gain_image(each, camera))) for each in (old, new))
+    return np.asarray(new_sum / old_sum)
+
+
+def _image_axes(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the centered coordinates x [1, W] and y [H, 1] of all pixels, float32."""
+    half = camera.width / 2.0
+    x, y = ((np.arange(n) - (n - 1) / 2.0) / half for n in (camera.width, camera.height))
+    return x.astype(np.float32)[None, :], y.astype(np.float32)[:, None]

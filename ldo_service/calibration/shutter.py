@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.geometry.frames import brightest
 
 # Pixels per cell of the grid on which the image motion is computed; it is smooth between them.
 CELL_PX = 8
@@ -123,7 +124,7 @@ class FrameMotion:
         color_place = place(flow * color_s)
         moved = cv2.remap(image, *color_place, cv2.INTER_LINEAR)
         # A pixel that mixes with an invalid one, which is black, is invalid.
-        is_valid = (image if image.ndim == 2 else image.max(axis=2)) > 0
+        is_valid = (image if image.ndim == 2 else brightest(image)) > 0
         if not is_valid.all():
             share = cv2.remap(is_valid.astype(np.uint8) * 255, *color_place, cv2.INTER_LINEAR)
             moved[share < 255] = 0

@@ -102,6 +102,12 @@ class RawFrame:
         return in_meters(self.depth, self.depth_scale)
 
 
+def brightest(color: np.ndarray) -> np.ndarray:
+    """Return the largest of the three channels of a color image [H, W, 3], as [H, W]."""
+    red, green, blue = cv2.split(color)
+    return np.asarray(cv2.max(cv2.max(red, green), blue))
+
+
 def in_meters(depth: np.ndarray, depth_scale: float) -> np.ndarray:
     """Convert a depth image to meters.
 

@@ -87,11 +87,15 @@ class KeyframeRecord:
     camera: Camera  # Intrinsics of `gray` and `depth`.
     gray: bytes  # PNG image of the size of `camera`.
     depth: bytes  # Depth of the size of `camera`, 16 bits compressed by zstd.
+    # Change of the camera correction since images and points were stored; they are converted when
+    # they are used, because it would take long to convert all records at once.
+    change: CorrectionChange | None = None
 
     @cached_property
     def features(self) -> Features:
         """ORB features with their pixels in `camera`."""
-        points = self.points_camera.astype(np.float64)
+        points, change = self.points_camera.astype(np.float64), self.change
+        points = points if change is None else change.points(points, self.camera)
         return Features(self.camera.project(points), points, self.descriptors)
 
     def sift_features(self, config: FeatureConfig) -> Features:
@@ -122,15 +126,16 @@ class KeyframeRecord:
     @cached_property
     def _packed(self) -> dict[str, Any]:
         kept = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {**kept, "camera": asdict(self.camera)}
+        change = {} if self.change is None else {"change": self.change.pack()}
+        del kept["change"]
+        return {**kept, "camera": asdict(self.camera), **change}
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "KeyframeRecord":
-        """Return the record from its packed form.
-
-        A packed form of version 0.1 has the key `segment` instead of `submap`; both are read.
-        """
+        """Return the record from its packed form; version 0.1 has `segment` for `submap`."""
         values = {**kept, "camera": Camera.of(kept["camera"])}
+        if "change" in values:
+            values["change"] = CorrectionChange.of(values["change"])
         if "segment" in values:
             values["submap"] = values.pop("segment")
         return KeyframeRecord(**values)
@@ -156,38 +161,34 @@ class KeyframeRecord:
         """
         if not ignore_mask.any():
             return self
-        kept = _are_still(self.points_camera.astype(float), self.camera, ignore_mask)
+        points = self.features.points_camera
+        kept = _are_still(points, self.camera, ignore_mask)
         return replace(
             self,
-            points_camera=self.points_camera[kept],
+            points_camera=points[kept].astype(np.float32),
             descriptors=self.descriptors[kept],
             gray=_gray_bytes(self._gray, ignore_mask),
             depth=_depth_bytes(self.depth_m, ignore_mask),
+            change=None,
         )
 
     def recorrected(self, change: CorrectionChange) -> "KeyframeRecord":
-        """Return a copy of the record, converted to a new camera correction."""
-        gray, depth_m = change.gray(self._gray, self.camera), self.depth_m
-        nothing = np.zeros(gray.shape, bool)
-        points = change.points(self.points_camera.astype(np.float64), self.camera)
-        return replace(
-            self,
-            points_camera=points.astype(np.float32),
-            gray=_gray_bytes(gray, nothing),
-            depth=_depth_bytes(change.depth_m(depth_m, self.camera), nothing),
-        )
+        """Return a copy of the record for a new camera correction."""
+        return replace(self, change=change.after(self.change))
 
     @property
     def _gray(self) -> np.ndarray:
-        gray = cv2.imdecode(np.frombuffer(self.gray, np.uint8), cv2.IMREAD_GRAYSCALE)
-        return np.asarray(gray, np.uint8)
+        png = np.frombuffer(self.gray, np.uint8)
+        gray = np.asarray(cv2.imdecode(png, cv2.IMREAD_GRAYSCALE), np.uint8)
+        return gray if self.change is None else self.change.gray(gray, self.camera)
 
     @property
     def depth_m(self) -> np.ndarray:
         """Depth [H, W] float32 in meters; 0 where unknown."""
         width, height = self.camera.width, self.camera.height
         steps = codecs.decode_depth("z16+zstd", width, height, memoryview(self.depth))
-        return steps.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
+        depth_m = steps.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
+        return depth_m if self.change is None else self.change.depth_m(depth_m, self.camera)
 
 
 def make_keyframe_record(

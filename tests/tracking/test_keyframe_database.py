@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ldo_service.calibration.correction import CameraCorrection, CorrectionChange
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
@@ -129,3 +130,39 @@ def test_record_excludes_masked_pixels(room) -> None:
     columns = record.camera.project(record.points_camera.astype(np.float64))[:, 0]
     assert len(columns) > 20
     assert columns.min() > 79
+
+
+def changes() -> tuple[CorrectionChange, CorrectionChange]:
+    nothing = CameraCorrection()
+    first = CameraCorrection((0.01, 0.0, -0.01), ((-0.3, 0.1, 0.0),) * 3)
+    second = CameraCorrection((0.02, 0.01, -0.01), ((-0.4, 0.1, 0.0),) * 3)
+    return CorrectionChange(nothing, first), CorrectionChange(first, second)
+
+
+def test_record_converts_its_images_and_points_to_the_last_correction(large_room) -> None:
+    record, (first, second) = record_at(large_room, np.eye(4)), changes()
+    changed = record.recorrected(first).recorrected(second)
+    whole = CorrectionChange(first.old, second.new)
+    before, after = record.keyframe(PyramidConfig()), changed.keyframe(PyramidConfig())
+    camera = record.camera
+    assert np.array_equal(after.view.gray, whole.gray(before.view.gray, camera))
+    assert np.array_equal(after.view.depth_m, whole.depth_m(before.view.depth_m, camera))
+    assert not np.array_equal(after.view.depth_m, before.view.depth_m)
+    assert np.array_equal(
+        changed.features.points_camera, whole.points(record.features.points_camera, camera)
+    )
+    restored = KeyframeRecord.unpack(changed.pack())
+    assert restored.change == whole
+    assert np.array_equal(restored.depth_m, changed.depth_m)
+
+
+def test_masking_keeps_the_correction_of_a_record(large_room) -> None:
+    first, _ = changes()
+    record = record_at(large_room, np.eye(4)).recorrected(first)
+    mask = np.zeros((record.camera.height, record.camera.width), bool)
+    mask[:20] = True
+    masked = record.without(mask)
+    assert not masked.depth_m[:20].any()
+    # Depth is stored in steps of half a millimeter.
+    np.testing.assert_allclose(masked.depth_m[20:], record.depth_m[20:], atol=0.26e-3)
+    assert masked.recorrected(first).change == first
