@@ -1,0 +1,65 @@
+"""Binding of the comparison of calibration views, `kernels/surfaces.hpp`."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = NDArray[np.float64]
+
+def surfaces(
+    depth_m: Values, rays: Values, step_ratio: float, step_m: float, result: Values
+) -> None:
+    """Compute points and normals of the blocks of a view.
+
+    Args:
+        depth_m: Depth of the blocks, [h, w] meters; 0 where unknown.
+        rays: Viewing rays of the blocks with z = 1, [h w, 3].
+        step_ratio: Neighbors belong to one surface if their depths differ by less than this
+            fraction of the depth plus `step_m`.
+        step_m: See `step_ratio`.
+        result: Output, [h w, 6]: point and unit normal of each block. The normal is 0 0 0 unless
+            the block and its four neighbors belong to one surface.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides.
+    """
+
+def compare(
+    there: Values,
+    here: Values,
+    basis: Values,
+    T_here_there: Values,
+    intrinsics: tuple[float, float, float, float],
+    block: int,
+    width: int,
+    stride: int,
+    max_step_ratio: float,
+    rows: Values,
+    depths: Values,
+    indices: NDArray[np.int64],
+) -> int:
+    """Compare each `stride`-th surface block of one view with the surface of another view.
+
+    The residual is the distance of the moved point from the tangent plane here, in meters.
+
+    Args:
+        there: Result of `surfaces` for the first view, [h w, 6].
+        here: The same for the second view.
+        basis: Basis functions of the depth bias at the blocks, [h w, 3].
+        T_here_there: Transform from the first camera to the second one, [4, 4].
+        intrinsics: fx, fy, cx, cy of the full image.
+        block: Side of a block, pixels.
+        width: Number of blocks in a row, w.
+        stride: Distance of compared blocks along each axis, in blocks.
+        max_step_ratio: Depth difference, as a fraction of depth, beyond which two points are on
+            different surfaces.
+        rows: Output, [N, 10]: derivatives of the residual by bias, rotation and translation of
+            T_here_there (exp(x) T), and the residual. N is the number of compared blocks.
+        depths: Output, [N]: depth of the moved points, meters.
+        indices: Output, [N, 2]: blocks there and here.
+
+    Returns:
+        The number of rows written.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, or a number is out of range.
+    """

@@ -1,0 +1,107 @@
+// Comparison of the surfaces of two calibration views, compiled once per instruction set (LDO_ISA).
+#include "surfaces.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace ldo::LDO_ISA {
+namespace {
+
+double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+void cross(const double* a, const double* b, double* result) {
+  result[0] = a[1] * b[2] - a[2] * b[1];
+  result[1] = a[2] * b[0] - a[0] * b[2];
+  result[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+bool has_normal(const double* surface) {
+  return surface[3] != 0 || surface[4] != 0 || surface[5] != 0;
+}
+
+// Index of the block that a point projects into, or -1.
+int64_t block_of(const SurfaceView& view, const double* p) {
+  constexpr double kNearestM = 0.1;
+  if (!(p[2] > kNearestM)) return -1;
+  const double column = std::floor((view.fx * p[0] / p[2] + view.cx + 0.5) / view.block);
+  const double row = std::floor((view.fy * p[1] / p[2] + view.cy + 0.5) / view.block);
+  const bool inside = column >= 0 && row >= 0 && column < static_cast<double>(view.width) &&
+                      row < static_cast<double>(view.height);
+  return inside ? static_cast<int64_t>(row) * view.width + static_cast<int64_t>(column) : -1;
+}
+
+// Write one row if the point there lies on a surface that the view here shows.
+bool compare_block(const SurfaceView& view, const Comparison& input, int64_t a, double* row,
+                   double* depth_m, int64_t* indices) {
+  const double* there = input.there + kSurfaceDoubles * a;
+  if (!has_normal(there)) return false;
+  const double* T = input.T_here_there;
+  double turned[3], point[3], apart[3];
+  for (int i = 0; i < 3; ++i) {
+    turned[i] = dot(T + 4 * i, there);
+    point[i] = turned[i] + T[4 * i + 3];
+  }
+  const int64_t b = block_of(view, point);
+  if (b < 0) return false;
+  const double* here = input.here + kSurfaceDoubles * b;
+  if (!has_normal(here)) return false;
+  if (!(std::abs(point[2] - here[2]) < input.max_step_ratio * point[2])) return false;
+  const double* n = here + 3;
+  // A point on a ray moves by -z^2 ray = -z point per unit of the bias.
+  const double slope_there = dot(turned, n) * there[2], slope_here = dot(here, n) * here[2];
+  for (int i = 0; i < 3; ++i) {
+    row[i] = slope_here * input.basis[3 * b + i] - slope_there * input.basis[3 * a + i];
+    row[6 + i] = n[i];
+    apart[i] = point[i] - here[i];
+  }
+  cross(point, n, row + 3);
+  row[9] = dot(apart, n);
+  *depth_m = point[2];
+  indices[0] = a;
+  indices[1] = b;
+  return true;
+}
+
+}  // namespace
+
+void surfaces(const double* depth_m, const double* rays, int64_t height, int64_t width,
+              double step_ratio, double step_m, double* result) {
+  for (int64_t a = 0; a < height * width; ++a) {
+    double* s = result + kSurfaceDoubles * a;
+    for (int i = 0; i < 3; ++i) s[i] = rays[3 * a + i] * depth_m[a];
+    s[3] = s[4] = s[5] = 0;
+  }
+  for (int64_t row = 1; row < height - 1; ++row) {
+    for (int64_t column = 1; column < width - 1; ++column) {
+      const int64_t a = row * width + column, offsets[4] = {1, -1, width, -width};
+      const double z = depth_m[a];
+      bool near = z > 0;
+      for (int64_t offset : offsets) {
+        const double other = depth_m[a + offset];
+        near = near && other > 0 && std::abs(other - z) < step_ratio * z + step_m;
+      }
+      if (!near) continue;
+      double* s = result + kSurfaceDoubles * a;
+      double right[3], down[3];
+      for (int i = 0; i < 3; ++i) {
+        right[i] = s[kSurfaceDoubles + i] - s[i - kSurfaceDoubles];
+        down[i] = s[kSurfaceDoubles * width + i] - s[i - kSurfaceDoubles * width];
+      }
+      cross(right, down, s + 3);
+      const double length = std::max(std::sqrt(dot(s + 3, s + 3)), 1e-12);
+      for (int i = 3; i < 6; ++i) s[i] /= length;
+    }
+  }
+}
+
+int64_t compare(const SurfaceView& view, const Comparison& input, Compared& result) {
+  int64_t count = 0;
+  for (int64_t row = 0; row < view.height; row += input.stride)
+    for (int64_t column = 0; column < view.width; column += input.stride)
+      count += compare_block(view, input, row * view.width + column,
+                             result.rows + kRowDoubles * count, result.depth_m + count,
+                             result.indices + 2 * count);
+  return count;
+}
+
+}  // namespace ldo::LDO_ISA

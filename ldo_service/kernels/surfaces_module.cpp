@@ -1,0 +1,100 @@
+// Python binding of the comparison of calibration views. It checks the arguments and selects the
+// instruction set.
+#include <nanobind/stl/tuple.h>
+
+#include <cmath>
+#include <tuple>
+
+#include "arrays.hpp"
+#include "isa.hpp"
+#include "surfaces.hpp"
+
+namespace ldo {
+namespace {
+
+struct Kernels {
+  decltype(&baseline::surfaces) surfaces;
+  decltype(&baseline::compare) compare;
+};
+
+Kernels kernels_for(Isa isa) {
+#if LDO_X86
+  if (isa == Isa::avx512) return {avx512::surfaces, avx512::compare};
+  if (isa == Isa::avx2) return {avx2::surfaces, avx2::compare};
+#endif
+  (void)isa;
+  return {baseline::surfaces, baseline::compare};
+}
+
+Kernels chosen{};  // Set when the module is imported.
+
+void require_positive(double value, const char* name) {
+  require(std::isfinite(value) && value > 0, std::string(name) + " must be finite and positive.");
+}
+
+void surfaces(const Array& depth_m, const Array& rays, double step_ratio, double step_m,
+              const WritableArray& result) {
+  require(depth_m.ndim() == 2, "depth_m must have shape [h, w].");
+  const size_t h = depth_m.shape(0), w = depth_m.shape(1);
+  require_shape(rays, "rays", {h * w, 3});
+  require(result.ndim() == 2 && result.shape(0) == h * w && result.shape(1) == kSurfaceDoubles,
+          "result must have shape [h w, 6].");
+  const double* z = values_of<double>(depth_m, "depth_m");
+  const double* directions = values_of<double>(rays, "rays");
+  double* values = values_of<double>(result, "result");
+  nb::gil_scoped_release release;
+  chosen.surfaces(z, directions, static_cast<int64_t>(h), static_cast<int64_t>(w), step_ratio,
+                  step_m, values);
+}
+
+using Intrinsics = std::tuple<double, double, double, double>;
+
+int64_t compare(const Array& there, const Array& here, const Array& basis,
+                const Array& T_here_there, const Intrinsics& intrinsics, int block, int width,
+                int stride, double max_step_ratio, const WritableArray& rows,
+                const WritableArray& depths, const WritableArray& indices) {
+  require(there.ndim() == 2 && there.shape(1) == kSurfaceDoubles,
+          "there must have shape [h w, 6].");
+  const size_t size = there.shape(0);
+  require_shape(here, "here", {size, kSurfaceDoubles});
+  require_shape(basis, "basis", {size, 3});
+  require_shape(T_here_there, "T_here_there", {4, 4});
+  require(block >= 1 && stride >= 1, "block and stride must be at least 1.");
+  require(width >= 1 && size % static_cast<size_t>(width) == 0, "width must divide the blocks.");
+  const auto [fx, fy, cx, cy] = intrinsics;
+  require_positive(fx, "fx");
+  require_positive(fy, "fy");
+  const SurfaceView view{static_cast<int64_t>(size) / width, width, fx, fy, cx, cy,
+                         static_cast<double>(block)};
+  const auto compared = [stride](int64_t side) {
+    return static_cast<size_t>((side + stride - 1) / stride);
+  };
+  const size_t n = compared(view.height) * compared(view.width);
+  require(rows.ndim() == 2 && rows.shape(0) >= n && rows.shape(1) == kRowDoubles,
+          "rows must have shape [N, 10], with a row for each compared block.");
+  require(depths.ndim() == 1 && depths.shape(0) >= n, "depths must have as many rows as rows.");
+  require(indices.ndim() == 2 && indices.shape(0) >= n && indices.shape(1) == 2,
+          "indices must have shape [N, 2], with as many rows as rows.");
+  const Comparison input{values_of<double>(there, "there"),
+                         values_of<double>(here, "here"),
+                         values_of<double>(basis, "basis"),
+                         values_of<double>(T_here_there, "T_here_there"),
+                         stride,
+                         max_step_ratio};
+  Compared result{values_of<double>(rows, "rows"), values_of<double>(depths, "depths"),
+                  values_of<int64_t>(indices, "indices")};
+  nb::gil_scoped_release release;
+  return chosen.compare(view, input, result);
+}
+
+}  // namespace
+
+NB_MODULE(_surfaces, m) {
+  using namespace nb::literals;
+  chosen = kernels_for(chosen_isa());
+  m.def("surfaces", &surfaces, "depth_m"_a, "rays"_a, "step_ratio"_a, "step_m"_a, "result"_a);
+  m.def("compare", &compare, "there"_a, "here"_a, "basis"_a, "T_here_there"_a, "intrinsics"_a,
+        "block"_a, "width"_a, "stride"_a, "max_step_ratio"_a, "rows"_a, "depths"_a, "indices"_a);
+}
+
+}  // namespace ldo

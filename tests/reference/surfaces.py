@@ -1,0 +1,56 @@
+"""NumPy implementation of `_surfaces`; see `ldo_service/kernels/_surfaces.pyi`."""
+
+import numpy as np
+
+
+def surfaces(depth_m: np.ndarray, rays: np.ndarray, step_ratio: float, step_m: float) -> np.ndarray:
+    """Return points and unit normals [h w, 6] of the blocks of a view."""
+    height, width = depth_m.shape
+    points = rays.reshape(height, width, 3) * depth_m[..., None]
+    result = np.zeros((height, width, 6))
+    result[..., :3] = points
+    n = np.cross(points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1])
+    n /= np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-12)
+    z = depth_m[1:-1, 1:-1]
+    near = z > 0
+    neighbors = depth_m[1:-1, 2:], depth_m[1:-1, :-2], depth_m[2:, 1:-1], depth_m[:-2, 1:-1]
+    for other in neighbors:
+        near &= (other > 0) & (abs(other - z) < step_ratio * z + step_m)
+    result[1:-1, 1:-1, 3:][near] = n[near]
+    return result.reshape(-1, 6)
+
+
+def compare(
+    there: np.ndarray,
+    here: np.ndarray,
+    basis: np.ndarray,
+    T_here_there: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    block: int,
+    width: int,
+    stride: int,
+    max_step_ratio: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows [N, 10], depths [N] and indices [N, 2] of the compared blocks."""
+    fx, fy, cx, cy = intrinsics
+    height = len(there) // width
+    chosen = np.zeros((height, width), bool)
+    chosen[::stride, ::stride] = True
+    a = np.flatnonzero(chosen.reshape(-1) & there[:, 3:].any(axis=1))
+    turned = there[a, :3] @ T_here_there[:3, :3].T
+    points = turned + T_here_there[:3, 3]
+    ahead = points[:, 2] > 0.1
+    a, turned, points = a[ahead], turned[ahead], points[ahead]
+    column = np.floor((fx * points[:, 0] / points[:, 2] + cx + 0.5) / block).astype(int)
+    row = np.floor((fy * points[:, 1] / points[:, 2] + cy + 0.5) / block).astype(int)
+    seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    a, turned, points, b = (x[seen] for x in (a, turned, points, row * width + column))
+    seen = here[b, 3:].any(axis=1)
+    seen &= abs(points[:, 2] - here[b, 2]) < max_step_ratio * points[:, 2]
+    a, turned, points, b = (x[seen] for x in (a, turned, points, b))
+    place, n = here[b, :3], here[b, 3:]
+    by_bias = (np.sum(place * n, axis=1) * place[:, 2])[:, None] * basis[b]
+    by_bias -= (np.sum(turned * n, axis=1) * there[a, 2])[:, None] * basis[a]
+    residual = np.sum((points - place) * n, axis=1)
+    rows = np.c_[by_bias, np.cross(points, n), n, residual]
+    return rows, points[:, 2], np.stack([a, b], axis=1)
