@@ -1,10 +1,11 @@
 """Least squares of shared coefficients, with the unknowns of each block eliminated.
 
 A block contains the measurements of one pair of views. The unknowns of a block, such as the
-relative pose, occur in no other block. The coefficients are shared by all blocks.
+relative pose, occur in no other block. The coefficients are shared by all blocks. Leading
+dimensions [...] are independent systems that use the same cells, such as the color channels.
 """
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,33 +13,68 @@ import numpy as np
 STUDENT_FREEDOM = 5.0  # Degrees of freedom of the t-distribution of residuals.
 GROUPS = 8  # Maximum number of groups of successive blocks; each group is held out once.
 MIN_CELL_COUNT = 20  # Cells with at most this many residuals are skipped; their mean is noise.
-CELL_QUANTILES = (5, 95)  # Percentiles to which residuals are clipped before they are averaged.
+CLIPPED_SHARE = 0.05  # Fraction of residuals at each end that is clipped before they are averaged.
+CHECK_WORK = 0.2  # Work of the check of one block, in the unit of `estimation.estimate`.
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
     """Linearized measurements of one pair of views: residual + shared dc + own dx.
 
-    dc is the step of the shared coefficients, dx that of the unknowns of this block.
+    dc is the step of the K shared coefficients, dx that of the M unknowns of this block.
     """
 
-    shared: np.ndarray  # [N, K] derivative with respect to the shared coefficients.
-    own: np.ndarray  # [N, M] derivative with respect to the unknowns of this block.
-    residual: np.ndarray  # [N]
-    weight: np.ndarray  # [N]
-    cells: np.ndarray  # [C] int: cell of the image for each of the first C residuals, C <= N.
+    rows: np.ndarray  # [..., N, K + M + 1] columns: shared, own and the residual.
+    weight: np.ndarray  # [..., N]
+    cells: np.ndarray  # [N] int: cell of the image of each residual.
+
+    @property
+    def products(self) -> np.ndarray:
+        """Weighted sum of the products of each row with itself, [..., K + M + 1, K + M + 1]."""
+        return np.swapaxes(self.rows * self.weight[..., None], -1, -2) @ self.rows
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
-    """Step of the shared coefficients, with its evaluation on held-out blocks."""
+class Reduced:
+    """Normal equations of a block without its own unknowns.
 
-    step: np.ndarray  # [K]
-    own_steps: list[np.ndarray]  # [M] for each block.
-    sigma: np.ndarray  # [K] standard deviation by jackknife over the groups of blocks.
-    # Root mean square of the cells' mean residuals in held-out blocks. `rms_without` has all shared
-    # coefficients at 0; `rms_with` uses the coefficients estimated from the other groups. Within a
-    # cell, noise averages out.
+    The step of the block's own unknowns is -own [dc; 1].
+    """
+
+    H: np.ndarray  # [..., K, K]
+    g: np.ndarray  # [..., K]
+    own: np.ndarray  # [..., M, K + 1]
+
+    @staticmethod
+    def of(products: np.ndarray, count: int) -> "Reduced":
+        """Eliminate the block's own unknowns.
+
+        Args:
+            products: As `Block.products`; those of several blocks of one pair may be added.
+            count: Number K of the shared coefficients.
+        """
+        K, last = count, products.shape[-1] - 1
+        H_own = products[..., K:last, K:last]
+        trace = np.trace(H_own, axis1=-2, axis2=-1)[..., None, None]
+        H_own = H_own + np.eye(last - K) * (1e-9 * trace + 1e-9)
+        columns = [*range(K), last]
+        own = np.linalg.solve(H_own, products[..., K:last, columns])
+        rest = products[..., :K, columns] - products[..., :K, K:last] @ own
+        return Reduced(rest[..., :K], rest[..., K], own)
+
+    def own_step(self, step: np.ndarray) -> np.ndarray:
+        """Return the step [..., M] of the block's own unknowns for a step [..., K]."""
+        return -(self.own[..., :-1] @ step[..., None])[..., 0] - self.own[..., -1]
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """Root mean square of the cells' mean residuals in held-out blocks.
+
+    `rms_without` has all shared coefficients at 0; `rms_with` uses the coefficients estimated from
+    the other groups. Within a cell, noise averages out.
+    """
+
     rms_without: float
     rms_with: float
 
@@ -54,70 +90,91 @@ def student_weight(residual: np.ndarray, sigma: np.ndarray | float) -> np.ndarra
     return (STUDENT_FREEDOM + 1) / (STUDENT_FREEDOM + (residual / sigma) ** 2) / sigma**2
 
 
-def solve(blocks: Sequence[Block], prior: float, now: np.ndarray) -> Solution:
+def solve(blocks: Sequence[Reduced], prior: float, now: np.ndarray) -> np.ndarray:
     """Minimize the sum of weight (residual + shared dc + own dx)^2, plus prior |now + dc|^2.
 
     Args:
-        blocks: Measurements in the order of time.
+        blocks: Reduced normal equations.
         prior: Weight of the coefficients.
-        now: Coefficients at which the blocks are linearized, [K].
-    """
-    reduced = [_reduced(block) for block in blocks]
-    count = len(now)
-
-    def step_of(chosen: Sequence[int]) -> np.ndarray:
-        H, g = prior * np.eye(count), prior * now
-        for i in chosen:
-            H, g = H + reduced[i][0], g + reduced[i][1]
-        return -np.linalg.solve(H, g)
-
-    every = range(len(blocks))
-    step = step_of(every)
-    groups = np.array_split(np.arange(len(blocks)), min(GROUPS, len(blocks)))
-    without, with_ = [], []
-    steps = []
-    for group in groups:
-        left_out = set(group.tolist())
-        steps.append(step_of([i for i in every if i not in left_out]))
-        for i in left_out:
-            without.append(_cell_means(blocks[i], -now, reduced[i][2]))
-            with_.append(_cell_means(blocks[i], steps[-1], reduced[i][2]))
-    sigma = np.sqrt((len(groups) - 1) * np.var(steps, axis=0))
-    own = [-(K @ np.r_[step, 1.0]) for _, _, K in reduced]
-    return Solution(step, own, sigma, _rms(without), _rms(with_))
-
-
-def _reduced(block: Block) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Eliminate the block's own unknowns from its normal equations.
+        now: Coefficients at which the blocks are linearized, [..., K].
 
     Returns:
-        H [K, K] and g [K] of the shared coefficients, and G [M, K + 1]. The step of the block's own
-        unknowns is -G [dc; 1].
+        The step dc of the coefficients, [..., K].
     """
-    shared, own = block.shared * block.weight[:, None], block.own * block.weight[:, None]
-    H_shared, H_mixed, H_own = block.shared.T @ shared, shared.T @ block.own, block.own.T @ own
-    H_own = H_own + np.eye(len(H_own)) * (1e-9 * np.trace(H_own) + 1e-9)
-    g_shared, g_own = shared.T @ block.residual, own.T @ block.residual
-    G = np.linalg.solve(H_own, np.c_[H_mixed.T, g_own])
-    return H_shared - H_mixed @ G[:, :-1], g_shared - H_mixed @ G[:, -1], G
+    H, g = prior * np.eye(now.shape[-1]), prior * now
+    for block in blocks:
+        H, g = H + block.H, g + block.g
+    return -np.linalg.solve(H, g[..., None])[..., 0]
 
 
-def _cell_means(block: Block, step: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """Return the mean residual of each cell of the image after a step of the coefficients.
+def held_out(
+    blocks: Sequence[Reduced], prior: float, now: np.ndarray
+) -> list[tuple[range, np.ndarray]]:
+    """Return groups of successive blocks, each with the step [..., K] by all other blocks."""
+    groups = np.array_split(np.arange(len(blocks)), min(GROUPS, len(blocks)))
+    ranges = [range(int(group[0]), int(group[-1]) + 1) for group in groups]
+    return [
+        (group, solve([*blocks[: group.start], *blocks[group.stop :]], prior, now))
+        for group in ranges
+    ]
 
-    The block's own unknowns take the step that follows from it by G (see `_reduced`).
+
+def jackknife_covariance(blocks: Sequence[Reduced], prior: float, now: np.ndarray) -> np.ndarray:
+    """Return the covariance [K, K] of the coefficients by jackknife over groups of blocks."""
+    steps = np.array([step for _, step in held_out(blocks, prior, now)])
+    apart = steps - steps.mean(axis=0)
+    return (len(steps) - 1) / len(steps) * apart.T @ apart
+
+
+def check(
+    blocks: Sequence[Block], reduced: Sequence[Reduced], prior: float, now: np.ndarray
+) -> Generator[float, None, list[Check]]:
+    """Evaluate the coefficients on held-out blocks; yields its work after each block.
+
+    Returns:
+        A check of each independent system.
     """
+    without: list[list[np.ndarray]] = []
+    with_: list[list[np.ndarray]] = []
+    for group, step in held_out(reduced, prior, now):
+        for i in group:
+            without.append(_cell_means(blocks[i], -now, reduced[i]))
+            with_.append(_cell_means(blocks[i], step, reduced[i]))
+            yield CHECK_WORK
+    systems = range(len(without[0]))
+    return [
+        Check(*(_rms([means[i] for means in each]) for each in (without, with_))) for i in systems
+    ]
+
+
+def _cell_means(block: Block, step: np.ndarray, reduced: Reduced) -> list[np.ndarray]:
+    """Return the mean residuals of the cells of the image after a step of the coefficients.
+
+    The block's own unknowns take the step that follows from it.
+
+    Returns:
+        The means of each independent system.
+    """
+    steps = np.concatenate([step, reduced.own_step(step), np.ones((*step.shape[:-1], 1))], axis=-1)
+    residuals = (block.rows @ steps[..., None]).reshape(-1, len(block.cells))
     if not len(block.cells):
-        return np.zeros(0)
-    own_step = -(G @ np.r_[step, 1.0])
-    residual = block.residual + block.shared @ step + block.own @ own_step
-    residual = residual[: len(block.cells)]
-    clipped = np.clip(residual, *np.percentile(residual, CELL_QUANTILES))
-    count, total = np.bincount(block.cells), np.bincount(block.cells, clipped)
+        return [np.zeros(0) for _ in residuals]
+    count = np.bincount(block.cells)
     is_full = count > MIN_CELL_COUNT
-    return total[is_full] / count[is_full]
+    return [
+        np.bincount(block.cells, _clipped(residual))[is_full] / count[is_full]
+        for residual in residuals
+    ]
 
 
-def _rms(means: list[np.ndarray]) -> float:
+def _clipped(residual: np.ndarray) -> np.ndarray:
+    """Clip the smallest and the largest residuals [N]."""
+    low = int(CLIPPED_SHARE * len(residual))
+    high = len(residual) - 1 - low
+    ordered = np.partition(residual, (low, high))
+    return np.clip(residual, ordered[low], ordered[high])
+
+
+def _rms(means: Sequence[np.ndarray]) -> float:
     every = np.concatenate(means) if means else np.zeros(0)
     return float(np.sqrt(np.mean(every**2))) if len(every) else 0.0

@@ -12,14 +12,37 @@ are unknowns of each pair.
 
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from ldo_service.geometry import Camera, se3
+from ldo_service.kernels import _surfaces
 
-from .correction import bias_basis, unbiased_depth, vignetting_basis
-from .elimination import Block, Solution, solve, student_weight
-from .views import SURFACE_STEP_M, SURFACE_STEP_RATIO, CalibrationView, ViewPair
+from .correction import (
+    BIAS_TERMS,
+    VIGNETTING_TERMS,
+    bias_basis,
+    unbiased_depth,
+    vignetting_basis,
+)
+from .elimination import (
+    Block,
+    Check,
+    Reduced,
+    check,
+    jackknife_covariance,
+    solve,
+    student_weight,
+)
+from .views import (
+    SURFACE_STEP_M,
+    SURFACE_STEP_RATIO,
+    CalibrationView,
+    ViewPair,
+    block_centers,
+    reprojection,
+)
 
 # Depth noise of structured light, meters (Nguyen et al., 2012): s0 + s1 (z - z0)^2.
 DEPTH_SIGMA = (0.0012, 0.0019, 0.4)
@@ -31,29 +54,21 @@ MAX_STEP_RATIO = 0.08
 # Inverse variances of the coefficients' prior around 0. The residuals are correlated but count as
 # independent, so that they would outweigh a weaker prior.
 DEPTH_PRIOR, VIGNETTING_PRIOR = 4e4, 5e1
-# Gauss-Newton steps of each estimate. The next estimate starts from the result of this one.
-DEPTH_ROUNDS, COLOR_ROUNDS = 3, 3
-PAIRS_PER_PART = 16  # Pairs that one part of the work evaluates, about 40 ms.
+# Gauss-Newton steps of the first estimate, and of later ones, which start from its result.
+FIRST_ROUNDS, LATER_ROUNDS = 3, 2
+COLOR_ROUNDS = 2
 BLOCK_STRIDE = 3  # Every third block along each axis is compared; neighbors are alike.
 COLOR_STRIDE = 2  # Colors are compared at every second of these; neighbors have the same color.
 MIN_COMMON = 200  # Minimum number of compared colors; a pair with fewer is skipped for vignetting.
 CELLS = 8  # Cells of the image along its width.
 GRAY_SIGMA = 1.0  # Minimum noise of a blurred color, gray levels.
-
-
-@dataclass(frozen=True, slots=True)
-class _Cloud:
-    """Surface of a view after its depth is corrected by a given bias."""
-
-    depth_m: np.ndarray  # [h, w]
-    slope: np.ndarray  # [h, w] derivative of the depth with respect to the bias.
-    normals: np.ndarray  # [h, w, 3] unit length.
-    is_surface: np.ndarray  # [h, w] bool
+# Work of the steps below; a unit is about 1 ms on one core of an AMD EPYC.
+SURFACE_WORK, PAIR_WORK, COLOR_PAIR_WORK, COLOR_ROUND_WORK = 0.3, 0.5, 0.3, 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class _Common:
-    """Surface points that both views of a pair show, as flat indices into their blocks."""
+    """Surface points that both views of a pair show, as indices into their blocks."""
 
     there: np.ndarray  # [N] in the first view.
     here: np.ndarray  # [N] in the second one.
@@ -64,10 +79,11 @@ class Estimate:
     """Depth bias and vignetting, with the relative poses that fit the bias."""
 
     depth_bias: np.ndarray  # [3] 1/m
+    depth_bias_covariance: np.ndarray  # [3, 3] 1/m^2
     vignetting: np.ndarray  # [3, 3] channel by term
     pairs: list[ViewPair]  # Pairs with their relative poses, estimated jointly with the bias.
-    depth_check: Solution  # Solution from the dense depth alone, without features.
-    color_checks: list[Solution]  # One per channel; empty if too few colors were compared.
+    depth_check: Check  # Held-out residuals of the dense depth alone, without features.
+    color_checks: list[Check]  # One per channel; empty if too few colors were compared.
 
     @property
     def is_finite(self) -> bool:
@@ -91,11 +107,11 @@ def estimate(
     pairs: Sequence[ViewPair],
     depth_bias: np.ndarray,
     vignetting: np.ndarray,
-) -> Generator[None, None, Estimate]:
+) -> Generator[float, None, Estimate]:
     """Estimate depth bias, relative poses and vignetting by Gauss-Newton steps.
 
-    The generator yields after each part of the work, about 40 ms, so that the caller can spread the
-    work over frames.
+    The generator yields after each small step, such as the comparison of one pair, so that the
+    caller can spread the work over frames. It yields the amount of work, about 1 per millisecond.
 
     Args:
         views: Views by number.
@@ -104,118 +120,97 @@ def estimate(
         vignetting: Initial coefficients of the vignetting, [3, 3].
     """
     pairs = list(pairs)
-    for _ in range(DEPTH_ROUNDS):
-        blocks, _common = yield from _depth_blocks(views, pairs, depth_bias)
-        found = solve(blocks, DEPTH_PRIOR, depth_bias)
-        depth_bias = depth_bias + found.step
+    for _ in range(LATER_ROUNDS if depth_bias.any() else FIRST_ROUNDS):
+        linear = yield from _linearized(views, pairs, depth_bias)
+        before, step = depth_bias, solve(linear.reduced, DEPTH_PRIOR, depth_bias)
+        depth_bias = depth_bias + step
         pairs = [
-            replace(p, T_second_first=se3.exp(x) @ p.T_second_first)
-            for p, x in zip(pairs, found.own_steps, strict=True)
+            replace(p, T_second_first=se3.exp(r.own_step(step)) @ p.T_second_first)
+            for p, r in zip(pairs, linear.reduced, strict=True)
         ]
-    blocks, common = yield from _depth_blocks(views, pairs, depth_bias)
-    dense = [_without_features(block) for block in blocks]
-    depth_check = solve(dense, DEPTH_PRIOR, depth_bias)
-    checks, colors = [], []
-    for channel in range(3):
-        if len(pairs) > 2 * PAIRS_PER_PART:
-            yield
-        a, check = yield from _channel(views, pairs, common, channel, vignetting[channel])
-        colors.append(a)
-        checks += [] if check is None else [check]
-    return Estimate(depth_bias, np.array(colors), pairs, depth_check, checks)
+    covariance = jackknife_covariance(linear.reduced, DEPTH_PRIOR, before)
+    dense = [Reduced.of(block.products, BIAS_TERMS) for block in linear.dense]
+    (depth_check,) = yield from check(linear.dense, dense, DEPTH_PRIOR, before)
+    colors, color_checks = yield from _vignetting(views, pairs, linear.common, vignetting)
+    return Estimate(depth_bias, covariance, colors, pairs, depth_check, color_checks)
 
 
-def _without_features(block: Block) -> Block:
-    n = len(block.cells)
-    return Block(block.shared[:n], block.own[:n], block.residual[:n], block.weight[:n], block.cells)
+@lru_cache(maxsize=2)
+def _grid(camera: Camera, block: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rays, bias basis and vignetting basis of the blocks of a view, each [h w, 3]."""
+    u, v = block_centers(camera, block)
+    bases = bias_basis(u, v, camera), vignetting_basis(u, v, camera)
+    rays, bias, vignetting = (b.reshape(-1, 3) for b in (camera.rays_at(u, v), *bases))
+    return rays, bias, vignetting
 
 
-def _cloud(view: CalibrationView, coefficients: np.ndarray) -> _Cloud:
-    u, v = view.pixels()
-    depth_m = unbiased_depth(view.depth_m, bias_basis(u, v, view.camera) @ coefficients)
-    points = view.camera.rays_at(u, v) * depth_m[..., None]
-    normals, is_surface = np.zeros_like(points), np.zeros(depth_m.shape, bool)
-    right, left = points[1:-1, 2:], points[1:-1, :-2]
-    below, above = points[2:, 1:-1], points[:-2, 1:-1]
-    n = np.cross(right - left, below - above)
-    normals[1:-1, 1:-1] = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-12)
-    z = depth_m[1:-1, 1:-1]
-    near = z > 0
-    for neighbor in (right, left, below, above):
-        step = abs(neighbor[..., 2] - z)
-        near &= (neighbor[..., 2] > 0) & (step < SURFACE_STEP_RATIO * z + SURFACE_STEP_M)
-    is_surface[1:-1, 1:-1] = near
-    return _Cloud(depth_m, -(depth_m**2), normals, is_surface)
+# --- depth ----------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class _Linearized:
+    """All pairs, linearized at given coefficients and poses."""
+
+    reduced: list[Reduced]  # Dense depth and features.
+    dense: list[Block]
+    common: list[_Common]
 
 
-def _depth_blocks(
+def _linearized(
     views: Mapping[int, CalibrationView], pairs: Sequence[ViewPair], coefficients: np.ndarray
-) -> Generator[None, None, tuple[list[Block], list[_Common]]]:
-    clouds: dict[int, _Cloud] = {}
-    blocks: list[Block] = []
-    common: list[_Common] = []
-    for i, p in enumerate(pairs):
+) -> Generator[float, None, _Linearized]:
+    surfaces: dict[int, np.ndarray] = {}
+    linear = _Linearized([], [], [])
+    for p in pairs:
+        view = views[p.first]
         for number in (p.first, p.second):
-            if number not in clouds:
-                clouds[number] = _cloud(views[number], coefficients)
-        block, points = _depth_block(
-            views[p.first], clouds[p.first], clouds[p.second], p, coefficients
-        )
-        blocks.append(block)
-        common.append(points)
-        if i % PAIRS_PER_PART == PAIRS_PER_PART - 1:
-            yield
-    return blocks, common
+            if number not in surfaces:
+                surfaces[number] = _surface(views[number], coefficients)
+                yield SURFACE_WORK
+        block, points = _depth_block(view, surfaces[p.first], surfaces[p.second], p)
+        features = _feature_block(view.camera, p, coefficients)
+        linear.reduced.append(Reduced.of(block.products + features.products, BIAS_TERMS))
+        linear.dense.append(block)
+        linear.common.append(points)
+        yield PAIR_WORK
+    return linear
+
+
+def _surface(view: CalibrationView, coefficients: np.ndarray) -> np.ndarray:
+    """Return points and normals [h w, 6] of a view; see `_surfaces.surfaces`."""
+    rays, basis, _ = _grid(view.camera, view.block)
+    bias = (basis @ coefficients).reshape(view.depth_m.shape)
+    depth_m = unbiased_depth(view.depth_m.astype(np.float64), bias)
+    result = np.empty((len(rays), 6))
+    _surfaces.surfaces(depth_m, rays, SURFACE_STEP_RATIO, SURFACE_STEP_M, result)
+    return result
 
 
 def _depth_block(
-    view: CalibrationView, there: _Cloud, here: _Cloud, pair: ViewPair, coefficients: np.ndarray
+    view: CalibrationView, there: np.ndarray, here: np.ndarray, pair: ViewPair
 ) -> tuple[Block, _Common]:
-    u, v = view.pixels()
-    rays = view.camera.rays_at(u, v).reshape(-1, 3)
-    basis = bias_basis(u, v, view.camera).reshape(rays.shape)
-    R, t = pair.T_second_first[:3, :3], pair.T_second_first[:3, 3]
-    chosen = np.zeros(there.depth_m.shape, bool)
-    chosen[::BLOCK_STRIDE, ::BLOCK_STRIDE] = there.is_surface[::BLOCK_STRIDE, ::BLOCK_STRIDE]
-    a = np.flatnonzero(chosen)
-    directions = rays[a] @ R.T
-    points = directions * there.depth_m.reshape(-1)[a, None] + t
-    b = _indices(points, view)
-    is_seen = b >= 0
-    depth_here = here.depth_m.reshape(-1)[b]
-    is_seen &= here.is_surface.reshape(-1)[b]
-    is_seen &= abs(points[:, 2] - depth_here) < MAX_STEP_RATIO * points[:, 2]
-    a, b, points, directions = a[is_seen], b[is_seen], points[is_seen], directions[is_seen]
-    z, n = here.depth_m.reshape(-1)[b], here.normals.reshape(-1, 3)[b]
-    residual = np.sum((points - rays[b] * z[:, None]) * n, axis=1)
-    s0, s1, z0 = DEPTH_SIGMA
-    sigma_m = s0 + s1 * (points[:, 2] - z0) ** 2
-    spread = max(1.48 * np.median(abs(residual / sigma_m)), 0.5) if len(residual) else 1.0
-    slope_there, slope_here = there.slope.reshape(-1)[a], here.slope.reshape(-1)[b]
-    shared = (np.sum(directions * n, axis=1) * slope_there)[:, None] * basis[a]
-    shared -= (np.sum(rays[b] * n, axis=1) * slope_here)[:, None] * basis[b]
-    own = np.c_[np.cross(points, n), n]
-    weight = DEPTH_WEIGHT * student_weight(residual, sigma_m * spread)
-    features = _feature_rows(view.camera, pair, coefficients)
-    cells = _cells(b, here.depth_m.shape[1])
-    block = Block(
-        np.r_[shared, features.shared],
-        np.r_[own, features.own],
-        np.r_[residual, features.residual],
-        np.r_[weight, features.weight],
-        cells,
-    )
-    return block, _Common(a, b)
-
-
-def _indices(points: np.ndarray, view: CalibrationView) -> np.ndarray:
-    """Return the flat index of the block that each camera point [N, 3] projects into, or -1."""
+    """Compare the surfaces of both views of a pair; see `_surfaces.compare`."""
     height, width = view.depth_m.shape
-    is_ahead = points[:, 2] > 0.1
-    safe = np.where(is_ahead[:, None], points, [0.0, 0.0, 1.0])
-    column, row = np.floor((view.camera.project(safe) + 0.5) / view.block).astype(int).T
-    inside = is_ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return np.where(inside, row * width + column, -1)
+    most = -(-height // BLOCK_STRIDE) * -(-width // BLOCK_STRIDE)
+    rows, depths, indices = np.empty((most, 10)), np.empty(most), np.empty((most, 2), np.int64)
+    count = _surfaces.compare(
+        there,
+        here,
+        _grid(view.camera, view.block)[1],
+        pair.T_second_first,
+        (view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy),
+        view.block,
+        width,
+        BLOCK_STRIDE,
+        MAX_STEP_RATIO,
+        rows,
+        depths,
+        indices,
+    )
+    rows, depths, (a, b) = rows[:count], depths[:count], indices[:count].T
+    s0, s1, z0 = DEPTH_SIGMA
+    sigma_m, residual = s0 + s1 * (depths - z0) ** 2, rows[:, -1]
+    spread = max(1.48 * np.median(abs(residual / sigma_m)), 0.5) if count else 1.0
+    weight = DEPTH_WEIGHT * student_weight(residual, sigma_m * spread)
+    return Block(rows, weight, _cells(b, width)), _Common(a, b)
 
 
 def _cells(blocks: np.ndarray, width: int) -> np.ndarray:
@@ -224,78 +219,85 @@ def _cells(blocks: np.ndarray, width: int) -> np.ndarray:
     return (row * CELLS // width) * CELLS + column * CELLS // width
 
 
-def _feature_rows(camera: Camera, pair: ViewPair, coefficients: np.ndarray) -> Block:
+def _feature_block(camera: Camera, pair: ViewPair, coefficients: np.ndarray) -> Block:
     """Return the linearized reprojection errors of the features in pixels; u and v alternate."""
     u, v = pair.pixels_first.T
     basis = bias_basis(u, v, camera)
     z = unbiased_depth(pair.depth_first_m, basis @ coefficients)
-    R, t = pair.T_second_first[:3, :3], pair.T_second_first[:3, 3]
-    directions = camera.rays_at(u, v) @ R.T
-    points = directions * z[:, None] + t
-    count = len(points)
-    P = np.zeros((count, 2, 3))  # Derivative of the projection with respect to the point.
-    P[:, 0, 0], P[:, 1, 1] = camera.fx / points[:, 2], camera.fy / points[:, 2]
-    P[:, 0, 2] = -camera.fx * points[:, 0] / points[:, 2] ** 2
-    P[:, 1, 2] = -camera.fy * points[:, 1] / points[:, 2] ** 2
-    residual = (camera.project(points) - pair.pixels_second).reshape(-1)
-    # Derivative of the point with respect to each rotation.
-    turned = np.cross(np.eye(3), points[:, None])
-    own = np.concatenate([P @ turned.transpose(0, 2, 1), P], axis=2).reshape(2 * count, 6)
-    by_depth = (P @ directions[..., None])[..., 0] * -(z**2)[:, None]
-    shared = (by_depth[..., None] * basis[:, None]).reshape(2 * count, -1)
-    weight = student_weight(residual, FEATURE_SIGMA_PX)
-    return Block(shared, own, residual, weight, np.zeros(0, int))
+    errors, by_point, points = reprojection(
+        camera, pair.T_second_first, camera.rays_at(u, v) * z[:, None], pair.pixels_second
+    )
+    # A point on a ray moves by -z^2 ray = -z point per unit of the bias.
+    turned = points - pair.T_second_first[:3, 3]
+    by_bias = -(by_point[..., 3:] @ turned[..., None]) * z[:, None, None] * basis[:, None]
+    rows = np.concatenate([by_bias, by_point, errors[..., None]], axis=-1).reshape(-1, 10)
+    return Block(rows, student_weight(rows[:, -1], FEATURE_SIGMA_PX), np.zeros(0, int))
 
 
-def _channel(
+# --- color ----------------------------------------------------------------------------------------
+def _vignetting(
     views: Mapping[int, CalibrationView],
     pairs: Sequence[ViewPair],
     common: Sequence[_Common],
-    channel: int,
     start: np.ndarray,
-) -> Generator[None, None, tuple[np.ndarray, Solution | None]]:
-    now, own = start, None
-    samples = [
-        sample
-        for p, points in zip(pairs, common, strict=True)
-        if (sample := _brightness(views[p.first], views[p.second], points, channel)) is not None
-    ]
-    found = None
+) -> Generator[float, None, tuple[np.ndarray, list[Check]]]:
+    """Estimate the coefficients of the vignetting, [3, 3], and check each channel."""
+    compared: list[Block] = []
+    for p, points in zip(pairs, common, strict=True):
+        block = _color_block(views[p.first], views[p.second], points)
+        if block is not None:
+            compared.append(block)
+        yield COLOR_PAIR_WORK
+    if not compared:
+        return start, []
+    now, nothing, reduced = start, np.zeros_like(start), []
     for _ in range(COLOR_ROUNDS):
-        blocks = []
-        for i, (level, log_ratio, basis, cells) in enumerate(samples):
-            shared = -basis * level[:, None]
-            gain = np.c_[level, np.ones(len(level))]
-            residual = level * log_ratio + shared @ now
-            rest = residual - np.median(residual) if own is None else residual + gain @ own[i]
-            sigma = max(1.48 * float(np.median(abs(rest))), GRAY_SIGMA)
-            blocks.append(Block(shared, gain, residual, student_weight(rest, sigma), cells))
-        if not blocks:
-            return start, None
-        if len(blocks) > 2 * PAIRS_PER_PART:
-            yield
-        found = solve(blocks, VIGNETTING_PRIOR, now)
-        now, own = now + found.step, found.own_steps
-    return now, found
+        own_steps = [r.own_step(now) for r in reduced] or [None] * len(compared)
+        reduced = []
+        for block, own in zip(compared, own_steps, strict=True):
+            weight = _color_weight(block.rows, now, own)
+            reduced.append(Reduced.of(replace(block, weight=weight).products, VIGNETTING_TERMS))
+            yield COLOR_ROUND_WORK
+        now = solve(reduced, VIGNETTING_PRIOR, nothing)
+    checks = yield from check(compared, reduced, VIGNETTING_PRIOR, nothing)
+    return now, checks
 
 
-def _brightness(
-    first: CalibrationView, second: CalibrationView, points: _Common, channel: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """Compare one color channel of two views at their common points.
+def _color_weight(rows: np.ndarray, now: np.ndarray, own: np.ndarray | None) -> np.ndarray:
+    """Return the weights [3, N] of the rows [3, N, 6] of a pair by their residuals.
+
+    Args:
+        rows: Derivatives by vignetting, gain and offset, and the residual without vignetting.
+        now: Coefficients of the vignetting, [3, 3].
+        own: Gain and offset of the pair, [3, 2]; None if unknown.
+    """
+    rest = (rows[..., :3] @ now[..., None])[..., 0] + rows[..., 5]
+    if own is None:
+        rest = rest - np.median(rest, axis=1, keepdims=True)
+    else:
+        rest = rest + (rows[..., 3:5] @ own[..., None])[..., 0]
+    sigma = np.maximum(1.48 * np.median(abs(rest), axis=1, keepdims=True), GRAY_SIGMA)
+    return student_weight(rest, sigma)
+
+
+def _color_block(first: CalibrationView, second: CalibrationView, points: _Common) -> Block | None:
+    """Compare the colors of two views at their common points.
 
     Returns:
-        Mean level [N], log ratio [N], difference of the basis functions [N, 3] and cell [N] of each
-        point; None if there are fewer than MIN_COMMON points.
+        A block of the three channels, whose weights are 1. Its own unknowns are gain and offset.
+        None if there are fewer than MIN_COMMON points.
     """
     is_exposed = first.is_exposed.reshape(-1)[points.there]
     is_exposed &= second.is_exposed.reshape(-1)[points.here]
     a, b = points.there[is_exposed][::COLOR_STRIDE], points.here[is_exposed][::COLOR_STRIDE]
     if len(a) < MIN_COMMON:
         return None
-    there = first.color.reshape(-1, 3)[a, channel].astype(np.float64)
-    here = second.color.reshape(-1, 3)[b, channel].astype(np.float64)
-    u, v = first.pixels()
-    basis = vignetting_basis(u, v, first.camera).reshape(-1, 3)
-    cells = _cells(b, first.depth_m.shape[1])
-    return (there + here) / 2.0, np.log(here / there), basis[b] - basis[a], cells
+    there = first.color.reshape(-1, 3)[a].T.astype(np.float64)
+    here = second.color.reshape(-1, 3)[b].T.astype(np.float64)
+    _, _, basis = _grid(first.camera, first.block)
+    level = (there + here) / 2.0
+    rows = np.empty((3, len(a), VIGNETTING_TERMS + 3))
+    rows[..., :3] = level[..., None] * (basis[a] - basis[b])
+    rows[..., 3], rows[..., 4] = level, 1.0
+    rows[..., 5] = level * np.log(here / there)
+    return Block(rows, np.ones(level.shape), _cells(b, first.depth_m.shape[1]))

@@ -6,9 +6,10 @@
         ...  # Track the frame.
         change = calibration.observe(raw, T_odom_camera, motion)
 
-Each call of `observe` does a bounded part of the work. An estimate is used only if held-out pairs
-of views confirm it: the correction must reduce their residuals clearly. After the estimate from the
-largest number of views, the calibration is finished and costs nothing more.
+Each call of `observe` does a bounded part of the work, so that the tracker skips no frame. An
+estimate is used only if held-out pairs of views confirm it: the correction must reduce their
+residuals clearly. After the estimate from the largest number of views, the calibration is finished
+and costs nothing more.
 """
 
 import logging
@@ -36,6 +37,7 @@ MAX_TIMING_CHANGE_S = 0.01
 # 0.90 to 0.93 on bonn_crowd, where people walk through the views, and 1.00 where there is no bias.
 MAX_KEPT_RATIO = 0.97
 PAIR_DISTANCES = (1, 2, 3, 5, 8)  # A new view is paired with the views this many views before it.
+WORK_PER_FRAME = 12.0  # Work of an estimate in one frame, in the unit of `estimate`: 10 ms.
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,12 +100,13 @@ class SelfCalibration:
         self._packed: dict[str, dict[str, Any]] = {"maker": self._maker.pack()}
         self._timing = ShutterTiming()  # Timing that the views compensate.
         self._has_estimate = False  # True after the first estimate, used or not.
-        # True if only an estimate from the largest number of views may change the correction: after
-        # the views were made again with another timing, or if the correction is of an earlier run.
+        self._views_estimated = 0  # Number of views of the last estimate.
+        # True after the views were made again with another timing, and if the correction is of an
+        # earlier run. Only an estimate from more views than before may change the correction.
         self._is_renewed = False
         self._stage = 0  # Index into `config.views` of the next estimate.
         # Running estimate, the number of views that it uses, and the number of its parts done.
-        self._running: Generator[None, None, Estimate] | None = None
+        self._running: Generator[float, None, Estimate] | None = None
         self._views_used = self._parts_done = 0
 
     @staticmethod
@@ -128,7 +131,8 @@ class SelfCalibration:
         calibration._depth_bias = np.array(correction.depth_bias)
         calibration._vignetting = np.array(correction.vignetting)
         calibration._has_estimate = calibration._is_renewed = True
-        calibration._stage = max(len(calibration.config.views) - 1, 0)
+        calibration._views_estimated = max(calibration.config.views, default=0)
+        calibration._forget()
         return calibration
 
     @property
@@ -142,7 +146,7 @@ class SelfCalibration:
         T_odom_camera: np.ndarray | None,
         motion: FrameMotion | None = None,
     ) -> CorrectionChange | None:
-        """Make a view from a frame if the camera has moved, and do one part of a running estimate.
+        """Do one part of the work: continue an estimate, or make a view of the frame.
 
         Args:
             raw: The frame without correction.
@@ -159,11 +163,13 @@ class SelfCalibration:
         if self.is_finished:
             return None
         self._frames_since_view += 1
+        if self._running is not None:
+            return self._continue()
         if self._is_view_due(raw, T_odom_camera):
             self._take_view(raw if motion is None else motion.compensated(raw), T_odom_camera)
-        if self._running is None and len(self._views) >= self.config.views[self._stage]:
-            self._start(len(self._views))
-        return None if self._running is None else self._continue()
+            if len(self._views) >= self.config.views[self._stage]:
+                self._start(len(self._views))
+        return None
 
     def _is_view_due(self, raw: RgbdFrame, T_odom_camera: np.ndarray | None) -> bool:
         if len(self._views) >= self.config.views[-1]:
@@ -179,7 +185,7 @@ class SelfCalibration:
     def _take_view(self, raw: RgbdFrame, T_odom_camera: np.ndarray | None) -> None:
         if self._views and next(iter(self._views.values())).camera != raw.camera:
             self._forget()  # Another camera or resolution.
-        view = self._maker.make(raw)
+        view = self._maker.make(raw, T_odom_camera)
         self._views[view.number] = view
         self._packed |= {"maker": self._maker.pack(), f"view_{view.number}": view.pack()}
         self._T_last_view, self._frames_since_view = T_odom_camera, 0
@@ -198,14 +204,16 @@ class SelfCalibration:
         """
         self._timing = timing
         if self.config.views and self.correction.has_depth_bias:
+            self._is_renewed, self.is_finished = True, False
             self._forget()
-            self.is_finished, self._is_renewed = False, True
-            self._stage = len(self.config.views) - 1
 
     def _forget(self) -> None:
         self._maker, self._views, self._pairs = ViewMaker(), {}, []
         self._packed = {"maker": self._maker.pack()}
-        self._running, self._stage = None, 0
+        self._running = None
+        enough = self._views_estimated + 1 if self._is_renewed else 0
+        stages = [i for i, number in enumerate(self.config.views) if number >= enough]
+        self._stage = min(stages, default=max(len(self.config.views) - 1, 0))
 
     # --- estimates --------------------------------------------------------------------------------
     def _start(self, count: int) -> None:
@@ -222,12 +230,15 @@ class SelfCalibration:
     def _continue(self) -> CorrectionChange | None:
         assert self._running is not None
         try:
-            next(self._running)
+            work = 0.0
+            while work < WORK_PER_FRAME:
+                work += next(self._running)
             self._parts_done += 1
             return None
         except StopIteration as done:
             found: Estimate = done.value
         self._running, self._parts_done, self._has_estimate = None, 0, True
+        self._views_estimated = self._views_used
         if not found.is_finite:
             self._end_stage()
             return None
@@ -292,6 +303,7 @@ class SelfCalibration:
             "stage": self._stage,
             "timing": self._timing.pack(),
             "has_estimate": self._has_estimate,
+            "views_estimated": self._views_estimated,
             "is_renewed": self._is_renewed,
             "is_running": self._running is not None,
             "views_used": self._views_used,
@@ -321,9 +333,11 @@ class SelfCalibration:
             pair = pair_of(self._views[first], self._views[second])
             assert pair is not None
             self._pairs.append(pair.at(T_second_first))
+        # States of earlier versions lack some of the entries that are read by `get`.
         self._running, self._stage = None, int(now["stage"])
         self._timing = ShutterTiming.of(now.get("timing", {}))
         self._has_estimate = bool(now.get("has_estimate", True))
+        self._views_estimated = int(now.get("views_estimated", 0))
         self._is_renewed = bool(now.get("is_renewed", False))
         self._views_used = int(now["views_used"])
         if now["is_running"]:

@@ -127,7 +127,7 @@ class FrameMotion:
         is_valid = (image if image.ndim == 2 else brightest(image)) > 0
         if not is_valid.all():
             share = cv2.remap(is_valid.astype(np.uint8) * 255, *color_place, cv2.INTER_LINEAR)
-            moved[share < 255] = 0
+            moved = cv2.bitwise_and(moved, moved, mask=cv2.inRange(share, 255, 255))
         timing = self.timing
         depth_s = _row_times_s(flow[1], timing.depth_readout_s, timing.depth_delay_s, camera)
         nearest = cv2.remap(depth_m, *place(flow * depth_s), cv2.INTER_NEAREST)

@@ -13,14 +13,16 @@ from ldo_service.calibration.correction import (
     read_corrections,
     unbiased_depth,
 )
+from ldo_service.calibration.estimation import estimate
 from ldo_service.calibration.self_calibration import (
     SelfCalibration,
     SelfCalibrationConfig,
 )
 from ldo_service.calibration.shutter import FrameMotion, ShutterTiming
+from ldo_service.calibration.views import ViewMaker, pair_of, reprojection
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
-from ldo_service.geometry import RgbdFrame
+from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
 
 # Sizes of a PrimeSense camera: 70 to 210 mm at the sides, 3 m away, and corners at 0.65.
@@ -103,6 +105,66 @@ def test_restored_calibration_continues_bitwise_equal(
     rest = biased[split:], moved[split:]
     assert changes_of(first, *rest) == changes_of(second, *rest)
     assert encode_state(first.snapshot()) == encode_state(second.snapshot())
+
+
+def test_estimate_that_runs_over_several_frames_is_restored_bitwise_equal(
+    room: Sequence, frames: list[RgbdFrame]
+) -> None:
+    biased, moved = [measured(f, TRUE) for f in frames], poses(room)
+    first, second = SelfCalibration(CONFIG), SelfCalibration(CONFIG)
+    split = 0
+    while first.snapshot()["now"]["parts_done"] < 2:
+        assert first.observe(biased[split], moved[split]) is None
+        split += 1
+    second.restore(decode_state(encode_state(first.snapshot())))
+    rest = biased[split:], moved[split:]
+    changes = changes_of(first, *rest)
+    assert changes
+    assert changes == changes_of(second, *rest)
+    assert encode_state(first.snapshot()) == encode_state(second.snapshot())
+
+
+def test_no_step_of_an_estimate_does_more_than_a_frames_work(
+    room: Sequence, frames: list[RgbdFrame]
+) -> None:
+    maker = ViewMaker()
+    chosen = zip(frames[::6], poses(room)[::6], strict=True)
+    views = {n: maker.make(measured(f, TRUE), T) for n, (f, T) in enumerate(chosen)}
+    pairs = [pair_of(views[n], views[n + 1]) for n in range(len(views) - 1)]
+    steps = estimate(views, [p for p in pairs if p is not None], np.zeros(3), np.zeros((3, 3)))
+    work = list(steps)
+    assert 0 < max(work) <= 1
+    assert sum(work) > len(views)
+
+
+def test_pair_from_the_poses_of_the_tracker_equals_that_of_ransac(
+    room: Sequence, frames: list[RgbdFrame]
+) -> None:
+    truth, shift = poses(room), se3.exp(np.array([0.01, 0.005, 0.0, 0.02, 0.0, 0.01]))
+    maker, lost = ViewMaker(), ViewMaker()
+    wrong = [truth[0], truth[4] @ shift]
+    views = [maker.make(f, T) for f, T in zip((frames[0], frames[4]), wrong, strict=True)]
+    with_pose = pair_of(*views)
+    without_pose = pair_of(*(lost.make(frame) for frame in (frames[0], frames[4])))
+    T_true = se3.inverse(truth[4]) @ truth[0]
+    for pair in (with_pose, without_pose):
+        assert pair is not None
+        np.testing.assert_allclose(pair.T_second_first, T_true, atol=0.01)
+
+
+def test_reprojection_derivatives_equal_finite_differences() -> None:
+    camera = Camera(640, 480, 520.0, 525.0, 320.0, 240.0)
+    points = np.array([[0.3, -0.2, 2.0], [-0.5, 0.4, 1.5]])
+    pixels, T = np.zeros((2, 2)), se3.exp(np.array([0.1, -0.2, 0.05, 0.1, 0.0, 0.2]))
+    errors, by_point, moved = reprojection(camera, T, points, pixels)
+    np.testing.assert_allclose(errors, camera.project(moved))
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = 1e-7
+        changed, _, _ = reprojection(camera, se3.exp(step) @ T, points, pixels)
+        np.testing.assert_allclose(
+            (changed - errors) / 1e-7, by_point[..., axis], rtol=1e-4, atol=1e-2
+        )
 
 
 def test_correction_removes_what_the_camera_added(frames: list[RgbdFrame]) -> None:
