@@ -3,7 +3,9 @@
 Depth. The surface points of the first view of a pair, transformed into the second view, must lie on
 the tangent planes of its surface. The unknowns are the bias coefficients and the relative pose of
 each pair. The reprojection errors of features constrain the poses too, because the image positions
-of features have no bias.
+of features have no bias. Residual and derivatives contain the same noisy depths. A derivative at
+the mean of both depths has no noise in common with the residual, which contains their difference:
+otherwise the noise of a Kinect would shift the y^2 coefficient by up to 0.01/m.
 
 Color. The log ratio of the brightness of one surface point in two views equals the difference of
 log V at its two pixels, apart from a change of the exposure. The gain and the offset of this change
@@ -47,7 +49,7 @@ from .views import (
 # Depth noise of structured light, meters (Nguyen et al., 2012): s0 + s1 (z - z0)^2.
 DEPTH_SIGMA = (0.0012, 0.0019, 0.4)
 # Weight of a depth residual relative to a feature; low, because neighboring points share errors.
-DEPTH_WEIGHT = 0.03
+DEPTH_WEIGHT = 0.12
 FEATURE_SIGMA_PX = 1.0
 # Depth difference, as a fraction of depth, beyond which two points are on different surfaces.
 MAX_STEP_RATIO = 0.08

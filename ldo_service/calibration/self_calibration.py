@@ -217,10 +217,14 @@ class SelfCalibration:
 
     # --- estimates --------------------------------------------------------------------------------
     def _start(self, count: int) -> None:
-        """Start an estimate from the first `count` views; skip it if they form too few pairs."""
+        """Start an estimate from the first `count` views; skip it if they form too few pairs.
+
+        With fewer pairs than views, the views show little texture, and parts of the image depend on
+        a few pairs.
+        """
         self._views_used = count
         pairs = [pair for pair in self._pairs if pair.second < count]
-        if len(pairs) < self.config.min_pairs:
+        if len(pairs) < max(self.config.min_pairs, count):
             self._end_stage()
             return
         views = {number: view for number, view in self._views.items() if number < count}

@@ -39,7 +39,9 @@ def compare(
 ) -> int:
     """Compare each `stride`-th surface block of one view with the surface of another view.
 
-    The residual is the distance of the moved point from the tangent plane here, in meters.
+    The residual is the distance of the moved point from the tangent plane here, in meters. Its
+    derivatives are those at the mean depth of point and plane, so that their noise does not
+    correlate with that of the residual.
 
     Args:
         there: Result of `surfaces` for the first view, [h w, 6].
@@ -50,11 +52,11 @@ def compare(
         block: Side of a block, pixels.
         width: Number of blocks in a row, w.
         stride: Distance of compared blocks along each axis, in blocks.
-        max_step_ratio: Depth difference, as a fraction of depth, beyond which two points are on
+        max_step_ratio: Depth difference, as a fraction of depth, beyond which point and plane are
             different surfaces.
         rows: Output, [N, 10]: derivatives of the residual by bias, rotation and translation of
             T_here_there (exp(x) T), and the residual. N is the number of compared blocks.
-        depths: Output, [N]: depth of the moved points, meters.
+        depths: Output, [N]: mean depth of the moved point and the plane on its ray, meters.
         indices: Output, [N, 2]: blocks there and here.
 
     Returns:

@@ -36,27 +36,37 @@ bool compare_block(const SurfaceView& view, const Comparison& input, int64_t a, 
   const double* there = input.there + kSurfaceDoubles * a;
   if (!has_normal(there)) return false;
   const double* T = input.T_here_there;
-  double turned[3], point[3], apart[3];
-  for (int i = 0; i < 3; ++i) {
-    turned[i] = dot(T + 4 * i, there);
-    point[i] = turned[i] + T[4 * i + 3];
-  }
+  double point[3], apart[3];
+  for (int i = 0; i < 3; ++i) point[i] = dot(T + 4 * i, there) + T[4 * i + 3];
   const int64_t b = block_of(view, point);
   if (b < 0) return false;
   const double* here = input.here + kSurfaceDoubles * b;
   if (!has_normal(here)) return false;
-  if (!(std::abs(point[2] - here[2]) < input.max_step_ratio * point[2])) return false;
   const double* n = here + 3;
+  // Depth of the tangent plane here on the ray of the point.
+  const double plane_m = point[2] * dot(here, n) / dot(point, n);
+  if (!(std::abs(point[2] - plane_m) < input.max_step_ratio * point[2])) return false;
+  // The derivatives are those at the mean depth of both measurements. The noise of either one
+  // correlates with that of the residual, and the estimate would be biased.
+  const double point_share = 0.5 * (point[2] + plane_m) / point[2];
+  const double here_share = 0.5 * (point[2] + plane_m) / plane_m;
+  double middle[3], before[3];
+  for (int i = 0; i < 3; ++i) {
+    middle[i] = point_share * point[i];
+    before[i] = middle[i] - T[4 * i + 3];
+    apart[i] = point[i] - here[i];
+  }
+  const double depth_there = T[2] * before[0] + T[6] * before[1] + T[10] * before[2];
   // A point on a ray moves by -z^2 ray = -z point per unit of the bias.
-  const double slope_there = dot(turned, n) * there[2], slope_here = dot(here, n) * here[2];
+  const double slope_there = dot(before, n) * depth_there;
+  const double slope_here = dot(here, n) * here[2] * here_share * here_share;
   for (int i = 0; i < 3; ++i) {
     row[i] = slope_here * input.basis[3 * b + i] - slope_there * input.basis[3 * a + i];
     row[6 + i] = n[i];
-    apart[i] = point[i] - here[i];
   }
-  cross(point, n, row + 3);
+  cross(middle, n, row + 3);
   row[9] = dot(apart, n);
-  *depth_m = point[2];
+  *depth_m = middle[2];
   indices[0] = a;
   indices[1] = b;
   return true;

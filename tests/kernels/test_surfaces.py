@@ -66,35 +66,64 @@ def test_comparison_equals_that_of_numpy(stride: int) -> None:
     np.testing.assert_allclose(depths, expected[1], atol=1e-14)
 
 
-def test_pose_derivatives_equal_finite_differences() -> None:
-    there = here = surfaces(bumpy_depth_m())
+def plane_depths_m() -> tuple[np.ndarray, np.ndarray]:
+    """Return the depth [H, W] of one plane in two cameras, whose relative pose is T."""
+    rays = grid()[0]
+    normal, distance = np.array([0.3, -0.2, 1.0]), 2.0
+    moved = T[:3, :3] @ normal
+    here = (distance + moved @ T[:3, 3]) / (rays @ moved)
+    return (distance / (rays @ normal)).reshape(H, W), here.reshape(H, W)
+
+
+def test_derivatives_equal_finite_differences_where_both_views_agree() -> None:
+    depths, (rays, basis) = plane_depths_m(), grid()
+    there, here = surfaces(depths[0]), surfaces(depths[1])
     rows, _, indices = compare(there, here, T)
+    assert len(rows) > 500
+    np.testing.assert_allclose(rows[:, 9], 0, atol=1e-12)
+
+    def difference(changed: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows that were compared in both cases, and the change of their residuals."""
+        _, i, j = np.intersect1d(indices[:, 0], changed[2][:, 0], return_indices=True)
+        is_same = indices[i, 1] == changed[2][j, 1]
+        assert is_same.sum() > 0.9 * len(rows)
+        i, j = i[is_same], j[is_same]
+        return i, (changed[0][j, 9] - rows[i, 9]) / 1e-6
+
     for axis in range(6):
         step = np.zeros(6)
         step[axis] = 1e-6
-        moved, _, same = compare(there, here, se3.exp(step) @ T)
-        both, i, j = np.intersect1d(indices[:, 0], same[:, 0], return_indices=True)
-        i, j = i[indices[i, 1] == same[j, 1]], j[indices[i, 1] == same[j, 1]]
-        assert len(i) > 0.9 * len(both)
-        difference = (moved[j, 9] - rows[i, 9]) / 1e-6
-        np.testing.assert_allclose(difference, rows[i, 3 + axis], atol=1e-4)
-
-
-def test_bias_derivatives_equal_finite_differences_with_fixed_normals() -> None:
-    depth_m, (rays, basis) = bumpy_depth_m(), grid()
-    there = surfaces(depth_m)
-    rows, _, indices = compare(there, there, T)
+        i, change = difference(compare(there, here, se3.exp(step) @ T))
+        np.testing.assert_allclose(change, rows[i, 3 + axis], atol=1e-4)
     for axis in range(3):
         bias = 1e-6 * basis[:, axis].reshape(H, W)
-        moved = there.copy()
-        moved[:, :3] = rays * unbiased_depth(depth_m, bias).reshape(-1, 1)
-        changed, _, same = compare(moved, moved, T)
-        i = np.flatnonzero(np.isin(indices[:, 0], same[:, 0]))
-        j = np.searchsorted(same[:, 0], indices[i, 0])
-        i, j = i[indices[i, 1] == same[j, 1]], j[indices[i, 1] == same[j, 1]]
-        assert len(i) > 300
-        difference = (changed[j, 9] - rows[i, 9]) / 1e-6
-        np.testing.assert_allclose(difference, rows[i, axis], atol=1e-4)
+        biased = there.copy(), here.copy()
+        for surface, depth_m in zip(biased, depths, strict=True):
+            surface[:, :3] = rays * unbiased_depth(depth_m, bias).reshape(-1, 1)
+        i, change = difference(compare(*biased, T))
+        np.testing.assert_allclose(change, rows[i, axis], atol=1e-4)
+
+
+def test_noise_of_the_depth_does_not_bias_the_gradient() -> None:
+    # The camera rolls by 90 degrees in front of a wall, so that the basis of a point changes.
+    roll, rng = se3.exp(np.array([0, 0, np.pi / 2, 0, 0, 0])), np.random.default_rng(0)
+    gradients, one_sided = [], []
+    for _ in range(200):
+        there, here = (surfaces(2.0 + 0.01 * rng.normal(size=(H, W))) for _ in range(2))
+        rows, _, indices = compare(there, here, roll)
+        gradients.append(np.mean(rows[:, 0] * rows[:, 9]))
+        # The derivative at the measurement itself, for comparison.
+        a, b = indices.T
+        basis, n = grid()[1][:, 0], here[b, 3:]
+        slope_here = np.sum(here[b, :3] * n, axis=1) * here[b, 2]
+        slope_there = np.sum(there[a, :3] @ roll[:3, :3].T * n, axis=1) * there[a, 2]
+        one_sided.append(np.mean((slope_here * basis[b] - slope_there * basis[a]) * rows[:, 9]))
+
+    def error_in_sigmas(samples: list[float]) -> float:
+        return abs(np.mean(samples)) / (np.std(samples) / np.sqrt(len(samples)))
+
+    assert error_in_sigmas(gradients) < 3
+    assert error_in_sigmas(one_sided) > 6
 
 
 def test_wrong_shapes_are_rejected() -> None:

@@ -37,20 +37,27 @@ def compare(
     chosen = np.zeros((height, width), bool)
     chosen[::stride, ::stride] = True
     a = np.flatnonzero(chosen.reshape(-1) & there[:, 3:].any(axis=1))
-    turned = there[a, :3] @ T_here_there[:3, :3].T
-    points = turned + T_here_there[:3, 3]
+    R, t = T_here_there[:3, :3], T_here_there[:3, 3]
+    points = there[a, :3] @ R.T + t
     ahead = points[:, 2] > 0.1
-    a, turned, points = a[ahead], turned[ahead], points[ahead]
+    a, points = a[ahead], points[ahead]
     column = np.floor((fx * points[:, 0] / points[:, 2] + cx + 0.5) / block).astype(int)
     row = np.floor((fy * points[:, 1] / points[:, 2] + cy + 0.5) / block).astype(int)
     seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    a, turned, points, b = (x[seen] for x in (a, turned, points, row * width + column))
+    a, points, b = (x[seen] for x in (a, points, row * width + column))
     seen = here[b, 3:].any(axis=1)
-    seen &= abs(points[:, 2] - here[b, 2]) < max_step_ratio * points[:, 2]
-    a, turned, points, b = (x[seen] for x in (a, turned, points, b))
+    a, points, b = (x[seen] for x in (a, points, b))
     place, n = here[b, :3], here[b, 3:]
-    by_bias = (np.sum(place * n, axis=1) * place[:, 2])[:, None] * basis[b]
-    by_bias -= (np.sum(turned * n, axis=1) * there[a, 2])[:, None] * basis[a]
+    z = points[:, 2]
+    plane_m = z * np.sum(place * n, axis=1) / np.sum(points * n, axis=1)
+    seen = abs(z - plane_m) < max_step_ratio * z
+    a, points, b, place, n, z, plane_m = (x[seen] for x in (a, points, b, place, n, z, plane_m))
+    mean_m = (z + plane_m) / 2
+    middle = points * (mean_m / z)[:, None]
+    before = (middle - t) @ R
+    slope_there = np.sum((middle - t) * n, axis=1) * before[:, 2]
+    slope_here = np.sum(place * n, axis=1) * place[:, 2] * (mean_m / plane_m) ** 2
+    by_bias = slope_here[:, None] * basis[b] - slope_there[:, None] * basis[a]
     residual = np.sum((points - place) * n, axis=1)
-    rows = np.c_[by_bias, np.cross(points, n), n, residual]
-    return rows, points[:, 2], np.stack([a, b], axis=1)
+    rows = np.c_[by_bias, np.cross(middle, n), n, residual]
+    return rows, middle[:, 2], np.stack([a, b], axis=1)
