@@ -5,7 +5,7 @@ relative pose, occur in no other block. The coefficients are shared by all block
 dimensions [...] are independent systems that use the same cells, such as the color channels.
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,11 +119,29 @@ def held_out(
     ]
 
 
-def jackknife_covariance(blocks: Sequence[Reduced], prior: float, now: np.ndarray) -> np.ndarray:
-    """Return the covariance [K, K] of the coefficients by jackknife over groups of blocks."""
-    steps = np.array([step for _, step in held_out(blocks, prior, now)])
+def covariance(
+    blocks: Sequence[Reduced], prior: float, now: np.ndarray, left_out: Sequence[Set[int]]
+) -> np.ndarray:
+    """Return the covariance [K, K] of the coefficients.
+
+    It is the sum of two covariances: that of independent residuals, which the prior limits, and
+    that of the jackknife, which contains errors that many residuals have in common.
+
+    Args:
+        blocks: Reduced normal equations.
+        prior: Weight of the coefficients.
+        now: Coefficients at which the blocks are linearized, [K].
+        left_out: Groups of indices of blocks; the jackknife leaves out each of them once.
+    """
+    H = prior * np.eye(len(now)) + sum(block.H for block in blocks)
+    steps = np.array(
+        [
+            solve([block for i, block in enumerate(blocks) if i not in group], prior, now)
+            for group in left_out
+        ]
+    )
     apart = steps - steps.mean(axis=0)
-    return (len(steps) - 1) / len(steps) * apart.T @ apart
+    return np.linalg.inv(H) + (len(steps) - 1) / len(steps) * apart.T @ apart
 
 
 def check(

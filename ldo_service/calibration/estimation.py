@@ -33,7 +33,7 @@ from .elimination import (
     Check,
     Reduced,
     check,
-    jackknife_covariance,
+    covariance,
     solve,
     student_weight,
 )
@@ -53,12 +53,13 @@ DEPTH_WEIGHT = 0.12
 FEATURE_SIGMA_PX = 1.0
 # Depth difference, as a fraction of depth, beyond which two points are on different surfaces.
 MAX_STEP_RATIO = 0.08
-# Inverse variances of the coefficients' prior around 0. The residuals are correlated but count as
-# independent, so that they would outweigh a weaker prior.
-DEPTH_PRIOR, VIGNETTING_PRIOR = 4e4, 5e1
+# Inverse variances of the coefficients' prior around 0: 0.01/m for the depth bias, the size of
+# that of an Xtion.
+DEPTH_PRIOR, VIGNETTING_PRIOR = 1e4, 5e1
 # Gauss-Newton steps of the first estimate, and of later ones, which start from its result.
 FIRST_ROUNDS, LATER_ROUNDS = 3, 2
 COLOR_ROUNDS = 2
+VIEW_GROUPS = 5  # Groups of views for the jackknife.
 BLOCK_STRIDE = 3  # Every third block along each axis is compared; neighbors are alike.
 COLOR_STRIDE = 2  # Colors are compared at every second of these; neighbors have the same color.
 MIN_COMMON = 200  # Minimum number of compared colors; a pair with fewer is skipped for vignetting.
@@ -130,11 +131,24 @@ def estimate(
             replace(p, T_second_first=se3.exp(r.own_step(step)) @ p.T_second_first)
             for p, r in zip(pairs, linear.reduced, strict=True)
         ]
-    covariance = jackknife_covariance(linear.reduced, DEPTH_PRIOR, before)
+    uncertainty = covariance(linear.reduced, DEPTH_PRIOR, before, _pairs_of_views(pairs))
     dense = [Reduced.of(block.products, BIAS_TERMS) for block in linear.dense]
     (depth_check,) = yield from check(linear.dense, dense, DEPTH_PRIOR, before)
     colors, color_checks = yield from _vignetting(views, pairs, linear.common, vignetting)
-    return Estimate(depth_bias, covariance, colors, pairs, depth_check, color_checks)
+    return Estimate(depth_bias, uncertainty, colors, pairs, depth_check, color_checks)
+
+
+def _pairs_of_views(pairs: Sequence[ViewPair]) -> list[set[int]]:
+    """Return groups of the indices of all pairs that use any of some successive views.
+
+    Pairs that share a view share its errors, so the jackknife leaves out whole views.
+    """
+    numbers = sorted({number for p in pairs for number in (p.first, p.second)})
+    groups = np.array_split(numbers, min(VIEW_GROUPS, len(numbers)))
+    return [
+        {i for i, p in enumerate(pairs) if p.first in group or p.second in group}
+        for group in map(set, groups)
+    ]
 
 
 @lru_cache(maxsize=2)

@@ -87,6 +87,8 @@ class SelfCalibration:
         self.config = config or SelfCalibrationConfig()
         self.correction = CameraCorrection()
         self.ratios = (1.0, 1.0)  # Held-out residuals of the last estimate: depth, color.
+        # Covariance of the last estimate of the depth bias, [3, 3] 1/m^2; 0 before the first one.
+        self.depth_bias_covariance = np.zeros((BIAS_TERMS, BIAS_TERMS))
         self.is_finished = not self.config.views
         self._maker = ViewMaker()
         self._views: dict[int, CalibrationView] = {}
@@ -158,7 +160,8 @@ class SelfCalibration:
             The change of the correction, which applies from the next frame on; None if the
             correction does not change.
         """
-        if motion is not None and motion.timing.differs(self._timing, MAX_TIMING_CHANGE_S):
+        is_idle = self._running is None  # A running estimate is completed with the old timing.
+        if is_idle and motion and motion.timing.differs(self._timing, MAX_TIMING_CHANGE_S):
             self._renew(motion.timing)
         if self.is_finished:
             return None
@@ -247,6 +250,7 @@ class SelfCalibration:
             self._end_stage()
             return None
         self._depth_bias, self._vignetting = found.depth_bias, found.vignetting
+        self.depth_bias_covariance = found.depth_bias_covariance
         self.ratios = found.depth_ratio, found.color_ratio
         poses = {(pair.first, pair.second): pair for pair in found.pairs}
         self._pairs = [poses.get((pair.first, pair.second), pair) for pair in self._pairs]
@@ -299,6 +303,7 @@ class SelfCalibration:
         now = {
             **self.correction.pack(),
             "ratios": list(self.ratios),
+            "depth_bias_covariance": self.depth_bias_covariance,
             "is_finished": self.is_finished,
             "last_depth_bias": self._depth_bias,
             "last_vignetting": self._vignetting,
@@ -324,6 +329,8 @@ class SelfCalibration:
         now = state["now"]
         self.correction = CameraCorrection.of(now)
         self.ratios = (float(now["ratios"][0]), float(now["ratios"][1]))
+        unknown = np.zeros((BIAS_TERMS, BIAS_TERMS))
+        self.depth_bias_covariance = now.get("depth_bias_covariance", unknown)
         # If `config.views` is empty, the calibration is off: the restored correction stays.
         self.is_finished = bool(now["is_finished"]) or not self.config.views
         self._depth_bias, self._vignetting = now["last_depth_bias"], now["last_vignetting"]

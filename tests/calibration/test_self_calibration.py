@@ -70,6 +70,11 @@ def test_known_bias_and_vignetting_are_found(room: Sequence, frames: list[RgbdFr
     error = found.bias(camera) - TRUE.bias(camera)
     assert np.sqrt(np.mean(error**2)) < 0.2 * np.sqrt(np.mean(TRUE.bias(camera) ** 2))
     np.testing.assert_allclose(found.gain(camera), TRUE.gain(camera), atol=0.06)
+    # The error of the bias is plausible for its covariance.
+    sigma = np.sqrt(np.diag(calibration.depth_bias_covariance))
+    assert (sigma > 0).all()
+    assert (abs(np.subtract(found.depth_bias, TRUE.depth_bias)) < 4 * sigma).all()
+    assert (sigma < 0.5 * np.abs(TRUE.depth_bias)).all()
 
 
 def test_exact_camera_gets_no_correction(room: Sequence, frames: list[RgbdFrame]) -> None:
