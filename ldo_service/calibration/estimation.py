@@ -122,15 +122,13 @@ def estimate(
         depth_bias: Initial coefficients of the depth bias, [3].
         vignetting: Initial coefficients of the vignetting, [3, 3].
     """
-    pairs = list(pairs)
-    for _ in range(LATER_ROUNDS if depth_bias.any() else FIRST_ROUNDS):
+    linear = yield from _linearized(views, pairs, depth_bias)
+    for _ in range((LATER_ROUNDS if depth_bias.any() else FIRST_ROUNDS) - 1):
+        step = solve(linear.reduced, DEPTH_PRIOR, depth_bias)
+        depth_bias, pairs = depth_bias + step, _moved(pairs, linear, step)
         linear = yield from _linearized(views, pairs, depth_bias)
-        before, step = depth_bias, solve(linear.reduced, DEPTH_PRIOR, depth_bias)
-        depth_bias = depth_bias + step
-        pairs = [
-            replace(p, T_second_first=se3.exp(r.own_step(step)) @ p.T_second_first)
-            for p, r in zip(pairs, linear.reduced, strict=True)
-        ]
+    before, step = depth_bias, solve(linear.reduced, DEPTH_PRIOR, depth_bias)
+    depth_bias, pairs = depth_bias + step, _moved(pairs, linear, step)
     uncertainty = covariance(linear.reduced, DEPTH_PRIOR, before, _pairs_of_views(pairs))
     dense = [Reduced.of(block.products, BIAS_TERMS) for block in linear.dense]
     (depth_check,) = yield from check(linear.dense, dense, DEPTH_PRIOR, before)
@@ -163,7 +161,7 @@ def _grid(camera: Camera, block: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 # --- depth ----------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class _Linearized:
-    """All pairs, linearized at given coefficients and poses."""
+    """Equations of all pairs, linearized at given coefficients and poses."""
 
     reduced: list[Reduced]  # Dense depth and features.
     dense: list[Block]
@@ -188,6 +186,14 @@ def _linearized(
         linear.common.append(points)
         yield PAIR_WORK
     return linear
+
+
+def _moved(pairs: Sequence[ViewPair], linear: _Linearized, step: np.ndarray) -> list[ViewPair]:
+    """Return the pairs with the relative poses after a step [3] of the coefficients."""
+    return [
+        p.at(se3.exp(reduced.own_step(step)) @ p.T_second_first)
+        for p, reduced in zip(pairs, linear.reduced, strict=True)
+    ]
 
 
 def _surface(view: CalibrationView, coefficients: np.ndarray) -> np.ndarray:

@@ -196,7 +196,8 @@ def _expected(
     if T_now_last is None or not is_known.any():
         return corners
     z = np.where(is_known, depth_m, np.median(depth_m[is_known]))
-    points = camera.points_at(*corners.T.astype(np.float64), z)
+    u, v = corners.T.astype(np.float64)
+    points = camera.points_at(u, v, z)
     points = points @ T_now_last[:3, :3].T + T_now_last[:3, 3]
     is_ahead = points[:, 2] > 0.1
     moved = camera.project(np.where(is_ahead[:, None], points, [0.0, 0.0, 1.0]))

@@ -108,9 +108,9 @@ int64_t compare(const SurfaceView& view, const Comparison& input, Compared& resu
   int64_t count = 0;
   for (int64_t row = 0; row < view.height; row += input.stride)
     for (int64_t column = 0; column < view.width; column += input.stride)
-      count += compare_block(view, input, row * view.width + column,
-                             result.rows + kRowDoubles * count, result.depth_m + count,
-                             result.indices + 2 * count);
+      count +=
+          compare_block(view, input, row * view.width + column, result.rows + kRowDoubles * count,
+                        result.depth_m + count, result.indices + 2 * count);
   return count;
 }
 

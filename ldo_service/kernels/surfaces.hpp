@@ -10,17 +10,17 @@ constexpr int kSurfaceDoubles = 6;
 constexpr int kRowDoubles = 10;
 
 struct SurfaceView {
-  int64_t height, width;   // Blocks.
-  double fx, fy, cx, cy;   // Intrinsics of the full image.
-  double block;            // Side of a block, pixels.
+  int64_t height, width;  // Blocks.
+  double fx, fy, cx, cy;  // Intrinsics of the full image.
+  double block;           // Side of a block, pixels.
 };
 
 // Comparison of each stride-th block along both axes.
 struct Comparison {
-  const double* there;           // [height width, 6]
-  const double* here;            // [height width, 6]
-  const double* basis;           // [height width, 3] of the depth bias.
-  const double* T_here_there;    // [4, 4]
+  const double* there;         // [height width, 6]
+  const double* here;          // [height width, 6]
+  const double* basis;         // [height width, 3] of the depth bias.
+  const double* T_here_there;  // [4, 4]
   int64_t stride;
   double max_step_ratio;
 };
@@ -31,11 +31,11 @@ struct Compared {
   int64_t* indices;  // [N, 2] blocks there and here.
 };
 
-#define LDO_DECLARE(isa)                                                               \
-  namespace isa {                                                                      \
-  void surfaces(const double* depth_m, const double* rays, int64_t height,             \
-                int64_t width, double step_ratio, double step_m, double* result);      \
-  int64_t compare(const SurfaceView& view, const Comparison& input, Compared& result); \
+#define LDO_DECLARE(isa)                                                                  \
+  namespace isa {                                                                         \
+  void surfaces(const double* depth_m, const double* rays, int64_t height, int64_t width, \
+                double step_ratio, double step_m, double* result);                        \
+  int64_t compare(const SurfaceView& view, const Comparison& input, Compared& result);    \
   }
 LDO_DECLARE(baseline)
 LDO_DECLARE(avx2)
