@@ -8,22 +8,21 @@ takes the whole frame at once, at the time of its middle row. Conventions: `ldo_
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 
 from ldo_service.geometry import Camera, RgbdFrame, se3
-from ldo_service.geometry.frames import brightest
+from ldo_service.kernels import _shutter
 
-# Pixels per cell of the grid on which the image motion is computed; it is smooth between them.
+# Pixels per cell of the grid on which the image motion is computed; it is smooth between them. The
+# kernel uses the same value.
 CELL_PX = 8
 # Shortest interval between two frames from which a velocity is computed: 100 Hz.
 MIN_INTERVAL_S = 0.01
 # Fastest motion of a camera: 570 degrees/s, of which a rolling shutter leaves no image.
 MAX_RAD_PER_S, MAX_M_PER_S = 10.0, 10.0
-MAX_ROW_SHIFT = 0.5  # Image motion in rows per row of the readout; the image would fold beyond 1.
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,28 +112,13 @@ class FrameMotion:
         A pixel (u, v) of the result is read from (u, v) + f t, where f is the image motion per
         second of the surface point at (u, v), and t is the time at which its row was recorded.
         """
-        flow, z_per_s = self._image_motion(depth_m, camera)
-        u, v = _grid(camera)
-        size = camera.width, camera.height
-
-        def place(shift_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return u + _enlarged(shift_px[0], size), v + _enlarged(shift_px[1], size)
-
-        color_s = _row_times_s(flow[1], self.timing.readout_s, 0.0, camera)
-        color_place = place(flow * color_s)
-        moved = cv2.remap(image, *color_place, cv2.INTER_LINEAR)
-        # A pixel that mixes with an invalid one, which is black, is invalid.
-        is_valid = (image if image.ndim == 2 else brightest(image)) > 0
-        if not is_valid.all():
-            share = cv2.remap(is_valid.astype(np.uint8) * 255, *color_place, cv2.INTER_LINEAR)
-            moved = cv2.bitwise_and(moved, moved, mask=cv2.inRange(share, 255, 255))
-        timing = self.timing
-        depth_s = _row_times_s(flow[1], timing.depth_readout_s, timing.depth_delay_s, camera)
-        nearest = cv2.remap(depth_m, *place(flow * depth_s), cv2.INTER_NEAREST)
-        is_known = nearest > 0
-        # Relative change of the depth since the middle of the frame.
-        ratio = 1.0 - _enlarged(z_per_s * depth_s, size)
-        return moved, np.where(is_known, nearest * ratio, np.float32(0.0))
+        return _shutter.warp(
+            np.ascontiguousarray(image),
+            np.ascontiguousarray(depth_m),
+            _intrinsics(camera),
+            self.velocity,
+            self.timing.times_s,
+        )
 
     def recorded(self, image: np.ndarray, depth_m: np.ndarray, camera: Camera) -> np.ndarray:
         """Return a color image [H, W, 3] of the whole frame at once as the camera records it.
@@ -144,52 +128,16 @@ class FrameMotion:
             depth_m: Its depth, [H, W] meters; 0 where unknown.
             camera: Camera of the image.
         """
-        flow, _ = self._image_motion(depth_m, camera)
+        depth_m = np.ascontiguousarray(depth_m)
+        flow = _shutter.image_motion(depth_m, _intrinsics(camera), self.velocity)[:2]
         # The time is that of the pixel's own row.
-        shift_px = flow * _row_times_s(np.float32(0.0), self.timing.readout_s, 0.0, camera)
-        size = camera.width, camera.height
-        grid_u, grid_v = _grid(camera)
-        place = grid_u - _enlarged(shift_px[0], size), grid_v - _enlarged(shift_px[1], size)
+        height, row_s = camera.height, self.timing.readout_s / max(camera.height - 1, 1)
+        v_cells = CELL_PX * np.arange(flow.shape[1]) + (CELL_PX - 1) / 2
+        time_s = ((v_cells - (height - 1) / 2) * row_s).astype(np.float32)
+        v, u = np.mgrid[:height, : camera.width].astype(np.float32)
+        shift_u, shift_v = (_enlarged(cells, camera) for cells in flow * time_s[:, None])
+        place = u - shift_u, v - shift_v
         return cv2.remap(image, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-    def _image_motion(self, depth_m: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the motion of the surface on a grid of cells.
-
-        Returns:
-            The image motion [2, h, w] in pixels per second, and the relative change of depth [h, w]
-            per second.
-        """
-        u, v = _cells(camera)
-        x = (u - np.float32(camera.cx)) / np.float32(camera.fx)
-        y = (v - np.float32(camera.cy)) / np.float32(camera.fy)
-        inverse = _inverse_depth(depth_m, v.shape[0], u.shape[1])
-        rx, ry, rz, tx, ty, tz = self.velocity.astype(np.float32)
-        # A point X has the velocity -(t + r x X) in the camera frame.
-        z_per_s = -(tz * inverse + rx * y - ry * x)
-        flow_u = np.float32(camera.fx) * (-(tx * inverse + ry - rz * y) - x * z_per_s)
-        flow_v = np.float32(camera.fy) * (-(ty * inverse + rz * x - rx) - y * z_per_s)
-        return np.stack([flow_u, flow_v]), z_per_s
-
-
-def _row_times_s(
-    flow_v: np.ndarray | np.float32, readout_s: float, delay_s: float, camera: Camera
-) -> np.ndarray:
-    """Return when the surface points of the cells were recorded, [h, w] seconds.
-
-    A point that moves downwards is recorded in a later row than the one in which it is in the
-    middle of the frame, and the row is recorded later in turn.
-
-    Args:
-        flow_v: Image motion of the points in v, [h, w] or scalar, pixels per second.
-        readout_s: Time from the first to the last row.
-        delay_s: Time of the middle row.
-        camera: Camera of the image.
-    """
-    row_s = readout_s / max(camera.height - 1, 1)
-    _, v = _cells(camera)
-    shift = np.clip(flow_v * np.float32(row_s), -MAX_ROW_SHIFT, MAX_ROW_SHIFT)
-    at_once_s = (v - np.float32((camera.height - 1) / 2)) * np.float32(row_s) + np.float32(delay_s)
-    return at_once_s / (1.0 - shift)
 
 
 def displacement_rad(velocity: np.ndarray, timing: ShutterTiming, depth_m: float) -> float:
@@ -205,36 +153,12 @@ def displacement_rad(velocity: np.ndarray, timing: ShutterTiming, depth_m: float
     return float(speed) * max(color_s, abs(timing.depth_readout_s) / 2 + abs(timing.depth_delay_s))
 
 
-def _inverse_depth(depth_m: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return the inverse depth [height, width] of the cells, 1/m; the median where unknown."""
-    sampled = depth_m[CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
-    cells = np.zeros((height, width), np.float32)
-    cells[: sampled.shape[0], : sampled.shape[1]] = sampled
-    is_known = cells > 0
-    if not is_known.any():
-        return cells
-    usual_m = np.median(cells[is_known])
-    return np.float32(1.0) / np.where(is_known, cells, usual_m)
+def _intrinsics(camera: Camera) -> tuple[float, float, float, float]:
+    return camera.fx, camera.fy, camera.cx, camera.cy
 
 
-def _enlarged(cells: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Interpolate values of cells [h, w] to all pixels of an image of `size` (W, H)."""
+def _enlarged(cells: np.ndarray, camera: Camera) -> np.ndarray:
+    """Interpolate values of cells [h, w] to all pixels of an image, [H, W]."""
     whole = cells.shape[1] * CELL_PX, cells.shape[0] * CELL_PX
     pixels = cv2.resize(cells, whole, interpolation=cv2.INTER_LINEAR)
-    return pixels[: size[1], : size[0]]
-
-
-@lru_cache(maxsize=4)
-def _cells(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the image coordinates u [1, w] and v [h, 1] of the centers of the cells."""
-    width, height = -(-camera.width // CELL_PX), -(-camera.height // CELL_PX)
-    center = (CELL_PX - 1) / 2
-    u = (CELL_PX * np.arange(width) + center).astype(np.float32)
-    v = (CELL_PX * np.arange(height) + center).astype(np.float32)
-    return u[None, :], v[:, None]
-
-
-@lru_cache(maxsize=4)
-def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
-    return u, v
+    return pixels[: camera.height, : camera.width]

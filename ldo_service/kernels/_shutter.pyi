@@ -1,0 +1,53 @@
+"""Binding of the compensation of the camera's motion during a frame, `kernels/shutter.hpp`."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+def image_motion(
+    depth: NDArray[np.float32],
+    intrinsics: tuple[float, float, float, float],
+    velocity: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Compute the motion of the surface at the centers of cells of 8x8 pixels.
+
+    The function releases the GIL, as `warp` does.
+
+    Args:
+        depth: Depth, [H, W] meters; 0 where unknown. The median stands in for unknown depth.
+        intrinsics: Intrinsics (fx, fy, cx, cy), pixels.
+        velocity: Velocity of the camera, [6]: rotation in rad/s, then translation in m/s, in the
+            camera frame.
+
+    Returns:
+        Motion [3, h, w] along u and v in pixels per second, and the relative change of depth per
+        second.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, or an intrinsic is invalid.
+    """
+
+def warp(
+    image: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    intrinsics: tuple[float, float, float, float],
+    velocity: NDArray[np.float64],
+    times_s: tuple[float, float, float],
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Move an image and its depth to where the camera would have recorded them at once.
+
+    The result has the same bits on all instruction sets.
+
+    Args:
+        image: Image, [H, W] or [H, W, 3]; a black pixel is missing.
+        depth: Depth, [H, W] meters; 0 where unknown.
+        intrinsics: Intrinsics (fx, fy, cx, cy), pixels.
+        velocity: Velocity of the camera, [6], as in `image_motion`.
+        times_s: Readout of color, readout of depth, and delay of depth, seconds.
+
+    Returns:
+        The image by bilinear interpolation, black where it mixes with a missing pixel or is read
+        from outside; and the depth of the nearest pixel, [H, W] meters, 0 where unknown.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, or an intrinsic is invalid.
+    """
