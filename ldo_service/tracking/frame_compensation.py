@@ -5,6 +5,8 @@ Conventions: `ldo_service.geometry`.
 
 from dataclasses import replace
 
+import numpy as np
+
 from ldo_service.calibration.shutter import FrameMotion, ShutterTiming, displacement_rad
 from ldo_service.geometry import RgbdFrame, se3
 
@@ -13,8 +15,8 @@ from .motion_segmentation import shows_motion
 from .odometry_config import OdometryConfig
 from .pose_candidates import InitialGuessAligner, PoseHypothesis
 from .pyramid import Pyramid, pyramid_of
-from .shutter import ShutterState, needs_realignment
-from .shutter_timing import band_equations
+from .shutter import ShutterState, displacement_ratio
+from .shutter_timing import BandEquations, band_equations
 from .state import OdometryState
 from .tracking_quality import TrackingStatus
 
@@ -32,19 +34,26 @@ class FrameCompensator:
         self.config = config
         self.guesses = guesses
         self._view: tuple[RgbdFrame, Pyramid] | None = None  # The last frame and its pyramid.
-        # Motion that the last pyramid compensates; None if the motion of the frame is unknown.
+        # Motion that the pyramid compensates; None if the motion of the frame is unknown.
+        self._compensated: FrameMotion | None = None
+        # Motion that the pose of the last frame fits; None if the motion of the frame is unknown.
         self.motion: FrameMotion | None = None
 
     def expect(self, frame: RgbdFrame, state: OdometryState) -> Pyramid:
         """Compensate a frame that is not tracked yet with the motion of the frames before it."""
         expected = state.shutter.expected_motion(state.motion, frame.stamp_ns, self.config.shutter)
-        return self._compensated(frame, expected)
+        return self._compensate(frame, expected)
 
     def view(self, frame: RgbdFrame) -> Pyramid:
         """Return the pyramid of a frame; that of the last frame is cached."""
         if self._view is None or self._view[0] is not frame:
-            return self._compensated(frame, None)
+            return self._compensate(frame, None)
         return self._view[1]
+
+    def finish(self, frame: RgbdFrame) -> None:
+        """Compensate the last frame with the motion that its pose fits, if it was corrected."""
+        if self.motion is not self._compensated:
+            self._compensate(frame, self.motion)
 
     def measure(
         self,
@@ -54,9 +63,11 @@ class FrameCompensator:
         status: TrackingStatus,
         state: OdometryState,
     ) -> tuple[PoseHypothesis, ShutterState]:
-        """Compensate a frame with the motion that its pose shows.
+        """Measure the motion during a frame, and return the pose that fits this motion.
 
-        The frame is aligned again if this motion is not as expected.
+        If the motion is not as expected, the frame is compensated and aligned again. If the
+        difference is small, only the pose is corrected, to first order, unless the frame is not OK
+        or becomes a keyframe.
 
         Args:
             frame: The frame of the last call of `expect`.
@@ -66,59 +77,113 @@ class FrameCompensator:
             state: State before the frame.
 
         Returns:
-            The pose of the compensated frame, and the next state of the compensation.
+            The pose, and the next state of the compensation.
         """
         config, shutter = self.config.shutter, state.shutter
         is_jump = state.status is TrackingStatus.LOST or candidate.pose_source == "relocalized"
-        if not config.is_on or is_jump:
-            return candidate, self._interrupted(frame, shutter)
+        motion = None
+        if config.is_on and not is_jump:
+            motion = self._measured_motion(frame, keyframe, candidate, state)
+        if motion is None:
+            self._interrupt(frame)
+            return candidate, shutter.interrupted()
         is_ok = status is TrackingStatus.OK
         if not is_ok:
             shutter = replace(shutter, pending=None)
-        moved, motion = self._moved(shutter, frame, keyframe, candidate, state)
-        if motion is None:
-            return candidate, self._interrupted(frame, moved)
-        focal_ratio, depth_m = frame.camera.fx / frame.camera.width, candidate.median_depth_m
-        if needs_realignment(self.motion, motion, depth_m, focal_ratio, config):
-            before = self._view, self.motion
-            view = self._compensated(frame, motion)
-            again = self.guesses.align_again(keyframe, view, candidate)
-            if _is_worse(again, candidate):
-                self._view, self.motion = before
+        equations, expected = None, self._compensated
+        ratio = displacement_ratio(expected, motion, candidate.median_depth_m, frame.camera)
+        if ratio > config.realign_ratio:
+            is_small = ratio <= config.max_linear_ratio and is_ok
+            if expected is None or not is_small or self._is_needed(keyframe, candidate, state):
+                candidate = self._aligned_again(frame, keyframe, candidate, motion)
             else:
-                candidate = again
-                moved = self._moved(shutter, frame, keyframe, candidate, state)[0]
+                equations = self._equations(frame, keyframe, candidate, shutter, expected)
+                candidate = _corrected(candidate, equations, motion)
+            motion = self._measured_motion(frame, keyframe, candidate, state)
+            if motion is None:
+                self._interrupt(frame)
+                return candidate, shutter.interrupted()
+        shutter = shutter.moved(motion, config)
+        if equations is not None:
+            self.motion = motion
         elif self.motion is None:
-            self.motion = motion  # Too slow to matter.
+            self.motion = self._compensated = motion  # Too slow to matter.
         if is_ok and not shows_motion(state.dynamic_mask):  # Moving points are false evidence.
-            moved = self._with_pending(moved, frame, keyframe, candidate)
-        return candidate, moved
+            shutter = self._with_pending(shutter, frame, keyframe, candidate, equations)
+        return candidate, shutter
 
-    def _moved(
+    def forget(self) -> None:
+        """Drop the last frame."""
+        self._view = self.motion = self._compensated = None
+
+    def _compensate(self, frame: RgbdFrame, motion: FrameMotion | None) -> Pyramid:
+        self._view = frame, pyramid_of(frame, self.config.pyramid, motion)
+        self.motion = self._compensated = motion
+        return self._view[1]
+
+    def _interrupt(self, frame: RgbdFrame) -> None:
+        """Compensate nothing in a frame whose motion is unknown."""
+        if self.motion is not None:
+            self._compensate(frame, None)
+
+    def _is_needed(
+        self, keyframe: ReferenceKeyframe, candidate: PoseHypothesis, state: OdometryState
+    ) -> bool:
+        """Return whether an OK frame with this pose becomes a keyframe."""
+        alignment, depth_m = candidate.alignment, candidate.median_depth_m
+        T_odom_camera = keyframe.T_odom_keyframe @ alignment.T_reference_camera
+        config = self.config.keyframes
+        return state.needed_keyframe(T_odom_camera, alignment, depth_m, config) is not None
+
+    def _measured_motion(
         self,
-        shutter: ShutterState,
         frame: RgbdFrame,
         keyframe: ReferenceKeyframe,
         candidate: PoseHypothesis,
         state: OdometryState,
-    ) -> tuple[ShutterState, FrameMotion | None]:
+    ) -> FrameMotion | None:
         T_odom_camera = keyframe.T_odom_keyframe @ candidate.alignment.T_reference_camera
-        return shutter.moved(state.motion, T_odom_camera, frame.stamp_ns, self.config.shutter)
+        return state.shutter.measured_motion(
+            state.motion, T_odom_camera, frame.stamp_ns, self.config.shutter
+        )
 
-    def _interrupted(self, frame: RgbdFrame, shutter: ShutterState) -> ShutterState:
-        """Compensate nothing in a frame whose motion is unknown."""
-        if self.motion is not None:
-            self._compensated(frame, None)
-        return shutter.interrupted()
+    def _aligned_again(
+        self,
+        frame: RgbdFrame,
+        keyframe: ReferenceKeyframe,
+        candidate: PoseHypothesis,
+        motion: FrameMotion,
+    ) -> PoseHypothesis:
+        """Compensate a frame with a motion and align it again, unless this makes it worse."""
+        before = self._view, self._compensated
+        again = self.guesses.align_again(keyframe, self._compensate(frame, motion), candidate)
+        if not _is_worse(again, candidate):
+            return again
+        self._view, self._compensated = before
+        self.motion = self._compensated
+        return candidate
 
-    def forget(self) -> None:
-        """Drop the last frame."""
-        self._view = self.motion = None
-
-    def _compensated(self, frame: RgbdFrame, motion: FrameMotion | None) -> Pyramid:
-        self._view = frame, pyramid_of(frame, self.config.pyramid, motion)
-        self.motion = motion
-        return self._view[1]
+    def _equations(
+        self,
+        frame: RgbdFrame,
+        keyframe: ReferenceKeyframe,
+        candidate: PoseHypothesis,
+        shutter: ShutterState,
+        compensated: FrameMotion,
+    ) -> BandEquations:
+        """Return the equations of a frame; an unknown motion of the reference counts as none."""
+        unknown = np.zeros(6)
+        velocity_there = shutter.reference_velocity
+        return band_equations(
+            keyframe.reference,
+            self.view(frame),
+            se3.inverse(candidate.alignment.T_reference_camera),
+            candidate.alignment.appearance,
+            self.config.align.residuals,
+            keyframe.motion or FrameMotion(unknown, compensated.timing),
+            compensated,
+            unknown if velocity_there is None else velocity_there,
+        )
 
     def _with_pending(
         self,
@@ -126,9 +191,10 @@ class FrameCompensator:
         frame: RgbdFrame,
         keyframe: ReferenceKeyframe,
         candidate: PoseHypothesis,
+        equations: BandEquations | None,
     ) -> ShutterState:
         """Add the equations of a frame for the times of the shutter, while they are estimated."""
-        velocity_there, motion = shutter.reference_velocity, self.motion
+        velocity_there, motion = shutter.reference_velocity, self._compensated
         if velocity_there is None or keyframe.motion is None or motion is None:
             return shutter
         config = self.config.shutter
@@ -136,17 +202,21 @@ class FrameCompensator:
         is_due = shutter.evidence.count < config.max_frames and speed_rad > config.min_motion_rad
         if not is_due or keyframe.view.camera != frame.camera:
             return shutter
-        equations = band_equations(
-            keyframe.reference,
-            self.view(frame),
-            se3.inverse(candidate.alignment.T_reference_camera),
-            candidate.alignment.appearance,
-            self.config.align.residuals,
-            keyframe.motion,
-            motion,
-            velocity_there,
-        )
+        if equations is None:
+            equations = self._equations(frame, keyframe, candidate, shutter, motion)
+        else:  # The velocity of a new reference has been measured since.
+            equations = replace(equations, reference_velocity=velocity_there)
         return replace(shutter, pending=equations if len(equations.rows) else None)
+
+
+def _corrected(
+    candidate: PoseHypothesis, equations: BandEquations, motion: FrameMotion
+) -> PoseHypothesis:
+    """Return the pose that alignment would find if another motion was compensated."""
+    alignment = candidate.alignment
+    change = se3.exp(equations.pose_change(motion.velocity))
+    T_reference_camera = se3.orthonormalize(alignment.T_reference_camera @ change)
+    return replace(candidate, alignment=replace(alignment, T_reference_camera=T_reference_camera))
 
 
 def _is_worse(again: PoseHypothesis, before: PoseHypothesis) -> bool:

@@ -103,9 +103,14 @@ class FrameTracker:
         candidate, shutter = self._compensator.measure(
             frame, keyframe, candidate, status, self.state
         )
+        if status is TrackingStatus.WEAK and self._classify(candidate) is TrackingStatus.OK:
+            status = TrackingStatus.OK  # The compensation explains the residuals.
         self.state = replace(self.state, shutter=shutter)
         tracked = self._accepted_result(frame, keyframe, candidate, status)
-        return self._search_other_submaps(tracked, keyframe, self.view(frame))
+        tracked = self._search_other_submaps(tracked, keyframe, self.view(frame))
+        if tracked.needed_keyframe is not None:
+            self._compensator.finish(frame)
+        return tracked
 
     def start_submap(self, frame: RgbdFrame) -> TrackedFrame:
         """Return the LOST frame just tracked as the first frame of a new submap.

@@ -31,6 +31,7 @@ SHARED = slice(8, 11)  # Unknowns of the camera: readout of color, readout and d
 LEVEL = 1
 BANDS = 6  # Bands of rows that are displaced as a whole.
 MIN_BAND_POINTS = 50  # Points; a band with fewer is left out.
+ROW_STRIDE = 4  # The mean rows of a band are those of every fourth point.
 # Noise of the equations as a multiple of that of alignment. The rows far from the middle tell the
 # readout, and are outliers of the alignment as long as the readout is not compensated.
 NOISE_RATIO = 3.0
@@ -76,6 +77,23 @@ class BandEquations:
         motions = {name: FrameMotion.unpack(kept[name]) for name in ("at_reference", "at_frame")}
         return BandEquations(**{**kept, **motions})
 
+    def pose_change(self, velocity: np.ndarray) -> np.ndarray:
+        """Return by how much the pose changes if the frame is compensated with another velocity.
+
+        The change is a first-order approximation.
+
+        Args:
+            velocity: Velocity of the frame, [6] per second.
+
+        Returns:
+            The increment xi [6], which changes the pose to T_reference_camera * exp(xi).
+        """
+        difference = replace(self.at_frame, velocity=velocity - self.at_frame.velocity)
+        twists = _row_twists(difference, self.rows[:, 1])
+        A = self.hessian.sum(axis=(0, 1)) + np.diag(np.r_[np.full(6, 1e-6), BRIGHTNESS_PRIOR])
+        b = (self.hessian[..., POSE] @ twists[..., None]).sum(axis=(0, 1, 3))
+        return -np.linalg.solve(A, b)[POSE]
+
     def timing_equations(self, velocity: np.ndarray) -> np.ndarray:
         """Return the normal equations for the times.
 
@@ -90,22 +108,18 @@ class BandEquations:
         to_camera = se3.adjoint(self.T_camera_reference)
         velocity_there = to_camera @ self.reference_velocity
         used_there = replace(self.at_reference, velocity=to_camera @ self.at_reference.velocity)
-        A, b, nothing = np.zeros((11, 11)), np.zeros(11), np.zeros(6)
-        for (there, here), hessians, gradients in zip(
-            self.rows.tolist(), self.hessian, self.gradient, strict=True
-        ):
-            by_readout = here * velocity - there * velocity_there
-            by_delay = velocity - velocity_there
-            for is_color, hessian, gradient in zip((True, False), hessians, gradients, strict=True):
-                done = np.zeros(8)
-                done[POSE] = _row_twist(self.at_frame, here, is_color=is_color)
-                done[POSE] -= _row_twist(used_there, there, is_color=is_color)
-                J = np.eye(11, 8)
-                J[SHARED, POSE] = (
-                    (by_readout, nothing, nothing) if is_color else (nothing, by_readout, by_delay)
-                )
-                A += J @ hessian @ J.T
-                b += J @ (hessian @ done - gradient)
+        there, here = self.rows.T
+        # Twists [B, 2, 6] that are compensated already, and those per second of each time.
+        done = _row_twists(self.at_frame, here) - _row_twists(used_there, there)
+        J = np.zeros((len(here), 2, 11, 8))
+        J[:, :, OWN] = np.eye(8)
+        by_readout = here[:, None] * velocity - there[:, None] * velocity_there
+        J[:, 0, 8, POSE] = J[:, 1, 9, POSE] = by_readout
+        J[:, 1, 10, POSE] = velocity - velocity_there
+        weighted = J @ self.hessian
+        A = (weighted @ J.swapaxes(-1, -2)).sum(axis=(0, 1))
+        b = (weighted[..., POSE] @ done[..., None])[..., 0] - (J @ self.gradient[..., None])[..., 0]
+        b = b.sum(axis=(0, 1))
         A[OWN, OWN] += np.diag(np.r_[np.full(6, 1e-6), BRIGHTNESS_PRIOR])
         eliminated = np.linalg.solve(A[OWN, OWN], np.c_[A[OWN, SHARED], b[OWN]])
         return np.c_[A[SHARED, SHARED], b[SHARED]] - A[SHARED, OWN] @ eliminated
@@ -135,7 +149,6 @@ def band_equations(
     """
     index = min(LEVEL, len(frame.levels) - 1, len(reference.points) - 1)
     points, level = reference.points[index], frame.levels[index]
-    row_there, row_here = _rows(points, level, T_camera_reference)
     color = replace(
         brightness,
         intensity_sigma=NOISE_RATIO * brightness.intensity_sigma,
@@ -147,18 +160,18 @@ def band_equations(
         depth_noise_scale=NOISE_RATIO * brightness.depth_noise_scale,
     )
     hessians, gradients, rows = [], [], []
-    for low, high in pairwise(np.linspace(-0.5, 0.5, BANDS + 1).tolist()):
-        chosen = (row_there >= low) & (row_there < high) & (np.abs(row_here) <= 0.5)
-        if np.count_nonzero(chosen) < MIN_BAND_POINTS:
+    for first, last in _bands(points, level):
+        band = np.ascontiguousarray(points[:, first:last])
+        row_there, row_here, inside = _rows(band[:, ::ROW_STRIDE], level, T_camera_reference)
+        if ROW_STRIDE * np.count_nonzero(inside) < MIN_BAND_POINTS:
             continue
-        band = np.ascontiguousarray(points[:, chosen])
         equations = [
             normal_equations(band, level, T_camera_reference, noise, config)
             for noise in (color, depth)
         ]
         hessians.append([e.hessian for e in equations])
         gradients.append([e.gradient for e in equations])
-        rows.append((row_there[chosen].mean(), row_here[chosen].mean()))
+        rows.append((row_there[inside].mean(), row_here[inside].mean()))
     return BandEquations(
         np.array(hessians).reshape(-1, 2, 8, 8),
         np.array(gradients).reshape(-1, 2, 8),
@@ -230,25 +243,39 @@ class TimingEvidence:
         )
 
 
-def _row_twist(motion: FrameMotion, row: float, *, is_color: bool) -> np.ndarray:
-    """Return the twist [6] by which a row, -0.5..0.5, of color or depth was moved."""
+def _row_twists(motion: FrameMotion, rows: np.ndarray) -> np.ndarray:
+    """Return the twists [B, 2, 6] by which rows [B], -0.5..0.5, of color and depth were moved."""
     timing = motion.timing
-    if is_color:
-        return timing.readout_s * row * motion.velocity
-    return (timing.depth_readout_s * row + timing.depth_delay_s) * motion.velocity
+    color_s = timing.readout_s * rows
+    depth_s = timing.depth_readout_s * rows + timing.depth_delay_s
+    return np.stack([color_s, depth_s], axis=1)[..., None] * motion.velocity
+
+
+def _bands(points: np.ndarray, level: Level) -> list[tuple[int, int]]:
+    """Return the first and last index of the points [7, N] of each band; points ascend by row."""
+    camera = level.camera
+    row = np.rint(points[1] / points[2] * np.float32(camera.fy) + np.float32(camera.cy))
+    edges = np.linspace(-0.5, camera.height - 0.5, BANDS + 1)
+    return list(pairwise(np.searchsorted(row, edges).tolist()))
 
 
 def _rows(
     points: np.ndarray, level: Level, T_camera_reference: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows [N] of points [7, N] in the reference and in the frame, -0.5..0.5."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where points [7, N] of the reference are in the images.
+
+    Returns:
+        Their rows [N] in the reference and in the frame, -0.5..0.5, and whether they are in a row
+        of the frame, [N] bool.
+    """
     camera = level.camera
     R, t = T_camera_reference[:3, :3], T_camera_reference[:3, 3]
     moved = R[1:] @ points[:3] + t[1:, None]
     depth_m = np.maximum(moved[1], 1e-3)
     middle, height = (camera.height - 1) / 2, camera.height
     row_there = (points[1] / points[2] * camera.fy + camera.cy - middle) / height
-    return row_there, (moved[0] / depth_m * camera.fy + camera.cy - middle) / height
+    row_here = (moved[0] / depth_m * camera.fy + camera.cy - middle) / height
+    return row_there, row_here, np.abs(row_here) <= 0.5
 
 
 def _solved(equations: np.ndarray) -> np.ndarray:
