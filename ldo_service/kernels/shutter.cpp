@@ -1,6 +1,7 @@
 // Compensation of the camera's motion during a frame, compiled once per instruction set (LDO_ISA).
 // The kernels run on one thread. Each row takes three steps: the displacement of its pixels, the
-// places that they are read from, and the interpolation. Only the reading is not vectorized.
+// places that they are read from, and the interpolation. Only the reading is not vectorized. The
+// compiler does not vectorize a loop after it is inlined and `__restrict` is lost.
 #include "shutter.hpp"
 
 #include <algorithm>
@@ -88,7 +89,7 @@ class Grid {
   const int rows_, columns_;
   std::vector<float> values_;
   std::vector<float> line_;    // Values of one row of pixels at the columns of the cells.
-  std::vector<float> pixels_;  // From half a cell before the first pixel on.
+  std::vector<float> pixels_;  // Values of the row, the first half a cell before its first pixel.
 };
 
 // Displacement of the pixels in color and in depth, and the relative change of depth.
