@@ -93,16 +93,14 @@ class FrameTracker:
             if found is None:
                 return self._lost_result(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, TrackingStatus.OK
-            # Reset the noise history, since noise differs between scenes, and the motion evidence,
-            # which is valid for one keyframe only.
+            # Noise differs between scenes, and motion evidence is valid for one keyframe only.
             origin = KeyframeOrigin.KNOWN if self.can_reuse_keyframes else KeyframeOrigin.NEW
             self.state = replace(
                 self.state, history=ResidualHistory(), motion_evidence=None, origin=origin
             )
         # Motion, dynamic mask, need of a keyframe, and search of other submaps.
-        candidate, shutter = self._compensator.measure(
-            frame, keyframe, candidate, status, self.state
-        )
+        measured = self._compensator.measure(frame, keyframe, candidate, status, self.state)
+        candidate, shutter = measured
         if status is TrackingStatus.WEAK and self._classify(candidate) is TrackingStatus.OK:
             status = TrackingStatus.OK  # The compensation explains the residuals.
         self.state = replace(self.state, shutter=shutter)
@@ -395,9 +393,8 @@ class FrameTracker:
         )
 
     def _submaps_after(self, frame: RgbdFrame, status: TrackingStatus) -> Submaps:
-        submaps = self.state.submaps
         if status is not TrackingStatus.LOST:
-            return submaps.after_tracked()
+            return self.state.submaps.after_tracked()
         view = self.view(frame)
         thumbnail = make_thumbnail(view) if self._is_usable(view) else None
-        return submaps.after_lost(thumbnail, self.config.submaps)
+        return self.state.submaps.after_lost(thumbnail, self.config.submaps)
