@@ -36,6 +36,7 @@ FIGURES = {
 WIDTH = 120  # Columns of the tables when the output is no terminal.
 NO_TRUTH = "The source has no ground truth, so trajectories are not evaluated."
 NO_MAP = "The run localized in {folder} and made no map, so renderings are not evaluated."
+NO_PROTOCOL = "`ldo eval --protocol` prints how each metric is defined; so does docs/evaluation.md."
 NO_LPIPS = "LPIPS is not computed; --lpips FILE.onnx adds it."
 
 
@@ -97,6 +98,9 @@ def evaluate(
             "two inputs, float32 [1, 3, H, W], RGB in -1..1; one output with a single number",
         ),
     ] = None,
+    protocol: Annotated[
+        bool, argument(help="print the definition of the metrics above each table")
+    ] = False,
     json_: Annotated[Json, argument(name="json")] = False,
 ) -> None:
     """Evaluate a run: its trajectory, loop closures, rendered map and labels.
@@ -105,7 +109,7 @@ def evaluate(
     map are compared with the frames, and labels of the map with the true labels of the source.
     Without true poses, only the map is evaluated.
 
-    The command prints the protocol above the results. It writes trajectory.png and rendering.png
+    The command writes trajectory.png and rendering.png
     into DIR, and labels.png if the source has true labels and a detector ran. `ldo run
     --hold-out-every 5` keeps every fifth frame out of the map, so that the map can be evaluated on
     these frames.
@@ -125,7 +129,7 @@ def evaluate(
         about = {"lpips": lpips and str(lpips), "labelled_by": labelled_by(config)}
         print(json.dumps({**to_json(results), **about}, indent=1))
     else:
-        print_results(results, lpips, config)
+        print_results(results, lpips, config, has_protocol=protocol)
 
 
 def run_config(folder: Path) -> Config:
@@ -143,34 +147,46 @@ def labelled_by(config: Config) -> dict[str, str]:
     return {"detector": config.detector.model, "labeller": labeller}
 
 
-def print_results(results: Results, lpips: Path | None, config: Config) -> None:
+def print_results(
+    results: Results, lpips: Path | None, config: Config, *, has_protocol: bool = False
+) -> None:
     """Print all results of an evaluation as tables.
 
     Args:
         results: The results.
         lpips: Network of LPIPS; None if LPIPS was not computed.
         config: Configuration of the run.
+        has_protocol: Print the definition of the metrics above each table.
     """
     console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
+
+    def explain(definitions: str) -> None:
+        if has_protocol:
+            console.print(definitions, style="dim")
+
     console.print(str(results.counts))
     if results.trajectories is None:
         console.print(NO_TRUTH)
     else:
-        console.print(trajectory.PROTOCOL, style="dim")
+        explain(trajectory.PROTOCOL)
         console.print(trajectory_table(results.trajectories))
     if results.loops is not None:
-        console.print(loops.PROTOCOL, style="dim")
+        explain(loops.PROTOCOL)
         console.print(loops_table(results.loops))
     if config.tracker.localization_map:
         console.print(NO_MAP.format(folder=config.tracker.localization_map), soft_wrap=True)
     else:
+        explain(views.PROTOCOL)
         _print_renderings(console, results, lpips)
+        if results.labels:
+            explain(semantics.PROTOCOL)
         _print_labels(console, results, labelled_by(config))
+    if not has_protocol:
+        console.print(NO_PROTOCOL, style="dim")
     console.print("Pictures: " + ", ".join(map(str, results.pictures)), soft_wrap=True)
 
 
 def _print_renderings(console: Console, results: Results, lpips: Path | None) -> None:
-    console.print(views.PROTOCOL, style="dim")
     console.print(results.evaluated.counts(), style="dim")
     console.print(f"LPIPS by {lpips}." if lpips else NO_LPIPS, style="dim")
     if results.renderings:
@@ -183,7 +199,6 @@ def _print_labels(console: Console, results: Results, who: dict[str, str]) -> No
         console.print(results.unlabelled, style="dim")
     if not results.labels:
         return
-    console.print(semantics.PROTOCOL, style="dim")
     named = (f"{kind}: {name or 'none'}" for kind, name in who.items())
     console.print(f"Labels by {', '.join(named)}.", style="dim", soft_wrap=True)
     console.print(label_table(results.labels))

@@ -31,6 +31,7 @@ from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD
 
 # Frames that are decoded in advance: one is being decoded, one is queued, and one is in reserve.
 READ_AHEAD = 3
+MAX_NAMED = 5  # Number of bad frames that are reported one by one.
 
 M = TypeVar("M", bound=Message)
 
@@ -89,9 +90,11 @@ class FrameReader:
         try:
             return raw_frame_to_message(self._sequence.read(index), compress_depth=False)
         except FrameError as error:
-            if self.rejected == 0:
-                self._warn(f"{error} The frame is skipped; further bad frames are only counted.")
             self.rejected += 1
+            if self.rejected < MAX_NAMED:
+                self._warn(f"{error} The frame is skipped.")
+            elif self.rejected == MAX_NAMED:
+                self._warn(f"{error} The frame is skipped; further bad frames are only counted.")
             return None
 
 

@@ -347,8 +347,9 @@ def open_window(source: Source, config: ViewerConfig, title: str) -> Iterator[Wi
         ConfigError: If the machine does not have the address.
     """
     _require_own(config.address)
-    # INFO would log a line per browser.
-    logging.getLogger("websockets.server").setLevel(logging.WARNING)
+    # INFO would log a line per browser, and ERROR a traceback for each program that opens the port
+    # and sends no request, such as a scan of the ports.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     with redirect_stdout(io.StringIO()):  # Viser prints a banner.
         server = Server(host=config.address, port=config.port, label=title, verbose=False)
     try:

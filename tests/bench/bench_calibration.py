@@ -2,12 +2,12 @@
 
     python -m tests.bench.bench_calibration [--source DIR ...] [--max-frames N] [--twice]
 
-The runs of each sequence are without a calibration, with that of vignetting and depth bias alone,
-with that of the shutter's timing alone, and with all; and, with --twice, with all and the result of
-the run before from the first frame on. For each run it prints the frames by tracking status, the
-ATE of the poses in odometry over the frames that are not LOST and belong to the first submap, the
-last held-out residuals of depth and color, the corrections in use, the readout of color, the
-readout and the delay of depth, and the CPU time per frame of the tracker and of the calibration.
+The runs of each sequence are without a calibration, with that of vignetting, of depth bias and of
+the shutter's timing alone, and with all; and, with --twice, with all and the result of the run
+before from the first frame on. For each run it prints the frames by tracking status, the ATE of the
+poses in odometry over the frames that are not LOST and belong to the first submap, the last
+held-out residuals of depth and color, the corrections in use, the readout of color, the readout and
+the delay of depth, and the CPU time per frame of the tracker and of the calibration.
 """
 
 import argparse
@@ -107,7 +107,8 @@ def main() -> None:
         nothing, off = SelfCalibrationConfig(views=()), ShutterConfig(is_on=False)
         for name, config, shutter in (
             ("without", nothing, off),
-            ("static", SelfCalibrationConfig(), off),
+            ("color", SelfCalibrationConfig(max_depth_ratio=0.0), off),
+            ("depth", SelfCalibrationConfig(max_color_ratio=0.0), off),
             ("timing", nothing, ShutterConfig()),
             ("all", SelfCalibrationConfig(), ShutterConfig()),
         ):
