@@ -174,7 +174,7 @@ def _cell_means(block: Block, step: np.ndarray, reduced: Reduced) -> list[np.nda
         The means of each independent system.
     """
     steps = np.concatenate([step, reduced.own_step(step), np.ones((*step.shape[:-1], 1))], axis=-1)
-    residuals = (block.rows @ steps[..., None]).reshape(-1, len(block.cells))
+    residuals = np.atleast_2d((block.rows @ steps[..., None])[..., 0])
     if not len(block.cells):
         return [np.zeros(0) for _ in residuals]
     count = np.bincount(block.cells)

@@ -27,7 +27,7 @@ def without_truth(room_folder: Path, tmp_path: Path) -> Path:
 
 
 def test_protocol_is_printed_above_the_scores(capsys, run: Path, room_folder: Path) -> None:
-    code, out, _ = ldo(capsys, "eval", run, room_folder)
+    code, out, _ = ldo(capsys, "eval", run, room_folder, "--protocol")
     assert code == 0
     parts = (
         *(
@@ -48,6 +48,11 @@ def test_protocol_is_printed_above_the_scores(capsys, run: Path, room_folder: Pa
     places = [out.index(part) for part in parts]
     assert places == sorted(places)
     assert out.count("LPIPS") == 1
+    _, short, _ = ldo(capsys, "eval", run, room_folder)
+    assert "Umeyama" not in short
+    assert "A: held-out frames" not in short
+    assert "ATE RMSE" in short
+    assert "ldo eval --protocol" in short
     sheet = cv2.imread(str(run / "rendering.png"))
     assert sheet is not None
     assert sheet.shape[0] > 3 * 240, "a row for each held-out frame"

@@ -193,7 +193,7 @@ def test_detector_labels_have_no_recall_beyond_coco(sequence: Sequence, labelled
 def test_eval_command_prints_protocol_and_tables_and_saves_labels_png(
     capsys, labelled: Path, folder: Path
 ) -> None:
-    code, out, _ = ldo(capsys, "eval", labelled, folder)
+    code, out, _ = ldo(capsys, "eval", labelled, folder, "--protocol")
     assert code == 0
     parts = (
         "PSNR dB",

@@ -115,15 +115,21 @@ def test_two_runs_write_the_same_bytes(room: Sequence, finished: Path, tmp_path:
         assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes(), name
 
 
-def test_bad_frames_are_skipped_counted_and_warned_about_once(
+def test_bad_frames_are_skipped_and_counted_and_the_first_are_named(
     room: Sequence, tmp_path: Path
 ) -> None:
     warnings: list[str] = []
-    record = run(WithBadFrames(room, {5, 6, 20}), tmp_path / "out", warn=warnings.append)
-    assert record.summary["frames_rejected"] == 3
-    assert len(record.online()) == FRAMES - 3
-    assert len(warnings) == 1
-    assert "frame 5" in warnings[0]
+    bad = {5, 6, 20, 21, 22, 23}
+    record = run(
+        WithBadFrames(room, bad),
+        tmp_path / "out",
+        "offline.max_rejected_ratio=0.5",
+        warn=warnings.append,
+    )
+    assert record.summary["frames_rejected"] == len(bad)
+    assert len(record.online()) == FRAMES - len(bad)
+    assert [int(text.split()[1]) for text in warnings] == [5, 6, 20, 21, 22]
+    assert "only counted" in warnings[-1]
 
 
 def test_too_many_bad_frames_fail_and_keep_partial_results(room: Sequence, tmp_path: Path) -> None:
