@@ -11,6 +11,7 @@ from .replica import ReplicaSequence
 from .rig import SequenceOptions
 from .scannet import ScanNetSequence
 from .seven_scenes import SevenScenesSequence
+from .stray_scanner import StrayScannerSequence
 from .tum import TumSequence
 
 __all__ = ["Cached", "Layout", "Sequence", "SequenceOptions", "open_sequence"]
@@ -42,6 +43,12 @@ LAYOUTS = (
         lambda path: any(path.glob("frame-*.color.*")),
         SevenScenesSequence,
         has_options=True,
+    ),
+    Layout(
+        "Stray Scanner",
+        "rgb.mp4, depth/ and odometry.csv",
+        lambda path: (path / "rgb.mp4").is_file(),
+        lambda path, _options: StrayScannerSequence(path),
     ),
 )
 

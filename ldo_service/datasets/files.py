@@ -5,6 +5,7 @@ import logging
 import os
 import re
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,35 @@ from ldo_service.geometry import Camera, Trajectory, se3
 
 log = logging.getLogger(__name__)
 
+LAST_STAMP_NS = 2**63 - 1  # Maximum of int64, in the year 2262.
 FRAME_RATE_HZ = 30  # Assumed rate of data sets without stamps: frame k is at k / 30 s.
 
 
 def name_of(folder: Path) -> str:
     """Return the name of a folder as the user gave it; a link is not followed."""
     return Path(os.path.abspath(folder)).name
+
+
+def parse_stamp(seconds: str) -> int:
+    """Parse a stamp in seconds, and return it in nanoseconds.
+
+    Raises:
+        ValueError: The text is no number, or too large.
+    """
+    try:
+        # The stamp is parsed as Decimal, because a float cannot hold nanoseconds since 1970.
+        stamp_ns = int(Decimal(seconds.strip()) * 10**9)
+    except (InvalidOperation, OverflowError) as error:
+        raise ValueError(seconds) from error
+    if abs(stamp_ns) > LAST_STAMP_NS:
+        raise ValueError(seconds)
+    return stamp_ns
+
+
+def inside(folder: Path, name: str) -> Path | None:
+    """Return the path of a file that a list names, or None if it is outside the folder."""
+    path = Path(name)
+    return None if path.is_absolute() or ".." in path.parts or "\0" in name else folder / path
 
 
 @dataclass(frozen=True, slots=True)

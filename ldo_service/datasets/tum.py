@@ -8,7 +8,6 @@ camera.json              optional for the original recordings; see CAMERA_JSON
 import logging
 import re
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, RawFrame, Trajectory, associate
 from ldo_service.geometry.sequence import Sequence
 
-from .files import Calibration, name_of, number, pinhole, read_json
+from .files import Calibration, inside, name_of, number, parse_stamp, pinhole, read_json
 from .images import read_color, read_depth
 
 log = logging.getLogger(__name__)
@@ -28,7 +27,6 @@ CAMERA_JSON = (
 )
 # Maximum stamp difference of paired color and depth images; the value of TUM's associate.py.
 ASSOCIATION_TOLERANCE_NS = 20_000_000
-LAST_STAMP_NS = 2**63 - 1  # Maximum of int64, in the year 2262.
 DEPTH_SCALE = 5000.0  # Units per meter in all recordings of the benchmark.
 
 # Calibration of the color cameras as published with the benchmark; fr3 is rectified already.
@@ -117,16 +115,14 @@ def _listing(path: Path) -> _Listing:
 def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
     words = line.split(maxsplit=1)
     try:
-        # The stamp is parsed as Decimal, because a float cannot hold nanoseconds since 1970.
-        stamp_ns = int(Decimal(words[0]) * 10**9)
-        name = words[1].strip()
-        if abs(stamp_ns) > LAST_STAMP_NS or "\0" in name:
+        stamp_ns, name = parse_stamp(words[0]), words[1].strip()
+        if "\0" in name:
             raise ValueError(line)
-    except (InvalidOperation, ValueError, OverflowError, IndexError):
+    except (ValueError, IndexError):
         raise DataError(
             f"{path}, line {line_number}: expected `stamp file`, found {line[:80]!r}."
         ) from None
-    if Path(name).is_absolute() or ".." in Path(name).parts:
+    if inside(path.parent, name) is None:
         raise DataError(
             f"{path}, line {line_number}: {name[:80]} is outside the folder. Copy or link the "
             "images into the folder."

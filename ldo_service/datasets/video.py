@@ -1,0 +1,130 @@
+"""Reader of the frames of a video, by PyAV."""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from ldo_service.errors import ConfigError, DataError, FrameError, install_command
+
+from .images import MAX_PIXELS
+
+
+class Video:
+    """Frames of a video file in the order of their stamps.
+
+    Frames that are read in order are decoded once. Another order makes the reader go back to the
+    keyframe before. At most one decoded frame is held. Reading is safe in several threads.
+
+    Attributes:
+        width: Width of the frames in pixels.
+        height: Height of the frames in pixels.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a file and list its frames, without decoding them.
+
+        Raises:
+            ConfigError: PyAV is not installed.
+            DataError: The file cannot be read or has no frames.
+        """
+        try:
+            import av  # Only the readers of videos need it.
+        except ImportError as error:
+            raise ConfigError(
+                f"{path} is a video, which needs the extra `phones`. Install it by "
+                f"{install_command('phones')}."
+            ) from error
+        self._path, self._error = path, av.FFmpegError
+        try:
+            self._container = av.open(str(path))
+            self._stream: Any = self._container.streams.video[0]
+            packets = [
+                (packet.pts, packet.is_keyframe)
+                for packet in self._container.demux(self._stream)
+                if packet.pts is not None and not packet.is_discard
+            ]
+        except (av.FFmpegError, IndexError, ValueError) as error:
+            raise DataError(
+                f"{path} cannot be read as a video ({type(error).__name__}: {error}). It may be "
+                "truncated. Export or copy the recording again."
+            ) from error
+        packets.sort()
+        self._stamps = [stamp for stamp, _ in packets]  # In units of the stream.
+        self._keyframes = [k for k, (_, is_key) in enumerate(packets) if is_key] or [0]
+        self.width, self.height = int(self._stream.width), int(self._stream.height)
+        if not packets or not 0 < self.width * self.height <= MAX_PIXELS:
+            raise DataError(
+                f"{path} has {len(packets)} frames of {self.width}x{self.height} pixels, expected "
+                f"at least one frame and at most {MAX_PIXELS} pixels. Export the recording again."
+            )
+        self._frames: Iterator[Any] | None = None  # Decoded frames from `_next` on.
+        self._next = 0
+        self._missing = range(0)  # Frames before `_next` that the decoder did not deliver.
+        self._lock = Lock()
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def read(self, index: int) -> np.ndarray:
+        """Return a frame [H, W, 3] uint8 RGB.
+
+        Raises:
+            FrameError: The frame cannot be decoded.
+        """
+        with self._lock:
+            frame = self._decoded(index)
+            if frame is None:
+                raise FrameError(
+                    f"{self._path}, frame {index}, cannot be decoded. Export or copy the recording "
+                    "again."
+                )
+            return frame.to_ndarray(format="rgb24")
+
+    def _decoded(self, index: int) -> Any:
+        """Return the decoded frame with an index, or None if the decoder does not deliver it."""
+        if index in self._missing:
+            return None
+        keyframe = self._keyframes[max(bisect_right(self._keyframes, index) - 1, 0)]
+        if self._frames is not None and keyframe <= self._next <= index:
+            return self._advance(index)
+        self._seek(keyframe)
+        frame = self._advance(index)
+        if frame is None and keyframe > 0:  # The frame may refer to an earlier keyframe.
+            self._seek(0)
+            frame = self._advance(index)
+        return frame
+
+    def _seek(self, index: int) -> None:
+        self._container.seek(self._stamps[index], stream=self._stream)
+        self._frames, self._next, self._missing = self._decode(), index, range(0)
+
+    def _advance(self, index: int) -> Any:
+        """Decode up to a frame; return None and keep the next one if the frame is missing."""
+        assert self._frames is not None
+        for frame in self._frames:
+            position = bisect_left(self._stamps, frame.pts)
+            if position >= index:
+                break
+        else:
+            self._frames = None
+            return None
+        if position > index:
+            self._frames, self._next = chain([frame], self._frames), position
+            self._missing = range(index, position)
+            return None
+        self._next = index + 1
+        return frame
+
+    def _decode(self) -> Iterator[Any]:
+        """Yield all frames that can be decoded from the current position of the file on."""
+        for packet in self._container.demux(self._stream):
+            try:
+                frames = packet.decode()
+            except self._error:  # Damaged; `read` reports the frames that it misses.
+                continue
+            yield from (frame for frame in frames if frame.pts is not None)
