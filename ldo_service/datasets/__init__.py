@@ -7,6 +7,7 @@ from ldo_service.geometry.sequence import Cached, Sequence
 from ldo_service.synthetic import SCENES, open_synthetic
 
 from .layout import Layout, registered_layouts
+from .record3d import Record3DSequence
 from .replica import ReplicaSequence
 from .rig import SequenceOptions
 from .scannet import ScanNetSequence
@@ -49,6 +50,12 @@ LAYOUTS = (
         "rgb.mp4, depth/ and odometry.csv",
         lambda path: (path / "rgb.mp4").is_file(),
         lambda path, _options: StrayScannerSequence(path),
+    ),
+    Layout(
+        "Record3D",
+        "a file .r3d",
+        lambda path: path.is_file() and path.suffix.lower() == ".r3d",
+        lambda path, _options: Record3DSequence(path),
     ),
 )
 

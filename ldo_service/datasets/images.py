@@ -21,7 +21,20 @@ def read_color(path: Path) -> np.ndarray:
     Raises:
         FrameError: The file cannot be read or decoded.
     """
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return decode_color(_read(path), str(path))
+
+
+def decode_color(data: bytes, source: str) -> np.ndarray:
+    """Decode a color image [H, W, 3] uint8 RGB from the bytes of a PNG or JPEG.
+
+    Args:
+        data: The bytes.
+        source: Name of the image, for errors.
+
+    Raises:
+        FrameError: The bytes cannot be decoded.
+    """
+    image = _decode(data, source, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -31,7 +44,7 @@ def read_depth(path: Path) -> np.ndarray:
     Raises:
         FrameError: The file cannot be read or decoded, or is not a 16-bit gray image.
     """
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    image = _decode(_read(path), str(path), cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise FrameError(
             f"{path} is {image.dtype}{image.shape}, expected one channel of 16 bits. "
@@ -46,7 +59,7 @@ def read_labels(path: Path, dtype: type[np.unsignedinteger]) -> np.ndarray:
     Raises:
         FrameError: The file cannot be read or decoded, or its pixels are not of type `dtype`.
     """
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    image = _decode(_read(path), str(path), cv2.IMREAD_UNCHANGED)
     if image.dtype != dtype or image.ndim != 2:
         raise FrameError(
             f"{path} is {image.dtype}{image.shape}, expected one channel of "
@@ -70,39 +83,42 @@ def first_size(paths: list[Path]) -> tuple[int, int]:
 
 
 def _size(path: Path) -> tuple[int, int]:
-    height, width = _decode(path, cv2.IMREAD_UNCHANGED).shape[:2]
+    height, width = _decode(_read(path), str(path), cv2.IMREAD_UNCHANGED).shape[:2]
     return width, height
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
+def _read(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise FrameError(
             f"{path} cannot be read ({error.strerror}). Restore it, or remove it from the sequence."
         ) from error
+
+
+def _decode(data: bytes, source: str, flags: int) -> np.ndarray:
     if not _is_complete(data):
-        raise FrameError(f"{path} is truncated at {len(data)} bytes. Copy or download it again.")
-    _require_size(path, data)
+        raise FrameError(f"{source} is truncated at {len(data)} bytes. Copy or download it again.")
+    _require_size(data, source)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     if image is None:
-        raise FrameError(f"{path} is not a readable image. Copy or download it again.")
+        raise FrameError(f"{source} is not a readable image. Copy or download it again.")
     return image
 
 
-def _require_size(path: Path, data: bytes) -> None:
+def _require_size(data: bytes, source: str) -> None:
     """Check the size in the header, before a decoder allocates memory."""
     size = read_image_size(memoryview(data))
     if size is None:
         raise FrameError(
-            f"{path} is not a readable image (PNG or JPEG). Copy or download it again."
+            f"{source} is not a readable image (PNG or JPEG). Copy or download it again."
         )
     if size[0] * size[1] > MAX_PIXELS:
         raise FrameError(
-            f"{path} has {size[0]}x{size[1]} pixels by its header, expected at most {MAX_PIXELS} "
+            f"{source} has {size[0]}x{size[1]} pixels by its header, expected at most {MAX_PIXELS} "
             "in total. Copy or download it again."
         )
 

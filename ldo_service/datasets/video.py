@@ -34,12 +34,13 @@ class Video:
         """
         try:
             import av  # Only the readers of videos need it.
+            from av.error import FFmpegError
         except ImportError as error:
             raise ConfigError(
                 f"{path} is a video, which needs the extra `phones`. Install it by "
                 f"{install_command('phones')}."
             ) from error
-        self._path, self._error = path, av.FFmpegError
+        self._path, self._error = path, FFmpegError
         try:
             self._container = av.open(str(path))
             self._stream: Any = self._container.streams.video[0]
@@ -48,7 +49,7 @@ class Video:
                 for packet in self._container.demux(self._stream)
                 if packet.pts is not None and not packet.is_discard
             ]
-        except (av.FFmpegError, IndexError, ValueError) as error:
+        except (FFmpegError, IndexError, ValueError) as error:
             raise DataError(
                 f"{path} cannot be read as a video ({type(error).__name__}: {error}). It may be "
                 "truncated. Export or copy the recording again."

@@ -1,10 +1,13 @@
 """Writers of frames in the formats of phones and scanners, by their published descriptions."""
 
+import json
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import av
 import cv2
+import liblzfse
 import numpy as np
 
 from ldo_service.geometry import Camera, RawFrame
@@ -87,3 +90,44 @@ def enlarged_matrix(camera: Camera, factor: int) -> np.ndarray:
     K[:2, 2] = (np.array([camera.cx, camera.cy]) + 0.5) * factor - 0.5
     K[2, 2] = 1
     return K
+
+
+def write_r3d(
+    path: Path, frames: list[RawFrame], depth_size: tuple[int, int] | None = None, **changed: object
+) -> Path:
+    """Write a file of Record3D; `changed` replaces values of the metadata, None removes them."""
+    camera, (width, height) = frames[0].camera, depth_size or frames[0].depth.shape[::-1]
+    metadata = {
+        "w": camera.width,
+        "h": camera.height,
+        "dw": width,
+        "dh": height,
+        "fps": 30,
+        "K": camera.matrix.T.ravel().tolist(),
+        "poses": [[0, 0, 0, 1, 0, 0, 0]] * len(frames),
+        "initPose": [0, 0, 0, 1, 0, 0, 0],
+        "frameTimestamps": [(f.stamp_ns - frames[0].stamp_ns) / 1e9 for f in frames],
+        **changed,
+    }
+    known = {key: value for key, value in metadata.items() if value is not None}
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("metadata", json.dumps(known))
+        for k, frame in enumerate(frames):
+            mm = millimeters(frame, (width, height))
+            depth_m = np.where(mm > 0, mm / np.float32(1000), np.nan).astype(np.float32)
+            confidence = np.where(mm > 0, 2, 0).astype(np.uint8)
+            jpeg = cv2.imencode(".jpg", frame.color[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 95))[1]
+            archive.writestr(f"rgbd/{k}.jpg", jpeg.tobytes())
+            archive.writestr(f"rgbd/{k}.depth", liblzfse.compress(depth_m.tobytes()))
+            archive.writestr(f"rgbd/{k}.conf", liblzfse.compress(confidence.tobytes()))
+    return path
+
+
+def change_archive(path: Path, changed: dict[str, bytes | None]) -> None:
+    """Replace files in a ZIP archive; None removes the file."""
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in {**files, **changed}.items():
+            if content is not None:
+                archive.writestr(name, content)
