@@ -7,6 +7,7 @@ from ldo_service.geometry.sequence import Cached, Sequence
 from ldo_service.synthetic import SCENES, open_synthetic
 
 from .layout import Layout, registered_layouts
+from .nerfstudio import NerfstudioSequence
 from .record3d import Record3DSequence
 from .replica import ReplicaSequence
 from .rig import SequenceOptions
@@ -56,6 +57,12 @@ LAYOUTS = (
         "a file .r3d",
         lambda path: path.is_file() and path.suffix.lower() == ".r3d",
         lambda path, _options: Record3DSequence(path),
+    ),
+    Layout(
+        "nerfstudio",
+        "transforms.json with depth_file_path",
+        lambda path: (path / "transforms.json").is_file(),
+        lambda path, _options: NerfstudioSequence(path),
     ),
 )
 

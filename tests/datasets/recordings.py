@@ -131,3 +131,34 @@ def change_archive(path: Path, changed: dict[str, bytes | None]) -> None:
         for name, content in {**files, **changed}.items():
             if content is not None:
                 archive.writestr(name, content)
+
+
+def write_nerfstudio(
+    folder: Path, frames: list[RawFrame], depth_size: tuple[int, int] | None = None
+) -> Path:
+    """Write a folder of nerfstudio; depth is in the unit of the frames unless it is resampled."""
+    camera = frames[0].camera
+    content = {
+        "camera_model": "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx + 0.5,
+        "cy": camera.cy + 0.5,
+        "depth_unit_scale_factor": 0.001 if depth_size else 1 / frames[0].depth_scale,
+        "frames": [
+            {
+                "file_path": f"images/frame_{k:05d}.png",
+                "depth_file_path": f"depth/frame_{k:05d}.png",
+                "transform_matrix": np.eye(4).tolist(),
+            }
+            for k in range(len(frames))
+        ],
+    }
+    for frame, entry in zip(frames, content["frames"], strict=True):
+        write_image(folder / entry["file_path"], frame.color)
+        depth = millimeters(frame, depth_size) if depth_size else frame.depth
+        write_image(folder / entry["depth_file_path"], depth)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
