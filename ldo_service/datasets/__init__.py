@@ -12,6 +12,7 @@ from .record3d import Record3DSequence
 from .replica import ReplicaSequence
 from .rig import SequenceOptions
 from .scannet import ScanNetSequence
+from .sens import SensSequence
 from .seven_scenes import SevenScenesSequence
 from .stray_scanner import StrayScannerSequence
 from .tum import TumSequence
@@ -63,6 +64,13 @@ LAYOUTS = (
         "transforms.json with depth_file_path",
         lambda path: (path / "transforms.json").is_file(),
         lambda path, _options: NerfstudioSequence(path),
+    ),
+    Layout(
+        "ScanNet as it is published",
+        "a file .sens",
+        lambda path: path.is_file() and path.suffix.lower() == ".sens",
+        SensSequence,
+        has_options=True,
     ),
 )
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
-from ldo_service.geometry.registration import register_depth
+from ldo_service.geometry.registration import register_depth, resample_color
 
 from .files import is_rigid
 
@@ -35,6 +35,28 @@ class Rig:
             Depth in the color camera, [Hc, Wc] float32, meters; 0 where unknown.
         """
         return register_depth(depth_m, self.depth_camera, self.color_camera, self.T_color_depth)
+
+    def on_one_grid(
+        self, color: np.ndarray, depth: np.ndarray, depth_scale: float, is_registering: bool
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Bring color and depth to one pixel grid.
+
+        Args:
+            color: Color image, [Hc, Wc, 3] uint8 RGB.
+            depth: Depth, [Hd, Wd] uint16.
+            depth_scale: Units of depth per meter.
+            is_registering: True registers depth to the color camera. False resamples color to the
+                depth camera, which must have the same center and orientation.
+
+        Returns:
+            Color [H, W, 3], depth [H, W], and the units of depth per meter.
+        """
+        if is_registering:
+            return color, self.register(depth.astype(np.float32) / depth_scale), 1.0
+        color, is_seen = resample_color(color, self.color_camera, self.depth_camera)
+        if depth.shape == is_seen.shape:  # Otherwise RawFrame raises the error.
+            depth = np.where(is_seen, depth, np.uint16(0))
+        return color, depth, depth_scale
 
     def T_world_color(self, T_world_depth: np.ndarray) -> np.ndarray:
         """Return the poses [..., 4, 4] of the color camera from those of the depth camera."""

@@ -21,7 +21,6 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import RawFrame, Trajectory, se3
-from ldo_service.geometry.registration import resample_color
 from ldo_service.geometry.sequence import Sequence
 
 from .files import (
@@ -57,9 +56,12 @@ class ScanNetSequence(Sequence):
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""
-        color = read_color(self._files.color[index])
-        depth = read_depth(self._files.depth[index])
-        color, depth, depth_scale = self._on_one_grid(color, depth)
+        color, depth, depth_scale = self._rig.on_one_grid(
+            read_color(self._files.color[index]),
+            read_depth(self._files.depth[index]),
+            DEPTH_SCALE,
+            self._is_registering,
+        )
         stamp_ns = int(self.stamps_ns[index])
         return RawFrame(index, stamp_ns, color, depth, depth_scale, self.raw_camera)
 
@@ -74,25 +76,6 @@ class ScanNetSequence(Sequence):
         if depth is None or not self._is_registering:
             return depth
         return replace(depth, T_world_camera=self._rig.T_world_color(depth.T_world_camera))
-
-    def _on_one_grid(
-        self, color: np.ndarray, depth: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Bring color and depth to the pixel grid of this sequence's camera.
-
-        Args:
-            color: Color image, [Hc, Wc, 3] uint8 RGB.
-            depth: Depth, [Hd, Wd] uint16 millimeters.
-
-        Returns:
-            Color [H, W, 3], depth [H, W], and the units of depth per meter.
-        """
-        if self._is_registering:
-            return color, self._rig.register(depth.astype(np.float32) / DEPTH_SCALE), 1.0
-        color, is_seen = resample_color(color, self._rig.color_camera, self._rig.depth_camera)
-        if depth.shape == is_seen.shape:  # Otherwise RawFrame raises the error.
-            depth = np.where(is_seen, depth, np.uint16(0))
-        return color, depth, DEPTH_SCALE
 
 
 def _rig(folder: Path, color_size: tuple[int, int], depth_size: tuple[int, int]) -> Rig:

@@ -1,7 +1,9 @@
 """Writers of frames in the formats of phones and scanners, by their published descriptions."""
 
 import json
+import struct
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -162,3 +164,44 @@ def write_nerfstudio(
         write_image(folder / entry["depth_file_path"], depth)
     (folder / "transforms.json").write_text(json.dumps(content))
     return folder
+
+
+def write_sens(
+    path: Path,
+    frames: list[RawFrame],
+    suffix: str = ".jpg",
+    zipped: bool = True,
+    T_sensor_depth: np.ndarray | None = None,
+) -> Path:
+    """Write a file .sens; frame k is at x = k m, and frame 1 has no pose.
+
+    Args:
+        path: The file.
+        frames: The frames, with depth uint16.
+        suffix: Encoding of color: ".jpg", ".png" or "", which is raw.
+        zipped: True compresses depth.
+        T_sensor_depth: Extrinsics of the depth camera, [4, 4]; None is the identity.
+    """
+    camera, K = frames[0].camera, np.eye(4, dtype="<f4")
+    K[:3, :3] = camera.matrix
+    T = np.eye(4) if T_sensor_depth is None else T_sensor_depth
+    size = camera.width, camera.height
+    with path.open("wb") as file:
+        file.write(struct.pack("<IQ", 4, 15) + b"StructureSensor")
+        for matrix in (K, np.eye(4), K, T):
+            file.write(matrix.astype("<f4").tobytes())
+        file.write(struct.pack("<2i", {"": 0, ".png": 1, ".jpg": 2}[suffix], int(zipped)))
+        file.write(struct.pack("<4IfQ", *size, *size, frames[0].depth_scale, len(frames)))
+        for k, frame in enumerate(frames):
+            pose = np.full((4, 4), -np.inf) if k == 1 else np.eye(4)
+            pose[0, 3] += k
+            bgr = frame.color[..., ::-1]
+            color = cv2.imencode(suffix, bgr)[1].tobytes() if suffix else frame.color.tobytes()
+            depth = frame.depth.astype("<u2").tobytes()
+            depth = zlib.compress(depth) if zipped else depth
+            stamp_us = frame.stamp_ns // 1000
+            file.write(pose.astype("<f4").tobytes())
+            file.write(struct.pack("<4Q", stamp_us, stamp_us, len(color), len(depth)))
+            file.write(color + depth)
+        file.write(struct.pack("<Q", 0))  # No inertial measurements.
+    return path

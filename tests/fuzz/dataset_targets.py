@@ -1,14 +1,26 @@
 """Fuzz targets for data sets: each kind of file in each layout, next to valid files."""
 
 import json
+from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from zipfile import ZipFile
 
 import cv2
 import numpy as np
 
 from ldo_service.datasets import open_sequence
+from tests.datasets.recordings import (
+    change_archive,
+    small_frames,
+    write_nerfstudio,
+    write_r3d,
+    write_sens,
+    write_stray,
+)
 
-from .target import Target, in_folder
+from .target import Target, as_file, in_folder
 
 WIDTH, HEIGHT = 40, 32
 COLOR = np.random.default_rng(7).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
@@ -70,7 +82,24 @@ SEVEN_SCENES = {
     "frame-000000.depth.png": png(DEPTH),
     "frame-000000.pose.txt": POSE,
 }
+FRAMES = small_frames(2, WIDTH, HEIGHT)
+
+
+def written(write: Callable[[Path], object]) -> dict[str, bytes]:
+    """Return the files that a writer writes into a folder, by their paths in it."""
+    with TemporaryDirectory() as folder:
+        write(Path(folder))
+        paths = [path for path in sorted(Path(folder).rglob("*")) if path.is_file()]
+        return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+STRAY = written(lambda folder: write_stray(folder, FRAMES, (20, 16)))
+NERFSTUDIO = written(lambda folder: write_nerfstudio(folder, FRAMES, (20, 16)))
+[R3D] = written(lambda folder: write_r3d(folder / "a.r3d", FRAMES, (20, 16))).values()
+[SENS] = written(lambda folder: write_sens(folder / "a.sens", FRAMES, ".png")).values()
+[SENS_RAW] = written(lambda folder: write_sens(folder / "a.sens", FRAMES, "", False)).values()
 LAYOUTS = {"TUM": TUM, "Replica": REPLICA, "ScanNet": SCANNET, "7-Scenes": SEVEN_SCENES}
+LAYOUTS |= {"Stray Scanner": STRAY, "nerfstudio": NERFSTUDIO}
 
 
 def frames_of(folder: Path) -> None:
@@ -84,8 +113,27 @@ def frames_of(folder: Path) -> None:
         assert sequence[index].depth_m.shape == (sequence.camera.height, sequence.camera.width)
 
 
+def in_r3d(name: str) -> Target:
+    """Return a target for a file in an archive of Record3D."""
+
+    def frames_of_archive(path: Path) -> None:
+        content = path.read_bytes()
+        path.write_bytes(R3D)
+        change_archive(path, {name: content})
+        frames_of(path)
+
+    with ZipFile(BytesIO(R3D)) as archive:
+        seed = archive.read(name)
+    return Target(f"Record3D: {name}", as_file("a.r3d", frames_of_archive), [seed])
+
+
 TARGETS = [
     Target(f"{layout}: {name}", in_folder(name, frames_of, files), [body])
     for layout, files in LAYOUTS.items()
     for name, body in files.items()
+]
+TARGETS += [
+    Target("Record3D", as_file("a.r3d", frames_of), [R3D]),
+    *(in_r3d(name) for name in ("metadata", "rgbd/0.jpg", "rgbd/0.depth", "rgbd/0.conf")),
+    Target(".sens", as_file("a.sens", frames_of), [SENS, SENS_RAW]),
 ]

@@ -1,0 +1,241 @@
+"""Sequences in ScanNet's binary format .sens, version 4 (Dai et al., CVPR 2017).
+
+All numbers are little-endian, and matrices are 4x4 float32 by rows:
+
+    uint32 version, uint64 length of the name, name of the sensor
+    intrinsics of color, extrinsics of color, intrinsics of depth, extrinsics of depth
+    int32 color compression, int32 depth compression
+    uint32 width and height of color, width and height of depth
+    float32 units of depth per meter, uint64 number of frames
+    frames: pose camera to world, -inf where unknown; uint64 stamp of color, stamp of depth, both in
+    microseconds; uint64 bytes of color, bytes of depth; color; depth
+
+Color is raw RGB, PNG or JPEG; depth is uint16, raw or compressed by zlib. What follows the frames,
+such as inertial measurements, is not read. Cameras, registration and poses are treated as those of
+the exported files, see `scannet`.
+"""
+
+import logging
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from ldo_service.errors import DataError, FrameError
+from ldo_service.geometry import Camera, RawFrame, Trajectory, se3
+from ldo_service.geometry.sequence import Sequence
+
+from .files import FRAME_RATE_HZ, LAST_STAMP_NS, Calibration, is_rigid
+from .images import MAX_PIXELS, decode_color
+from .rig import Rig, SequenceOptions
+
+log = logging.getLogger(__name__)
+
+VERSION = 4
+MAX_NAME_BYTES = 4096
+RAW_COLOR, PNG, JPEG = 0, 1, 2  # Compressions of color.
+RAW_DEPTH, ZLIB = 0, 1  # Compressions of depth.
+MATRICES = struct.Struct("<64f")
+FORMAT = struct.Struct("<2i4IfQ")
+FRAME = struct.Struct("<16f4Q")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Header:
+    """Header of a file."""
+
+    rig: Rig
+    depth_scale: float  # Units of depth per meter.
+    color_compression: int
+    depth_compression: int
+    frames: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Index:
+    """Where the frames lie in the file, and what is stored beside their images."""
+
+    T_world_camera: np.ndarray  # [N, 4, 4] float64; not finite where unknown.
+    stamps_us: np.ndarray  # [N] uint64, of color.
+    offsets: np.ndarray  # [N] int64, of the color image.
+    sizes: np.ndarray  # [N, 2] int64, bytes of color and depth.
+
+
+class SensSequence(Sequence):
+    """Sequence of a file .sens. Frames are read when they are asked for."""
+
+    def __init__(self, path: Path, options: SequenceOptions) -> None:
+        """Open the sequence of a file, and index its frames."""
+        self._path = path
+        try:
+            with path.open("rb") as file:
+                self._header = _header(file, path)
+                self._index = _index(file, path, self._header.frames)
+        except OSError as error:
+            raise DataError(f"{path} cannot be read: {error}.") from error
+        self._rig = options.over(self._header.rig)
+        self._is_registering = options.register_depth or not self._rig.is_one_view
+        camera = self._rig.color_camera if self._is_registering else self._rig.depth_camera
+        super().__init__(path.stem, camera, _stamps_ns(self._index.stamps_us, path))
+
+    def read(self, index: int) -> RawFrame:
+        """Return a frame; see `Sequence.read`."""
+        source = f"{self._path}, frame {index}"
+        color_size, depth_size = map(int, self._index.sizes[index])
+        try:
+            with self._path.open("rb") as file:
+                file.seek(int(self._index.offsets[index]))
+                color, depth = file.read(color_size), file.read(depth_size)
+        except OSError as error:
+            raise FrameError(f"{source} cannot be read: {error}.") from error
+        color, depth, depth_scale = self._rig.on_one_grid(
+            self._color(color, source),
+            self._depth(depth, source),
+            self._header.depth_scale,
+            self._is_registering,
+        )
+        stamp_ns = int(self.stamps_ns[index])
+        return RawFrame(index, stamp_ns, color, depth, depth_scale, self.raw_camera)
+
+    def truth(self) -> Trajectory | None:
+        """Return the ground-truth trajectory, or None if no frame has a pose.
+
+        If depth is registered to the color camera, the poses are those of the color camera, else
+        those of the depth camera.
+        """
+        poses = self._index.T_world_camera
+        known = np.flatnonzero([is_rigid(T) for T in poses])
+        if not len(known):
+            return None
+        T_world_camera = np.array([se3.orthonormalize(T) for T in poses[known]])
+        if self._is_registering:
+            T_world_camera = self._rig.T_world_color(T_world_camera)
+        return Trajectory(self.stamps_ns[known] / 1e9, T_world_camera)
+
+    def _color(self, data: bytes, source: str) -> np.ndarray:
+        """Return the color image [Hc, Wc, 3] uint8 RGB."""
+        if self._header.color_compression != RAW_COLOR:
+            return decode_color(data, f"{source}, color")
+        camera = self._header.rig.color_camera
+        _require_bytes(data, camera.width * camera.height * 3, f"{source}, color")
+        return np.frombuffer(data, np.uint8).reshape(camera.height, camera.width, 3)
+
+    def _depth(self, data: bytes, source: str) -> np.ndarray:
+        """Return the depth image [Hd, Wd] uint16."""
+        camera = self._header.rig.depth_camera
+        size = camera.width * camera.height * 2
+        if self._header.depth_compression == ZLIB:
+            try:  # The limit is needed, because few bytes may expand to gigabytes.
+                data = zlib.decompressobj().decompress(data, size + 1)
+            except zlib.error as error:
+                raise FrameError(
+                    f"{source}, depth cannot be decompressed: {error}. Download the file again."
+                ) from error
+        _require_bytes(data, size, f"{source}, depth")
+        return np.frombuffer(data, "<u2").astype(np.uint16).reshape(camera.height, camera.width)
+
+
+def _require_bytes(data: bytes, size: int, source: str) -> None:
+    if len(data) != size:
+        raise FrameError(
+            f"{source} does not have {size} bytes, as its size in pixels needs. Download the file "
+            "again."
+        )
+
+
+def _exactly(file: BinaryIO, size: int, path: Path, place: str) -> bytes:
+    """Read a number of bytes.
+
+    Raises:
+        DataError: The file ends before.
+    """
+    data = file.read(size)
+    if len(data) < size:
+        raise DataError(f"{path} is truncated in {place}. Copy or download it again.")
+    return data
+
+
+def _header(file: BinaryIO, path: Path) -> _Header:
+    """Read the header.
+
+    Raises:
+        DataError: The header is truncated, or a value is invalid or not supported.
+    """
+    version, name_bytes = struct.unpack("<IQ", _exactly(file, 12, path, "its header"))
+    if version != VERSION or name_bytes > MAX_NAME_BYTES:
+        raise DataError(
+            f"{path} is no file .sens of version {VERSION}: its version is {version}, and the name "
+            f"of its sensor has {name_bytes} bytes. Convert it by ScanNet's tools."
+        )
+    _exactly(file, name_bytes, path, "its header")
+    matrices = MATRICES.unpack(_exactly(file, MATRICES.size, path, "its header"))
+    K_color, T_color, K_depth, T_depth = np.array(matrices, float).reshape(4, 4, 4)
+    color, depth, *sizes, depth_scale, frames = FORMAT.unpack(
+        _exactly(file, FORMAT.size, path, "its header")
+    )
+    if color not in (RAW_COLOR, PNG, JPEG) or depth not in (RAW_DEPTH, ZLIB):
+        raise DataError(
+            f"{path} has color of compression {color} and depth of compression {depth}, expected "
+            "raw (0), PNG (1) or JPEG (2), and raw (0) or zlib (1). Export it by SensReader."
+        )
+    if not (is_rigid(T_color) and is_rigid(T_depth)):
+        raise DataError(
+            f"{path}: the extrinsics of color {T_color.tolist()} and depth {T_depth.tolist()} must "
+            "be rigid transforms. Copy or download it again."
+        )
+    try:
+        cameras = (_camera(K_color, *sizes[:2]), _camera(K_depth, *sizes[2:]))
+        scale = Calibration(cameras[1], depth_scale).depth_scale
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+    T_color_depth = se3.inverse(se3.orthonormalize(T_color)) @ se3.orthonormalize(T_depth)
+    return _Header(Rig(*cameras, T_color_depth), scale, color, depth, frames)
+
+
+def _camera(K: np.ndarray, width: int, height: int) -> Camera:
+    if width * height > MAX_PIXELS:
+        raise DataError(f"{width}x{height} pixels are more than the maximum of {MAX_PIXELS}.")
+    fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+    return Camera(width, height, fx, fy, cx, cy)
+
+
+def _index(file: BinaryIO, path: Path, frames: int) -> _Index:
+    """Read what is stored beside the images of all frames.
+
+    Raises:
+        DataError: The file has no frames, or is truncated.
+    """
+    end = path.stat().st_size
+    if not 0 < frames <= end // FRAME.size:
+        raise DataError(
+            f"{path} has {end} bytes and {frames} frames by its header, expected at least one "
+            "frame, and room for all of them. Copy or download it again."
+        )
+    poses, stamps_us, offsets, sizes = [], [], [], []
+    for k in range(frames):
+        place = f"frame {k} of {frames}"
+        *pose, stamp_us, _, color, depth = FRAME.unpack(_exactly(file, FRAME.size, path, place))
+        poses.append(pose)
+        stamps_us.append(stamp_us)
+        offsets.append(file.tell())
+        sizes.append((color, depth))
+        if offsets[-1] + color + depth > end:
+            raise DataError(f"{path} is truncated in {place}. Copy or download it again.")
+        file.seek(color + depth, 1)
+    return _Index(
+        np.array(poses, float).reshape(-1, 4, 4),
+        np.array(stamps_us, np.uint64),
+        np.array(offsets, np.int64),
+        np.array(sizes, np.int64),
+    )
+
+
+def _stamps_ns(stamps_us: np.ndarray, path: Path) -> np.ndarray:
+    """Return stamps [N] int64 that ascend: those of the file, or 30 Hz where these do not."""
+    if np.all(stamps_us[1:] > stamps_us[:-1]) and stamps_us[-1] <= LAST_STAMP_NS // 1000:
+        return stamps_us.astype(np.int64) * 1000
+    log.info("%s: the stamps do not ascend; its frames count as %d Hz.", path, FRAME_RATE_HZ)
+    return np.arange(len(stamps_us), dtype=np.int64) * 10**9 // FRAME_RATE_HZ
