@@ -5,7 +5,7 @@ import logging
 import os
 import re
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ def parse_stamp(seconds: str) -> int:
     try:
         # The stamp is parsed as Decimal, because a float cannot hold nanoseconds since 1970.
         stamp_ns = int(Decimal(seconds.strip()) * 10**9)
-    except (InvalidOperation, OverflowError) as error:
+    except ArithmeticError as error:
         raise ValueError(seconds) from error
     if abs(stamp_ns) > LAST_STAMP_NS:
         raise ValueError(seconds)

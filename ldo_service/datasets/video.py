@@ -44,12 +44,14 @@ class Video:
         try:
             self._container = av.open(str(path))
             self._stream: Any = self._container.streams.video[0]
+            self.width, self.height = int(self._stream.width), int(self._stream.height)
             packets = [
                 (packet.pts, packet.is_keyframe)
                 for packet in self._container.demux(self._stream)
                 if packet.pts is not None and not packet.is_discard
             ]
-        except (FFmpegError, IndexError, ValueError) as error:
+        except (FFmpegError, IndexError, ValueError, AttributeError) as error:
+            # A stream of an unknown codec has no width.
             raise DataError(
                 f"{path} cannot be read as a video ({type(error).__name__}: {error}). It may be "
                 "truncated. Export or copy the recording again."
@@ -57,7 +59,6 @@ class Video:
         packets.sort()
         self._stamps = [stamp for stamp, _ in packets]  # In units of the stream.
         self._keyframes = [k for k, (_, is_key) in enumerate(packets) if is_key] or [0]
-        self.width, self.height = int(self._stream.width), int(self._stream.height)
         if not packets or not 0 < self.width * self.height <= MAX_PIXELS:
             raise DataError(
                 f"{path} has {len(packets)} frames of {self.width}x{self.height} pixels, expected "

@@ -11,7 +11,7 @@ import pytest
 from ldo_service.storage.state_store import STATE_VERSION
 
 from .dataset_targets import COLOR as IMAGE
-from .dataset_targets import jpeg, png
+from .dataset_targets import STRAY, jpeg, png
 from .run_folder_targets import RUN, SEMANTICS, bytes_of, gaussians_of_a_chunk, record
 from .targets import TARGETS
 
@@ -29,6 +29,9 @@ FOUND = [
     ("Replica: cam_params.json", DEEP_JSON),
     ("TUM: rgb.txt", b"0.1 rgb/\0.png\n"),
     ("TUM: rgb.txt", b"99999999999999999999 rgb/a.png\n"),
+    ("TUM: rgb.txt", b"1e999999 rgb/a.png\n"),
+    ("Stray Scanner: odometry.csv", b"timestamp, frame\n1e999999, 0\n"),
+    ("Stray Scanner: rgb.mp4", STRAY["rgb.mp4"].replace(b"avc1", b"none")),
     ("TUM: rgb/a.png", LONG_CHUNK + b"IEND\xaeB`\x82"),
     ("Replica: results/frame000000.jpg", LARGE_JPEG),
     ("images", bytes([40, 32, 3]) + LONG_CHUNK),
