@@ -1,8 +1,12 @@
 """Sequences in the layout of the TUM RGB-D benchmark (Sturm et al., IROS 2012).
 
+The benchmarks of Bonn (Palazzolo et al., IROS 2019) and ETH3D SLAM (Schoeps et al., CVPR 2019) have
+the same layout.
+
 rgb.txt depth.txt        lines of `stamp file`; stamps in seconds, `#` starts a comment
 groundtruth.txt          optional: lines of `stamp tx ty tz qx qy qz qw`, camera to world
 camera.json              optional for the original recordings; see CAMERA_JSON
+calibration.txt          of ETH3D SLAM: `fx fy cx cy`; used if there is no camera.json
 """
 
 import logging
@@ -17,7 +21,7 @@ from ldo_service.geometry import Camera, RawFrame, Trajectory, associate
 from ldo_service.geometry.sequence import Sequence
 
 from .files import Calibration, inside, name_of, number, parse_stamp, pinhole, read_json
-from .images import read_color, read_depth
+from .images import first_size, read_color, read_depth
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +33,8 @@ CAMERA_JSON = (
 ASSOCIATION_TOLERANCE_NS = 20_000_000
 DEPTH_SCALE = 5000.0  # Units per meter in all recordings of the benchmark.
 
-# Calibration of the color cameras as published with the benchmark; fr3 is rectified already.
+# Published calibrations of the color cameras of the benchmarks, by a part of the folder's name;
+# fr3 is rectified already.
 PUBLISHED_CAMERAS = {
     "freiburg1": Camera(
         *(640, 480, 517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
@@ -38,6 +43,10 @@ PUBLISHED_CAMERAS = {
         *(640, 480, 520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)
     ),
     "freiburg3": Camera(640, 480, 535.4, 539.2, 320.1, 247.6),
+    "rgbd_bonn": Camera(
+        *(640, 480, 542.822841, 542.576870, 315.593520, 237.756098),
+        (0.039903, -0.099343, -0.000730, -0.000144, 0.0),
+    ),
 }
 
 
@@ -71,7 +80,7 @@ class TumSequence(Sequence):
                 *(folder, len(color.files) - len(pairs), len(color.files)),
             )
         self._files = [(color.files[i], depth.files[j]) for i, j in pairs]
-        calibration = _calibration(folder)
+        calibration = _calibration(folder, [folder / file for file, _ in self._files])
         self.depth_scale = calibration.depth_scale
         super().__init__(name_of(folder), calibration.camera, color.stamps_ns[pairs[:, 0]])
 
@@ -130,17 +139,34 @@ def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
     return stamp_ns, name
 
 
-def _calibration(folder: Path) -> Calibration:
+def _calibration(folder: Path, color: list[Path]) -> Calibration:
     path = folder / "camera.json"
     if path.is_file():
         fields = read_json(path)
         scale = number(fields, "depth_scale", path) if "depth_scale" in fields else DEPTH_SCALE
         return Calibration(pinhole(fields, "width", "height", path), scale)
+    eth3d = folder / "calibration.txt"
+    if eth3d.is_file():
+        return Calibration(_pinhole_of_eth3d(eth3d, first_size(color)), DEPTH_SCALE)
     names = f"{name_of(folder)} {folder.resolve().name}"
-    recording = re.search(r"freiburg[123]", names)
+    recording = re.search("|".join(PUBLISHED_CAMERAS), names)
     if recording is None:
         raise DataError(
-            f"{folder} has no camera.json, and its name does not contain freiburg1, 2 or 3, for "
-            f"which intrinsics are published. Create {path}, such as {CAMERA_JSON}."
+            f"{folder} has no camera.json, and its name does not contain freiburg1, 2 or 3 or "
+            f"rgbd_bonn, for which intrinsics are published. Create {path}, such as {CAMERA_JSON}."
         )
     return Calibration(PUBLISHED_CAMERAS[recording[0]], DEPTH_SCALE)
+
+
+def _pinhole_of_eth3d(path: Path, size: tuple[int, int]) -> Camera:
+    """Read the camera of calibration.txt, for images of a width and a height."""
+    try:
+        fx, fy, cx, cy = (float(word) for word in path.read_text().split())
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"{path} cannot be read as the four numbers `fx fy cx cy`: {error}."
+        ) from error
+    try:
+        return Camera(*size, fx, fy, cx, cy)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error

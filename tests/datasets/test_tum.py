@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import open_sequence
+from ldo_service.datasets.tum import PUBLISHED_CAMERAS
 from ldo_service.errors import DataError, FrameError
 from ldo_service.geometry import Camera
 
@@ -201,3 +202,41 @@ def test_sequence_behind_a_link_has_the_name_of_the_link(
     (folder / "camera.json").unlink()  # The published intrinsics are chosen by name.
     link.symlink_to(folder)
     assert open_sequence(str(link)).name == link.name
+
+
+def test_calibration_txt_of_eth3d_is_for_the_size_of_the_images(tum_folder: Writer) -> None:
+    folder = tum_folder(["1", "2"], ["1", "2"], None)
+    (folder / "calibration.txt").write_text("20.5 21 11.25 7\n")
+    (folder / "associated.txt").write_text("1 rgb/1.png 1 depth/1.png\n")
+    sequence = open_sequence(str(folder))
+    assert sequence.camera == Camera(24, 16, 20.5, 21.0, 11.25, 7.0)
+    assert sequence[1].depth_m.max() == np.float32(0.4)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("20 21 11", "the four numbers `fx fy cx cy`: not enough values"),
+        ("20 21 11 y", "could not convert string to float: 'y'"),
+        ("2000000 21 11 7", "focal length fx=2e[+]06 px is implausible"),
+    ],
+)
+def test_broken_calibration_txt_is_named(tum_folder: Writer, text: str, message: str) -> None:
+    folder = tum_folder(["1"], ["1"], None)
+    (folder / "calibration.txt").write_text(text)
+    with pytest.raises(DataError, match=f"calibration.txt.*{message}"):
+        open_sequence(str(folder))
+
+
+def test_intrinsics_of_bonn_are_known_by_the_name_of_the_folder(
+    write_tum: Writer, tmp_path: Path
+) -> None:
+    folder = write_tum(tmp_path / "rgbd_bonn_crowd", ["1"], ["1"], None, (480, 640))
+    camera = open_sequence(str(folder)).raw_camera
+    assert (camera.fx, camera.cy, camera.distortion[0]) == (542.822841, 237.756098, 0.039903)
+
+
+def test_intrinsics_of_bonn_are_those_beside_the_shared_part(data: Path) -> None:
+    fields = json.loads((data / "tum/bonn_crowd_part/camera.json").read_text())
+    del fields["depth_scale"]
+    assert Camera.of(fields) == PUBLISHED_CAMERAS["rgbd_bonn"]
