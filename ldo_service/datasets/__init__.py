@@ -8,6 +8,7 @@ from ldo_service.synthetic import SCENES, open_synthetic
 
 from .layout import Layout, registered_layouts
 from .nerfstudio import NerfstudioSequence
+from .open3d import Open3dSequence
 from .record3d import Record3DSequence
 from .replica import ReplicaSequence
 from .rig import SequenceOptions
@@ -32,6 +33,12 @@ LAYOUTS = (
         "results/frame*.jpg and results/depth*.png",
         lambda path: (path / "results").is_dir(),
         lambda path, _options: ReplicaSequence(path),
+    ),
+    Layout(
+        "Open3D and Redwood",
+        "color/*.jpg, depth/*.png and camera_intrinsic.json",
+        Open3dSequence.matches,
+        lambda path, _options: Open3dSequence(path),
     ),
     Layout(
         "ScanNet as SensReader exports it",

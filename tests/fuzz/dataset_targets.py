@@ -98,8 +98,19 @@ NERFSTUDIO = written(lambda folder: write_nerfstudio(folder, FRAMES, (20, 16)))
 [R3D] = written(lambda folder: write_r3d(folder / "a.r3d", FRAMES, (20, 16))).values()
 [SENS] = written(lambda folder: write_sens(folder / "a.sens", FRAMES, ".png")).values()
 [SENS_RAW] = written(lambda folder: write_sens(folder / "a.sens", FRAMES, "", False)).values()
+OPEN3D = {
+    "color/0.jpg": jpeg(COLOR),
+    "depth/0.png": png(DEPTH),
+    "intrinsic.json": json.dumps(
+        {
+            "width": WIDTH,
+            "height": HEIGHT,
+            "intrinsic_matrix": [40.0, 0, 0, 0, 41.0, 0, 19.5, 15.5, 1],
+        }
+    ).encode(),
+}
 LAYOUTS = {"TUM": TUM, "Replica": REPLICA, "ScanNet": SCANNET, "7-Scenes": SEVEN_SCENES}
-LAYOUTS |= {"Stray Scanner": STRAY, "nerfstudio": NERFSTUDIO}
+LAYOUTS |= {"Stray Scanner": STRAY, "nerfstudio": NERFSTUDIO, "Open3D": OPEN3D}
 
 
 def frames_of(folder: Path) -> None:

@@ -1,0 +1,91 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.datasets import SequenceOptions, open_sequence
+from ldo_service.errors import ConfigError, DataError, FrameError
+
+from .recordings import small_frames, write_image
+
+FRAMES = small_frames(3)
+INTRINSICS = {
+    "width": 64,
+    "height": 48,
+    "intrinsic_matrix": FRAMES[0].camera.matrix.T.ravel().tolist(),
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write(tmp_path / "desk", "{:06d}")
+
+
+def write(folder: Path, name: str, intrinsics: str = "camera_intrinsic.json") -> Path:
+    for k, frame in enumerate(FRAMES):
+        write_image(folder / f"color/{name.format(k)}.png", frame.color)
+        write_image(folder / f"depth/{name.format(k)}.png", frame.depth)
+    (folder / intrinsics).write_text(json.dumps(INTRINSICS))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "intrinsics"),
+    [("{:06d}", "camera_intrinsic.json"), ("{:07d}-000000033333", "intrinsic.json")],
+)
+def test_frames_are_those_of_the_folder(tmp_path: Path, name: str, intrinsics: str) -> None:
+    sequence = open_sequence(str(write(tmp_path / "desk", name, intrinsics)))
+    assert (sequence.name, sequence.raw_camera) == ("desk", FRAMES[0].camera)
+    assert sequence.stamps_ns.tolist() == [0, 33333333, 66666666]
+    for k, expected in enumerate(FRAMES):
+        raw = sequence.read(k)
+        assert np.array_equal(raw.color, expected.color)
+        assert np.array_equal(raw.depth, expected.depth)
+        assert raw.depth_scale == 1000.0
+    assert sequence.truth() is None
+
+
+def test_image_of_another_size_is_one_bad_frame(folder: Path) -> None:
+    write_image(folder / "depth/000001.png", np.zeros((24, 32), np.uint16))
+    sequence = open_sequence(str(folder))
+    with pytest.raises(FrameError, match="color is 64x48 and depth 32x24 pixels"):
+        sequence.read(1)
+    assert sequence[2].index == 2
+
+
+def _set(key: str, value: object) -> Callable[[Path], object]:
+    return lambda folder: (folder / "camera_intrinsic.json").write_text(
+        json.dumps({**INTRINSICS, key: value})
+    )
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (_set("intrinsic_matrix", [1, 2]), 'expected 9 numbers under "intrinsic_matrix"'),
+        (_set("intrinsic_matrix", ["a"] * 9), "expected a finite number under \"fx\".*it is 'a'"),
+        (_set("width", None), 'expected a finite number under "width"'),
+        (_set("height", 4800), "focal length fy=51.2 px is implausible"),
+        (lambda f: (f / "camera_intrinsic.json").write_text("{"), "cannot be read as JSON"),
+    ],
+)
+def test_invalid_intrinsics_are_named(
+    folder: Path, damage: Callable[[Path], object], message: str
+) -> None:
+    damage(folder)
+    with pytest.raises(DataError, match=f"camera_intrinsic.json.*{message}"):
+        open_sequence(str(folder))
+
+
+def test_folder_without_depth_is_named(folder: Path) -> None:
+    for path in (folder / "depth").iterdir():
+        path.unlink()
+    with pytest.raises(DataError, match="has 3 color and 0 depth images"):
+        open_sequence(str(folder))
+
+
+def test_registration_is_rejected_because_depth_is_registered(folder: Path) -> None:
+    with pytest.raises(ConfigError, match="registered to color already"):
+        open_sequence(str(folder), SequenceOptions(register_depth=True))
