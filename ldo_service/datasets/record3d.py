@@ -43,7 +43,7 @@ class Record3DSequence(Sequence):
     def __init__(self, path: Path) -> None:
         """Open the recording of a file."""
         try:
-            import liblzfse  # Only this reader needs it.
+            import liblzfse  # The library is optional.
         except ImportError as error:
             raise ConfigError(
                 f"{path} is a recording of Record3D, which needs the extra `phones`. Install it by "

@@ -56,7 +56,7 @@ class _Header:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Index:
-    """Where the frames lie in the file, and what is stored beside their images."""
+    """Positions of the frames in the file, and the values that are stored beside their images."""
 
     T_world_camera: np.ndarray  # [N, 4, 4] float64; not finite where unknown.
     stamps_us: np.ndarray  # [N] uint64, of color.
@@ -203,7 +203,7 @@ def _camera(K: np.ndarray, width: int, height: int) -> Camera:
 
 
 def _index(file: BinaryIO, path: Path, frames: int) -> _Index:
-    """Read what is stored beside the images of all frames.
+    """Read the headers of all frames.
 
     Raises:
         DataError: The file has no frames, or is truncated.

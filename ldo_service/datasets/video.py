@@ -33,7 +33,7 @@ class Video:
             DataError: The file cannot be read or has no frames.
         """
         try:
-            import av  # Only the readers of videos need it.
+            import av  # The library is optional.
             from av.error import FFmpegError
         except ImportError as error:
             raise ConfigError(
@@ -57,7 +57,7 @@ class Video:
                 "truncated. Export or copy the recording again."
             ) from error
         packets.sort()
-        self._stamps = [stamp for stamp, _ in packets]  # In units of the stream.
+        self._stamps = [stamp for stamp, _ in packets]  # The unit is that of the stream.
         self._keyframes = [k for k, (_, is_key) in enumerate(packets) if is_key] or [0]
         if not packets or not 0 < self.width * self.height <= MAX_PIXELS:
             raise DataError(

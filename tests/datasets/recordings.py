@@ -203,5 +203,5 @@ def write_sens(
             file.write(pose.astype("<f4").tobytes())
             file.write(struct.pack("<4Q", stamp_us, stamp_us, len(color), len(depth)))
             file.write(color + depth)
-        file.write(struct.pack("<Q", 0))  # No inertial measurements.
+        file.write(struct.pack("<Q", 0))  # The number of inertial measurements.
     return path

@@ -22,7 +22,7 @@ from .recordings import (
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 FRAMES = range(0, 300, 5)
-MAX_ATE_RATIO = 1.3  # Of the ATE of the original, for formats that lose information.
+MAX_ATE_RATIO = 1.3  # The bound of ATE / ATE of the original, for lossy formats.
 
 
 def track(frames: list[RawFrame]) -> tuple[np.ndarray, Counter[str]]:

@@ -22,7 +22,7 @@ def plane_m(camera: Camera, width: int, height: int) -> np.ndarray:
 
 @pytest.mark.parametrize("size", [(1920, 1440), (1922, 1443), (1000, 750)])
 def test_enlarged_depth_of_a_plane_is_exact(size: tuple[int, int]) -> None:
-    """Also if the size is no multiple of the block, so that the grid lacks the last columns."""
+    """If the size is no multiple of the block, the grid lacks the last columns."""
     width, height = size
     full = Camera(width, height, 0.8 * width, 0.8 * width, width / 2 - 3, height / 2 + 5)
     grid = PhoneGrid(full)
@@ -60,7 +60,7 @@ def test_depth_between_two_surfaces_and_beside_unmeasured_pixels_is_dropped() ->
     large = enlarge_depth(depth, (16, 32), (16.0, 32.0))
     assert set(np.unique(large)) == {0.0, 1.0, 2.0}
     expected = np.zeros(32)
-    expected[:14], expected[18:26] = 1, 2  # Up to the last pixel centers of each surface.
+    expected[:14], expected[18:26] = 1, 2  # Each surface ends at its last pixel center.
     assert np.array_equal(large, np.broadcast_to(expected, (16, 32)))
 
 

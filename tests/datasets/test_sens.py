@@ -60,7 +60,7 @@ def test_frame_without_a_valid_pose_has_no_truth(path: Path) -> None:
 
 
 def test_depth_of_a_separate_camera_is_registered_to_color(tmp_path: Path) -> None:
-    """At 2 m, 0.1 m between the cameras are 51.2 * 0.1 / 2 pixels."""
+    """A wall at 2 m moves by 51.2 * 0.1 / 2 = 2.6 pixels for 0.1 m between the cameras."""
     T = se3.exp(np.array([0, 0, 0, 0.1, 0, 0]))
     frames = [
         frame.__class__(
