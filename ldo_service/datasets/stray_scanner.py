@@ -82,8 +82,9 @@ def _camera(path: Path, video: Video) -> Camera:
         raise DataError(f"{path} cannot be read as a matrix: {error}.") from error
     if K.shape != (3, 3):
         raise DataError(f"{path} has the shape {K.shape}, expected 3 rows of 3 numbers.")
+    fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     try:
-        return Camera(video.width, video.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        return Camera(video.width, video.height, fx, fy, cx, cy)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
 

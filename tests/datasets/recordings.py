@@ -205,3 +205,22 @@ def write_sens(
             file.write(color + depth)
         file.write(struct.pack("<Q", 0))  # The number of inertial measurements.
     return path
+
+
+def write_open3d(
+    folder: Path, frames: list[RawFrame], name: str = "{:06d}", intrinsics: str = "intrinsic.json"
+) -> Path:
+    """Write a folder of Open3D; the names of the images are `name`, formatted by their numbers."""
+    for k, frame in enumerate(frames):
+        write_image(folder / f"color/{name.format(k)}.png", frame.color)
+        write_image(
+            folder / f"depth/{name.format(k)}.png", millimeters(frame, frame.depth.shape[::-1])
+        )
+    camera = frames[0].camera
+    content = {
+        "width": camera.width,
+        "height": camera.height,
+        "intrinsic_matrix": camera.matrix.T.ravel().tolist(),
+    }
+    (folder / intrinsics).write_text(json.dumps(content))
+    return folder

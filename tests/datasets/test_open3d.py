@@ -8,27 +8,14 @@ import pytest
 from ldo_service.datasets import SequenceOptions, open_sequence
 from ldo_service.errors import ConfigError, DataError, FrameError
 
-from .recordings import small_frames, write_image
+from .recordings import small_frames, write_image, write_open3d
 
 FRAMES = small_frames(3)
-INTRINSICS = {
-    "width": 64,
-    "height": 48,
-    "intrinsic_matrix": FRAMES[0].camera.matrix.T.ravel().tolist(),
-}
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    return write(tmp_path / "desk", "{:06d}")
-
-
-def write(folder: Path, name: str, intrinsics: str = "camera_intrinsic.json") -> Path:
-    for k, frame in enumerate(FRAMES):
-        write_image(folder / f"color/{name.format(k)}.png", frame.color)
-        write_image(folder / f"depth/{name.format(k)}.png", frame.depth)
-    (folder / intrinsics).write_text(json.dumps(INTRINSICS))
-    return folder
+    return write_open3d(tmp_path / "desk", FRAMES)
 
 
 @pytest.mark.parametrize(
@@ -36,7 +23,7 @@ def write(folder: Path, name: str, intrinsics: str = "camera_intrinsic.json") ->
     [("{:06d}", "camera_intrinsic.json"), ("{:07d}-000000033333", "intrinsic.json")],
 )
 def test_frames_are_those_of_the_folder(tmp_path: Path, name: str, intrinsics: str) -> None:
-    sequence = open_sequence(str(write(tmp_path / "desk", name, intrinsics)))
+    sequence = open_sequence(str(write_open3d(tmp_path / "desk", FRAMES, name, intrinsics)))
     assert (sequence.name, sequence.raw_camera) == ("desk", FRAMES[0].camera)
     assert sequence.stamps_ns.tolist() == [0, 33333333, 66666666]
     for k, expected in enumerate(FRAMES):
@@ -56,9 +43,11 @@ def test_image_of_another_size_is_one_bad_frame(folder: Path) -> None:
 
 
 def _set(key: str, value: object) -> Callable[[Path], object]:
-    return lambda folder: (folder / "camera_intrinsic.json").write_text(
-        json.dumps({**INTRINSICS, key: value})
-    )
+    def change(folder: Path) -> None:
+        path = folder / "intrinsic.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+
+    return change
 
 
 @pytest.mark.parametrize(
@@ -68,14 +57,14 @@ def _set(key: str, value: object) -> Callable[[Path], object]:
         (_set("intrinsic_matrix", ["a"] * 9), "expected a finite number under \"fx\".*it is 'a'"),
         (_set("width", None), 'expected a finite number under "width"'),
         (_set("height", 4800), "focal length fy=51.2 px is implausible"),
-        (lambda f: (f / "camera_intrinsic.json").write_text("{"), "cannot be read as JSON"),
+        (lambda f: (f / "intrinsic.json").write_text("{"), "cannot be read as JSON"),
     ],
 )
 def test_invalid_intrinsics_are_named(
     folder: Path, damage: Callable[[Path], object], message: str
 ) -> None:
     damage(folder)
-    with pytest.raises(DataError, match=f"camera_intrinsic.json.*{message}"):
+    with pytest.raises(DataError, match=f"/intrinsic.json.*{message}"):
         open_sequence(str(folder))
 
 

@@ -1,11 +1,23 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from ldo_service.conversions.frames import raw_frame_from_message, raw_frame_to_message
 from ldo_service.datasets import Layout, SequenceOptions, layout, open_sequence
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.schemas import CameraRgbd, decode, encode
 from ldo_service.synthetic import SCENES
+
+from .recordings import (
+    small_frames,
+    write_nerfstudio,
+    write_open3d,
+    write_r3d,
+    write_sens,
+    write_stray,
+)
 
 
 def test_synthetic_without_a_name_is_the_room() -> None:
@@ -82,6 +94,24 @@ def test_registration_is_rejected_where_depth_is_registered_already(
     for source in (tum_folder(["1"], ["1"]), replica_folder([0]), "synthetic:room"):
         with pytest.raises(ConfigError, match="registered to color already"):
             open_sequence(str(source), SequenceOptions(register_depth=True))
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda folder: write_stray(folder / "stray", small_frames(2), (32, 24)),
+        lambda folder: write_r3d(folder / "a.r3d", small_frames(2), (32, 24)),
+        lambda folder: write_nerfstudio(folder / "nerfstudio", small_frames(2), (32, 24)),
+        lambda folder: write_sens(folder / "a.sens", small_frames(2)),
+        lambda folder: write_open3d(folder / "open3d", small_frames(2)),
+    ],
+)
+def test_frame_of_each_format_can_be_sent(write: Callable[[Path], Path], tmp_path: Path) -> None:
+    raw = open_sequence(str(write(tmp_path))).read(1)
+    body = encode(raw_frame_to_message(raw))
+    found = raw_frame_from_message(decode(body, CameraRgbd), 1)
+    assert (found.camera, found.stamp_ns) == (raw.camera, raw.stamp_ns)
+    assert np.array_equal(found.depth, raw.depth)
 
 
 # --- layouts of other packages --------------------------------------------------------------------
