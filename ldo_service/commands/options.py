@@ -47,8 +47,9 @@ Source = Annotated[
     tyro.conf.Positional,
     argument(
         metavar="SOURCE",
-        help="folder of a data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet export, or one seq-XX of "
-        "7-Scenes, recognized by its files), a recording, or a built-in scene synthetic:NAME; "
+        help="data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet, one seq-XX of 7-Scenes, Open3D, "
+        "nerfstudio, Stray Scanner or Record3D, recognized by its files), a recording, or a "
+        "built-in scene synthetic:NAME; "
         f"NAME is {', '.join(SCENES)}",
     ),
 ]

@@ -127,7 +127,7 @@ class Record3DSequence(Sequence):
         data, (height, width) = self._frame_bytes(name), self._depth_shape
         size = height * width * np.dtype(dtype).itemsize
         # The header is checked first, because the decoder allocates the size that it declares.
-        declared = struct.unpack_from("<I", data, 4)[0] if len(data) >= 8 else -1
+        declared = struct.unpack_from("<I", data, 4)[0] if len(data) >= 12 else -1
         try:
             content = self._lzfse.decompress(data) if 0 < declared <= size else b""
         except (self._lzfse.error, MemoryError):
