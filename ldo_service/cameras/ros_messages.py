@@ -1,4 +1,4 @@
-"""Decoding of ROS 2 images and camera infos from the CDR that a bridge forwards.
+"""Decoding of ROS 2 images and camera infos from CDR, as a bridge forwards it or a bag stores it.
 
 Encodings are those of `sensor_msgs/image_encodings`; depth is in millimeters as 16UC1 and in meters
 as 32FC1 (REP 118).
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError, FrameError, install_command
-from ldo_service.geometry.codecs import read_image_size
+from ldo_service.geometry.codecs import PNG, read_image_size
 from ldo_service.schemas import CameraModel, CameraRgbd, Image
 from ldo_service.schemas.frames import MAX_PIXELS, ImageEncoding
 
@@ -30,6 +30,9 @@ DEPTH_KINDS: dict[str, tuple[ImageEncoding, str, float]] = {
 # Number of bytes before the PNG of compressed depth: a format and two quantization parameters.
 COMPRESSED_DEPTH_HEADER = 12
 PLUMB_BOB, RATIONAL, UNDISTORTED = "plumb_bob", "rational_polynomial", ("", "none")
+BROWN_CONRADY = "Brown Conrady"  # Name of librealsense for plumb_bob.
+IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +60,17 @@ def read_color(body: bytes, topic: str) -> RosImage:
     Raises:
         FrameError: The message is invalid, or its encoding is not supported.
     """
-    if is_compressed(topic):
-        return _compressed(_message(body, "sensor_msgs/msg/CompressedImage"), 0)
-    message = _message(body, "sensor_msgs/msg/Image")
+    return color_image(decoded(body, COMPRESSED_IMAGE if is_compressed(topic) else IMAGE))
+
+
+def color_image(message: Any) -> RosImage:
+    """Convert a decoded sensor_msgs/Image or sensor_msgs/CompressedImage to a color image.
+
+    Raises:
+        FrameError: The encoding is not supported, or the size does not fit the data.
+    """
+    if message.__msgtype__ == COMPRESSED_IMAGE:
+        return _compressed(message, 0)
     channels = COLOR_CHANNELS.get(message.encoding)
     if channels is None:
         raise FrameError(
@@ -83,14 +94,23 @@ def read_depth(body: bytes, topic: str) -> RosImage:
     Raises:
         FrameError: The message is invalid, or its encoding is not supported.
     """
-    if is_compressed(topic):
-        message = _message(body, "sensor_msgs/msg/CompressedImage")
+    return depth_image(decoded(body, COMPRESSED_IMAGE if is_compressed(topic) else IMAGE))
+
+
+def depth_image(message: Any) -> RosImage:
+    """Convert a decoded sensor_msgs/Image or sensor_msgs/CompressedImage to a depth image.
+
+    Raises:
+        FrameError: The encoding is not supported, or the size does not fit the data.
+    """
+    if message.__msgtype__ == COMPRESSED_IMAGE:
         if not message.format.startswith("16UC1"):
             raise FrameError(
                 f"compressed depth format {message.format[:40]!r} is not supported, expected 16UC1."
             )
-        return _compressed(message, COMPRESSED_DEPTH_HEADER, 1000.0)
-    message = _message(body, "sensor_msgs/msg/Image")
+        # The transport `compressed` stores depth as plain PNG, without the header.
+        is_plain = message.data[: len(PNG)].tobytes() == PNG
+        return _compressed(message, 0 if is_plain else COMPRESSED_DEPTH_HEADER, 1000.0)
     if message.encoding not in DEPTH_KINDS:
         raise FrameError(
             f"depth encoding {message.encoding[:40]!r} is not supported, expected one of "
@@ -113,7 +133,15 @@ def read_camera(body: bytes, is_rectified: bool) -> CameraModel:
     Raises:
         FrameError: The message is invalid, or its distortion model is not supported.
     """
-    info = _message(body, "sensor_msgs/msg/CameraInfo")
+    return camera_model(decoded(body, CAMERA_INFO), is_rectified)
+
+
+def camera_model(info: Any, is_rectified: bool) -> CameraModel:
+    """Convert a decoded sensor_msgs/CameraInfo to a camera model; see `read_camera`.
+
+    Raises:
+        FrameError: The message is invalid, or its distortion model is not supported.
+    """
     matrix = np.reshape(info.p, (3, 4)) if is_rectified else np.reshape(info.k, (3, 3))
     try:
         return CameraModel(
@@ -187,11 +215,16 @@ def typestore() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)  # Later versions did not change these messages.
 
 
-def _message(body: bytes, kind: str) -> Any:
+def decoded(body: bytes, kind: str) -> Any:
+    """Decode a message of a type, such as sensor_msgs/msg/Image, from CDR.
+
+    Raises:
+        FrameError: The bytes are not CDR of ROS 2, or not a message of this type.
+    """
     if body[:2] not in CDR_HEADERS:
         raise FrameError(
             f"{len(body)} bytes that begin with {body[:4].hex()} are not CDR of ROS 2. Check that "
-            "the bridge is zenoh-bridge-ros2dds."
+            "the bridge is zenoh-bridge-ros2dds, or that the bag was made by ROS 2."
         )
     store = typestore()
     try:
@@ -254,9 +287,9 @@ def _distortion(info: Any) -> tuple[float, ...]:
     d = tuple(float(number) for number in info.d)
     if not any(d) or info.distortion_model in UNDISTORTED:
         return ()
-    if info.distortion_model not in (PLUMB_BOB, RATIONAL):
+    if info.distortion_model not in (PLUMB_BOB, RATIONAL, BROWN_CONRADY):
         raise FrameError(
             f"distortion model {info.distortion_model!r} is not supported, expected {PLUMB_BOB} or "
-            f"{RATIONAL}. Subscribe to rectified images, and give --rectified."
+            f"{RATIONAL}. Use topics of rectified images; for `ldo publish ros2`, add --rectified."
         )
     return d
