@@ -48,7 +48,8 @@ Source = Annotated[
     argument(
         metavar="SOURCE",
         help="folder of a data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet export, or one seq-XX of "
-        "7-Scenes, recognized by its files), a recording, or a built-in scene synthetic:NAME; "
+        "7-Scenes, recognized by its files), a bag of ROS, a recording, or a built-in scene "
+        "synthetic:NAME; "
         f"NAME is {', '.join(SCENES)}",
     ),
 ]

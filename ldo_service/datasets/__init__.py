@@ -9,6 +9,7 @@ from ldo_service.synthetic import SCENES, open_synthetic
 from .layout import Layout, registered_layouts
 from .replica import ReplicaSequence
 from .rig import SequenceOptions
+from .ros_bag import RosBagSequence, is_bag
 from .scannet import ScanNetSequence
 from .seven_scenes import SevenScenesSequence
 from .tum import TumSequence
@@ -42,6 +43,14 @@ LAYOUTS = (
         lambda path: any(path.glob("frame-*.color.*")),
         SevenScenesSequence,
         has_options=True,
+    ),
+    Layout(
+        "a bag of ROS 1 or ROS 2",
+        "a file .bag, .mcap or .db3, or a folder with metadata.yaml",
+        is_bag,
+        RosBagSequence,
+        has_options=True,
+        has_topics=True,
     ),
 )
 

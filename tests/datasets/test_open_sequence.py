@@ -58,9 +58,9 @@ def test_folder_of_unknown_layout_lists_the_expected_files(tmp_path: Path) -> No
 def test_missing_folder_and_file_have_different_messages(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"does not exist.*TUM"):
         open_sequence(str(tmp_path / "nowhere"))
-    (tmp_path / "a.mcap").touch()
-    with pytest.raises(DataError, match="the file .*no known layout"):
-        open_sequence(str(tmp_path / "a.mcap"))
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(DataError, match=r"the file .*no known layout"):
+        open_sequence(str(tmp_path / "a.txt"))
 
 
 def test_every_message_is_one_paragraph(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from ldo_service.storage.state_store import STATE_VERSION
 
 from .dataset_targets import COLOR as IMAGE
-from .dataset_targets import jpeg, png
+from .dataset_targets import METADATA, jpeg, png
 from .run_folder_targets import RUN, SEMANTICS, bytes_of, gaussians_of_a_chunk, record
 from .targets import TARGETS
 
@@ -52,6 +52,7 @@ FOUND = [
     ("keyframes.json", RUN["keyframes.json"].replace(b'"keyframe": 0', b'"keyframe": 1e999')),
     ("chunk of Gaussians", LARGE_CHUNK),
     ("recording as a data set", bytes_of(lambda path: record(path, stamp_ns=2**63))),
+    ("metadata of a bag", METADATA.replace(b"message_count: 2", b"message_count: null")),
     ("config.yaml", DEEP_YAML),
     ("config.yaml", b"tracker: 2027-13-45\n"),
     ("--set", b"tracker.hold_out=" + b"[" * 3000),
