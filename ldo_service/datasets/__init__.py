@@ -14,7 +14,7 @@ from .scannet import ScanNetSequence
 from .seven_scenes import SevenScenesSequence
 from .tum import TumSequence
 
-__all__ = ["Cached", "Layout", "Sequence", "SequenceOptions", "open_sequence"]
+__all__ = ["Cached", "Layout", "Sequence", "SequenceOptions", "find_layout", "open_sequence"]
 
 # Layouts of this package. The first one that matches a path opens it.
 LAYOUTS = (
@@ -80,9 +80,8 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     path, layouts = Path(source).expanduser(), (*LAYOUTS, *registered_layouts())
     if not path.exists():
         raise DataError(f"{source} does not exist. Expected one of these: {_known(layouts)}.")
-    for layout in layouts:
-        if layout.matches(path):
-            return layout.open_sequence(path, options)
+    if layout := find_layout(path):
+        return layout.open_sequence(path, options)
     if parts := sorted(part.parent.name for part in path.glob("seq-*/frame-000000.color.*")):
         raise DataError(
             f"{path} contains several sequences of 7-Scenes. Give one of them, such as "
@@ -90,6 +89,12 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
         )
     kind = "folder" if path.is_dir() else "file"
     raise DataError(f"the {kind} {path} has no known layout. Known layouts: {_known(layouts)}.")
+
+
+def find_layout(path: Path) -> Layout | None:
+    """Return the layout that a path has, or None if it has none of the known layouts."""
+    layouts = *LAYOUTS, *registered_layouts()
+    return next((layout for layout in layouts if layout.matches(path)), None)
 
 
 def _known(layouts: tuple[Layout, ...]) -> str:

@@ -98,6 +98,8 @@ class RosBagSequence(Sequence):
         self._rig = _rig(bag, color, depth, self._first_images(), camera, options)
         self._units_per_m = _realsense_units_per_m(bag, depth)
         super().__init__(name_of(path), camera, stamps_ns[pairs[:, 0]])
+        self.depth_offsets_ns = depth_stamps_ns[pairs[:, 1]] - self.stamps_ns
+        self.registration = "source" if self._rig is None else "reader"
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""

@@ -1,6 +1,7 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ldo_service.datasets import Layout, SequenceOptions, layout, open_sequence
@@ -82,6 +83,29 @@ def test_registration_is_rejected_where_depth_is_registered_already(
     for source in (tum_folder(["1"], ["1"]), replica_folder([0]), "synthetic:room"):
         with pytest.raises(ConfigError, match="registered to color already"):
             open_sequence(str(source), SequenceOptions(register_depth=True))
+
+
+def test_every_layout_says_where_depth_is_registered(
+    tum_folder: Callable[..., Path],
+    replica_folder: Callable[..., Path],
+    scannet_folder: Callable[..., Path],
+    seven_scenes_folder: Callable[..., Path],
+) -> None:
+    moved = np.eye(4)
+    moved[0, 3] = 0.02
+    seven_scenes = str(seven_scenes_folder([0, 1]))
+    assert open_sequence(str(tum_folder(["1"], ["1.01"]))).registration == "source"
+    assert open_sequence(str(replica_folder([0]))).registration == "source"
+    assert open_sequence(str(scannet_folder([0, 1], moved))).registration == "reader"
+    assert open_sequence(seven_scenes).registration == "none"
+    registered = open_sequence(seven_scenes, SequenceOptions(register_depth=True))
+    assert registered.registration == "reader"
+
+
+def test_stamps_of_depth_are_kept(tum_folder: Callable[..., Path]) -> None:
+    offsets_ns = open_sequence(str(tum_folder(["1", "2"], ["1.01", "1.995"]))).depth_offsets_ns
+    assert offsets_ns is not None
+    assert offsets_ns.tolist() == [10_000_000, -5_000_000]
 
 
 # --- layouts of other packages --------------------------------------------------------------------
