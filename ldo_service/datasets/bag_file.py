@@ -31,8 +31,10 @@ REALSENSE_TAIL = 4
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path has the name of a bag."""
-    return (path.suffix in SUFFIXES and path.is_file()) or (path / METADATA).is_file()
+    """Return whether a path has the name of a bag, or a folder has the files of one."""
+    if path.is_file():
+        return path.suffix in SUFFIXES
+    return (path / METADATA).is_file() or any(path.glob("*.db3"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +55,7 @@ class StoredMessage:
     # for types without a header.
     stamp_ns: int
     connection: Any  # Connection of rosbags.
-    place: Any  # Where the message is stored.
+    place: Any  # Entry of the index (ROS 1), or a `_Ros2Place`.
 
 
 class BagFile:

@@ -61,6 +61,7 @@ DEPTH_NAMES = (
     r"depth/image(_raw|_rect|_rect_raw)?$",
     r"Depth_\d+/image/data$",
     r"depth",
+    r"stereo/image_raw$",  # DepthAI.
 )
 REGISTERED = re.compile(r"aligned_depth_to|depth_to_(color|rgb)|depth_registered")
 NOT_COLOR = re.compile(r"depth|mono|infra|confidence", re.IGNORECASE)

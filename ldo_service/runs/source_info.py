@@ -26,7 +26,7 @@ class Timing:
     frames: int
     first_stamp_s: float
     duration_s: float
-    rate_hz: float | None  # From the median interval; None for a single frame.
+    rate_hz: float | None  # Inverse of the median interval; None for a single frame.
     gaps: int  # Number of intervals longer than MIN_GAP_PERIODS median intervals.
     longest_interval_s: float | None
 
@@ -39,7 +39,7 @@ class DepthInfo:
     # Stamp of depth minus stamp of color: median, and largest absolute value; None if unknown.
     offset_ms: float | None
     max_offset_ms: float | None
-    # From the sampled frames that can be read; None if there is none.
+    # Values of the sampled frames that can be read; None if there is none.
     valid_ratio: float | None
     median_m: float | None
 
@@ -53,7 +53,7 @@ class SourceInfo:
     camera: dict[str, Any]  # Fields of `Camera`.
     depth: DepthInfo
     sampled_frames: int
-    unreadable_frames: int  # Among the sampled frames.
+    unreadable_frames: int  # Number of sampled frames that cannot be read.
     true_poses: int  # Number of poses of the ground truth; 0 if there is none.
     has_true_labels: bool
 

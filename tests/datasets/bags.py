@@ -27,8 +27,13 @@ KINDS = ("ros1", "mcap", "sqlite3")
 Entry = tuple[int, str, Any]
 
 
-def write_bag(folder: Path, kind: str, entries: Iterable[Entry], name: str = "bag") -> Path:
-    """Write a bag of one of KINDS, and return its path."""
+def write_bag(
+    folder: Path, kind: str, entries: Iterable[Entry], name: str = "bag", image_tail: bytes = b""
+) -> Path:
+    """Write a bag of one of KINDS, and return its path.
+
+    `image_tail` follows each image of ROS 1, as librealsense appends the depth unit.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     if kind == "ros1":
         path = folder / f"{name}.bag"
@@ -38,7 +43,8 @@ def write_bag(folder: Path, kind: str, entries: Iterable[Entry], name: str = "ba
                 type_name = message.__msgtype__
                 if topic not in links:
                     links[topic] = writer.add_connection(topic, type_name, typestore=NOETIC)
-                body = STORE.cdr_to_ros1(cdr(message), type_name)
+                tail = image_tail if type_name == "sensor_msgs/msg/Image" else b""
+                body = bytes(STORE.cdr_to_ros1(cdr(message), type_name)) + tail
                 writer.write(links[topic], time_ns, body)
         return path
     path = folder / name

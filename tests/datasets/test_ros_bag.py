@@ -194,6 +194,7 @@ def test_file_is_closed_with_the_sequence(tmp_path: Path) -> None:
         ),
         ("/rgb/image_raw", "/depth_to_rgb/image_raw", "/rgb/camera_info"),
         ("/zed/rgb/image", "/zed/depth/image", "/zed/rgb/camera_info"),
+        ("/oak/rgb/image_raw", "/oak/stereo/image_raw", "/oak/rgb/camera_info"),
     ],
 )
 def test_usual_names_are_found(tmp_path: Path, color: str, depth: str, info: str) -> None:
@@ -293,15 +294,16 @@ def test_missing_camera_info_of_unregistered_depth_is_named(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("unit", "units_per_m"), [("Float32", 2000.0), ("String", 2000.0), ("nothing", 1000.0)]
 )
+@pytest.mark.parametrize("lens", ["Brown Conrady", "Inverse Brown Conrady"])
 def test_recording_of_realsense_viewer_has_its_depth_unit_and_extrinsics(
-    tmp_path: Path, unit: str, units_per_m: float
+    tmp_path: Path, unit: str, units_per_m: float, lens: str
 ) -> None:
     """The topics and messages are those that librealsense 2.55 and 2.59 wrote."""
     sensors = "/device_0/sensor_0/Depth_0", "/device_0/sensor_1/Color_0"
     types, option = STORE.types, "/device_0/sensor_0/option/Depth_Units/value"
     identity = static_transform("", "", np.eye(4)).transforms[0].transform
     extrinsics = static_transform("", "", T_COLOR_DEPTH).transforms[0].transform
-    brown = replace(info_of(CAMERA), distortion_model="Brown Conrady")
+    brown = replace(info_of(CAMERA), distortion_model=lens)
     depth_mm = np.full((8, 12), 3000, np.uint16)
     entries = [
         (1, f"{sensors[1]}/info/camera_info", brown),
@@ -315,7 +317,8 @@ def test_recording_of_realsense_viewer_has_its_depth_unit_and_extrinsics(
         entries.append((1, option, types["std_msgs/msg/Float32"](0.0005000000237487257)))
     elif unit == "String":
         entries.append((1, option, types["std_msgs/msg/String"]("0.000500")))
-    frame = open_sequence(str(write_bag(tmp_path, "ros1", entries))).read(0)
+    path = write_bag(tmp_path, "ros1", entries, image_tail=np.float32(0.0005).tobytes())
+    frame = open_sequence(str(path)).read(0)
     depth_m = np.full((8, 12), 3000 / units_per_m, np.float32)
     expected = register_depth(depth_m, SMALL_DEPTH_CAMERA, CAMERA, T_COLOR_DEPTH)
     np.testing.assert_allclose(frame.depth_m(), expected, atol=1e-6)
@@ -372,6 +375,12 @@ def test_mcap_without_chunks_is_rejected(tmp_path: Path) -> None:
     writer.add_message(channel, 5, cdr(color_message(5)), 5)
     writer.finish()
     reject(path, r"no index of chunks\. Write it again .*`mcap filter plain\.mcap")
+
+
+def test_bag_of_ros2_that_was_not_closed_is_rejected(tmp_path: Path) -> None:
+    folder = write_bag(tmp_path, "sqlite3", small())
+    (folder / "metadata.yaml").unlink()
+    reject(folder, "metadata.*does not exist.*`ros2 bag reindex bag`")
 
 
 def test_folder_whose_metadata_are_no_metadata_is_rejected(tmp_path: Path) -> None:
