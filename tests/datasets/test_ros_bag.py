@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import Writer
-from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
 
 from ldo_service.datasets import Sequence, SequenceOptions, open_sequence
 from ldo_service.datasets.bag_file import BagFile
@@ -128,9 +129,18 @@ def test_single_file_of_a_bag_is_enough(tmp_path: Path, kind: str, suffix: str) 
     assert (sequence.read(1).depth_m() == 1.5).all()
 
 
-@pytest.mark.parametrize("mode", [CompressionMode.MESSAGE, CompressionMode.FILE])
-def test_compressed_bag_of_ros2_is_read(tmp_path: Path, mode: CompressionMode) -> None:
-    writer = Writer(tmp_path / "bag", version=9)
+@pytest.mark.parametrize(
+    ("plugin", "mode"),
+    [
+        (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+        (StoragePlugin.SQLITE3, CompressionMode.FILE),
+        (StoragePlugin.MCAP, CompressionMode.STORAGE),
+    ],
+)
+def test_compressed_bag_of_ros2_is_read(
+    tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode
+) -> None:
+    writer = Writer2(tmp_path / "bag", version=9, storage_plugin=plugin)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
         for time_ns, topic, message in small():
@@ -138,6 +148,22 @@ def test_compressed_bag_of_ros2_is_read(tmp_path: Path, mode: CompressionMode) -
             link = link or writer.add_connection(topic, message.__msgtype__, typestore=STORE)
             writer.write(link, time_ns, cdr(message))
     np.testing.assert_array_equal(open_sequence(str(tmp_path / "bag")).read(1).color, PIXELS)
+
+
+@pytest.mark.parametrize("algorithm", list(Writer1.CompressionFormat))
+def test_compressed_bag_of_ros1_is_read(
+    tmp_path: Path, algorithm: Writer1.CompressionFormat, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = Writer1.open
+
+    def open_compressed(writer: Writer1) -> None:
+        writer.set_compression(algorithm)
+        opened(writer)
+
+    monkeypatch.setattr(Writer1, "open", open_compressed)
+    path = write_bag(tmp_path, "ros1", small())
+    assert f"compression={algorithm.name.lower()}".encode() in path.read_bytes()
+    np.testing.assert_array_equal(open_sequence(str(path)).read(1).color, PIXELS)
 
 
 @pytest.mark.parametrize("kind", KINDS)
