@@ -4,14 +4,15 @@ Encodings are those of `sensor_msgs/image_encodings`; depth is in millimeters as
 as 32FC1 (REP 118).
 """
 
-from dataclasses import dataclass
+import struct
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 
 from ldo_service.errors import ConfigError, FrameError, install_command
-from ldo_service.geometry.codecs import PNG, read_image_size
+from ldo_service.geometry.codecs import PNG, decode_depth, read_image_size
 from ldo_service.schemas import CameraModel, CameraRgbd, Image
 from ldo_service.schemas.frames import MAX_PIXELS, ImageEncoding
 
@@ -106,13 +107,7 @@ def depth_image(message: Any) -> RosImage:
         FrameError: The encoding is not supported, or the size does not fit the data.
     """
     if message.__msgtype__ == COMPRESSED_IMAGE:
-        if not message.format.startswith("16UC1"):
-            raise FrameError(
-                f"compressed depth format {message.format[:40]!r} is not supported, expected 16UC1."
-            )
-        # The transport `compressed` stores depth as plain PNG, without the header.
-        is_plain = message.data[: len(PNG)].tobytes() == PNG
-        return _compressed(message, 0 if is_plain else COMPRESSED_DEPTH_HEADER, 1000.0)
+        return _compressed_depth(message)
     if message.encoding not in DEPTH_KINDS:
         raise FrameError(
             f"depth encoding {message.encoding[:40]!r} is not supported, expected one of "
@@ -278,6 +273,33 @@ def _compressed(message: Any, start: int, depth_scale: float = 1.0) -> RosImage:
     except ValueError as error:
         raise FrameError(f"a compressed image is invalid: {error}.") from error
     return _ros_image(message, image, depth_scale)
+
+
+def _compressed_depth(message: Any) -> RosImage:
+    """Wrap compressed depth in millimeters, or decode compressed depth in meters.
+
+    The transport `compressedDepth` stores float depth as the 16-bit integers A / depth + B. Its
+    header has a format and the float32 numbers A and B. An integer of 0 means not measured.
+
+    Raises:
+        FrameError: The format is not supported, or the data are invalid.
+    """
+    if message.format.startswith("16UC1"):
+        # The transport `compressed` stores depth as plain PNG, without the header.
+        is_plain = message.data[: len(PNG)].tobytes() == PNG
+        return _compressed(message, 0 if is_plain else COMPRESSED_DEPTH_HEADER, 1000.0)
+    if not message.format.startswith("32FC1"):
+        raise FrameError(
+            f"compressed depth format {message.format[:40]!r} is not supported, expected 16UC1 or "
+            "32FC1."
+        )
+    stored = _compressed(message, COMPRESSED_DEPTH_HEADER)
+    image = stored.image
+    values = decode_depth(image.encoding, image.width, image.height, image.data).astype(np.float32)
+    _, A, B = struct.unpack("<iff", message.data[:COMPRESSED_DEPTH_HEADER].tobytes())
+    with np.errstate(all="ignore"):
+        depth_m = np.where(values > 0, np.float32(A) / (values - np.float32(B)), np.float32("nan"))
+    return replace(stored, image=Image.raw("f32", depth_m.astype(np.float32)))
 
 
 def _distortion(info: Any) -> tuple[float, ...]:
