@@ -262,8 +262,10 @@ def _camera(bag: BagFile, image: Topic) -> Camera:
         )
     is_rectified = "rect" in COMPRESSED.sub("", image.name).rpartition("/")[2]
     try:
-        (first,) = bag.messages([topic], limit=1)
-        model = camera_model(bag.read(first), is_rectified)
+        found = bag.messages([topic], limit=1)
+        if not found:
+            raise DataError("the index lists messages that are not in the file. Copy it again.")
+        model = camera_model(bag.read(found[0]), is_rectified)
         return Camera.of(structs.asdict(model))
     except (FrameError, DataError) as error:
         raise DataError(f"{bag.path}, {topic.name}: {error}") from error

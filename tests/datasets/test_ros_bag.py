@@ -3,12 +3,14 @@
 import gc
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -148,6 +150,30 @@ def test_compressed_bag_of_ros2_is_read(
             link = link or writer.add_connection(topic, message.__msgtype__, typestore=STORE)
             writer.write(link, time_ns, cdr(message))
     np.testing.assert_array_equal(open_sequence(str(tmp_path / "bag")).read(1).color, PIXELS)
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
+def test_bag_of_several_files_is_read_by_several_threads(
+    room: Sequence, tmp_path: Path, kind: str
+) -> None:
+    """`ros2 bag record --max-bag-size` splits a bag like this."""
+    first = write_bag(tmp_path, kind, entries_of(room, range(1, 5)), "first")
+    second = write_bag(tmp_path, kind, entries_of(room, range(5, 9)), "second")
+    (file,) = (path for path in second.iterdir() if path.name.startswith("second."))
+    file.rename(first / file.name)
+    metadata = yaml.safe_load((first / "metadata.yaml").read_text())
+    about = metadata["rosbag2_bagfile_information"]
+    about["relative_file_paths"].append(file.name)
+    about["message_count"] *= 2
+    for topic in about["topics_with_message_count"]:
+        topic["message_count"] *= 2
+    (first / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    sequence = open_sequence(str(first))
+    order = [7, 0, 3, 4] * 5
+    with ThreadPoolExecutor(4) as threads:
+        frames = list(threads.map(sequence.read, order))
+    for index, frame in zip(order, frames, strict=True):
+        np.testing.assert_array_equal(frame.color, room.read(index + 1).color)
 
 
 @pytest.mark.parametrize("algorithm", list(Writer1.CompressionFormat))
