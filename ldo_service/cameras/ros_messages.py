@@ -1,17 +1,18 @@
-"""Decoding of ROS 2 images and camera infos from the CDR that a bridge forwards.
+"""Decoding of ROS 2 images and camera infos from CDR, as a bridge forwards it or a bag stores it.
 
 Encodings are those of `sensor_msgs/image_encodings`; depth is in millimeters as 16UC1 and in meters
 as 32FC1 (REP 118).
 """
 
-from dataclasses import dataclass
+import struct
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 
 from ldo_service.errors import ConfigError, FrameError, install_command
-from ldo_service.geometry.codecs import read_image_size
+from ldo_service.geometry.codecs import PNG, decode_depth, read_image_size
 from ldo_service.schemas import CameraModel, CameraRgbd, Image
 from ldo_service.schemas.frames import MAX_PIXELS, ImageEncoding
 
@@ -30,6 +31,11 @@ DEPTH_KINDS: dict[str, tuple[ImageEncoding, str, float]] = {
 # Number of bytes before the PNG of compressed depth: a format and two quantization parameters.
 COMPRESSED_DEPTH_HEADER = 12
 PLUMB_BOB, RATIONAL, UNDISTORTED = "plumb_bob", "rational_polynomial", ("", "none")
+# Names of librealsense for plumb_bob. Its "inverse" model undistorts by inverting this polynomial.
+# The pixels of a lens with k1 = -0.06 agree within 0.03 px at 1280x720 (librealsense 2.55).
+REALSENSE_PLUMB_BOB = ("Brown Conrady", "Inverse Brown Conrady")
+IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +63,17 @@ def read_color(body: bytes, topic: str) -> RosImage:
     Raises:
         FrameError: The message is invalid, or its encoding is not supported.
     """
-    if is_compressed(topic):
-        return _compressed(_message(body, "sensor_msgs/msg/CompressedImage"), 0)
-    message = _message(body, "sensor_msgs/msg/Image")
+    return color_image(decoded(body, COMPRESSED_IMAGE if is_compressed(topic) else IMAGE))
+
+
+def color_image(message: Any) -> RosImage:
+    """Convert a decoded sensor_msgs/Image or sensor_msgs/CompressedImage to a color image.
+
+    Raises:
+        FrameError: The encoding is not supported, or the size does not fit the data.
+    """
+    if message.__msgtype__ == COMPRESSED_IMAGE:
+        return _compressed(message, 0)
     channels = COLOR_CHANNELS.get(message.encoding)
     if channels is None:
         raise FrameError(
@@ -83,14 +97,17 @@ def read_depth(body: bytes, topic: str) -> RosImage:
     Raises:
         FrameError: The message is invalid, or its encoding is not supported.
     """
-    if is_compressed(topic):
-        message = _message(body, "sensor_msgs/msg/CompressedImage")
-        if not message.format.startswith("16UC1"):
-            raise FrameError(
-                f"compressed depth format {message.format[:40]!r} is not supported, expected 16UC1."
-            )
-        return _compressed(message, COMPRESSED_DEPTH_HEADER, 1000.0)
-    message = _message(body, "sensor_msgs/msg/Image")
+    return depth_image(decoded(body, COMPRESSED_IMAGE if is_compressed(topic) else IMAGE))
+
+
+def depth_image(message: Any) -> RosImage:
+    """Convert a decoded sensor_msgs/Image or sensor_msgs/CompressedImage to a depth image.
+
+    Raises:
+        FrameError: The encoding is not supported, or the size does not fit the data.
+    """
+    if message.__msgtype__ == COMPRESSED_IMAGE:
+        return _compressed_depth(message)
     if message.encoding not in DEPTH_KINDS:
         raise FrameError(
             f"depth encoding {message.encoding[:40]!r} is not supported, expected one of "
@@ -113,7 +130,15 @@ def read_camera(body: bytes, is_rectified: bool) -> CameraModel:
     Raises:
         FrameError: The message is invalid, or its distortion model is not supported.
     """
-    info = _message(body, "sensor_msgs/msg/CameraInfo")
+    return camera_model(decoded(body, CAMERA_INFO), is_rectified)
+
+
+def camera_model(info: Any, is_rectified: bool) -> CameraModel:
+    """Convert a decoded sensor_msgs/CameraInfo to a camera model; see `read_camera`.
+
+    Raises:
+        FrameError: The message is invalid, or its distortion model is not supported.
+    """
     matrix = np.reshape(info.p, (3, 4)) if is_rectified else np.reshape(info.k, (3, 3))
     try:
         return CameraModel(
@@ -187,11 +212,16 @@ def typestore() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)  # Later versions did not change these messages.
 
 
-def _message(body: bytes, kind: str) -> Any:
+def decoded(body: bytes, kind: str) -> Any:
+    """Decode a message of a type, such as sensor_msgs/msg/Image, from CDR.
+
+    Raises:
+        FrameError: The bytes are not CDR of ROS 2, or not a message of this type.
+    """
     if body[:2] not in CDR_HEADERS:
         raise FrameError(
             f"{len(body)} bytes that begin with {body[:4].hex()} are not CDR of ROS 2. Check that "
-            "the bridge is zenoh-bridge-ros2dds."
+            "the bridge is zenoh-bridge-ros2dds, or that the bag was made by ROS 2."
         )
     store = typestore()
     try:
@@ -245,6 +275,33 @@ def _compressed(message: Any, start: int, depth_scale: float = 1.0) -> RosImage:
     return _ros_image(message, image, depth_scale)
 
 
+def _compressed_depth(message: Any) -> RosImage:
+    """Wrap compressed depth in millimeters, or decode compressed depth in meters.
+
+    The transport `compressedDepth` stores float depth as the 16-bit integers A / depth + B. Its
+    header has a format and the float32 numbers A and B. An integer of 0 means not measured.
+
+    Raises:
+        FrameError: The format is not supported, or the data are invalid.
+    """
+    if message.format.startswith("16UC1"):
+        # The transport `compressed` stores depth as plain PNG, without the header.
+        is_plain = message.data[: len(PNG)].tobytes() == PNG
+        return _compressed(message, 0 if is_plain else COMPRESSED_DEPTH_HEADER, 1000.0)
+    if not message.format.startswith("32FC1"):
+        raise FrameError(
+            f"compressed depth format {message.format[:40]!r} is not supported, expected 16UC1 or "
+            "32FC1."
+        )
+    stored = _compressed(message, COMPRESSED_DEPTH_HEADER)
+    image = stored.image
+    values = decode_depth(image.encoding, image.width, image.height, image.data).astype(np.float32)
+    _, A, B = struct.unpack("<iff", message.data[:COMPRESSED_DEPTH_HEADER].tobytes())
+    with np.errstate(all="ignore"):
+        depth_m = np.where(values > 0, np.float32(A) / (values - np.float32(B)), np.float32("nan"))
+    return replace(stored, image=Image.raw("f32", depth_m.astype(np.float32)))
+
+
 def _distortion(info: Any) -> tuple[float, ...]:
     """Return the distortion coefficients in the order of OpenCV, which ROS uses too.
 
@@ -254,9 +311,9 @@ def _distortion(info: Any) -> tuple[float, ...]:
     d = tuple(float(number) for number in info.d)
     if not any(d) or info.distortion_model in UNDISTORTED:
         return ()
-    if info.distortion_model not in (PLUMB_BOB, RATIONAL):
+    if info.distortion_model not in (PLUMB_BOB, RATIONAL, *REALSENSE_PLUMB_BOB):
         raise FrameError(
             f"distortion model {info.distortion_model!r} is not supported, expected {PLUMB_BOB} or "
-            f"{RATIONAL}. Subscribe to rectified images, and give --rectified."
+            f"{RATIONAL}. Use topics of rectified images; for `ldo publish ros2`, add --rectified."
         )
     return d

@@ -142,6 +142,7 @@ def verbs() -> dict[str, Callable[..., None]]:
         doctor,
         evaluate,
         export,
+        info,
         keys,
         models,
         publish,
@@ -159,6 +160,7 @@ def verbs() -> dict[str, Callable[..., None]]:
     return {
         "demo": demo.demo,
         "run": run.run,
+        "info": info.info,
         "eval": evaluate.evaluate,
         "suite": suite.suite,
         "query": query.query,

@@ -48,8 +48,8 @@ Source = Annotated[
     argument(
         metavar="SOURCE",
         help="data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet, one seq-XX of 7-Scenes, Open3D, "
-        "nerfstudio, Stray Scanner or Record3D, recognized by its files), a recording, or a "
-        "built-in scene synthetic:NAME; "
+        "nerfstudio, Stray Scanner or Record3D, recognized by its files), a bag of ROS, a "
+        "recording, or a built-in scene synthetic:NAME; "
         f"NAME is {', '.join(SCENES)}",
     ),
 ]

@@ -1,5 +1,6 @@
 """Settings of frame input, data sets, offline runs, service, recordings and viewer."""
 
+import re
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -31,15 +32,24 @@ class FrameSourceSettings:
 
 @dataclass(frozen=True, slots=True)
 class DatasetSettings:
-    """Data sets with separate cameras for depth and color (ScanNet, 7-Scenes)."""
+    """Data sets: registration of depth (ScanNet, 7-Scenes, bags), and topics of bags."""
 
     # True registers depth to the color camera. False uses the depth as it is in the files.
     register_depth: bool = False
     # Transform from depth to color coordinates: the 16 numbers of the 4x4 matrix, row by row, with
     # the translation in meters. Empty uses the transform of the data set.
     T_color_depth: tuple[float, ...] = ()
+    # Topics of the images in a bag of ROS, such as `[color=/a/image_raw, depth=/b/image_raw]`. A
+    # topic that is not listed is found by type and name.
+    topics: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for topic in self.topics:
+            if not re.fullmatch(r"(color|depth)=/\S+", topic):
+                raise ConfigError(
+                    f"dataset.topics={list(self.topics)} must be a list of color=/TOPIC and "
+                    "depth=/TOPIC."
+                )
         if len(self.T_color_depth) not in (0, 16):
             raise ConfigError(
                 f"dataset.T_color_depth={list(self.T_color_depth)} must be 16 numbers, the 4x4 "
@@ -52,11 +62,13 @@ class DatasetSettings:
         Raises:
             ConfigError: T_color_depth is not a rigid transform.
         """
-        if not self.T_color_depth:
-            return SequenceOptions(register_depth=self.register_depth)
-        T_color_depth = np.array(self.T_color_depth).reshape(4, 4)
+        T_color_depth = np.array(self.T_color_depth).reshape(4, 4) if self.T_color_depth else None
         try:
-            return SequenceOptions(register_depth=self.register_depth, T_color_depth=T_color_depth)
+            return SequenceOptions(
+                register_depth=self.register_depth,
+                T_color_depth=T_color_depth,
+                topics=dict(topic.split("=", 1) for topic in self.topics),
+            )
         except ConfigError as error:
             values = list(self.T_color_depth)
             raise ConfigError(f"dataset.T_color_depth={values} must be rigid: {error}") from error

@@ -12,13 +12,14 @@ from .open3d import Open3dSequence
 from .record3d import Record3DSequence
 from .replica import ReplicaSequence
 from .rig import SequenceOptions
+from .ros_bag import RosBagSequence, is_bag
 from .scannet import ScanNetSequence
 from .sens import SensSequence
 from .seven_scenes import SevenScenesSequence
 from .stray_scanner import StrayScannerSequence
 from .tum import TumSequence
 
-__all__ = ["Cached", "Layout", "Sequence", "SequenceOptions", "open_sequence"]
+__all__ = ["Cached", "Layout", "Sequence", "SequenceOptions", "find_layout", "open_sequence"]
 
 # Layouts of this package. The first one that matches a path opens it.
 LAYOUTS = (
@@ -79,6 +80,14 @@ LAYOUTS = (
         SensSequence,
         has_options=True,
     ),
+    Layout(
+        "a bag of ROS 1 or ROS 2",
+        "a file .bag, .mcap or .db3, or a folder with metadata.yaml",
+        is_bag,
+        RosBagSequence,
+        has_options=True,
+        has_topics=True,
+    ),
 )
 
 
@@ -107,11 +116,8 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     path = Path(source).expanduser()
     if not path.exists():
         raise DataError(f"{source} does not exist. Expected one of these: {_known()}.")
-    # Other packages are loaded only if no layout of this package matches.
-    for layouts in (lambda: LAYOUTS, registered_layouts):
-        for layout in layouts():
-            if layout.matches(path):
-                return layout.open_sequence(path, options)
+    if layout := find_layout(path):
+        return layout.open_sequence(path, options)
     if parts := sorted(part.parent.name for part in path.glob("seq-*/frame-000000.color.*")):
         raise DataError(
             f"{path} contains several sequences of 7-Scenes. Give one of them, such as "
@@ -119,6 +125,18 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
         )
     kind = "folder" if path.is_dir() else "file"
     raise DataError(f"the {kind} {path} has no known layout. Known layouts: {_known()}.")
+
+
+def find_layout(path: Path) -> Layout | None:
+    """Return the layout that a path has, or None if it has none of the known layouts.
+
+    Other packages are loaded only if no layout of this package matches.
+    """
+    for layouts in (lambda: LAYOUTS, registered_layouts):
+        for layout in layouts():
+            if layout.matches(path):
+                return layout
+    return None
 
 
 def _known() -> str:

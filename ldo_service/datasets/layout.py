@@ -36,6 +36,7 @@ class Layout:
             ConfigError for options that do not fit.
         has_options: True if `open` accepts options other than the defaults. These register the
             depth to the color camera.
+        has_topics: True if `open` accepts the options that name topics.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Layout:
     matches: Callable[[Path], bool]
     open: Callable[[Path, SequenceOptions], Sequence]
     has_options: bool = False
+    has_topics: bool = False
 
     def open_sequence(self, path: Path, options: SequenceOptions) -> Sequence:
         """Open a path that has the layout.
@@ -56,6 +58,8 @@ class Layout:
                 f"the depth of {path} ({self.name}) is registered to color already. Remove the "
                 "registration options."
             )
+        if options.topics and not self.has_topics:
+            raise ConfigError(f"{path} ({self.name}) has no topics. Remove dataset.topics.")
         return self.open(path, options)
 
 

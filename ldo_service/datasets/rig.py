@@ -1,5 +1,6 @@
 """Color and depth cameras of a sensor, and registration between them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -65,7 +66,7 @@ class Rig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceOptions:
-    """Options for layouts with unregistered depth: ScanNet and 7-Scenes.
+    """Options for layouts with unregistered depth (ScanNet, 7-Scenes, bags) or topics (bags).
 
     Raises:
         ConfigError: T_color_depth is not a rigid transform.
@@ -78,6 +79,8 @@ class SequenceOptions:
     color_camera: Camera | None = None
     depth_camera: Camera | None = None
     T_color_depth: np.ndarray | None = None  # Depth to color coordinates, [4, 4], meters.
+    # Topics in a bag, by stream ("color" or "depth"); others are found by type and name.
+    topics: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.T_color_depth is not None and not is_rigid(self.T_color_depth):
@@ -88,7 +91,7 @@ class SequenceOptions:
 
     @property
     def is_default(self) -> bool:
-        """True if no option is set."""
+        """True if no option of the registration is set."""
         return not self.register_depth and not self._given()
 
     def over(self, rig: Rig) -> Rig:

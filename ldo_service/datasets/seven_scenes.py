@@ -57,6 +57,7 @@ class SevenScenesSequence(Sequence):
         self._is_registering = options.register_depth
         camera = self._rig.color_camera if options.register_depth else self._rig.depth_camera
         super().__init__(name_of(folder), camera, self._files.stamps_ns)
+        self.registration = "reader" if self._is_registering else "none"
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""

@@ -83,6 +83,7 @@ class TumSequence(Sequence):
         calibration = _calibration(folder, [folder / file for file, _ in self._files])
         self.depth_scale = calibration.depth_scale
         super().__init__(name_of(folder), calibration.camera, color.stamps_ns[pairs[:, 0]])
+        self.depth_offsets_ns = depth.stamps_ns[pairs[:, 1]] - self.stamps_ns
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""

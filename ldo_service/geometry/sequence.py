@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -40,7 +41,13 @@ class Sequence(ABC):
         name: Name of the sequence in tables of results.
         raw_camera: Intrinsics with lens distortion.
         stamps_ns: Stamps, [len] int64, ascending.
+        depth_offsets_ns: Stamps of the depth images minus `stamps_ns`, [len] int64; None if depth
+            has no stamps of its own.
+        registration: Where depth is registered to color: in the source, by `read`, or nowhere.
     """
+
+    depth_offsets_ns: np.ndarray | None = None
+    registration: Literal["source", "reader", "none"] = "source"
 
     def __init__(self, name: str, raw_camera: Camera, stamps_ns: np.ndarray) -> None:
         self.name = name
@@ -93,6 +100,8 @@ class Cached(Sequence):
 
     def __init__(self, sequence: Sequence) -> None:
         super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns)
+        self.depth_offsets_ns = sequence.depth_offsets_ns
+        self.registration = sequence.registration
         self._sequence = sequence
         self._frames: dict[int, RawFrame] = {}
 

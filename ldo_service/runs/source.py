@@ -17,7 +17,8 @@ from ldo_service.conversions.frames import (
     raw_frame_to_message,
 )
 from ldo_service.conversions.poses import pose_to_message
-from ldo_service.datasets import SequenceOptions, open_sequence
+from ldo_service.datasets import SequenceOptions, find_layout, open_sequence
+from ldo_service.datasets.bag_file import is_bag
 from ldo_service.datasets.files import name_of
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
@@ -149,7 +150,27 @@ def open_source(source: str, options: SequenceOptions | None = None) -> Sequence
         DataError: The source cannot be read.
     """
     folder = Path(source).expanduser()
-    return RecordingSequence(folder) if recorded_actors(folder) else open_sequence(source, options)
+    return RecordingSequence(folder) if _is_recording(folder) else open_sequence(source, options)
+
+
+def layout_of(source: str) -> str:
+    """Return the name of the layout of a source, for users; a source that does not exist has none.
+
+    Raises:
+        ConfigError: A layout of another package cannot be loaded.
+    """
+    path = Path(source).expanduser()
+    if source.partition(":")[0] == "synthetic":
+        return "a built-in scene"
+    if _is_recording(path):
+        return "a recording of `ldo record`"
+    layout = find_layout(path)
+    return "none" if layout is None else layout.name
+
+
+def _is_recording(folder: Path) -> bool:
+    """Return whether a folder is a recording, and no bag of ROS 2 with files of similar names."""
+    return bool(recorded_actors(folder)) and not is_bag(folder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,6 +246,10 @@ class RecordingSequence(Sequence):
             )
         stamps_ns = np.array([frame.color.stamp_ns for frame in self._frames], np.int64)
         super().__init__(name_of(folder), self._camera(folder), stamps_ns)
+        if all(frame.depth for frame in self._frames):
+            depth_stamps_ns = [frame.depth.stamp_ns for frame in self._frames if frame.depth]
+            self.depth_offsets_ns = np.array(depth_stamps_ns, np.int64) - stamps_ns
+            self.registration = "reader"
 
     def _camera(self, folder: Path) -> Camera:
         """Return the camera of the first frame that can be read."""

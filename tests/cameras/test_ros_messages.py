@@ -1,5 +1,6 @@
 """Images and camera infos in CDR, serialized by rosbags; invalid messages raise FrameError."""
 
+import struct
 import sys
 
 import cv2
@@ -162,10 +163,39 @@ def test_cdr_of_another_version_is_rejected() -> None:
         read_color(b"\0\7\0\0" + cdr(image("rgb8", COLOR))[4:], "/image_raw")
 
 
-@pytest.mark.parametrize("kind", ["32FC1; compressedDepth png", "jpeg"])
+@pytest.mark.parametrize("kind", ["8UC1; compressedDepth png", "jpeg"])
 def test_compressed_depth_of_another_kind_is_rejected(kind: str) -> None:
-    with pytest.raises(FrameError, match="16UC1"):
+    with pytest.raises(FrameError, match="16UC1 or 32FC1"):
         read_depth(cdr(compressed(kind, bytes(12) + PNG16)), "/depth/compressedDepth")
+
+
+def test_compressed_depth_in_meters_is_decoded() -> None:
+    """The quantization is that of compressed_depth_image_transport with its default settings."""
+    depth_m = np.linspace(0.3, 9.9, DEPTH_MM.size, dtype=np.float32).reshape(DEPTH_MM.shape)
+    A = 100.0 * (100.0 + 1.0)
+    B = 1.0 - A / 10.0
+    stored = (A / depth_m + B).astype(np.uint16)
+    stored[0, 0] = 0
+    png = cv2.imencode(".png", stored)[1].tobytes()
+    message = compressed("32FC1; compressedDepth png", struct.pack("<iff", 0, A, B) + png)
+    read = depth_m_of(read_depth(cdr(message), "/depth/compressedDepth"))
+    assert np.isnan(read[0, 0])
+    # A step of the integer changes the depth by depth^2 / A.
+    error_m = np.abs(read - depth_m).reshape(-1)[1:]
+    assert (error_m <= (depth_m * depth_m / A * 1.05).reshape(-1)[1:]).all()
+
+
+@pytest.mark.parametrize("length", [0, 5, 12, 30])
+def test_truncated_compressed_depth_is_rejected(length: int) -> None:
+    body = struct.pack("<iff", 0, 1.0, 1.0) + PNG16
+    with pytest.raises(FrameError, match="neither PNG nor JPEG"):
+        read_depth(cdr(compressed("32FC1; compressedDepth png", body[:length])), "/d/compressed")
+
+
+def test_depth_as_plain_png_is_read() -> None:
+    message = compressed("16UC1; png compressed", PNG16)
+    read = read_depth(cdr(message), "/depth/image_raw/compressed")
+    np.testing.assert_array_equal(depth_m_of(read), DEPTH_MM / 1000)
 
 
 def test_compressed_data_without_an_image_are_rejected() -> None:

@@ -34,7 +34,7 @@ def test_default_print_has_public_and_changed_settings_only() -> None:
     settings = settings_of(Config())
     lines = explained_yaml(Config()).splitlines()
     printed = [line for line in lines if "  # " in line]
-    assert len(printed) == sum(setting.is_public for setting in settings) == 65
+    assert len(printed) == sum(setting.is_public for setting in settings) == 66
     all_lines = explained_yaml(Config(), with_advanced=True).splitlines()
     assert len([line for line in all_lines if "  # " in line]) == len(settings)
     assert "pyramid_levels" not in explained_yaml(Config())
@@ -122,6 +122,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
             "tracker.T_base_camera.quaternion_wxyz=[1.0, 1.0, 0.0, 0.0] must have norm 1",
         ),
         ("dataset.T_color_depth=[1, 0]", "dataset.T_color_depth=[1.0, 0.0] must be 16 numbers"),
+        ("dataset.topics=[ir=/a]", "dataset.topics=['ir=/a'] must be a list of color=/TOPIC and"),
     ],
 )
 def test_invalid_setting_is_refused_with_the_reason(setting: str, expected: str) -> None:

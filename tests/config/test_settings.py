@@ -44,7 +44,7 @@ def test_the_number_and_the_depth_of_settings_stay_small() -> None:
         f"{len(paper)} of the paper; deepest path: {deepest} levels"
     )
     assert len(SETTINGS) - len(paper) <= 150
-    assert len(public) == 65
+    assert len(public) == 66
     assert not any(s.is_public for s in paper)
     assert deepest <= 4
 
@@ -123,7 +123,8 @@ def other_values(setting: Setting) -> list[Any]:
             rules = ["yolov8", "semantic", "fixed", "iou", "box", "paper"]
             return ["elsewhere", *rules]
         case _:
-            return [["x {}"], ["optimizer"], [0.5, 0.5, 0.5], [2, 2], [0.6, 0.8, 0, 0], [1.0] * 16]
+            names = [["x {}"], ["optimizer"], ["color=/a"]]
+            return [*names, [0.5, 0.5, 0.5], [2, 2], [0.6, 0.8, 0, 0], [1.0] * 16]
 
 
 @pytest.mark.parametrize("setting", SETTINGS, ids=ids)

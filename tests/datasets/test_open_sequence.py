@@ -70,9 +70,9 @@ def test_folder_of_unknown_layout_lists_the_expected_files(tmp_path: Path) -> No
 def test_missing_folder_and_file_have_different_messages(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"does not exist.*TUM"):
         open_sequence(str(tmp_path / "nowhere"))
-    (tmp_path / "a.mcap").touch()
+    (tmp_path / "a.txt").touch()
     with pytest.raises(DataError, match=r"the file .*no known layout"):
-        open_sequence(str(tmp_path / "a.mcap"))
+        open_sequence(str(tmp_path / "a.txt"))
 
 
 def test_every_message_is_one_paragraph(tmp_path: Path) -> None:
@@ -112,6 +112,29 @@ def test_frame_of_each_format_can_be_sent(write: Callable[[Path], Path], tmp_pat
     found = raw_frame_from_message(decode(body, CameraRgbd), 1)
     assert (found.camera, found.stamp_ns) == (raw.camera, raw.stamp_ns)
     assert np.array_equal(found.depth, raw.depth)
+
+
+def test_every_layout_says_where_depth_is_registered(
+    tum_folder: Callable[..., Path],
+    replica_folder: Callable[..., Path],
+    scannet_folder: Callable[..., Path],
+    seven_scenes_folder: Callable[..., Path],
+) -> None:
+    moved = np.eye(4)
+    moved[0, 3] = 0.02
+    seven_scenes = str(seven_scenes_folder([0, 1]))
+    assert open_sequence(str(tum_folder(["1"], ["1.01"]))).registration == "source"
+    assert open_sequence(str(replica_folder([0]))).registration == "source"
+    assert open_sequence(str(scannet_folder([0, 1], moved))).registration == "reader"
+    assert open_sequence(seven_scenes).registration == "none"
+    registered = open_sequence(seven_scenes, SequenceOptions(register_depth=True))
+    assert registered.registration == "reader"
+
+
+def test_stamps_of_depth_are_kept(tum_folder: Callable[..., Path]) -> None:
+    offsets_ns = open_sequence(str(tum_folder(["1", "2"], ["1.01", "1.995"]))).depth_offsets_ns
+    assert offsets_ns is not None
+    assert offsets_ns.tolist() == [10_000_000, -5_000_000]
 
 
 # --- layouts of other packages --------------------------------------------------------------------

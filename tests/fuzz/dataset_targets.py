@@ -1,6 +1,7 @@
 """Fuzz targets for data sets: each kind of file in each layout, next to valid files."""
 
 import json
+import tempfile
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -11,6 +12,8 @@ import cv2
 import numpy as np
 
 from ldo_service.datasets import open_sequence
+from ldo_service.geometry import Camera, RawFrame
+from tests.datasets.bags import COLOR_INFO, info_of, lossless, write_bag
 from tests.datasets.recordings import (
     change_archive,
     small_frames,
@@ -138,10 +141,32 @@ def in_r3d(name: str) -> Target:
     return Target(f"Record3D: {name}", as_file("a.r3d", frames_of_archive), [seed])
 
 
+def bag(kind: str, *files: str) -> list[bytes]:
+    """Return the files of a bag with two frames."""
+    camera = Camera(WIDTH, HEIGHT, 40.0, 41.0, 19.5, 15.5, (0.1, 0, 0, 0, 0))
+    entries = [(1, COLOR_INFO, info_of(camera))]
+    for stamp_ns in (10**9, 2 * 10**9):
+        raw = RawFrame(0, stamp_ns, COLOR, DEPTH, 1000.0, camera)
+        entries += [(stamp_ns, topic, message) for topic, message in lossless(raw)]
+    with tempfile.TemporaryDirectory() as name:
+        path = write_bag(Path(name), kind, entries)
+        return [(path / file).read_bytes() for file in files] or [path.read_bytes()]
+
+
+MCAP, METADATA = bag("mcap", "bag.mcap", "metadata.yaml")
+
 TARGETS = [
-    Target(f"{layout}: {name}", in_folder(name, frames_of, files), [body])
-    for layout, files in LAYOUTS.items()
-    for name, body in files.items()
+    *(
+        Target(f"{layout}: {name}", in_folder(name, frames_of, files), [body])
+        for layout, files in LAYOUTS.items()
+        for name, body in files.items()
+    ),
+    Target("bag of ROS 1", as_file("bag.bag", frames_of), bag("ros1")),
+    Target("bag in MCAP", as_file("bag.mcap", frames_of), [MCAP]),
+    Target("bag in sqlite", as_file("bag.db3", frames_of), bag("sqlite3", "bag.db3")),
+    Target(
+        "metadata of a bag", in_folder("metadata.yaml", frames_of, {"bag.mcap": MCAP}), [METADATA]
+    ),
 ]
 TARGETS += [
     Target("Record3D", as_file("a.r3d", frames_of), [R3D]),

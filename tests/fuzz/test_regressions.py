@@ -11,7 +11,7 @@ import pytest
 from ldo_service.storage.state_store import STATE_VERSION
 
 from .dataset_targets import COLOR as IMAGE
-from .dataset_targets import STRAY, jpeg, png
+from .dataset_targets import MCAP, METADATA, STRAY, jpeg, png
 from .run_folder_targets import RUN, SEMANTICS, bytes_of, gaussians_of_a_chunk, record
 from .targets import TARGETS
 
@@ -22,6 +22,8 @@ LARGE_JPEG = jpeg(IMAGE).replace(struct.pack(">HH", *IMAGE.shape[:2]), b"\x7f\xf
 LOOPS = RUN["loops.json"]
 ENCRYPTED = re.sub(rb"(PK\x01\x02.{4})..", b"\\g<1>\x01\x00", SEMANTICS, flags=re.DOTALL)
 CHUNK = gaussians_of_a_chunk()
+# The channel, the number and both times of the first message; its time is outside its chunk.
+FIRST, LATE = struct.pack("<HIQQ", 1, 0, 1, 1), struct.pack("<HIQQ", 1, 0, 1 << 32, 1)
 LARGE_CHUNK = CHUNK[:4] + b"\xe0" + b"\xff" * 7 + b"\x0f" + CHUNK[6:]  # The stated size is 10^18.
 
 FOUND = [
@@ -55,6 +57,8 @@ FOUND = [
     ("keyframes.json", RUN["keyframes.json"].replace(b'"keyframe": 0', b'"keyframe": 1e999')),
     ("chunk of Gaussians", LARGE_CHUNK),
     ("recording as a data set", bytes_of(lambda path: record(path, stamp_ns=2**63))),
+    ("bag in MCAP", MCAP.replace(FIRST, LATE)),
+    ("metadata of a bag", METADATA.replace(b"message_count: 2", b"message_count: null")),
     ("config.yaml", DEEP_YAML),
     ("config.yaml", b"tracker: 2027-13-45\n"),
     ("--set", b"tracker.hold_out=" + b"[" * 3000),

@@ -1,0 +1,101 @@
+"""Command `ldo info`."""
+
+import json
+from dataclasses import asdict
+from datetime import UTC, datetime
+from typing import Annotated
+
+from rich.console import Console
+from rich.table import Table
+
+from ldo_service.config import load_config
+from ldo_service.runs.source import layout_of, open_source
+from ldo_service.runs.source_info import SourceInfo, describe, estimated_run_s
+
+from .options import ConfigFile, Json, Settings, Source, argument
+
+FIRST_UNIX_S = 946_684_800  # The year 2000. A smaller stamp is no time of day.
+REGISTRATION = {
+    "source": "registered to color in the source",
+    "reader": "registered to color when a frame is read",
+    "none": "not registered to color; set dataset.register_depth=true",
+}
+
+
+def info(
+    source: Source,
+    config: ConfigFile = None,
+    set: Settings = (),
+    probe: Annotated[
+        int | None, argument(metavar="N", help="estimate the time of a run from N frames")
+    ] = None,
+    json_: Annotated[Json, argument(name="json")] = False,
+) -> None:
+    """Print what is in a source: frames, rate, gaps, calibration, depth and ground truth.
+
+    The command reads all stamps and five of the frames. A gap is an interval of more than 1.5
+    median intervals. --probe runs the first N frames to estimate the time of `ldo run` on this
+    machine.
+
+      ldo info ~/data/rgbd_dataset_freiburg1_desk
+      ldo info synthetic:room --probe 30
+    """
+    layout = layout_of(source)
+    settings = load_config(config, set)
+    sequence = open_source(source, settings.dataset.options())
+    found = describe(sequence)
+    run_s = None if probe is None else estimated_run_s(sequence, settings, probe)
+    if json_:
+        about = {"source": source, "layout": layout, "estimated_run_s": run_s}
+        print(json.dumps({**about, **asdict(found)}, indent=1))
+        return
+    table = Table(title=source, show_header=False)
+    for name, value in _rows(layout, found).items():
+        table.add_row(name, value)
+    if run_s is not None:
+        table.add_row("time of `ldo run`", f"about {run_s:.0f} s on this machine")
+    Console().print(table)
+
+
+def _rows(layout: str, found: SourceInfo) -> dict[str, str]:
+    timing, camera, depth = found.timing, found.camera, found.depth
+    rate = f"{timing.rate_hz:.2f} Hz" if timing.rate_hz else "unknown"
+    distortion = ", ".join(f"{k:g}" for k in camera["distortion"]) or "none"
+    unreadable = f"{found.unreadable_frames} of {found.sampled_frames} sampled frames"
+    return {
+        "layout": layout,
+        "frames": f"{timing.frames} in {timing.duration_s:.1f} s, at {rate}",
+        "first stamp": _stamp(timing.first_stamp_s),
+        "gaps": _gaps(found),
+        "camera": f"{camera['width']}x{camera['height']}, fx {camera['fx']:g}, fy "
+        f"{camera['fy']:g}, cx {camera['cx']:g}, cy {camera['cy']:g}",
+        "distortion": distortion,
+        "depth": REGISTRATION[depth.registration],
+        "depth after color": _offset(found),
+        "valid depth": "unknown"
+        if depth.valid_ratio is None
+        else f"{depth.valid_ratio:.1%} of the pixels, median {depth.median_m or 0:.2f} m",
+        **({"unreadable": unreadable} if found.unreadable_frames else {}),
+        "ground truth": f"{found.true_poses} poses" if found.true_poses else "none",
+        **({"true labels": "yes"} if found.has_true_labels else {}),
+    }
+
+
+def _stamp(stamp_s: float) -> str:
+    if stamp_s < FIRST_UNIX_S:
+        return f"{stamp_s:.3f} s"
+    return f"{stamp_s:.3f} s ({datetime.fromtimestamp(stamp_s, UTC):%Y-%m-%d %H:%M:%S} UTC)"
+
+
+def _gaps(found: SourceInfo) -> str:
+    timing = found.timing
+    if not timing.gaps or timing.longest_interval_s is None:
+        return "none"
+    return f"{timing.gaps}, the longest of {timing.longest_interval_s:.3f} s"
+
+
+def _offset(found: SourceInfo) -> str:
+    depth = found.depth
+    if depth.offset_ms is None or depth.max_offset_ms is None:
+        return "one stamp for both"
+    return f"{depth.offset_ms:.1f} ms (median), at most {depth.max_offset_ms:.1f} ms apart"

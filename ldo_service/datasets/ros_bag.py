@@ -1,0 +1,388 @@
+"""Sequences in bags of ROS 1 and ROS 2: RGB-D cameras, and recordings of RealSense Viewer.
+
+A bag needs three topics: color images, depth images, and the camera info of color. They are found
+by their types and usual names, or by `SequenceOptions`. The images are sensor_msgs/Image or
+sensor_msgs/CompressedImage. Each color image has the nearest depth image within 20 ms.
+
+Depth is registered to color in the file if both images have the same size and the same frame, or
+if the name of the depth topic says so. Otherwise, depth is registered here, with the camera info of
+depth and the transform between both frames in /tf_static. Imu, odometry and moving transforms are
+not used.
+"""
+
+import logging
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from msgspec import structs
+
+from ldo_service.cameras.ros_messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    RosImage,
+    camera_model,
+    color_image,
+    depth_image,
+)
+from ldo_service.errors import ConfigError, DataError, FrameError
+from ldo_service.geometry import Camera, RawFrame, Trajectory, associate, codecs, se3
+from ldo_service.geometry.frames import in_meters
+from ldo_service.geometry.sequence import Sequence
+
+from .bag_file import BagFile, StoredMessage, Topic, is_bag
+from .files import name_of
+from .rig import Rig, SequenceOptions
+
+__all__ = ["RosBagSequence", "is_bag"]
+
+log = logging.getLogger(__name__)
+
+# Maximum stamp difference of paired color and depth images, as for TUM sequences.
+MAX_SKEW_NS = 20_000_000
+MAX_STATIC = 1000  # Maximum number of messages that are read of a topic with constant content.
+TRIES = 10  # Number of first images of a topic of which one must be readable.
+
+# Names of topics, without the suffix of compressed images. An earlier pattern is preferred.
+COLOR_NAMES = (
+    r"(color|rgb)/image_raw$",
+    r"(color|rgb)/image(_raw)?_color$",
+    r"(color|rgb)/image_rect(_color|_raw)?$",
+    r"Color_\d+/image/data$",
+    r"color|rgb",
+)
+DEPTH_NAMES = (
+    r"(aligned_depth_to|depth_to)_(color|rgb)/image_raw$",
+    r"depth_registered/(\w+/)?image(_raw|_rect|_rect_raw)?$",
+    r"depth/image(_raw|_rect|_rect_raw)?$",
+    r"Depth_\d+/image/data$",
+    r"depth",
+    r"stereo/image_raw$",  # DepthAI.
+)
+REGISTERED = re.compile(r"aligned_depth_to|depth_to_(color|rgb)|depth_registered")
+NOT_COLOR = re.compile(r"depth|mono|infra|confidence", re.IGNORECASE)
+NOT_DEPTH = re.compile(r"(color|rgb)_to_depth|confidence|points", re.IGNORECASE)
+COMPRESSED = re.compile(r"/(compressed|compressedDepth)$")
+
+
+class RosBagSequence(Sequence):
+    """Sequence of the RGB-D camera in a bag; the stamp of a frame is that of the color image."""
+
+    def __init__(self, path: Path, options: SequenceOptions) -> None:
+        """Open a bag and read the stamps of its images."""
+        self._bag = bag = BagFile(path)
+        color, depth = _image_topics(bag, options)
+        messages = bag.messages((color, depth))
+        colors, depths = (_ascending(messages, topic) for topic in (color, depth))
+        stamps_ns, depth_stamps_ns = (
+            np.array([message.stamp_ns for message in stream], np.int64)
+            for stream in (colors, depths)
+        )
+        pairs = associate(stamps_ns, depth_stamps_ns, MAX_SKEW_NS)
+        if len(pairs) == 0:
+            raise DataError(
+                f"{path}: none of the {len(colors)} images of {color.name} is within 20 ms of any "
+                f"of the {len(depths)} images of {depth.name}. Check that one clock made the "
+                "stamps of both."
+            )
+        if len(pairs) < len(colors):
+            log.info(
+                "%s: skipping %d of %d color images, which have no depth image within 20 ms.",
+                *(path, len(colors) - len(pairs), len(colors)),
+            )
+        self._frames = [(colors[i], depths[j]) for i, j in pairs]
+        camera = options.color_camera or _camera(bag, color)
+        self._rig = _rig(bag, color, depth, self._first_images(), camera, options)
+        self._units_per_m = _realsense_units_per_m(bag, depth)
+        super().__init__(name_of(path), camera, stamps_ns[pairs[:, 0]])
+        self.depth_offsets_ns = depth_stamps_ns[pairs[:, 1]] - self.stamps_ns
+        self.registration = "source" if self._rig is None else "reader"
+
+    def read(self, index: int) -> RawFrame:
+        """Return a frame; see `Sequence.read`."""
+        color, depth = self._images(index)
+        image = color.image
+        pixels = codecs.decode_color(image.encoding, image.width, image.height, image.data)
+        image = depth.image
+        values = codecs.decode_depth(image.encoding, image.width, image.height, image.data)
+        is_integer = values.dtype == np.uint16
+        depth_scale = (is_integer and self._units_per_m) or depth.depth_scale
+        if self._rig is not None:
+            values, depth_scale = self._rig.register(in_meters(values, depth_scale)), 1.0
+        stamp_ns = int(self.stamps_ns[index])
+        return RawFrame(index, stamp_ns, pixels, values, depth_scale, self.raw_camera)
+
+    def truth(self) -> Trajectory | None:
+        """Return None, because a bag has no ground truth."""
+        return None
+
+    def _images(self, index: int) -> tuple[RosImage, RosImage]:
+        color, depth = self._frames[index]
+        return color_image(self._bag.read(color)), depth_image(self._bag.read(depth))
+
+    def _first_images(self) -> tuple[RosImage, RosImage]:
+        """Return the images of the first readable frame.
+
+        Raises:
+            DataError: None of the first frames can be read.
+        """
+        reason = ""
+        for index in range(min(TRIES, len(self._frames))):
+            try:
+                return self._images(index)
+            except FrameError as error:
+                reason = reason or str(error)
+        raise DataError(f"{self._bag.path}: its first frames cannot be read: {reason}")
+
+
+def _ascending(messages: list[StoredMessage], topic: Topic) -> list[StoredMessage]:
+    """Return the messages of a topic by ascending stamp; the first one of equal stamps."""
+    found: dict[int, StoredMessage] = {}
+    for message in messages:
+        if message.connection.topic == topic.name:
+            found.setdefault(message.stamp_ns, message)
+    return [found[stamp_ns] for stamp_ns in sorted(found)]
+
+
+# --- topics ---------------------------------------------------------------------------------------
+def _image_topics(bag: BagFile, options: SequenceOptions) -> tuple[Topic, Topic]:
+    """Return the topics of color and depth.
+
+    Raises:
+        DataError: A topic is missing, or several fit.
+        ConfigError: A topic of the options is not in the bag.
+    """
+    color = _topic(bag, "color", options.topics.get("color", ""), COLOR_NAMES, NOT_COLOR, None)
+    return color, _topic(
+        bag, "depth", options.topics.get("depth", ""), DEPTH_NAMES, NOT_DEPTH, color
+    )
+
+
+def _topic(
+    bag: BagFile,
+    stream: str,
+    given: str,
+    names: tuple[str, ...],
+    excluded: re.Pattern[str],
+    beside: Topic | None,
+) -> Topic:
+    """Return the topic of a stream.
+
+    Args:
+        bag: The bag.
+        stream: "color" or "depth".
+        given: Name of the topic in the options; empty searches it.
+        names: Patterns of usual names, the preferred one first.
+        excluded: Pattern of names that belong to other streams.
+        beside: Topic of the same camera; topics that share its namespace are preferred.
+    """
+    images = [t for t in bag.topics.values() if t.kind in (IMAGE, COMPRESSED_IMAGE) and t.count]
+    setting = f"dataset.topics=[{stream}="
+    if given:
+        for topic in images:
+            if topic.name == given:
+                return topic
+        raise ConfigError(
+            f"{setting}{given}] names no topic with images in {bag.path}. "
+            f"{_listed('Its topics with images', images)}."
+        )
+    ranked: dict[tuple[int, int, int], list[Topic]] = {}
+    for topic in images:
+        name = COMPRESSED.sub("", topic.name)
+        ranks = [k for k, known in enumerate(names) if re.search(known, name, re.IGNORECASE)]
+        if ranks and not excluded.search(name):
+            distance = -_common_parts(topic.name, beside.name) if beside else 0
+            rank = distance, ranks[0], int(topic.kind == COMPRESSED_IMAGE)
+            ranked.setdefault(rank, []).append(topic)
+    if not ranked:
+        raise DataError(
+            f"{bag.path} has no topic that is known to have {stream} images. "
+            f"{_listed('Its topics', [t for t in bag.topics.values() if t.count])}. If one of them "
+            f"has {stream} images (sensor_msgs/Image or CompressedImage), name it by --set "
+            f"'{setting}/TOPIC]'."
+        )
+    best = ranked[min(ranked)]
+    if len(best) > 1:
+        raise DataError(
+            f"{bag.path} has several topics with {stream} images: "
+            f"{', '.join(topic.name for topic in best)}. Choose one by --set "
+            f"'{setting}{best[0].name}]'."
+        )
+    return best[0]
+
+
+def _common_parts(a: str, b: str) -> int:
+    """Return the number of first parts that the names of two topics share."""
+    parts = zip(a.strip("/").split("/"), b.strip("/").split("/"), strict=False)
+    return next((k for k, (x, y) in enumerate(parts) if x != y), 99)
+
+
+def _listed(title: str, topics: list[Topic]) -> str:
+    if not topics:
+        return f"{title}: none"
+    shown = ", ".join(f"{topic.name} ({topic.kind.replace('/msg/', '/')})" for topic in topics[:20])
+    return f"{title}: {shown}" + (f" and {len(topics) - 20} more" if len(topics) > 20 else "")
+
+
+# --- calibration ----------------------------------------------------------------------------------
+def _info_topic(bag: BagFile, image: Topic) -> Topic | None:
+    """Return the topic of the camera info of an image topic, or None if there is none."""
+    name = COMPRESSED.sub("", image.name)
+    folder = name.rpartition("/")[0]
+    for info in (
+        f"{folder}/camera_info",
+        f"{name}/camera_info",
+        f"{folder.removesuffix('/image')}/info/camera_info",  # RealSense Viewer.
+        f"{folder.rpartition('/')[0]}/camera_info",
+    ):
+        topic = bag.topics.get(info)
+        if topic is not None and topic.kind == CAMERA_INFO and topic.count:
+            return topic
+    return None
+
+
+def _camera(bag: BagFile, image: Topic) -> Camera:
+    """Return the camera of an image topic; that of rectified images has no distortion.
+
+    Raises:
+        DataError: There is no camera info, or it is invalid.
+    """
+    topic = _info_topic(bag, image)
+    if topic is None:
+        folder = COMPRESSED.sub("", image.name).rpartition("/")[0]
+        infos = [t for t in bag.topics.values() if t.kind == CAMERA_INFO]
+        raise DataError(
+            f"{bag.path} has no camera info of {image.name}. Expected sensor_msgs/CameraInfo on "
+            f"{folder}/camera_info. {_listed('Its topics of this type', infos)}. Record this topic "
+            "too, or choose other images by dataset.topics."
+        )
+    is_rectified = "rect" in COMPRESSED.sub("", image.name).rpartition("/")[2]
+    try:
+        found = bag.messages([topic], limit=1)
+        if not found:
+            raise DataError("the index lists messages that are not in the file. Copy it again.")
+        model = camera_model(bag.read(found[0]), is_rectified)
+        return Camera.of(structs.asdict(model))
+    except (FrameError, DataError) as error:
+        raise DataError(f"{bag.path}, {topic.name}: {error}") from error
+
+
+def _rig(
+    bag: BagFile,
+    color: Topic,
+    depth: Topic,
+    images: tuple[RosImage, RosImage],
+    color_camera: Camera,
+    options: SequenceOptions,
+) -> Rig | None:
+    """Return the cameras for the registration of depth, or None if depth is registered already.
+
+    Raises:
+        DataError: The transform from depth to color, or the camera info of depth is unknown.
+    """
+    T_color_depth = options.T_color_depth
+    if T_color_depth is None:
+        T_color_depth = _transform(bag, color, depth, images)
+    sizes = {(image.image.width, image.image.height) for image in images}
+    is_one_view = Rig(color_camera, color_camera, T_color_depth).is_one_view
+    if is_one_view and len(sizes) == 1 and not options.register_depth:
+        return None
+    depth_camera = options.depth_camera or _camera(bag, depth)
+    return replace(options.over(Rig(color_camera, depth_camera)), T_color_depth=T_color_depth)
+
+
+def _transform(
+    bag: BagFile, color: Topic, depth: Topic, images: tuple[RosImage, RosImage]
+) -> np.ndarray:
+    """Return the transform [4, 4] from depth to color coordinates, in meters.
+
+    Raises:
+        DataError: The bag does not contain it.
+    """
+    if REGISTERED.search(depth.name):
+        return np.eye(4)
+    T_color_ref, T_depth_ref = (_realsense_extrinsics(bag, topic) for topic in (color, depth))
+    if T_color_ref is not None and T_depth_ref is not None:
+        return T_color_ref @ se3.inverse(T_depth_ref)
+    color_frame, depth_frame = (image.frame_id.lstrip("/") for image in images)
+    if color_frame == depth_frame:
+        return np.eye(4)
+    T_color_depth = _static_transform(bag, color_frame, depth_frame)
+    if T_color_depth is None:
+        raise DataError(
+            f"{bag.path}: the depth of {depth.name} is not registered to color. Its frame is "
+            f"{depth_frame!r}, that of color {color_frame!r}, and /tf_static does not connect "
+            "them. Record depth that is registered (realsense2_camera: align_depth.enable:=true), "
+            "or record /tf_static, or set dataset.T_color_depth."
+        )
+    return T_color_depth
+
+
+def _static_transform(bag: BagFile, target: str, source: str) -> np.ndarray | None:
+    """Return the transform [4, 4] from one frame to another in /tf_static, or None."""
+    edges: dict[str, dict[str, np.ndarray]] = {}
+    for message in _all_messages(bag, lambda topic: topic.name == "/tf_static"):
+        for stamped in getattr(message, "transforms", ()):
+            parent = stamped.header.frame_id.lstrip("/")
+            child = stamped.child_frame_id.lstrip("/")
+            T_parent_child = _matrix(stamped.transform)
+            if T_parent_child is not None:
+                edges.setdefault(child, {})[parent] = T_parent_child
+                edges.setdefault(parent, {})[child] = se3.inverse(T_parent_child)
+    found = {source: np.eye(4)}  # Transforms from `source` to each reached frame.
+    frames = [source]
+    for frame in frames:
+        for following, T_following_frame in edges.get(frame, {}).items():
+            if following not in found:
+                found[following] = T_following_frame @ found[frame]
+                frames.append(following)
+    return found.get(target)
+
+
+def _realsense_extrinsics(bag: BagFile, image: Topic) -> np.ndarray | None:
+    """Return the transform from the reference to a stream of RealSense Viewer (ROS 1), or None."""
+    base = COMPRESSED.sub("", image.name).removesuffix("/image/data")
+    topics = re.compile(re.escape(base) + r"/tf/\d+")
+    for message in _all_messages(bag, lambda topic: bool(topics.fullmatch(topic.name))):
+        return _matrix(message) if hasattr(message, "rotation") else None
+    return None
+
+
+def _realsense_units_per_m(bag: BagFile, depth: Topic) -> float | None:
+    """Return the depth units per meter that RealSense Viewer recorded, or None."""
+    sensor = re.match(r"/device_\d+/sensor_\d+/", depth.name)
+    if sensor is None:
+        return None
+    name = f"{sensor[0]}option/Depth_Units/value"
+    for message in _all_messages(bag, lambda topic: topic.name == name):
+        try:
+            # A float32, or text; rounding restores the decimal value.
+            unit_m = round(float(message.data), 9)
+        except (AttributeError, ValueError):
+            return None
+        return 1 / unit_m if 0 < unit_m < 1 else None
+    return None
+
+
+def _all_messages(bag: BagFile, is_wanted: Callable[[Topic], bool]) -> Iterator[Any]:
+    """Yield the messages of topics that can be read, at most MAX_STATIC of each."""
+    for topic in filter(is_wanted, bag.topics.values()):
+        for message in bag.messages([topic], MAX_STATIC):
+            try:
+                yield bag.read(message)
+            except FrameError as error:
+                log.warning("%s; no action needed if depth is registered.", error)
+
+
+def _matrix(transform: Any) -> np.ndarray | None:
+    """Return the matrix [4, 4] of a geometry_msgs/Transform, or None if it is invalid."""
+    q, t = transform.rotation, transform.translation
+    quaternion, translation = np.array([q.w, q.x, q.y, q.z]), np.array([t.x, t.y, t.z])
+    norm = float(np.linalg.norm(quaternion))
+    if not (0.9 < norm < 1.1 and np.all(np.isfinite(translation))):
+        return None
+    return se3.from_quaternion(translation, quaternion / norm)

@@ -1,0 +1,136 @@
+"""Description of a source of frames: rate, gaps, calibration, depth, and ground truth."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from ldo_service.config import Config
+from ldo_service.errors import FrameError
+from ldo_service.geometry.sequence import Sequence
+
+from .job import RunOptions
+from .offline import run_offline
+from .source import Selection
+
+MIN_GAP_PERIODS = 1.5  # An interval longer than this many median intervals is a gap.
+SAMPLES = 5  # Number of frames that are read, evenly spaced.
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Stamps of the frames of a source."""
+
+    frames: int
+    first_stamp_s: float
+    duration_s: float
+    rate_hz: float | None  # Inverse of the median interval; None for a single frame.
+    gaps: int  # Number of intervals longer than MIN_GAP_PERIODS median intervals.
+    longest_interval_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class DepthInfo:
+    """Depth of a source."""
+
+    registration: str  # See `Sequence.registration`.
+    # Stamp of depth minus stamp of color: median, and largest absolute value; None if unknown.
+    offset_ms: float | None
+    max_offset_ms: float | None
+    # Values of the sampled frames that can be read; None if there is none.
+    valid_ratio: float | None
+    median_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class SourceInfo:
+    """Description of a source."""
+
+    name: str
+    timing: Timing
+    camera: dict[str, Any]  # Fields of `Camera`.
+    depth: DepthInfo
+    sampled_frames: int
+    unreadable_frames: int  # Number of sampled frames that cannot be read.
+    true_poses: int  # Number of poses of the ground truth; 0 if there is none.
+    has_true_labels: bool
+
+
+def describe(sequence: Sequence) -> SourceInfo:
+    """Describe a sequence, after reading SAMPLES of its frames.
+
+    Raises:
+        DataError: The ground truth is invalid.
+    """
+    indices = np.unique(np.linspace(0, len(sequence) - 1, SAMPLES).round().astype(int))
+    depths_m = [_depth_m(sequence, int(index)) for index in indices if len(sequence)]
+    truth = sequence.truth()
+    return SourceInfo(
+        name=sequence.name,
+        timing=_timing(sequence.stamps_ns),
+        camera=asdict(sequence.raw_camera),
+        depth=_depth(sequence, [depth_m for depth_m in depths_m if depth_m is not None]),
+        sampled_frames=len(depths_m),
+        unreadable_frames=sum(depth_m is None for depth_m in depths_m),
+        true_poses=0 if truth is None else len(truth.stamps_s),
+        has_true_labels=sequence.true_labels() is not None,
+    )
+
+
+def estimated_run_s(sequence: Sequence, config: Config, frames: int) -> float:
+    """Estimate the time of an offline run over all frames, by a run over the first ones.
+
+    Args:
+        sequence: The sequence.
+        config: Configuration of the run.
+        frames: Number of frames of the short run.
+
+    Returns:
+        The time in seconds.
+
+    Raises:
+        LdoError: The short run fails as a whole run would.
+    """
+    selection = Selection(max_frames=frames)
+    with TemporaryDirectory() as name:
+        job = RunOptions(sequence, Path(name), config, selection, lambda _: None)
+        summary = run_offline(job, lambda *_: None).summary
+    return len(sequence) / summary["fps"]
+
+
+def _depth_m(sequence: Sequence, index: int) -> np.ndarray | None:
+    """Return the depth of a frame as the camera delivered it, or None if it cannot be read."""
+    try:
+        return sequence.read(index).depth_m()
+    except FrameError:
+        return None
+
+
+def _timing(stamps_ns: np.ndarray) -> Timing:
+    intervals_s = np.diff(stamps_ns) * 1e-9
+    period_s = float(np.median(intervals_s)) if len(intervals_s) else None
+    return Timing(
+        frames=len(stamps_ns),
+        first_stamp_s=float(stamps_ns[0]) * 1e-9 if len(stamps_ns) else 0.0,
+        duration_s=float(intervals_s.sum()),
+        rate_hz=1 / period_s if period_s else None,
+        gaps=int((intervals_s > MIN_GAP_PERIODS * period_s).sum()) if period_s else 0,
+        longest_interval_s=float(intervals_s.max()) if len(intervals_s) else None,
+    )
+
+
+def _depth(sequence: Sequence, depths_m: list[np.ndarray]) -> DepthInfo:
+    offsets_ns = sequence.depth_offsets_ns
+    valid = [depth_m[depth_m > 0] for depth_m in depths_m]
+    measured = np.concatenate(valid) if valid else np.empty(0)
+    pixels = sum(depth_m.size for depth_m in depths_m)
+    offsets_ms = None if offsets_ns is None or not len(offsets_ns) else offsets_ns * 1e-6
+    return DepthInfo(
+        registration=sequence.registration,
+        offset_ms=None if offsets_ms is None else float(np.median(offsets_ms)),
+        max_offset_ms=None if offsets_ms is None else float(np.abs(offsets_ms).max()),
+        valid_ratio=len(measured) / pixels if pixels else None,
+        median_m=float(np.median(measured)) if len(measured) else None,
+    )

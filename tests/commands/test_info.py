@@ -1,0 +1,30 @@
+"""The command `ldo info`."""
+
+import json
+from pathlib import Path
+
+from tests.commands.test_cli import assert_one_paragraph, ldo
+
+
+def test_command_prints_a_table_and_json(capsys, room_folder: Path) -> None:
+    code, out, _ = ldo(capsys, "info", room_folder)
+    assert code == 0
+    for text in ("TUM RGB-D", "16 in 0.5 s, at 30.00 Hz", "120 poses", "registered to color in"):
+        assert text in out
+    code, out, _ = ldo(capsys, "info", room_folder, "--json")
+    found = json.loads(out)
+    assert (code, found["layout"], found["timing"]["frames"]) == (0, "TUM RGB-D", 16)
+    assert found["estimated_run_s"] is None
+
+
+def test_probe_adds_the_time_of_a_run(capsys) -> None:
+    code, out, _ = ldo(capsys, "info", "synthetic:room", "--probe", "2")
+    assert code == 0
+    assert "time of `ldo run`" in out
+    assert "about" in out
+
+
+def test_source_that_does_not_exist_is_one_paragraph(capsys, tmp_path: Path) -> None:
+    code, _, err = ldo(capsys, "info", tmp_path / "nowhere")
+    assert code == 3
+    assert_one_paragraph(err)
