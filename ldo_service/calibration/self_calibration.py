@@ -342,8 +342,8 @@ class SelfCalibration:
         self._pairs = []
         for first, second, T_second_first in now["poses"]:
             pair = pair_of(self._views[first], self._views[second])
-            assert pair is not None
-            self._pairs.append(pair.at(T_second_first))
+            if pair is not None:  # A version may reject a pair that an earlier one accepted.
+                self._pairs.append(pair.at(T_second_first))
         # States of earlier versions lack some of the entries that are read by `get`.
         self._running, self._stage = None, int(now["stage"])
         self._timing = ShutterTiming.of(now.get("timing", {}))
@@ -353,8 +353,12 @@ class SelfCalibration:
         self._views_used = int(now["views_used"])
         if now["is_running"]:
             self._start(self._views_used)
-            for _ in range(int(now["parts_done"])):
-                self._continue()
+            # The parts of an earlier version, which lacks "views_estimated", were larger. Its
+            # estimate starts again.
+            parts = int(now["parts_done"]) if "views_estimated" in now else 0
+            for _ in range(parts):
+                if self._running is not None:
+                    self._continue()
 
     def metrics(self) -> dict[str, float]:
         """Return the number of views, and whether each correction is in use, 0 or 1."""

@@ -46,6 +46,8 @@ EXTRAS = {  # Optional extra of the package: modules that it installs.
     "keys": ("cryptography",),
     "realsense": ("pyrealsense2",),
     "ros2": ("rosbags",),
+    "bags": ("rosbags",),
+    "phones": ("av", "liblzfse"),
 }
 REINSTALL = "`.venv/bin/pip install -e .` in the clone of LDO-SLAM installs all libraries."
 LISTEN_S = 1.5  # Three heartbeats.

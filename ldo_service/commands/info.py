@@ -6,9 +6,11 @@ from datetime import UTC, datetime
 from typing import Annotated
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from ldo_service.config import load_config
+from ldo_service.errors import ConfigError
 from ldo_service.runs.source import layout_of, open_source
 from ldo_service.runs.source_info import SourceInfo, describe, estimated_run_s
 
@@ -40,6 +42,8 @@ def info(
       ldo info ~/data/rgbd_dataset_freiburg1_desk
       ldo info synthetic:room --probe 30
     """
+    if probe is not None and probe < 1:
+        raise ConfigError(f"--probe {probe} must be at least 1.")
     layout = layout_of(source)
     settings = load_config(config, set)
     sequence = open_source(source, settings.dataset.options())
@@ -49,9 +53,9 @@ def info(
         about = {"source": source, "layout": layout, "estimated_run_s": run_s}
         print(json.dumps({**about, **asdict(found)}, indent=1))
         return
-    table = Table(title=source, show_header=False)
+    table = Table(title=escape(source), show_header=False)
     for name, value in _rows(layout, found).items():
-        table.add_row(name, value)
+        table.add_row(name, escape(value))
     if run_s is not None:
         table.add_row("time of `ldo run`", f"about {run_s:.0f} s on this machine")
     Console().print(table)
@@ -61,7 +65,10 @@ def _rows(layout: str, found: SourceInfo) -> dict[str, str]:
     timing, camera, depth = found.timing, found.camera, found.depth
     rate = f"{timing.rate_hz:.2f} Hz" if timing.rate_hz else "unknown"
     distortion = ", ".join(f"{k:g}" for k in camera["distortion"]) or "none"
-    unreadable = f"{found.unreadable_frames} of {found.sampled_frames} sampled frames"
+    unreadable = (
+        f"{found.unreadable_frames} of {found.sampled_frames} sampled frames: "
+        f"{found.why_unreadable}"
+    )
     return {
         "layout": layout,
         "frames": f"{timing.frames} in {timing.duration_s:.1f} s, at {rate}",

@@ -115,7 +115,10 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
         return open_synthetic(name or "room")
     path = Path(source).expanduser()
     if not path.exists():
-        raise DataError(f"{source} does not exist. Expected one of these: {_known()}.")
+        raise DataError(
+            f"{source} does not exist. Check the path. A source is a recording in one of these "
+            f"layouts: {_known()}."
+        )
     if layout := find_layout(path):
         return layout.open_sequence(path, options)
     if parts := sorted(part.parent.name for part in path.glob("seq-*/frame-000000.color.*")):

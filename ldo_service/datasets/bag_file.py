@@ -33,7 +33,7 @@ REALSENSE_TAIL = 4
 def is_bag(path: Path) -> bool:
     """Return whether a path has the name of a bag, or a folder has the files of one."""
     if path.is_file():
-        return path.suffix in SUFFIXES
+        return path.suffix.lower() in SUFFIXES
     return (path / METADATA).is_file() or any(path.glob("*.db3"))
 
 
@@ -72,7 +72,7 @@ class BagFile:
         self.path = path
         self._lock = Lock()
         with self._readable():
-            is_ros1 = path.suffix == ".bag" and path.is_file()
+            is_ros1 = path.suffix.lower() == ".bag" and path.is_file()
             reader = _ros1_reader(path) if is_ros1 else _ros2_reader(path)
             finalize(self, reader.close)
             self._format: _Format = _Ros1(reader) if is_ros1 else _Ros2(reader)

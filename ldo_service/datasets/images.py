@@ -74,12 +74,13 @@ def first_size(paths: list[Path]) -> tuple[int, int]:
     Raises:
         FrameError: No image can be read.
     """
-    for path in paths[:-1]:
+    first: FrameError | None = None
+    for path in paths:
         try:
             return _size(path)
-        except FrameError:  # Reading this frame later raises the error again.
-            continue
-    return _size(paths[-1])
+        except FrameError as error:  # Reading this frame later raises the error again.
+            first = first or error
+    raise FrameError(f"none of {len(paths)} images can be read. The first: {first}") from first
 
 
 def _size(path: Path) -> tuple[int, int]:

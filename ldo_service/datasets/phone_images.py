@@ -84,6 +84,12 @@ class PhoneGrid:
                 f"frame {index}: color is {color.shape[1]}x{color.shape[0]} pixels, and its camera "
                 f"is for {full.width}x{full.height}. Check the intrinsics and the image."
             )
+        if depth.ndim != 2 or abs(depth.shape[1] * full.height / full.width - depth.shape[0]) > 1:
+            raise FrameError(
+                f"frame {index}: depth has the shape {depth.shape}, and color "
+                f"{full.width}x{full.height} pixels. Depth must be one image with the aspect ratio "
+                "of color. Export the recording again."
+            )
         grid = self.camera
         if n > 1:
             color = color[: grid.height * n, : grid.width * n]

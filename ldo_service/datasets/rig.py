@@ -69,7 +69,7 @@ class SequenceOptions:
     """Options for layouts with unregistered depth (ScanNet, 7-Scenes, bags) or topics (bags).
 
     Raises:
-        ConfigError: T_color_depth is not a rigid transform.
+        ConfigError: T_color_depth is not a rigid transform, or a stream of `topics` is unknown.
     """
 
     # True registers depth to the color camera, at the size of the color image.
@@ -83,6 +83,10 @@ class SequenceOptions:
     topics: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if unknown := sorted(self.topics.keys() - {"color", "depth"}):
+            raise ConfigError(
+                f"topics names the stream {unknown[0]!r}. Known streams: color, depth."
+            )
         if self.T_color_depth is not None and not is_rigid(self.T_color_depth):
             raise ConfigError(
                 f"T_color_depth is {self.T_color_depth.tolist()}, expected a rigid transform "

@@ -54,6 +54,7 @@ COLOR_NAMES = (
     r"(color|rgb)/image_rect(_color|_raw)?$",
     r"Color_\d+/image/data$",
     r"color|rgb",
+    r"/image(_raw|_color|_rect_color)?$",
 )
 DEPTH_NAMES = (
     r"(aligned_depth_to|depth_to)_(color|rgb)/image_raw$",
@@ -194,7 +195,10 @@ def _topic(
     for topic in images:
         name = COMPRESSED.sub("", topic.name)
         ranks = [k for k, known in enumerate(names) if re.search(known, name, re.IGNORECASE)]
-        if ranks and not excluded.search(name):
+        if topic is beside:
+            continue
+        # The namespace before the last two parts may name the camera, such as /depth_camera.
+        if ranks and not excluded.search("/".join(name.split("/")[-2:])):
             distance = -_common_parts(topic.name, beside.name) if beside else 0
             rank = distance, ranks[0], int(topic.kind == COMPRESSED_IMAGE)
             ranked.setdefault(rank, []).append(topic)

@@ -48,6 +48,13 @@ class ScanNetSequence(Sequence):
             numbered(folder / "depth", r"(\d+)\.png"),
             folder,
         )
+        if not (folder / "intrinsic").is_dir():
+            raise DataError(
+                f"{folder} has color/ and depth/, but neither intrinsic/ (ScanNet) nor "
+                "camera_intrinsic.json (Open3D, Redwood). Create camera_intrinsic.json, such as "
+                '{"width": 640, "height": 480, "intrinsic_matrix": [525, 0, 0, 0, 525, 0, 319.5, '
+                "239.5, 1]}, column by column."
+            )
         sizes = first_size(self._files.color), first_size(self._files.depth)
         self._rig = options.over(_rig(folder / "intrinsic", *sizes))
         self._is_registering = options.register_depth or not self._rig.is_one_view

@@ -80,6 +80,7 @@ class SensSequence(Sequence):
         self._is_registering = options.register_depth or not self._rig.is_one_view
         camera = self._rig.color_camera if self._is_registering else self._rig.depth_camera
         super().__init__(path.stem, camera, _stamps_ns(self._index.stamps_us, path))
+        self.registration = "reader" if self._is_registering else "source"
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""

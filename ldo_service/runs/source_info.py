@@ -54,6 +54,7 @@ class SourceInfo:
     depth: DepthInfo
     sampled_frames: int
     unreadable_frames: int  # Number of sampled frames that cannot be read.
+    why_unreadable: str | None  # Problem of the first of these; None if there is none.
     true_poses: int  # Number of poses of the ground truth; 0 if there is none.
     has_true_labels: bool
 
@@ -65,15 +66,18 @@ def describe(sequence: Sequence) -> SourceInfo:
         DataError: The ground truth is invalid.
     """
     indices = np.unique(np.linspace(0, len(sequence) - 1, SAMPLES).round().astype(int))
-    depths_m = [_depth_m(sequence, int(index)) for index in indices if len(sequence)]
+    read = [_depth_m(sequence, int(index)) for index in indices if len(sequence)]
+    depths_m = [depth_m for depth_m in read if not isinstance(depth_m, str)]
+    reasons = [reason for reason in read if isinstance(reason, str)]
     truth = sequence.truth()
     return SourceInfo(
         name=sequence.name,
         timing=_timing(sequence.stamps_ns),
         camera=asdict(sequence.raw_camera),
-        depth=_depth(sequence, [depth_m for depth_m in depths_m if depth_m is not None]),
-        sampled_frames=len(depths_m),
-        unreadable_frames=sum(depth_m is None for depth_m in depths_m),
+        depth=_depth(sequence, depths_m),
+        sampled_frames=len(read),
+        unreadable_frames=len(reasons),
+        why_unreadable=reasons[0] if reasons else None,
         true_poses=0 if truth is None else len(truth.stamps_s),
         has_true_labels=sequence.true_labels() is not None,
     )
@@ -100,12 +104,12 @@ def estimated_run_s(sequence: Sequence, config: Config, frames: int) -> float:
     return len(sequence) / summary["fps"]
 
 
-def _depth_m(sequence: Sequence, index: int) -> np.ndarray | None:
-    """Return the depth of a frame as the camera delivered it, or None if it cannot be read."""
+def _depth_m(sequence: Sequence, index: int) -> np.ndarray | str:
+    """Return the depth of a frame as the camera delivered it, or why it cannot be read."""
     try:
         return sequence.read(index).depth_m()
-    except FrameError:
-        return None
+    except FrameError as error:
+        return str(error)
 
 
 def _timing(stamps_ns: np.ndarray) -> Timing:

@@ -129,6 +129,22 @@ def test_estimate_that_runs_over_several_frames_is_restored_bitwise_equal(
     assert encode_state(first.snapshot()) == encode_state(second.snapshot())
 
 
+def test_running_estimate_of_an_earlier_version_starts_again(
+    room: Sequence, frames: list[RgbdFrame]
+) -> None:
+    biased, moved = [measured(f, TRUE) for f in frames], poses(room)
+    first, second = SelfCalibration(CONFIG), SelfCalibration(CONFIG)
+    split = 0
+    while not first.snapshot()["now"]["is_running"]:
+        first.observe(biased[split], moved[split])
+        split += 1
+    state = decode_state(encode_state(first.snapshot()))
+    del state["now"]["views_estimated"]  # The earlier version had no such entry,
+    state["now"]["parts_done"] = 25  # and other parts.
+    second.restore(state)
+    assert changes_of(second, biased[split:], moved[split:])
+
+
 def test_no_step_of_an_estimate_does_more_than_a_frames_work(
     room: Sequence, frames: list[RgbdFrame]
 ) -> None:

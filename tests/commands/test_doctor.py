@@ -1,6 +1,8 @@
 """Lines of `ldo doctor`; tests/service/test_health.py runs it with a service."""
 
 import importlib.util
+import tomllib
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -45,3 +47,8 @@ def test_dropped_messages_are_named_by_topic() -> None:
     assert ", 59 older graph/correction replaced by newer ones, 0 lost" in finding.text
     (finding,) = doctor.of_actor(ActorStatus("mapper", True, health(), 1.5))
     assert ", 0 dropped, " in finding.text
+
+
+def test_every_extra_of_the_package_is_checked() -> None:
+    pyproject = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    assert set(doctor.EXTRAS) == set(pyproject["project"]["optional-dependencies"])

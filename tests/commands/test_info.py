@@ -28,3 +28,27 @@ def test_source_that_does_not_exist_is_one_paragraph(capsys, tmp_path: Path) -> 
     code, _, err = ldo(capsys, "info", tmp_path / "nowhere")
     assert code == 3
     assert_one_paragraph(err)
+
+
+def test_reason_of_unreadable_frames_is_printed(capsys, room_folder: Path) -> None:
+    for image in (room_folder / "depth").iterdir():
+        image.write_bytes(b"no image")
+    code, out, _ = ldo(capsys, "info", room_folder, "--json")
+    assert code == 0
+    found = json.loads(out)
+    assert found["unreadable_frames"] == found["sampled_frames"] > 0
+    assert "depth" in found["why_unreadable"]
+
+
+def test_brackets_in_a_path_are_printed(capsys, tmp_path: Path, room_folder: Path) -> None:
+    folder = tmp_path / "q[" / "b]"
+    folder.parent.mkdir()
+    room_folder.rename(folder)
+    code, out, _ = ldo(capsys, "info", folder)
+    assert code == 0
+    assert "q[/b]" in out.replace("\n", "")
+
+
+def test_probe_without_frames_is_refused(capsys) -> None:
+    code, _, err = ldo(capsys, "info", "synthetic:room", "--probe", "0")
+    assert (code, "--probe 0 must be at least 1" in err) == (2, True)

@@ -133,3 +133,21 @@ def test_truncated_json_is_named(folder: Path) -> None:
     path.write_text(path.read_text()[:-10])
     with pytest.raises(DataError, match=r"transforms\.json cannot be read as JSON"):
         open_sequence(str(folder))
+
+
+def test_depth_of_another_aspect_ratio_is_a_bad_frame(folder: Path) -> None:
+    for path in (folder / "depths").glob("*.png") if (folder / "depths").is_dir() else []:
+        write_image(path, np.ascontiguousarray(FRAMES[0].depth.T))
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        write_image(folder / frame["depth_file_path"], np.ascontiguousarray(FRAMES[0].depth.T))
+    with pytest.raises(FrameError, match="aspect ratio"):
+        open_sequence(str(folder)).read(0)
+
+
+def test_missing_images_name_the_first_and_their_number(folder: Path) -> None:
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        (folder / frame["file_path"]).unlink()
+    with pytest.raises(DataError, match=r"none of 4 images can be read\. The first: "):
+        open_sequence(str(folder))

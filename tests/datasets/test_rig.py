@@ -42,3 +42,8 @@ def test_transform_that_is_not_rigid_is_rejected() -> None:
     for T in (2 * np.eye(4), np.eye(3), np.full((4, 4), np.nan)):
         with pytest.raises(ConfigError, match="expected a rigid transform"):
             SequenceOptions(T_color_depth=T)
+
+
+def test_unknown_stream_of_topics_is_refused() -> None:
+    with pytest.raises(ConfigError, match="'colour'"):
+        SequenceOptions(topics={"colour": "/x"})

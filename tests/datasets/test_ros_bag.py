@@ -247,6 +247,12 @@ def test_file_is_closed_with_the_sequence(tmp_path: Path) -> None:
         ("/rgb/image_raw", "/depth_to_rgb/image_raw", "/rgb/camera_info"),
         ("/zed/rgb/image", "/zed/depth/image", "/zed/rgb/camera_info"),
         ("/oak/rgb/image_raw", "/oak/stereo/image_raw", "/oak/rgb/camera_info"),
+        (
+            "/depth_camera/color/image_raw",
+            "/depth_camera/depth/image_raw",
+            "/depth_camera/color/camera_info",
+        ),
+        ("/camera/image_raw", "/camera/depth/image_raw", "/camera/camera_info"),
     ],
 )
 def test_usual_names_are_found(tmp_path: Path, color: str, depth: str, info: str) -> None:

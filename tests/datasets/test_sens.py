@@ -138,3 +138,9 @@ def test_invalid_file_is_named(path: Path, damage: Callable[[Path], object], mes
     with pytest.raises(DataError, match=f"scene0000_00.sens.*{message}") as caught:
         open_sequence(str(path))
     assert "\n" not in str(caught.value)
+
+
+def test_registration_is_that_of_the_reader_only_on_request(path: Path) -> None:
+    assert open_sequence(str(path)).registration == "source"
+    registered = open_sequence(str(path), SequenceOptions(register_depth=True))
+    assert registered.registration == "reader"
