@@ -35,7 +35,7 @@ class CovarianceConfig:
     """Settings of the covariance of a pose.
 
     They were chosen on seven sequences with exact truth. There the mean normalized estimation error
-    squared, whose expected value is 6, is 2 to 6 without the errors of a real camera, and 12 and 28
+    squared, whose expected value is 6, is 2 to 5 without the errors of a real camera, and 11 and 18
     with them: docs/benchmarks/covariance.md.
     """
 

@@ -1,0 +1,46 @@
+"""A layout of recordings for `ldo run`, in a package of its own.
+
+The recording is a file .npz with the arrays color [N, H, W, 3] uint8 and depth_mm [N, H, W] uint16,
+stamps_ns [N] int64, and camera [6]: width, height, fx, fy, cx, cy. The package registers LAYOUT in
+its pyproject.toml:
+
+    [project.entry-points."ldo.sequences"]
+    numpy_file = "own_layout:LAYOUT"
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from ldo_service.datasets import Layout, Sequence, SequenceOptions
+from ldo_service.errors import DataError
+from ldo_service.geometry import Camera, RawFrame, Trajectory
+
+NAMES = ("color", "depth_mm", "stamps_ns", "camera")
+
+
+class NumpySequence(Sequence):
+    """Frames of a file .npz."""
+
+    def __init__(self, path: Path, _options: SequenceOptions) -> None:
+        try:
+            with np.load(path) as file:
+                self._color, self._depth_mm, stamps_ns, camera = (file[name] for name in NAMES)
+        except (OSError, ValueError, KeyError) as error:
+            raise DataError(
+                f"{path} cannot be read ({error}). It needs: {', '.join(NAMES)}."
+            ) from error
+        width, height = map(int, camera[:2])
+        super().__init__(path.stem, Camera(width, height, *map(float, camera[2:])), stamps_ns)
+
+    def read(self, index: int) -> RawFrame:
+        """Return a frame; `Sequence.read` says what it raises."""
+        images = self._color[index], self._depth_mm[index]
+        return RawFrame(index, int(self.stamps_ns[index]), *images, 1000.0, self.raw_camera)
+
+    def truth(self) -> Trajectory | None:
+        """Return None, because the file has no ground truth."""
+        return None
+
+
+LAYOUT = Layout("NumPy", "a file .npz", lambda path: path.suffix == ".npz", NumpySequence)
