@@ -45,5 +45,5 @@ def test_transform_that_is_not_rigid_is_rejected() -> None:
 
 
 def test_unknown_stream_of_topics_is_refused() -> None:
-    with pytest.raises(ConfigError, match="'colour'"):
-        SequenceOptions(topics={"colour": "/x"})
+    with pytest.raises(ConfigError, match="'infrared'"):
+        SequenceOptions(topics={"infrared": "/x"})
