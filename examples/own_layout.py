@@ -30,8 +30,9 @@ class NumpySequence(Sequence):
             raise DataError(
                 f"{path} cannot be read ({error}). It needs: {', '.join(NAMES)}."
             ) from error
-        width, height = map(int, camera[:2])
-        super().__init__(path.stem, Camera(width, height, *map(float, camera[2:])), stamps_ns)
+        width, height, fx, fy, cx, cy = camera.tolist()
+        camera = Camera(int(width), int(height), fx, fy, cx, cy)
+        super().__init__(path.stem, camera, stamps_ns)
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; `Sequence.read` says what it raises."""
