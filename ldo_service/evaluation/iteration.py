@@ -100,7 +100,7 @@ class Iteration:
         return self._adam.step_fused(self.gaussians, self._rasterizer, self._by_planes, rate=0.1)
 
     def steps(self) -> Steps:
-        """Return the steps of an iteration by name."""
+        """Return the steps of an optimizer iteration as functions by name, to time each of them."""
         return {"forward": self.forward, "loss": self.loss, "descent": self.descent}
 
 

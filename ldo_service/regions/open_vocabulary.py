@@ -327,7 +327,7 @@ def add_region_labels(
 ) -> RegionDetections:
     """Add the labels of regions to the detections of a keyframe.
 
-    The label of a region with a box becomes the labeller's label of that box. If `boxes_vote`, the
+    A region with a box gives its label to the box as the open label. If `boxes_vote`, the
     detector's label of the box is dropped, because its vote is already a part of the region's
     label. A region without a box is added as a new box, unless it is a part of a larger region with
     the same label.

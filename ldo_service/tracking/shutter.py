@@ -83,7 +83,7 @@ class ShutterState:
     def expected_motion(
         self, before: ConstantVelocity, stamp_ns: int, config: ShutterConfig
     ) -> FrameMotion | None:
-        """Return the motion during a frame before it is tracked; None if unknown."""
+        """Predict the motion during a frame that is not tracked yet; None if unknown."""
         if self.mean_velocity is None or _interval_s(before, stamp_ns, config) is None:
             return None
         return FrameMotion(self.mean_velocity, self.timing)
