@@ -24,7 +24,7 @@ class NumpySequence(Sequence):
 
     def __init__(self, path: Path, _options: SequenceOptions) -> None:
         try:
-            with np.load(path) as file:
+            with np.load(path, allow_pickle=False) as file:
                 self._color, self._depth_mm, stamps_ns, camera = (file[name] for name in NAMES)
         except (OSError, ValueError, KeyError) as error:
             raise DataError(

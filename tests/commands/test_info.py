@@ -1,6 +1,7 @@
 """The command `ldo info`."""
 
 import json
+import shutil
 from pathlib import Path
 
 from tests.commands.test_cli import assert_one_paragraph, ldo
@@ -30,10 +31,11 @@ def test_source_that_does_not_exist_is_one_paragraph(capsys, tmp_path: Path) -> 
     assert_one_paragraph(err)
 
 
-def test_reason_of_unreadable_frames_is_printed(capsys, room_folder: Path) -> None:
-    for image in (room_folder / "depth").iterdir():
+def test_reason_of_unreadable_frames_is_printed(capsys, tmp_path: Path, room_folder: Path) -> None:
+    folder = shutil.copytree(room_folder, tmp_path / "room")
+    for image in (folder / "depth").iterdir():
         image.write_bytes(b"no image")
-    code, out, _ = ldo(capsys, "info", room_folder, "--json")
+    code, out, _ = ldo(capsys, "info", folder, "--json")
     assert code == 0
     found = json.loads(out)
     assert found["unreadable_frames"] == found["sampled_frames"] > 0
@@ -41,9 +43,7 @@ def test_reason_of_unreadable_frames_is_printed(capsys, room_folder: Path) -> No
 
 
 def test_brackets_in_a_path_are_printed(capsys, tmp_path: Path, room_folder: Path) -> None:
-    folder = tmp_path / "q[" / "b]"
-    folder.parent.mkdir()
-    room_folder.rename(folder)
+    folder = shutil.copytree(room_folder, tmp_path / "q[" / "b]")
     code, out, _ = ldo(capsys, "info", folder)
     assert code == 0
     assert "q[/b]" in out.replace("\n", "")
