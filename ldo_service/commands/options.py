@@ -10,9 +10,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ldo_service.actors.detector import require_detector
-from ldo_service.actors.vlm_labeller import require_labeller
-from ldo_service.config import Config, actor_parameters
+from ldo_service.config import Config
 from ldo_service.runs.job import Advance
 from ldo_service.synthetic import SCENES
 from ldo_service.tracking.keyframe_database import load_keyframe_database
@@ -117,20 +115,6 @@ def localizing(config: Config, folder: Path | None) -> Config:
     load_keyframe_database(folder)
     tracker = replace(config.tracker, localization_map=str(folder))
     return replace(config, tracker=tracker)
-
-
-def with_usable_networks(config: Config) -> Config:
-    """Check that the configured networks can be used, and return the configuration unchanged.
-
-    The live service does not call this function: it only warns about a network that it cannot use.
-
-    Raises:
-        ConfigError: If a network cannot be used.
-    """
-    parameters = actor_parameters(config)
-    require_detector(parameters.detector)
-    require_labeller(parameters.vlm_labeller)
-    return config
 
 
 @contextmanager

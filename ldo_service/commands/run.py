@@ -16,6 +16,7 @@ from ldo_service.geometry.sequence import Sequence
 from ldo_service.runs.folder import RunWriter, prepare
 from ldo_service.runs.front_end import FrontEnd
 from ldo_service.runs.job import Advance, RunOptions
+from ldo_service.runs.networks import require_usable_networks
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.realtime import run_realtime
 from ldo_service.runs.source import Selection, open_source
@@ -31,7 +32,6 @@ from .options import (
     argument,
     localizing,
     progress,
-    with_usable_networks,
 )
 
 
@@ -117,7 +117,7 @@ def run(
     console = Console(stderr=True)
     settings = with_options(load_config(config, set), hold_out_every, threads)
     settings = localizing(settings, localize)
-    with_usable_networks(settings)
+    require_usable_networks(settings)
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_source(source, settings.dataset.options())

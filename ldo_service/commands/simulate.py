@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import load_config
+from ldo_service.runs.networks import require_usable_networks
 from ldo_service.runs.simulation import ActorDigest, simulate_graph
 from ldo_service.runs.source import Selection, open_source
 
@@ -20,7 +21,6 @@ from .options import (
     Stride,
     argument,
     progress,
-    with_usable_networks,
 )
 from .run import with_options
 
@@ -45,7 +45,7 @@ def simulate(
     """
     console = Console(stderr=True, highlight=False)
     settings = with_options(load_config(config, set), hold_out=None, threads=threads)
-    with_usable_networks(settings)
+    require_usable_networks(settings)
     sequence = open_source(source, settings.dataset.options())
     selection = Selection(stride, max_frames)
     with progress("simulate", len(selection.indices(sequence)), console) as advance:

@@ -30,6 +30,7 @@ from ldo_service.errors import ConfigError, FrameError, StageError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.runs.actor_run import ActorRun, refinements
 from ldo_service.runs.folder import prepare
+from ldo_service.runs.networks import require_usable_networks
 from ldo_service.runs.summary import Usage
 from ldo_service.schemas import Keyframe, Message, TrackedPose
 from ldo_service.schemas.message import LAST_INTEGER
@@ -107,7 +108,8 @@ class Slam:
                 or the defaults.
 
         Raises:
-            ConfigError: A setting or the type of an argument is wrong.
+            ConfigError: A setting or the type of an argument is wrong, or a network that the
+                settings name cannot be used.
         """
         if not isinstance(camera, Camera):
             raise ConfigError(
@@ -122,6 +124,7 @@ class Slam:
             )
         self.camera, self.depth_scale = camera, float(depth_scale)
         self.config = _configured(config, settings)
+        require_usable_networks(self.config)
         self._run = ActorRun(self.config, None, observe=self._observe)
         self._frames = self._rejected = self._refined = 0
         self._used = Usage(0.0, 0.0)  # Time of all steps.

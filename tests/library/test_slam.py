@@ -224,6 +224,7 @@ def test_wrong_settings_and_cameras_are_refused(tmp_path: Path) -> None:
         ({"settings": {"mapper.iterations": "7"}}, r"mapper\.iterations"),
         ({"settings": {"mapper.iterations": 7, "mapper.iterations.x": 7}}, r"mapper\.iterations"),
         ({"settings": {3: 7}}, "name of a setting is 3"),
+        ({"settings": {"detector.model": "no such"}}, r"detector\.model=no such"),
     ):
         with pytest.raises(ConfigError, match=message):
             Slam(**{"camera": camera, **arguments})  # pyright: ignore[reportArgumentType]

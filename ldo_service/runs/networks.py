@@ -1,0 +1,18 @@
+"""Check of the configured neural networks before a run."""
+
+from ldo_service.actors.detector import require_detector
+from ldo_service.actors.vlm_labeller import require_labeller
+from ldo_service.config import Config, actor_parameters
+
+
+def require_usable_networks(config: Config) -> None:
+    """Check that the configured networks can be used.
+
+    The live service does not call this function: it only warns about a network that it cannot use.
+
+    Raises:
+        ConfigError: A network cannot be used.
+    """
+    parameters = actor_parameters(config)
+    require_detector(parameters.detector)
+    require_labeller(parameters.vlm_labeller)
