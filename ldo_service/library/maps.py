@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ldo_service.conversions.poses import pose_from_message
+from ldo_service.datasets.files import is_rigid
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.renderer import render
 from ldo_service.geometry import Camera, se3
@@ -16,8 +17,6 @@ from ldo_service.semantics.gaussian_labels import distribution
 from ldo_service.semantics.semantic_fusion import label_image
 
 from .arrays import read_only_array
-
-RIGID_TOLERANCE = 1e-4  # Largest deviation of R R^T from the identity in a pose of a caller.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -218,14 +217,7 @@ def _rigid(name: str, value: object) -> np.ndarray:
         ) from error
     if T.shape != (4, 4):
         raise ConfigError(f"{name} has the shape {T.shape}, must have the shape (4, 4).")
-    R = T[:3, :3]
-    is_rigid = (
-        bool(np.isfinite(T).all())
-        and np.abs(R @ R.T - np.eye(3)).max() < RIGID_TOLERANCE
-        and np.linalg.det(R) > 0
-        and np.array_equal(T[3], (0, 0, 0, 1))
-    )
-    if not is_rigid:
+    if not is_rigid(T):
         raise ConfigError(
             f"{name} is not a rigid transform: it must be finite, its rotation orthonormal without "
             "a reflection, and its last row 0 0 0 1."

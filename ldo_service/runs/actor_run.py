@@ -25,7 +25,7 @@ LAST_RATE = 0.05
 class ActorRun:
     """Actors of a run and the record of their outputs, used as a context manager.
 
-    `LogicalClock` tells why the results do not depend on the load of the machine. The threads of
+    `LogicalClock` explains why the results do not depend on the load of the machine. The threads of
     the actors end with the context; the record stays.
     """
 

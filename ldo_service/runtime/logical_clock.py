@@ -210,5 +210,5 @@ def _answer(due: PendingOutput, actor: str) -> StepOutput:
     except Exception as error:
         raise StageError(
             f"{actor} failed at tick {due.tick}: {type(error).__name__}: {error}. The traceback "
-            "tells where: `ldo --debug` prints it."
+            "shows where: `ldo --debug` prints it."
         ) from error

@@ -193,7 +193,7 @@ def test_compressed_bag_of_ros1_is_read(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_messages_with_one_time_of_recording_are_told_apart(tmp_path: Path, kind: str) -> None:
+def test_messages_with_one_time_of_recording_are_distinguished(tmp_path: Path, kind: str) -> None:
     entries = [(5, topic, message) for _, topic, message in small((10**9, 2 * 10**9, 3 * 10**9))]
     for number, (_, topic, message) in enumerate(entries):
         if topic == DEPTH:
