@@ -41,8 +41,8 @@ class FrameSourceConfig:
     """Limits for pairing, restarts and image sizes of a camera."""
 
     # Maximum time between the color and depth image of a pair. It is below half a frame period at
-    # 30 Hz, so that the first depth image within this time is the nearest one. A camera that turns
-    # at 1 rad/s rotates by 0.9 deg in this time.
+    # 30 Hz, so that the first depth image within this time is the nearest one. A camera that
+    # turns at 1 rad/s rotates by 0.9 deg in this time.
     max_skew_s: float = 0.015
     # Maximum number of images per stream that wait for their partner: 0.27 s at 30 Hz, 7 MB at
     # 640x480.

@@ -56,8 +56,8 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     reference: int | None  # Id of the reference keyframe; None before the first keyframe.
     T_reference_camera: Pose
     keyframe: int | None = None  # Id as a keyframe if this frame became one.
-    # Covariance of T_reference_camera for a perturbation on the right: rotation in rad, translation
-    # in m. Zeros if unknown: while LOST, and in the first frame of a submap.
+    # Covariance of T_reference_camera for a perturbation on the right: rotation in rad,
+    # translation in m. Zeros if unknown: while LOST, and in the first frame of a submap.
     covariance: Matrix6 = (0.0,) * 36
     inlier_fraction: float = 0.0  # Fraction of the residuals that are inliers.
     residual_color: float = 0.0  # Robust sigma of the color residuals, gray levels 0..255.
@@ -70,8 +70,8 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     # Spread of the poses from several initial guesses, rad of image motion.
     hypothesis_spread_rad: float = 0.0
     T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera).
-    # Submap whose frame is `map` in T_map_odom. 0 is the map itself; any other submap is not merged
-    # with the map yet.
+    # Submap whose frame is `map` in T_map_odom. 0 is the map itself; any other submap is not
+    # merged with the map yet.
     submap: int = 0
 
     def check(self) -> None:

@@ -53,8 +53,8 @@ DEPTH_WEIGHT = 0.12
 FEATURE_SIGMA_PX = 1.0
 # Depth difference, as a fraction of depth, beyond which two points are on different surfaces.
 MAX_STEP_RATIO = 0.08
-# Inverse variances of the coefficients' prior around 0: 0.01/m for the depth bias, the size of
-# that of an Xtion.
+# Inverse variances of the coefficients' prior around 0: 0.01/m for the depth bias, the
+# size of that of an Xtion.
 DEPTH_PRIOR, VIGNETTING_PRIOR = 1e4, 5e1
 # Gauss-Newton steps of the first estimate, and of later ones, which start from its result.
 FIRST_ROUNDS, LATER_ROUNDS = 3, 2

@@ -27,8 +27,8 @@ MIN_MOTION_RATIO = 15 / 640  # Minimum median motion of a pair's corners, fracti
 # distance of new corners, the distance as a fraction of the image width.
 CORNERS, CORNER_QUALITY, CORNER_DISTANCE_RATIO = 300, 0.005, 15 / 640
 FLOW_WINDOW_PX, FLOW_LEVELS = 13, 3
-# Maximum number of iterations per corner and level, and the step that ends them, pixels. Corners
-# that are lost use up all iterations.
+# Maximum number of iterations per corner and level, and the step that ends them, pixels.
+# Corners that are lost use up all iterations.
 FLOW_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.02)
 # A corner is tracked into the next image and back. It is dropped if it ends farther from its start.
 MAX_RETURN_PX = 0.5

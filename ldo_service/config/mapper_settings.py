@@ -105,8 +105,8 @@ class KeyframeImageSettings:
 class OffloadSettings:
     """Offloading of Gaussians to disk."""
 
-    # Maximum number of Gaussians in memory. Beyond this number, Gaussians out of view are offloaded
-    # to disk. The default number takes 300 MB with the moments of Adam.
+    # Maximum number of Gaussians in memory. Beyond this number, Gaussians out of view are
+    # offloaded to disk. The default number takes 300 MB with the moments of Adam.
     max_resident_gaussians: PositiveInt = 1_500_000
 
 
@@ -127,8 +127,8 @@ class ObjectSettings:
 
     # Number of keyframes that must observe a candidate before it becomes an object (III.C).
     min_observations: PositiveInt = 3
-    # Maximum number of objects in the map. The default number takes 6 MB of memory, and a few ms
-    # per keyframe if all objects are in view.
+    # Maximum number of objects in the map. The default number takes 6 MB of memory, and a few
+    # ms per keyframe if all objects are in view.
     max_objects: PositiveInt = 2000
     # Minimum IoU of the boxes of a detection and an object to associate the two (III.C).
     min_iou: PositiveRatio = advanced(0.4)
@@ -162,8 +162,8 @@ class PublishSettings:
     # Maximum number of Gaussians per message, so that a message does not delay others for long.
     # 16,384 Gaussians take 1.2 MB, or 1.8 MB with labels.
     max_gaussians_per_message: PositiveInt = advanced(16_384)
-    # Number of keyframes between messages with changed old Gaussians. These Gaussians are not sent
-    # at every keyframe, because each keyframe changes all Gaussians in view.
+    # Number of keyframes between messages with changed old Gaussians. These Gaussians are not
+    # sent at every keyframe, because each keyframe changes all Gaussians in view.
     update_interval_keyframes: PositiveInt = advanced(5)
 
 
@@ -191,8 +191,8 @@ class MapperSettings:
     # Number of keyframes between checkpoints of the map. After a crash, up to this many keyframes
     # are mapped again.
     checkpoint_interval_keyframes: PositiveInt = 5
-    # Folder of the keyframe images. Empty uses the state folder, or a temporary folder if there is
-    # no state folder.
+    # Folder of the keyframe images. Empty uses the state folder, or a temporary folder
+    # if there is no state folder.
     image_folder: str = advanced("")
     # Seed of the random choice of keyframes that are optimized.
     seed: NonNegativeInt = advanced(0)

@@ -37,8 +37,8 @@ class DetectorSettings:
     input_size_px: tuple[PositiveInt, PositiveInt] = advanced((640, 480))
     # IoU above which two boxes of one class are merged into one object, as in YOLOv5.
     nms_iou: Ratio = advanced(0.45)
-    # Maximum number of detections per image, those with the highest scores, as in the evaluation
-    # of COCO.
+    # Maximum number of detections per image, those with the highest scores, as in the evaluation of
+    # COCO.
     max_detections: PositiveInt = advanced(100)
 
 
@@ -60,8 +60,8 @@ class EncoderSettings:
     prompts: Annotated[tuple[str, ...], Meta(min_length=1)] = advanced(
         ("a photo of a {}.", "a cropped photo of a {}.", "a {} in a room.")
     )
-    # Mean that normalizes RGB in 0..1. Empty uses the mean in the file of the encoder, or the mean
-    # of CLIP if the file has none.
+    # Mean that normalizes RGB in 0..1. Empty uses the mean in the file of the encoder, or the
+    # mean of CLIP if the file has none.
     image_mean: tuple[float, ...] = advanced(())
     # Standard deviation that normalizes RGB in 0..1. Empty uses the value in the file of the
     # encoder, or the value of CLIP if the file has none.

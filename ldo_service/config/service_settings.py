@@ -25,8 +25,9 @@ from .values import (
 class FrameSourceSettings:
     """Pairing of color and depth images of a camera."""
 
-    # Maximum difference of the stamps of a paired color and depth image, seconds. The default is
-    # below half a frame period at 30 Hz, so that the nearest depth image is paired.
+    # Maximum difference of the stamps of a paired color and depth image, seconds. The
+    # default is below half a frame period at 30 Hz, so that the nearest depth image is
+    # paired.
     max_skew_s: Annotated[float, Meta(ge=0, lt=10)] = 0.015
 
 
@@ -107,8 +108,8 @@ class ServiceSettings:
     # Actors that run in processes of their own. The default is the actor that uses gtsam, which
     # holds the GIL during every call.
     process_actors: tuple[str, ...] = ("optimizer",)
-    # Actors that run on another machine, by `ldo serve --client --actor NAME`. This service does
-    # not wait for them.
+    # Actors that run on another machine, by `ldo serve --client --actor NAME`. This service
+    # does not wait for them.
     remote_actors: tuple[Literal["detector", "vlm_labeller", "loop_closer", "optimizer"], ...] = ()
     # Maximum time for each actor to handle its queued messages when the service stops, seconds.
     shutdown_timeout_s: PositiveFloat = 10.0

@@ -106,9 +106,9 @@ class KeyframeSettings:
     min_interval_frames: PositiveInt = advanced(1)
     # Maximum number of frames between reference keyframes, if the camera moved at all.
     max_interval_frames: PositiveInt = advanced(30)
-    # A mapping keyframe is made if the motion since the last mapped frame exceeds this fraction of
-    # the rotation or translation limit. A value above 1 makes none. Mapping keyframes improve PSNR
-    # by 0.4 dB on the sequence kitchen.
+    # A mapping keyframe is made if the motion since the last mapped frame exceeds this
+    # fraction of the rotation or translation limit. A value above 1 makes none. Mapping
+    # keyframes improve PSNR by 0.4 dB on the sequence kitchen.
     mapping_only_ratio: PositiveFloat = advanced(0.33)
     # Number of keyframes after which the tracker searches for a known keyframe before it makes a
     # new keyframe. With fewer keyframes, every new one improves the map. 0 never searches.
@@ -150,8 +150,8 @@ class SubmapSettings:
     """Submaps that the tracker starts after it was lost."""
 
     # Number of LOST frames in a row after which the tracker starts a new submap. A third of this
-    # number is enough if each frame shows another view. Frames of a covered camera do not count. 0
-    # never starts one.
+    # number is enough if each frame shows another view. Frames of a covered camera do not count.
+    # 0 never starts one.
     start_after_lost_frames: NonNegativeInt = 90
 
 
@@ -162,8 +162,8 @@ class QualitySettings:
     # The pose of a frame is WEAK if the frame shows less than this fraction of the surface in the
     # reference keyframe. The default was chosen on one apartment.
     weak_overlap: Ratio = advanced(0.15)
-    # A pose is WEAK if the ratio of its residual to the running median exceeds this value. A pose
-    # that features confirm closely is WEAK above a ratio of 6, and LOST above 15.
+    # A pose is WEAK if the ratio of its residual to the running median exceeds this value. A
+    # pose that features confirm closely is WEAK above a ratio of 6, and LOST above 15.
     weak_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(2.5)
     # A pose is LOST if the ratio of its residual to the running median exceeds this value.
     lost_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(5.0)

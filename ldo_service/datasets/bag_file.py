@@ -51,8 +51,8 @@ class Topic:
 class StoredMessage:
     """Message in a bag."""
 
-    # Stamp in the header of the message; where it is 0, the time of recording. It is meaningless
-    # for types without a header.
+    # Stamp in the header of the message; where it is 0, the time of recording. It is
+    # meaningless for types without a header.
     stamp_ns: int
     connection: Any  # Connection of rosbags.
     place: Any  # Entry of the index (ROS 1), or a `_Ros2Place`.

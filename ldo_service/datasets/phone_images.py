@@ -16,8 +16,9 @@ from ldo_service.geometry import Camera, RawFrame
 from ldo_service.geometry.camera import project, rays
 from ldo_service.geometry.registration import SAME_SURFACE
 
-# Minimum length of the longer side of the grid in pixels. It is the size of the data sets with
-# which tracking and mapping are measured, and twice the width at which the tracker aligns.
+# Minimum length of the longer side of the grid in pixels. It is the size of the data
+# sets with which tracking and mapping are measured, and twice the width at which the
+# tracker aligns.
 MIN_LONGER_SIDE = 640
 
 # Minimum confidence of ARKit, 0 to 2. Lower values mark edges of depth, and surfaces that are dark,

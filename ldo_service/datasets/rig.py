@@ -74,8 +74,8 @@ class SequenceOptions:
 
     # True registers depth to the color camera, at the size of the color image.
     register_depth: bool = False
-    # Replacements of the values in the files or in the data set's documentation; None replaces
-    # nothing.
+    # Replacements of the values in the files or in the data set's documentation; None
+    # replaces nothing.
     color_camera: Camera | None = None
     depth_camera: Camera | None = None
     T_color_depth: np.ndarray | None = None  # Depth to color coordinates, [4, 4], meters.

@@ -29,13 +29,13 @@ DEPTH_SCALE = 1000.0  # Units per meter.
 NOT_MEASURED = 65535  # Depth value that means unknown, as 0 does; from the data set's page.
 
 # The calibration of the depth camera is that of the data set's page. The color camera has the
-# Kinect's nominal focal length of 525 px, which Brachmann et al. (ICCV 2021) also use for 7-Scenes.
-# The baseline comes from two published calibrations of other Kinects (25.4 mm, ROS
-# kinect_calibration; 25.6 mm, LIRIS human activities data set). The calibrations agree along x, and
-# have no common offset above 2.2 mm along y and z. Their rotations are not used, because each
-# rotation fits only the principal points of its own calibration. The rotation here is the identity,
-# and the principal point of the color camera is at row 238. With these values, edges of depth lie
-# within a pixel of edges of color in the sequence RedKitchen.
+# Kinect's nominal focal length of 525 px, which Brachmann et al. (ICCV 2021) also use for
+# 7-Scenes. The baseline comes from two published calibrations of other Kinects (25.4 mm, ROS
+# kinect_calibration; 25.6 mm, LIRIS human activities data set). The calibrations agree along x,
+# and have no common offset above 2.2 mm along y and z. Their rotations are not used, because each
+# rotation fits only the principal points of its own calibration. The rotation here is the
+# identity, and the principal point of the color camera is at row 238. With these values, edges of
+# depth lie within a pixel of edges of color in the sequence RedKitchen.
 DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 COLOR_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 238.0)
 T_COLOR_DEPTH = np.array([[1.0, 0, 0, -0.0254], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])

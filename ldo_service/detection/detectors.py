@@ -20,8 +20,8 @@ class NetworkConfig:
 
     # Layout of the output: yolov5, yolox or yolov8; empty: determined by the shape of the output.
     layout: str = ""
-    # File with one class name per line; empty: the registered names of the network, else the names
-    # in its metadata, else the 80 names of COCO.
+    # File with one class name per line; empty: the registered names of the network, else the
+    # names in its metadata, else the 80 names of COCO.
     names: str = ""
     # Width and height of the input, used if the network takes any size.
     input_px: tuple[int, int] = (640, 480)

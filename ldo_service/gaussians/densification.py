@@ -174,8 +174,8 @@ class DensificationConfig:
     hole_px: int = 4
 
     # Placement of the Gaussians.
-    # Side of the largest cells: uniform areas get one Gaussian per 4x4 pixels. 2: +0.4 dB, twice
-    # as many Gaussians.
+    # Side of the largest cells: uniform areas get one Gaussian per 4x4 pixels. A side of 2 gives
+    # 0.4 dB more, and twice as many Gaussians.
     coarsest_px: int = 4
     # Largest contrast of one cell and its rim, 0..1. 0.2 gives 30 % more Gaussians, and no better
     # image once they are optimized.

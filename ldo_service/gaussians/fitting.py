@@ -35,8 +35,8 @@ class ViewSamplingConfig:
     min_shared: float = 0.3  # Least overlap of a covisible keyframe with the newest one, 0..1.
     # Number of keyframes just before the newest one that are checked for covisibility.
     recent: int = 32
-    # Number of random earlier keyframes that are checked too. It is constant, so that the cost does
-    # not grow with the length of the run.
+    # Number of random earlier keyframes that are checked too. It is constant, so that the cost
+    # does not grow with the length of the run.
     earlier: int = 32
 
     def __post_init__(self) -> None:

@@ -27,7 +27,7 @@ class PoseAdam:
     """Adam optimizer of the keyframe poses, with moments for each keyframe."""
 
     def __init__(self) -> None:
-        # By keyframe, [3, WIDTH]: first moments, second moments, and the number of steps.
+        # First moments, second moments and number of steps of each keyframe, [3, WIDTH].
         self._moments: dict[int, np.ndarray] = {}
 
     def direction(self, keyframe: int, gradient: np.ndarray) -> np.ndarray:
@@ -88,13 +88,13 @@ class GaussianOptimizerConfig:
     usual_reach: int = 60_000
 
     # Each iteration moves the exposure of its keyframe by this fraction of the way to the
-    # estimate. 0 keeps the exposures constant; 1 gives the same quality as 0.3. Gradient steps with
-    # a prior of gain 1 would lag behind the camera's exposure, which cost 2.3 dB in an apartment
-    # where gains vary by a fifth.
+    # estimate. 0 keeps the exposures constant; 1 gives the same quality as 0.3. Gradient
+    # steps with a prior of gain 1 would lag behind the camera's exposure, which cost 2.3
+    # dB in an apartment where gains vary by a fifth.
     exposure_share: float = 0.3
     # Learning rates of keyframe poses; 0 keeps the poses constant. 2e-4 gains 0.3 dB in the same
-    # apartment. It adds 1 mm of noise to exact poses: on 90 frames of a Replica apartment, the ATE
-    # is 0.13 cm with 2e-4 and 0.02 cm with 0.
+    # apartment. It adds 1 mm of noise to exact poses: on 90 frames of a Replica apartment, the
+    # ATE is 0.13 cm with 2e-4 and 0.02 cm with 0.
     rotation_rate_rad: float = 0.0
     translation_rate_m: float = 0.0
 

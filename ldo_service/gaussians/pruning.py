@@ -22,9 +22,9 @@ class PruningConfig:
     # Gaussians in its neighborhood (paper, III.A).
     max_relative_scale: float = 10.0
     neighborhood_m: float = 0.25  # Edge of the cubes of space that are the neighborhoods.
-    # A Gaussian must be visible in the image of its anchor keyframe or of the newest keyframe. This
-    # is checked when this many keyframes have followed the anchor keyframe, and later at random.
-    # Hidden Gaussians are removed, because other Gaussians have grown over them.
+    # A Gaussian must be visible in the image of its anchor keyframe or of the newest keyframe.
+    # This is checked when this many keyframes have followed the anchor keyframe, and later at
+    # random. Hidden Gaussians are removed, because other Gaussians have grown over them.
     confirm_keyframes: int = 5
     # Least sum of a visible Gaussian's blending weights over an image; 0 turns the check off. In
     # the sequence kitchen, the map has 430 k Gaussians without the check and 165 k with the check;

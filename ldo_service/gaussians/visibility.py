@@ -258,15 +258,15 @@ def _spheres(
 class OffloadConfig:
     """Settings of offloading: when Gaussians leave the memory, and which of them."""
 
-    # Largest number of Gaussians in memory; with the moments of Adam, they take 300 MB. The limit
-    # is checked every mapper.publish.update_interval_keyframes keyframes. Until then, new and
-    # loaded Gaussians may exceed it.
+    # Largest number of Gaussians in memory; with the moments of Adam, they take 300 MB. The
+    # limit is checked every mapper.publish.update_interval_keyframes keyframes. Until then, new
+    # and loaded Gaussians may exceed it.
     max_active: int = 1_500_000
     # Fraction of max_active that remains in memory after offloading; this takes about 0.1 s.
     low_water: float = 0.9
-    # Largest distance at which Gaussians count as visible. Depth cameras do not measure this far,
-    # so densification does not add surface whose Gaussians are offloaded. Within this distance, the
-    # measured surface hides the Gaussians behind it.
+    # Largest distance at which Gaussians count as visible. Depth cameras do not measure this
+    # far, so densification does not add surface whose Gaussians are offloaded. Within this
+    # distance, the measured surface hides the Gaussians behind it.
     reach_m: float = 20.0
     # Edge of the cubes of space; the Gaussians of one keyframe in one cube form a chunk. In an
     # apartment of two rooms, the chunks that the last 8 keyframes may see hold 36 % of the map

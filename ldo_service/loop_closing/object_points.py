@@ -26,13 +26,13 @@ class LandmarkConfig:
     """Parameters of the landmarks of a subgraph; III.C is a section of the paper."""
 
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
-    # Detections with the same label belong to one object if their distance is below this limit. It
-    # is half the width of a chair.
+    # Detections with the same label belong to one object if their distance is below this limit.
+    # It is half the width of a chair.
     same_m: float = 0.4
     # Maximum KL divergence of matching landmarks in both directions, nats (III.C).
     max_divergence: float = 0.3
-    # Maximum distance of matched landmarks. It is large because the boxes may show different sides
-    # of an object.
+    # Maximum distance of matched landmarks. It is large because the boxes may show different
+    # sides of an object.
     reach_m: float = 0.25
     # Minimum landmarks that agree with a pose; three determine a pose but do not confirm it.
     min_inliers: int = 4

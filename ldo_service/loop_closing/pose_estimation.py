@@ -11,8 +11,8 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.se3 import fit_rigid_transform
 
-# Minimum height of a triangle of points over its longest side, meters. Three points that are nearly
-# on a line do not determine the rotation about this line.
+# Minimum height of a triangle of points over its longest side, meters. Three points that are
+# nearly on a line do not determine the rotation about this line.
 SPREAD = 0.1
 
 
@@ -112,8 +112,9 @@ class DepthConsistencyConfig:
     min_overlap: float = 0.2
     # Maximum root mean square distance of the two surfaces along the normals.
     max_rmse_m: float = 0.03
-    # Maximum conflict: of the new points in the old view, the fraction that lies in the free space
-    # of the old camera. Moved objects cause some conflict; a wrong pose puts walls into free space.
+    # Maximum conflict: of the new points in the old view, the fraction that lies in the free
+    # space of the old camera. Moved objects cause some conflict; a wrong pose puts walls into
+    # free space.
     max_conflict: float = 0.15
 
     def __post_init__(self) -> None:

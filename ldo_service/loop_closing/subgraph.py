@@ -21,8 +21,8 @@ class SubgraphConfig:
 
     min_keyframes: int = 3  # Minimum keyframes (III.C).
     max_keyframes: int = 5  # Maximum keyframes (III.C).
-    # Rotation plus parallax from the first to the last keyframe above which a subgraph is complete
-    # with `min_keyframes` keyframes. Half of the view of a depth camera is then new.
+    # Rotation plus parallax from the first to the last keyframe above which a subgraph is
+    # complete with `min_keyframes` keyframes. Half of the view of a depth camera is then new.
     turned_rad: float = 0.5
     # Rotation plus parallax between two keyframes above which a new subgraph begins. Consecutive
     # keyframes are 0.35 rad apart, unless frames were dropped.

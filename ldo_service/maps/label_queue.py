@@ -29,7 +29,7 @@ class LabelRequestQueue:
     """
 
     def __init__(self) -> None:
-        self._waiting: dict[int, WaitingRequest] = {}  # By region, the oldest first.
+        self._waiting: dict[int, WaitingRequest] = {}  # Keys are regions; the oldest is first.
         # Largest surface that a sent request showed, by region, square meters.
         self._shown_m2: dict[int, float] = {}
 

@@ -44,8 +44,8 @@ class PublishConfig:
     # every keyframe.
     update_interval_keyframes: int = 5
     snapshot_interval_keyframes: int = 10  # Minimum number of keyframes between two snapshots.
-    # A snapshot is published when the map has grown by this fraction since the previous snapshot.
-    # All snapshots together then have at most a few times the size of all deltas.
+    # A snapshot is published when the map has grown by this fraction since the previous
+    # snapshot. All snapshots together then have at most a few times the size of all deltas.
     min_snapshot_growth: float = 0.25
     # A snapshot is published after this number of keyframes even without growth, because a
     # subscriber that missed a delta waits for the next snapshot.

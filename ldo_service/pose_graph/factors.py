@@ -28,15 +28,17 @@ class NoiseConfig:
     sigma_translation_max_m: float = 0.5
     sigma_odometry_rad: float = 0.05  # Sigma of odometry over a missed keyframe.
     sigma_odometry_m: float = 0.1
-    # Alignment treats pixels as independent and models no bias, so its sigmas are too small: for a
-    # handheld Kinect, the median error of its relative poses is 7 sigma. Therefore the covariance
-    # of a random walk is added: about 1 % of the path and 0.5 deg/m after some meters. Without this
-    # covariance, a chain of measurements could not change as far as a true loop closure requires.
+    # Alignment treats pixels as independent and models no bias, so its sigmas are too small: for
+    # a handheld Kinect, the median error of its relative poses is 7 sigma. Therefore the
+    # covariance of a random walk is added: about 1 % of the path and 0.5 deg/m after some
+    # meters. Without this covariance, a chain of measurements could not change as far as a true
+    # loop closure requires.
     drift_rad_per_sqrt_m: float = 0.02
     drift_m_per_sqrt_m: float = 0.02
     turn_m_per_rad: float = 0.5  # Path length with the same drift as a rotation of 1 rad in place.
-    # Sigmas of the covariance that is added to a loop closure. The dense refinement of a closure
-    # also treats pixels as independent, and does not model errors of calibration and exposure.
+    # Sigmas of the covariance that is added to a loop closure. The dense refinement of a
+    # closure also treats pixels as independent, and does not model errors of calibration and
+    # exposure.
     sigma_loop_rad: float = 0.01
     sigma_loop_m: float = 0.01
     # Two sigmas of the center of a detected box, relative to the projected mean of the Gaussians of

@@ -27,18 +27,18 @@ Sigmas = Callable[[Variables, RelativePose], float]
 class LoopClosureConfig:
     """Limits for the acceptance of loop closures."""
 
-    # Maximum increase of the sum of squared residuals by a closure: the 99.73 % quantile (3 sigma)
-    # of chi^2 with six degrees of freedom. The residual of the closure alone is not sufficient: a
-    # false closure can move a chain of 100 measurements by a meter, and its residual is then only
-    # 2 sigma.
+    # Maximum increase of the sum of squared residuals by a closure: the 99.73 % quantile (3
+    # sigma) of chi^2 with six degrees of freedom. The residual of the closure alone is not
+    # sufficient: a false closure can move a chain of 100 measurements by a meter, and its
+    # residual is then only 2 sigma.
     max_cost: float = 20.06
     # Maximum residual of an accepted closure in any direction, in sigmas (as in RTAB-Map).
     max_sigmas: float = 3.0
     # If a new closure does not fit, the earlier closures with the largest residuals are tested for
     # removal. This is the maximum number of tests.
     max_removal_tests: int = 3
-    # Maximum number of accepted closures; each needs 1 kB and one more factor in the solver. If
-    # there are more, the older of the two most similar closures is removed.
+    # Maximum number of accepted closures; each needs 1 kB and one more factor in the solver.
+    # If there are more, the older of the two most similar closures is removed.
     max_closures: int = 500
     # Maximum number of stored closures that contradict a bridge edge. One of these closures
     # replaces the edge if more closures agree with it than with the edge (`component_merging`).

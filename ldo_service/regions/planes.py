@@ -42,8 +42,8 @@ class PlaneConfig:
     most: int = 24  # Planes are fitted to at most this number of surfaces, the largest ones.
     # Maximum difference, 1 / m, between the inverse depth of a plane and of its pixels.
     tolerance: float = 0.006
-    # Maximum fraction of a structural plane's outline past which a farther surface is visible.
-    # No farther surface is counted where the border of the image cuts the plane.
+    # Maximum fraction of a structural plane's outline past which a farther surface is visible. No
+    # farther surface is counted where the border of the image cuts the plane.
     behind: float = 0.3
     # Range of the distances outside of the outline at which farther surfaces are counted.
     gap_px: tuple[int, int] = (3, 8)

@@ -53,7 +53,7 @@ class RegionTracker:
 
     def __init__(self, config: RegionTrackerConfig | None = None) -> None:
         self.config = config or RegionTrackerConfig()
-        self._regions: dict[int, Region] = {}  # By id; the most recently observed region is last.
+        self._regions: dict[int, Region] = {}  # Keys are ids; the latest observed is last.
         self._next_id = 0
         self._allowed = 0.0  # Number of label requests that are allowed now.
 

@@ -19,9 +19,9 @@ class RegionTrackerConfig:
     # Keyframes without a better view after which a label is requested.
     patience: int = 3
     max_requests: int = 3  # Maximum label requests for a region.
-    # Maximum label requests per keyframe, on average; regions with the best views come first. Half
-    # of the regions show no object. The paper makes requests on 10-25 % of the frames (IV.B.8). On
-    # the synthetic flat, 1.0 requests per keyframe are made.
+    # Maximum label requests per keyframe, on average; regions with the best views come first.
+    # Half of the regions show no object. The paper makes requests on 10-25 % of the frames
+    # (IV.B.8). On the synthetic flat, 1.0 requests per keyframe are made.
     per_keyframe: float = 2.5
     # Maximum label requests at one keyframe, if earlier keyframes made fewer than per_keyframe.
     at_once: int = 4

@@ -17,8 +17,8 @@ from .folder import RunWriter
 from .job import REFINE_ITERATIONS
 from .summary import Percentiles, Usage, percentiles, summarize
 
-# Learning rates at the end of a refinement, as a fraction of those at its start. The rates decay so
-# that the map converges.
+# Learning rates at the end of a refinement, as a fraction of those at its start. The rates
+# decay so that the map converges.
 LAST_RATE = 0.05
 
 

@@ -55,7 +55,7 @@ class FinalPoses:
     """
 
     def __init__(self) -> None:
-        # By id of a keyframe: the keyframe itself and all that were aligned to it, by time.
+        # Each keyframe, followed by all keyframes that were aligned to it, sorted by time.
         self._measured: dict[int, list[MeasuredKeyframe]] = {}
 
     def add(self, measured: MeasuredKeyframe, reference: int | None) -> None:

@@ -160,7 +160,7 @@ class RunWriter:
         self._csv.writerow(COLUMNS)
         self._tracked: list[FramePose] = []
         self._poses, self._final_poses = KeyframePoses(), FinalPoses()
-        self._merged_submaps: dict[int, int] = {}  # By merged submap: the submap it is now part of.
+        self._merged_submaps: dict[int, int] = {}  # Merged submap -> submap that contains it.
         self._keyframes: dict[int, dict[str, Any]] = {}
         self.replica = MapReplica()
         self._objects: MapObjects | None = None

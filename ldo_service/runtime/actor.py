@@ -132,8 +132,8 @@ class Actor:
     talks_outside = False
     # True if no other actor waits for the outputs. A step may then take minutes.
     is_backend = False
-    # True if a robot waits for the outputs. This actor's thread then has priority over the threads
-    # of other actors.
+    # True if a robot waits for the outputs. This actor's thread then has priority over the
+    # threads of other actors.
     is_prompt = False
 
     def __init__(self) -> None:

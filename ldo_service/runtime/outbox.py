@@ -7,8 +7,8 @@ from threading import Lock
 from ldo_service.storage.message_log import LoggedMessage, MessageLog
 from ldo_service.transport.flow_control import UnackedMessage
 
-# Number of newest messages that stay in memory although the log on disk has them. Retransmissions
-# to consumers that are not far behind then need not read the disk.
+# Number of newest messages that stay in memory although the log on disk has them.
+# Retransmissions to consumers that are not far behind then need not read the disk.
 MESSAGES_IN_MEMORY = 8
 
 

@@ -38,8 +38,8 @@ from ldo_service.transport.interface import Transport, call_soon
 log = logging.getLogger(__name__)
 
 COMMAND_KEY, REPLY_KEY = "link/command", "link/reply"
-# A command without a reply after this time, in seconds, may be lost and is sent again. A stage that
-# is still executing the command ignores the repetition.
+# A command without a reply after this time, in seconds, may be lost and is sent again. A
+# stage that is still executing the command ignores the repetition.
 REPEAT_AFTER_S = 0.25
 
 # Minimum time that each actor has to reply to a command, seconds: 3x the slowest step measured.

@@ -59,8 +59,8 @@ class SupervisionConfig:
     stall_after_s: float = 60.0
     # The same limit for actors that no other actor waits for: one optimization may take minutes.
     backend_stall_after_s: float = 600.0
-    # Maximum size on disk of the unhandled messages of one topic, MB: almost 8 minutes of keyframes
-    # of 640x480 at 2 Hz.
+    # Maximum size on disk of the unhandled messages of one topic, MB: almost 8 minutes of
+    # keyframes of 640x480 at 2 Hz.
     backlog_mb: float = 2000.0
     # Time without progress after which a consumer is evicted, because its producer waits for it.
     evict_after_s: float = 30.0

@@ -8,8 +8,8 @@ import numpy as np
 from ldo_service.detection.vocabulary import answers_to, normalized
 from ldo_service.errors import did_you_mean
 
-# Text encoder of an open-vocabulary labeller. It maps T texts to unit vectors, [T, D]; a text
-# without a vector gets zeros. It raises TextComparisonError if it fails.
+# Text encoder of an open-vocabulary labeller. It maps T texts to unit vectors, [T, D]; a
+# text without a vector gets zeros. It raises TextComparisonError if it fails.
 Encode = Callable[[Sequence[str]], np.ndarray]
 
 # Score of a hyponym or hypernym of the text; the text itself and its synonyms score 1.

@@ -12,8 +12,8 @@ from ldo_service.actors.topology import GRAPH
 from ldo_service.schemas import Health
 from ldo_service.schemas.map import MAX_ITERATIONS
 
-# Number of unhandled messages above which a note names the slow consumer: five seconds of keyframes
-# at 2 Hz.
+# Number of unhandled messages above which a note names the slow consumer: five seconds of
+# keyframes at 2 Hz.
 BEHIND = 10
 SLOW_STEP_S = 5.0  # 8x the slowest step measured (mapper, 1.5 M Gaussians).
 # Maximum time between steps, in seconds, with queued messages or a running camera. An actor takes a

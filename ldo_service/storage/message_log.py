@@ -18,8 +18,8 @@ log = logging.getLogger(__name__)
 # Size in bytes at which the log starts a new segment. A segment is one file. It is deleted only as
 # a whole, so handled messages may still occupy this much disk space.
 SEGMENT_BYTES = 32_000_000
-# Record before each message: its number, the sizes of its header and body in bytes, and the CRC-32
-# of both.
+# Record before each message: its number, the sizes of its header and body in bytes, and the
+# CRC-32 of both.
 _RECORD = struct.Struct("<QIII")
 
 

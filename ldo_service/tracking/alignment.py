@@ -165,8 +165,8 @@ class AlignConfig:
     damping: float = 1e-6
     # Lower bound of the photometric noise, gray levels: the noise of rounding and interpolation.
     min_intensity_sigma: float = 1.0
-    # Lower bound of the geometric noise as a multiple of `DepthNoise`: 0.24 mm at short range,
-    # where `DepthNoise` is 1.2 mm. It covers depth that is rounded to millimeters.
+    # Lower bound of the geometric noise as a multiple of `DepthNoise`: 0.24 mm at short
+    # range, where `DepthNoise` is 1.2 mm. It covers depth that is rounded to millimeters.
     min_depth_noise_scale: float = 0.2
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     # Lower bound of the geometric noise while the depth may have a smooth bias, as a multiple of

@@ -22,8 +22,9 @@ from .tracking_quality import TrackingStatus
 
 # Timing by which the velocity of a frame is judged.
 TEN_MS = ShutterTiming(depth_delay_s=0.01)
-# A frame that is aligned again is worse below this ratio of the overlap before, or above this ratio
-# of the noise. A compensation with a right motion increases the overlap and lowers the noise.
+# A frame that is aligned again is worse below this ratio of the overlap before, or above this
+# ratio of the noise. A compensation with a right motion increases the overlap and lowers the
+# noise.
 WORSE_OVERLAP, WORSE_NOISE = 0.8, 1.5
 
 

@@ -48,12 +48,13 @@ class KeyframeDatabaseConfig:
     # Maximum number of records, 0.13 MB each at 640x480 (sequence kitchen). Beyond this number, the
     # record whose two neighbors on the path are closest to each other is removed.
     count: int = 1000
-    # Maximum number of ORB features of a record: half of the number of a frame, to halve the time
-    # of matching.
+    # Maximum number of ORB features of a record: half of the number of a frame, to halve the
+    # time of matching.
     features: int = 500
-    # A new record replaces an older one within this distance, rad as in `motion.image_motion_rad`,
-    # because the new one shows the current state of the scene. The value is half the distance
-    # between keyframes, so that the database stops growing while a robot repeats its route.
+    # A new record replaces an older one within this distance, rad as in
+    # `motion.image_motion_rad`, because the new one shows the current state of the scene. The
+    # value is half the distance between keyframes, so that the database stops growing while a
+    # robot repeats its route.
     same: float = 0.1
     # Number of newest records that are never replaced, since new keyframes are measured against
     # them.

@@ -34,9 +34,9 @@ class KeyframeConfig:
     max_frames: int = 30
     # A frame can become a relay while the caller allows no keyframe: a reference for tracking
     # alone (`Relay`). It does so if its motion exceeds this multiple of max_rotation_rad or
-    # max_translation, or if its overlap is below min_overlap divided by this ratio. With a ratio of
-    # 1, each held-out frame that needs a keyframe would become a relay and add a link to the chain
-    # of relative poses.
+    # max_translation, or if its overlap is below min_overlap divided by this ratio. With a
+    # ratio of 1, each held-out frame that needs a keyframe would become a relay and add a
+    # link to the chain of relative poses.
     relay_ratio: float = 1.5
     # The camera stands still if the overlap is above still_overlap, and rotation (rad) and
     # translation (fraction of the median depth) are below still_motion.
@@ -45,8 +45,8 @@ class KeyframeConfig:
     # A frame becomes a mapping keyframe if its motion since the last mapped frame exceeds this
     # fraction of max_rotation_rad or max_translation; the reference keyframe stays. More views
     # improve the map, and fewer references improve tracking. On the sequence kitchen, at equal
-    # iterations, mapping keyframes improve held-out views by 0.4 dB, and the worst one by 2 dB.
-    # With a value above 1, there are no mapping keyframes.
+    # iterations, mapping keyframes improve held-out views by 0.4 dB, and the worst one by 2
+    # dB. With a value above 1, there are no mapping keyframes.
     mapping_only_ratio: float = 0.33
 
     def __post_init__(self) -> None:
@@ -118,8 +118,8 @@ class ReferenceKeyframe:
 
     view: Pyramid
     T_odom_keyframe: np.ndarray  # [4, 4]
-    # Ascending number that odometry assigns. The camera's frame numbers may restart, so they are
-    # not used.
+    # Ascending number that odometry assigns. The camera's frame numbers may restart, so they
+    # are not used.
     id: int
     submap: int = 0  # Submap in whose odometry frame T_odom_keyframe is expressed.
     # Pixels whose surface has moved, [H, W] bool at working resolution; found by `segment_motion`.

@@ -36,8 +36,8 @@ class MotionSegmentationConfig:
 
     is_on: bool = True  # False: the scene is assumed to be static.
     level: int = 1  # Pyramid level of the comparison: 160 pixels wide.
-    # Minimum depth difference that contradicts a static scene. It covers the pose errors of frames
-    # that are tracked against one keyframe.
+    # Minimum depth difference that contradicts a static scene. It covers the pose errors of
+    # frames that are tracked against one keyframe.
     min_m: float = 0.06
     # Multiple of the depth noise, as estimated by alignment, that is added to min_m.
     sigmas: float = 4.0

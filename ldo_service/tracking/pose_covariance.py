@@ -25,8 +25,8 @@ from ldo_service.errors import ConfigError, named
 POSE, BRIGHTNESS = slice(0, 6), slice(6, 8)
 # Prior of gain and bias as inverse variances: standard deviations of 3 % and of 3 gray levels.
 BRIGHTNESS_PRIOR = np.array([1e3, 0.1])
-# Information that is added to the Hessian of the pose: 1 rad and 1 m. It only acts in directions
-# that the residuals do not constrain.
+# Information that is added to the Hessian of the pose: 1 rad and 1 m. It only acts in
+# directions that the residuals do not constrain.
 PRIOR = np.eye(6)
 
 

@@ -73,8 +73,8 @@ class ShutterState:
     evidence: TimingEvidence = field(default_factory=TimingEvidence)
     # Mean velocity between the last two frames that have a pose, [6] per second; None if unknown.
     mean_velocity: np.ndarray | None = None
-    # Velocity at the reference keyframe, [6] per second: the mean of the velocities before and
-    # after it. None if unknown, and at the frame after a new reference.
+    # Velocity at the reference keyframe, [6] per second: the mean of the velocities before
+    # and after it. None if unknown, and at the frame after a new reference.
     reference_velocity: np.ndarray | None = None
     has_new_reference: bool = False  # True if the last frame became the reference.
     # Equations of the last frame, until the next frame tells its velocity.

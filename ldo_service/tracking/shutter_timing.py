@@ -36,8 +36,8 @@ ROW_STRIDE = 4  # The mean rows of a band are those of every fourth point.
 # readout, and are outliers of the alignment as long as the readout is not compensated.
 NOISE_RATIO = 3.0
 # Fraction of the residuals that count as independent, because the errors of neighboring residuals
-# are correlated. Pose errors fit 0.1 on exact renders, and 1e-4 to 3e-5 on a Kinect; the value lies
-# between.
+# are correlated. Pose errors fit 0.1 on exact renders, and 1e-4 to 3e-5 on a Kinect; the value
+# lies between.
 INDEPENDENT_FRACTION = 2e-3
 # Noise that removes one kind of residuals from the normal equations: gray levels, or a multiple of
 # `DepthNoise`.

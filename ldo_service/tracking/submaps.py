@@ -26,10 +26,10 @@ FRAMES_PER_VIEW = 3  # A LOST frame that shows another view counts like this man
 class SubmapConfig:
     """Settings of submaps."""
 
-    # Number of LOST frames in a row, each searched in vain, after which a new submap starts; 0:
-    # never. In the kitchen at 30 Hz, relocalization took up to 87 frames. A third of this number is
-    # enough if all frames show different views, as with a fast camera or few frames per second: at
-    # 2 to 5 Hz, relocalization took at most 10 frames.
+    # Number of LOST frames in a row, each searched in vain, after which a new submap starts;
+    # 0: never. In the kitchen at 30 Hz, relocalization took up to 87 frames. A third of this
+    # number is enough if all frames show different views, as with a fast camera or few
+    # frames per second: at 2 to 5 Hz, relocalization took at most 10 frames.
     begin_after_frames: int = 90
     # Correlation of the thumbnails of two frames below which the frames show different views.
     max_view_correlation: float = 0.9

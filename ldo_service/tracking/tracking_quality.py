@@ -54,8 +54,8 @@ class TrackingQualityConfig:
     lost_overlap: float = 0.08  # A frame with a smaller overlap is LOST.
     # Residual limits of a pose within confirmed_rad of the pose by features. They replace the
     # limits above if those are smaller, except while tracking is LOST. They were chosen on the
-    # ScanNet parts and on freiburg1_rpy. Of the frames above weak_residual, those within 0.03 rad
-    # of the feature pose erred by at most 0.01 rad, and the others by up to 0.07 rad.
+    # ScanNet parts and on freiburg1_rpy. Of the frames above weak_residual, those within 0.03
+    # rad of the feature pose erred by at most 0.01 rad, and the others by up to 0.07 rad.
     confirmed_rad: float = 0.03
     confirmed_weak_residual: float = 6.0
     confirmed_lost_residual: float = 15.0
@@ -67,10 +67,10 @@ class TrackingQualityConfig:
     relocalized_overlap: float = 0.35
     # Residual limit of the first OK frame after a loss, at the pose of the keyframe. The limit
     # grows by relocalized_residual_per_rad per radian of image motion from the keyframe
-    # (`motion.image_motion_rad`), up to weak_residual, because the noise of right poses grows too:
-    # its median in the kitchen is 1.4 at 0.15 rad and 2.0 at 0.55 rad. A fixed limit of 1.6 found a
-    # third fewer frames of the kitchen, and one more false pose in the ambiguous corridor of the
-    # flat.
+    # (`motion.image_motion_rad`), up to weak_residual, because the noise of right poses grows
+    # too: its median in the kitchen is 1.4 at 0.15 rad and 2.0 at 0.55 rad. A fixed limit of 1.6
+    # found a third fewer frames of the kitchen, and one more false pose in the ambiguous
+    # corridor of the flat.
     relocalized_residual: float = 1.3
     relocalized_residual_per_rad: float = 2.0
     # Expected noise while the history is empty. Intensity in gray levels.

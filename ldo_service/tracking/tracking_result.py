@@ -21,7 +21,7 @@ class KeyframeKind(StrEnum):
 
     FIRST = "first"  # Starts a submap and is measured from no other keyframe.
     REFERENCE = "reference"  # Becomes the reference: the next frames are aligned to this keyframe.
-    MAPPING = "mapping"  # Is mapped, but does not become the reference.
+    MAPPING = "mapping"  # The mapper uses it, but it does not become the reference.
 
 
 @dataclass(frozen=True, slots=True)

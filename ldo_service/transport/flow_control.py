@@ -111,8 +111,8 @@ class OutletPosition(NamedTuple):
     epoch: int
     seq: int  # Offset of the next message.
     unhandled: tuple[UnackedMessage, ...] = ()
-    # Offset of the first unhandled message, if a log on disk has the unhandled messages; None
-    # without a log.
+    # Offset of the first unhandled message, if a log on disk has the unhandled
+    # messages; None without a log.
     logged_from: int | None = None
 
     @property

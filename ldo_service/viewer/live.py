@@ -235,7 +235,7 @@ class LiveSource:
     def __init__(self, service: Client, config: ViewerConfig, stack: ExitStack) -> None:
         self._service = service
         self._epochs: dict[str, int] = {}  # Epochs of the actors in RESTARTED_TOGETHER.
-        self._began_s: dict[str, float] = {}  # By actor: time at which its new epoch was noticed.
+        self._began_s: dict[str, float] = {}  # Actor -> time of its new epoch.
         self._live = LiveScene(config, time.monotonic)
         self._inboxes = [
             stack.enter_context(service.poller(topic.subscription_key, topic.message, keep))

@@ -20,8 +20,8 @@ from .viewpoints import Viewpoint, surface_depth_m
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 SLAB = 1 << 18  # Voxels processed at a time.
 
-# Key: map axis that is up. Value: the map axes that become x (right) and y (ahead) of the plan seen
-# from above, the vertical map axis, and the sign of up along it.
+# Key: map axis that is up. Value: the map axes that become x (right) and y (ahead) of the plan
+# seen from above, the vertical map axis, and the sign of up along it.
 UP = {
     "x": (1, 2, 0, 1),
     "y": (2, 0, 1, 1),

@@ -56,8 +56,8 @@ KNOTS = np.concatenate([FIRST_HALF, FIRST_HALF * HALF_TURN, SECOND_HALF, SECOND_
 WALK_M_S, TURN_RAD_S = 0.63, 1.02
 STEPS_PER_KNOT = 64  # Resolution of the table that maps time to a position on the path.
 
-# Hand shake, as a slow sway and a quick tremor: period in seconds, amplitude of the camera center
-# in meters, and amplitude of the viewing direction.
+# Hand shake, as a slow sway and a quick tremor: period in seconds, amplitude of the camera
+# center in meters, and amplitude of the viewing direction.
 SWAY_S, SWAY_EYE_M, SWAY_GAZE = 0.6, 0.012, 0.022
 TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE = 0.2, 0.0015, 0.004
 

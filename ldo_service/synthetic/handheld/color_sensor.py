@@ -8,8 +8,8 @@ from ldo_service.geometry import Camera
 from ldo_service.synthetic.flat.sensor import blur, normal
 from ldo_service.synthetic.optics import undistorted
 
-# Vignetting of the green channel of an ASUS Xtion (Bonn RGB-D Dynamic, `crowd`). The radius r is 1
-# in the corners. The factor on the light is 0.65 there and 0.73 in the middle of the left side.
+# Vignetting of the green channel of an ASUS Xtion (Bonn RGB-D Dynamic, `crowd`). The radius r is
+# 1 in the corners. The factor on the light is 0.65 there and 0.73 in the middle of the left side.
 VIGNETTING = (-0.62, 0.42, -0.15)  # Coefficients of r^2, r^4, r^6 in (factor - 1).
 CHANNEL_LOSS = (1.06, 1.0, 0.88)  # Red, green, blue: multiples of (factor - 1) of green.
 TARGET = 0.42  # Mean gray value, 0..1, that automatic exposure aims at.

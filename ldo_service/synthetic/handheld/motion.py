@@ -7,8 +7,8 @@ import numpy as np
 from ldo_service.synthetic.flat.walk import KNOTS, timed_positions
 from ldo_service.synthetic.path import Path, closed_spline, lengths, looking
 
-# Hand shake, as a slow sway and a quick tremor: period in seconds, amplitude of the camera center
-# in meters, and amplitude of viewing direction and roll in radians.
+# Hand shake, as a slow sway and a quick tremor: period in seconds, amplitude of the camera
+# center in meters, and amplitude of viewing direction and roll in radians.
 SWAY_S, SWAY_EYE_M, SWAY_RAD = 0.6, 0.02, 0.06
 TREMOR_S, TREMOR_EYE_M, TREMOR_RAD = 0.2, 0.002, 0.008
 
