@@ -63,7 +63,7 @@ class Reduced:
         return Reduced(rest[..., :K], rest[..., K], own)
 
     def own_step(self, step: np.ndarray) -> np.ndarray:
-        """Return the step [..., M] of the block's own unknowns for a step [..., K]."""
+        """Return the block's own step [..., M] for a step [..., K] of the shared coefficients."""
         return -(self.own[..., :-1] @ step[..., None])[..., 0] - self.own[..., -1]
 
 

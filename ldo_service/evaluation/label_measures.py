@@ -206,8 +206,9 @@ def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
     [[1, 1, 0], [0, 0, 1]]
 
     Args:
-        truth: True index in a list of C names, [H, W] uint8; VOID is ignored.
-        shown: Index of the name in the map, [H, W] uint8; values from C on are unknown names.
+        truth: Index of the true name in a list of C names, [H, W] uint8; VOID is ignored.
+        shown: Index in that list of the name that the map shows, [H, W] uint8; values from C on
+            are unknown names.
         classes: Number of names, C.
 
     Returns:

@@ -55,8 +55,8 @@ def label_sheet(
     Args:
         pictures: Views to draw.
         map_names: Names of the map's labels, by label.
-        class_names: Names of the data set's classes, by class id. The legend has the names in the
-            `label_lists.full_list` of these classes.
+        class_names: Names of the data set's classes, by class id. The legend shows each name as
+            in `label_lists.full_list(class_names)`.
 
     Returns:
         The sheet, RGB [H, W, 3] uint8.

@@ -69,7 +69,7 @@ class MapView:
         if len(self.regions) != v or (v and not self.indices[-1] < n):
             raise ValueError(
                 f"regions has {len(self.regions)} entries for {v} Gaussians: it must have one for "
-                f"each, and all indices must be below {n}, the number of rows of the map."
+                f"each. Indices of Gaussians must be below {n}, the number of rows of the map."
             )
         if v and self.regions.max() >= len(self.boxes):
             raise ValueError(

@@ -54,7 +54,7 @@ def under_way(frames: int) -> str:
 
 
 def share_shown(shown: int, there: int) -> str:
-    """Return how many Gaussians of how many are drawn, as text; empty if all are drawn."""
+    """Return the number of drawn Gaussians and of all Gaussians as text; empty if all are drawn."""
     return f"{shown:,} of {there:,} Gaussians are drawn" if shown < there else ""
 
 
