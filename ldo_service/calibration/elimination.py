@@ -72,7 +72,7 @@ class Check:
     """Root mean square of the cells' mean residuals in held-out blocks.
 
     `rms_without` has all shared coefficients at 0; `rms_with` uses the coefficients estimated from
-    the other groups. Within a cell, noise averages out.
+    the blocks that were not held out. Within a cell, noise averages out.
     """
 
     rms_without: float

@@ -38,7 +38,7 @@ def rendering_sheet(
 
 
 def some_of(views: tuple[ViewErrors, ...], count: int = VIEWS) -> list[ViewErrors]:
-    """Choose the views with the best and the worst PSNR, and others at even intervals.
+    """Choose the views with the best and the worst PSNR, and others evenly spread over the frames.
 
     The result is sorted by frame.
     """

@@ -177,8 +177,8 @@ class GaussianMap:
         new = _piece(ids, rows, anchors, labels)
         if len(ids) and (ids[0] < self._next_id or np.any(np.diff(ids) <= 0)):
             raise ValueError(
-                f"ids must ascend and be at least {self._next_id}, the next unused id of this map: "
-                f"the first is {ids[0]}."
+                f"ids must ascend and start at {self._next_id} or above, the next unused id of "
+                f"this map. The given ids start at {ids[0]}."
             )
         start, stop = self._size, self._size + len(rows)
         self._reserve(stop)

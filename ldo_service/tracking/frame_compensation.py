@@ -52,7 +52,11 @@ class FrameCompensator:
         return self._view[1]
 
     def finish(self, frame: RgbdFrame) -> None:
-        """Compensate the last frame with the motion that its pose fits, if it was corrected."""
+        """Compensate the last frame again if `measure` has corrected its motion.
+
+        Args:
+            frame: The frame of the last call of `expect`.
+        """
         if self.motion is not self._compensated:
             self._compensate(frame, self.motion)
 

@@ -162,7 +162,7 @@ class FrameTracker:
 
     @property
     def motion(self) -> FrameMotion | None:
-        """Motion of the camera during the last frame, which is compensated; None if unknown."""
+        """Estimated motion of the camera during the last frame; None if it is unknown."""
         return self._compensator.motion
 
     def expect_bias(self, is_expected: bool) -> None:

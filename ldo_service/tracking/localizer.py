@@ -90,7 +90,8 @@ class Localizer(Odometry):
         """Start without a known pose in the map.
 
         Args:
-            database: Keyframe database of the map. Its poses T_odom_keyframe are in the map frame.
+            database: Keyframe database of the map. Its poses
+                `T_odom_keyframe` are in the map frame, not in an odometry frame.
             config: Settings; see `Odometry`.
             T_base_camera: Pose of the camera on the robot, [4, 4]; see `Odometry`.
         """
