@@ -21,6 +21,7 @@ from ldo_service.evaluation.semantics import GATES, LabelErrors
 from ldo_service.evaluation.trajectory import TrajectoryErrors
 from ldo_service.evaluation.views import RenderingErrors
 from ldo_service.runs.finished import read_run, require_file
+from ldo_service.runs.networks import labelled_by
 from ldo_service.runs.source import open_source
 
 from .options import Json, Source, argument, progress
@@ -139,12 +140,6 @@ def run_config(folder: Path) -> Config:
         DataError: If the folder has no config.yaml.
     """
     return load_config(require_file(folder, "config.yaml"))
-
-
-def labelled_by(config: Config) -> dict[str, str]:
-    """Return the names of the detector and the labeller of a run; empty if the run had none."""
-    labeller = config.vlm_labeller.model or config.vlm_labeller.url
-    return {"detector": config.detector.model, "labeller": labeller}
 
 
 def print_results(

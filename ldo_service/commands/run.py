@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from math import gcd
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +14,7 @@ from ldo_service.geometry import Trajectory
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.runs.folder import RunWriter, prepare
 from ldo_service.runs.front_end import FrontEnd
-from ldo_service.runs.job import Advance, RunOptions
+from ldo_service.runs.job import Advance, RunOptions, require_held_out
 from ldo_service.runs.networks import require_usable_networks
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.realtime import run_realtime
@@ -234,22 +233,6 @@ def require_separate(localize: Path | None, out: Path, refine: int) -> None:
         raise ConfigError("--localize never changes the map. Remove --refine-iterations.")
     if localize and localize.expanduser().resolve() == out.expanduser().resolve():
         raise ConfigError(f"--out {out} would replace the map of --localize. Choose another --out.")
-
-
-def require_held_out(stride: int, hold_out: int) -> None:
-    """Check that the run reads the frames that are held out.
-
-    Every `hold_out`-th frame of the whole sequence is held out, counted before the stride selects
-    frames. If both numbers have a common factor, the stride skips all held-out frames.
-
-    Raises:
-        ConfigError: If both numbers have a common factor.
-    """
-    if hold_out and gcd(stride, hold_out) > 1:
-        raise ConfigError(
-            f"--stride {stride} and --hold-out-every {hold_out} have a common factor, so "
-            "the stride would skip all held-out frames. Choose numbers without a common factor."
-        )
 
 
 def summary_table(summary: dict[str, Any], out: Path) -> Table:

@@ -38,6 +38,7 @@ class Job:
     voxel_m: float | None  # Side of a voxel; None for the default of the format.
     up: Up  # Axis of the map that points up.
     heights_m: tuple[float, float]  # Height range of the floor plan above the first camera.
+    threads: int  # Threads of mesh and occupancy.
     advance: Advance
 
 
@@ -51,6 +52,7 @@ def export_map(
     up: Up = "-y",
     heights_m: tuple[float, float] = (-0.5, 0.5),
     overwrite: bool = False,
+    threads: int | None = None,
     advance: Advance = lambda _done, _total: None,
 ) -> str:
     """Write the map or the trajectory to a file.
@@ -64,6 +66,7 @@ def export_map(
         up: Axis of the map that points up, for the floor plan of occupancy.
         heights_m: Height range of the floor plan in meters above the first camera.
         overwrite: True replaces an earlier file.
+        threads: Threads of mesh and occupancy; None for all cores.
         advance: Function that receives the progress of mesh and occupancy.
 
     Returns:
@@ -90,7 +93,8 @@ def export_map(
         )
     require_writable((run, source.folder), [out, *written], overwrite)
     try:
-        return WRITERS[format](Job(source, out, voxel_m, up, heights_m, advance))
+        threads = threads or os.cpu_count() or 1
+        return WRITERS[format](Job(source, out, voxel_m, up, heights_m, threads, advance))
     except OSError as error:
         raise ConfigError(
             f"{out} cannot be written: {error.strerror}. Choose another file (--out)."
@@ -161,7 +165,7 @@ def _mesh(job: Job) -> str:
         rows,
         viewpoints,
         config,
-        threads=os.cpu_count() or 1,
+        threads=job.threads,
         advance=lambda done: job.advance(done, len(viewpoints)),
     ).mesh()
     if not len(mesh.triangles):
@@ -180,7 +184,7 @@ def _occupancy(job: Job) -> str:
         rows,
         viewpoints,
         config,
-        threads=os.cpu_count() or 1,
+        threads=job.threads,
         advance=lambda done: job.advance(done, len(viewpoints)),
     )
     plan = floor_plan(grid, job.up, job.heights_m)

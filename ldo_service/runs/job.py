@@ -1,6 +1,7 @@
 """Options of a run."""
 
 from dataclasses import dataclass
+from math import gcd
 from pathlib import Path
 from typing import Protocol
 
@@ -70,3 +71,19 @@ class RunOptions:
 def requests(iterations: int) -> int:
     """Return the number of refinement requests into which `iterations` are divided."""
     return -(-iterations // REFINE_ITERATIONS)
+
+
+def require_held_out(stride: int, hold_out: int) -> None:
+    """Check that the run reads the frames that are held out.
+
+    Every `hold_out`-th frame of the whole sequence is held out, counted before the stride selects
+    frames. If both numbers have a common factor, the stride skips all held-out frames.
+
+    Raises:
+        ConfigError: If both numbers have a common factor.
+    """
+    if hold_out and gcd(stride, hold_out) > 1:
+        raise ConfigError(
+            f"--stride {stride} and --hold-out-every {hold_out} have a common factor, so "
+            "the stride would skip all held-out frames. Choose numbers without a common factor."
+        )

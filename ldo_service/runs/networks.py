@@ -1,4 +1,4 @@
-"""Check of the configured neural networks before a run."""
+"""Configured neural networks of a run: their names, and a check before the run."""
 
 from ldo_service.actors.detector import require_detector
 from ldo_service.actors.vlm_labeller import require_labeller
@@ -16,3 +16,9 @@ def require_usable_networks(config: Config) -> None:
     parameters = actor_parameters(config)
     require_detector(parameters.detector)
     require_labeller(parameters.vlm_labeller)
+
+
+def labelled_by(config: Config) -> dict[str, str]:
+    """Return the names of the detector and the labeller of a run; empty if the run had none."""
+    labeller = config.vlm_labeller.model or config.vlm_labeller.url
+    return {"detector": config.detector.model, "labeller": labeller}
