@@ -24,6 +24,7 @@ LAYERS = (
     ("actors",),
     ("config",),
     ("runs", "service"),
+    ("batch",),
     ("viewer", "suites", "testing", "library"),
     ("commands",),
     ("__main__",),

@@ -17,7 +17,7 @@ from rich.console import Console
 from ldo_service.errors import ConfigError, LdoError
 
 # Verbs that keep their partial results when they are interrupted.
-KEEPING = ("demo", "run", "suite")
+KEEPING = ("batch", "demo", "run", "suite")
 HELP = """\
 usage: ldo VERB ...
 
@@ -62,7 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         datefmt="%H:%M:%S",
     )
     if not debug:
-        logging.getLogger("httpx2").setLevel(logging.WARNING)  # INFO has a line per request.
+        for library in ("httpx2", "aiobotocore", "botocore"):  # INFO has a line per request.
+            logging.getLogger(library).setLevel(logging.WARNING)
     _end_on_interrupts()
     known = verbs()
     _raise_on_interrupts()
@@ -136,6 +137,7 @@ def first_lines() -> Iterator[str]:
 def verbs() -> dict[str, Callable[..., None]]:
     """Return the function of each verb, by name; the function's docstring is the help text."""
     from ldo_service.commands import (
+        batch,
         bench,
         control,
         demo,
@@ -162,6 +164,7 @@ def verbs() -> dict[str, Callable[..., None]]:
         "run": run.run,
         "info": info.info,
         "eval": evaluate.evaluate,
+        "batch": batch.batch,
         "suite": suite.suite,
         "query": query.query,
         "view": view.view,

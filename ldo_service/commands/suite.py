@@ -26,6 +26,14 @@ def suite(
         Path, argument(metavar="DIR", help="folder with the data sets of the suite")
     ] = Path(),
     set: Settings = (),
+    workers: Annotated[
+        int,
+        argument(
+            metavar="N",
+            help="runs at the same time; with more than one, the times of the tables depend on "
+            "the load",
+        ),
+    ] = 1,
     overwrite: Overwrite = False,
 ) -> None:
     """Run and evaluate several sequences and variants; print tables with mean and spread.
@@ -40,8 +48,10 @@ def suite(
       ldo suite table-9 --data ~/data --out suites/ablation --set detector.model=nano
       ldo suite my-suite.yaml --data ~/data --out suites/mine
     """
+    if workers < 1:
+        raise ConfigError(f"--workers {workers} must be at least 1.")
     chosen = load_suite(name)
-    work = SuiteRunner(chosen, data.expanduser(), out.expanduser(), set, overwrite)
+    work = SuiteRunner(chosen, data.expanduser(), out.expanduser(), set, overwrite, workers)
     _require_folder(work.out)
     console, total = Console(stderr=True), len(work.entries())
     done: list[SuiteRun] = []

@@ -1,4 +1,4 @@
-"""Execution of the runs of a suite, one after the other, each in its own process.
+"""Execution of the runs of a suite, each in its own process.
 
 Finished runs are not repeated, so an interrupted suite resumes where it stopped. A failed run is
 marked as failed in the table and does not stop the other runs.
@@ -6,22 +6,24 @@ marked as failed in the table and does not stop the other runs.
 
 import json
 import logging
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ldo_service import versions
-from ldo_service.errors import ConfigError
-from ldo_service.runs.front_end import FRONT_END
+from ldo_service.batch import BatchJob, LocalExecutor, Recording, ResultFolder
+from ldo_service.batch.job import RunPlan, key_of
+from ldo_service.batch.results import EVALUATION
+from ldo_service.batch.sources import measure
+from ldo_service.config import checked, load_config
+from ldo_service.errors import ConfigError, LdoError
 
 from .suite import SYNTHETIC, EvaluatedRun, Suite, SuiteRun
 
 log = logging.getLogger(__name__)
 
-LDO = (sys.executable, "-m", "ldo_service")
-ENTRY, RESULTS = "entry.json", "eval.json"
+NO_DATA = "no data"
+STAGING = ".staging"  # Folder of unfinished runs, in the folder of the suite.
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,7 @@ class SuiteRunner:
         out: Folder for the runs.
         settings: Settings of all runs; the settings of a variant override these.
         overwrite: True to repeat finished runs too.
+        workers: Runs at the same time. Each run uses all cores if this is 1, otherwise one core.
     """
 
     suite: Suite
@@ -56,83 +59,107 @@ class SuiteRunner:
     out: Path
     settings: tuple[str, ...] = ()
     overwrite: bool = False
+    workers: int = 1
 
     def entries(self) -> list[SuiteRun]:
         """Return all runs of the suite."""
         return list(self.suite.entries(self.data))
 
     def outcomes(self, begun: Callable[[SuiteRun], None]) -> Iterator[Outcome]:
-        """Run the suite and yield the outcome of each run.
+        """Run the suite and yield the outcome of each run, in the order of `entries`.
 
         Args:
             begun: Function that is called with each run before the run starts.
+
+        Raises:
+            ConfigError: A setting of a variant or an option of the suite is invalid.
         """
-        for entry in self.entries():
+        for settings in self.suite.variants.values():
+            self._plan(settings)
+        entries = self.entries()
+        sources = self._sources(entries)
+        failures = dict[str, str]()
+        # A run that reuses a front end starts after all runs that record one.
+        for is_second in (False, True):
+            wave = [entry for entry in entries if (entry.front_end is not None) == is_second]
+            jobs = self._jobs(wave, sources, begun)
+            with closing(LocalExecutor(self.workers).outcomes(jobs)) as outcomes:
+                failures |= {o.folder: o.error for o in outcomes if not o.has_results}
+        for entry in entries:
+            yield self._outcome(entry, sources[entry.source], failures.get(str(entry.folder), ""))
+
+    def _sources(self, entries: list[SuiteRun]) -> dict[str, Recording | str]:
+        """Return the recording of each source, or the reason why it cannot be used."""
+        return {entry.source: _recording(entry.source) for entry in entries}
+
+    def _jobs(
+        self,
+        entries: list[SuiteRun],
+        sources: dict[str, Recording | str],
+        begun: Callable[[SuiteRun], None],
+    ) -> Iterator[BatchJob]:
+        """Yield the job of each run that has no results yet."""
+        for entry in entries:
             begun(entry)
-            yield self._outcome(entry)
+            recording = sources[entry.source]
+            if isinstance(recording, Recording):
+                job = self.job(entry, recording)
+                if self.overwrite or ResultFolder.of(job).finished() is None:
+                    yield job
 
-    def _outcome(self, entry: SuiteRun) -> Outcome:
-        if not entry.source.startswith(SYNTHETIC) and not Path(entry.source).exists():
-            return Outcome(entry, None, "no data")
-        folder = self.out / entry.folder
-        if self.overwrite or not self._is_finished(entry, folder):
-            failed = self._run(entry, folder)
-            if failed:
-                log.error(
-                    "suite: run %s failed: %s The table shows this run as failed.",
-                    entry.folder,
-                    failed,
-                )
-                return Outcome(entry, None, "failed")
-        try:
-            return Outcome(entry, read_evaluated_run(folder))
-        except ConfigError as error:
-            log.error("suite: %s", error)
-            return Outcome(entry, None, "failed")
-
-    def _entry_json(self, entry: SuiteRun) -> str:
-        """Return everything that the results of a run depend on, as JSON."""
-        values = {
-            **asdict(entry),
-            "settings": (*self.settings, *entry.settings),
-            "options": self.suite.options(),
-            "ldo": versions()["ldo-slam"],
-        }
-        if self.suite.front_end is None:
-            del values["front_end"]
-        else:
-            values["front_end_settings"] = self.suite.front_end_settings()
-        return json.dumps(values, indent=1)
-
-    def _is_finished(self, entry: SuiteRun, folder: Path) -> bool:
-        entry_path = folder / ENTRY
-        is_kept = entry.variant != self.suite.front_end or (folder / FRONT_END).is_file()
-        return (
-            is_kept and entry_path.is_file() and entry_path.read_text() == self._entry_json(entry)
+    def job(self, entry: SuiteRun, recording: Recording) -> BatchJob:
+        """Return the job of a run."""
+        records = self.suite.front_end is not None and entry.front_end is None
+        reused = entry.front_end_folder
+        plan = self._plan(entry.settings)
+        first = key_of(recording, self._plan(self.suite.front_end_settings())) if reused else ""
+        return BatchJob(
+            recording=recording,
+            plan=plan,
+            out=str(self.out.absolute()),
+            folder=str(entry.folder),
+            key=key_of(recording, plan, front_end=first, keeps_front_end=records),
+            keeps_front_end=records,
+            front_end=str(reused or ""),
+            staging=str(self.out.absolute() / STAGING),
+            repeats=self.overwrite,
         )
 
-    def _run(self, entry: SuiteRun, folder: Path) -> str:
-        """Execute and evaluate a run; return the reason if it fails, else an empty string."""
-        settings = [
-            word for setting in (*self.settings, *entry.settings) for word in ("--set", setting)
-        ]
-        run = ("run", entry.source, "--out", str(folder), "--overwrite", *self.suite.options())
-        if entry.front_end_folder:
-            run += ("--reuse-front-end", str(self.out / entry.front_end_folder))
-        elif self.suite.front_end:
-            run += ("--keep-front-end",)
-        for name in (ENTRY, RESULTS):  # `ldo run --overwrite` refuses files that it did not write.
-            (folder / name).unlink(missing_ok=True)
-        done = _ldo(*run, *settings)
-        if done.returncode:
-            return _reason(done)
-        evaluated = _ldo("eval", str(folder), entry.source, "--json")
-        if evaluated.returncode:
-            return _reason(evaluated)
-        _write(folder / RESULTS, evaluated.stdout)
-        # This file marks the run as finished, so it is written last.
-        _write(folder / ENTRY, self._entry_json(entry))
-        return ""
+    def _plan(self, settings: tuple[str, ...] | None) -> RunPlan:
+        suite = self.suite
+        config = load_config(None, (*self.settings, *(settings or ())))
+        tracker = replace(config.tracker, hold_out=suite.hold_out)
+        return RunPlan(
+            config=checked(replace(config, tracker=tracker)),
+            stride=suite.stride,
+            max_frames=suite.max_frames,
+            refine=suite.refine,
+            threads=0 if self.workers == 1 else 1,
+        )
+
+    def _outcome(self, entry: SuiteRun, source: Recording | str, failure: str) -> Outcome:
+        if source == NO_DATA:
+            return Outcome(entry, None, NO_DATA)
+        failure = source if isinstance(source, str) else failure
+        try:
+            if not failure:
+                return Outcome(entry, read_evaluated_run(self.out / entry.folder))
+        except ConfigError as error:
+            failure = str(error)
+        log.error(
+            "suite: run %s failed: %s The table shows this run as failed.", entry.folder, failure
+        )
+        return Outcome(entry, None, "failed")
+
+
+def _recording(source: str) -> Recording | str:
+    """Return the recording of a source, or the reason why it cannot be used."""
+    if not source.startswith(SYNTHETIC) and not Path(source).exists():
+        return NO_DATA
+    try:
+        return measure(source)
+    except LdoError as error:
+        return str(error)
 
 
 def read_evaluated_run(folder: Path) -> EvaluatedRun:
@@ -142,27 +169,10 @@ def read_evaluated_run(folder: Path) -> EvaluatedRun:
         ConfigError: A file with results cannot be read.
     """
     try:
-        texts = [(folder / name).read_text() for name in ("summary.json", RESULTS)]
+        texts = [(folder / name).read_text() for name in ("summary.json", EVALUATION)]
         return EvaluatedRun(*map(json.loads, texts))
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"{folder} has no valid results ({error}). Remove this folder, and start the suite "
             "again to repeat the run."
         ) from error
-
-
-def _ldo(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*LDO, *words], capture_output=True, text=True, check=False)
-
-
-def _reason(done: subprocess.CompletedProcess[str]) -> str:
-    """Return the error message that a failed `ldo` process has printed."""
-    lines = [line for line in done.stderr.strip().splitlines() if line.strip()]
-    return lines[-1].removeprefix("ldo: ") if lines else f"exit code {done.returncode}."
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text)
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be written: {error.strerror}.") from error

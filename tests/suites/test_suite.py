@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from ldo_service.batch import Recording
 from ldo_service.config import load_config
 from ldo_service.errors import ConfigError
 from ldo_service.suites import (
@@ -72,17 +73,27 @@ def test_other_variants_reuse_the_front_end_of_the_same_seed() -> None:
     assert {entry.front_end_folder for entry in TWO.entries(Path())} == {None}
 
 
-def test_first_run_without_its_front_end_is_not_finished(tmp_path: Path) -> None:
+def test_keys_differ_where_the_results_do(tmp_path: Path) -> None:
+    def keys(suite: Suite, **options) -> list[str]:
+        runner = SuiteRunner(suite, Path("/data"), tmp_path, **options)
+        return [
+            runner.job(entry, Recording(entry.source, entry.sequence, 0, entry.source)).key
+            for entry in runner.entries()
+        ]
+
+    own = keys(TWO)
     shared = msgspec.structs.replace(TWO, front_end="plain", figures=("ate_cm",))
-    runner = SuiteRunner(shared, Path("/data"), tmp_path)
-    first, _, other, _ = runner.entries()[:4]
-    for entry in (first, other):
-        (tmp_path / entry.folder).mkdir(parents=True)
-        (tmp_path / entry.folder / "entry.json").write_text(runner._entry_json(entry))
-    assert runner._is_finished(other, tmp_path / other.folder)
-    assert not runner._is_finished(first, tmp_path / first.folder)
-    (tmp_path / first.folder / "front_end.mcap").touch()
-    assert runner._is_finished(first, tmp_path / first.folder)
+    assert len(set(own)) == len(own)
+    assert set(keys(shared)).isdisjoint(own)
+    assert keys(TWO, workers=2) == own
+    assert set(keys(TWO, settings=("mapper.seed=5",))).isdisjoint(own)
+
+
+def test_invalid_setting_of_a_variant_is_refused_before_any_run(tmp_path: Path) -> None:
+    wrong = msgspec.structs.replace(TWO, variants={"plain": (), "typo": ("mapper.iteration=2",)})
+    runner = SuiteRunner(wrong, Path("/data"), tmp_path)
+    with pytest.raises(ConfigError, match=r"mapper\.iterations"):
+        next(runner.outcomes(lambda _: pytest.fail("a run has begun")))
 
 
 def test_several_sequences_give_one_table_per_score() -> None:

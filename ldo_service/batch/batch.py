@@ -1,0 +1,113 @@
+"""Batch: its jobs, the results that exist already, and the outcomes of the others."""
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from msgspec import structs
+
+from ldo_service.errors import LdoError
+
+from .executors import Executor
+from .job import KEY_DIGITS, BatchJob, Outcome, RunPlan, key_of
+from .results import ResultFolder
+from .sources import Recording, measure
+from .store import Store
+
+# Threads that read local recordings for their digest, or wait for answers of a bucket.
+LOOKUP_THREADS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Options of a batch.
+
+    Attributes:
+        plan: Work on each recording.
+        out: Folder with all results.
+        staging: Folder for recordings and results of running processes.
+        max_staged_bytes: Limit of all staged recordings on one machine.
+    """
+
+    plan: RunPlan
+    out: Store
+    staging: Path
+    max_staged_bytes: int
+
+    def outcomes(
+        self,
+        sources: Sequence[str],
+        executor: Executor,
+        begun: Callable[[list[BatchJob]], None],
+    ) -> Iterator[Outcome]:
+        """Yield the outcome of each recording, those with finished results first.
+
+        Args:
+            sources: Sources, each one once.
+            executor: Executor of the jobs.
+            begun: Function that is called with all jobs to run, before the first one starts.
+        """
+        jobs, seen = list[BatchJob](), dict[str, str]()
+        for source, found in zip(sources, self._looked_up(sources), strict=True):
+            if found.folder and found.folder in seen:
+                yield _duplicate(source, seen[found.folder])
+                continue
+            seen[found.folder] = source
+            if isinstance(found, BatchJob):
+                jobs.append(found)
+            else:
+                yield found
+        begun(jobs)
+        with closing(executor.outcomes(jobs)) as outcomes:
+            yield from outcomes
+
+    def _looked_up(self, sources: Iterable[str]) -> Iterator[BatchJob | Outcome]:
+        """Yield a job for each source without results, and the outcome of the others."""
+        with ThreadPoolExecutor(LOOKUP_THREADS, "lookup") as threads:
+            yield from threads.map(self._look_up, sources)
+
+    def _look_up(self, source: str) -> BatchJob | Outcome:
+        try:
+            job = self.job(measure(source))
+            kept = ResultFolder.of(job).finished()
+        except LdoError as error:
+            name = Path(source).name
+            return Outcome(source=source, name=name, folder="", status="failed", error=str(error))
+        return (
+            job if kept is None else structs.replace(kept, source=source, name=job.recording.name)
+        )
+
+    def job(self, recording: Recording) -> BatchJob:
+        """Return the job of a recording. Its folder is named after the recording and the key."""
+        key = key_of(recording, self.plan)
+        return BatchJob(
+            recording=recording,
+            plan=self.plan,
+            out=self.out.url,
+            folder=f"{recording.name}-{key[:KEY_DIGITS]}",
+            key=key,
+            staging=str(self.staging),
+            max_staged_bytes=self.max_staged_bytes,
+        )
+
+
+def _duplicate(source: str, other: str) -> Outcome:
+    text = f"It has the same name and content as {other}, which is run once."
+    name = Path(source).name
+    return Outcome(source=source, name=name, folder="", status="duplicate", error=text)
+
+
+def default_workers(threads: int, memory_gb: float) -> int:
+    """Return the number of recordings that fit on this machine at the same time.
+
+    Args:
+        threads: Threads for each recording; 0 for all cores.
+        memory_gb: Memory for each recording.
+    """
+    cores = len(os.sched_getaffinity(0))
+    memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    by_memory = int(memory_bytes / (memory_gb * 1e9)) if memory_gb > 0 else cores
+    return max(1, min(cores // (threads or cores), by_memory))

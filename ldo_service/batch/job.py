@@ -1,0 +1,190 @@
+"""Work of a batch on one recording, and its outcome."""
+
+import hashlib
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ldo_service import __version__
+from ldo_service.config import Config, config_yaml
+from ldo_service.detection.model_registry import Models
+from ldo_service.detection.onnx_network import sha256
+from ldo_service.errors import ConfigError
+from ldo_service.runs.export import ExportFormat
+from ldo_service.runs.job import require_held_out
+from ldo_service.runs.source import Selection
+
+from .sources import Recording
+
+FORMAT = 1  # Increased if results of older versions of `ldo batch` cannot be kept.
+KEY_DIGITS = 12  # Hexadecimal digits of the key in the name of a folder.
+
+
+class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
+    """Part of the work that is the same for all recordings of a batch.
+
+    Attributes:
+        config: Configuration of the runs.
+        stride: Every N-th frame is used.
+        max_frames: Maximum number of frames; None for all.
+        refine: Iterations of the Gaussian optimizer after the last frame.
+        exports: Formats of `ldo export`.
+        threads: Threads of one process; 0 for all cores.
+
+    Raises:
+        ConfigError: An option is out of its range, or two options exclude each other.
+    """
+
+    config: Config
+    stride: int = 1
+    max_frames: int | None = None
+    refine: int = 0
+    exports: tuple[ExportFormat, ...] = ()
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if self.threads < 0:
+            raise ConfigError(f"--threads {self.threads} must not be negative.")
+        if self.refine < 0:
+            raise ConfigError(f"--refine-iterations {self.refine} must not be negative.")
+        Selection(self.stride, self.max_frames)
+        require_held_out(self.stride, self.config.tracker.hold_out)
+
+
+class BatchJob(msgspec.Struct, frozen=True, kw_only=True):
+    """Everything that a process needs to know to process one recording.
+
+    Attributes:
+        recording: The recording.
+        plan: The work.
+        out: Path or address of the folder with all results.
+        folder: Folder of this result, relative to `out`.
+        key: Digest of the content of the source and of everything that the results depend on.
+        keeps_front_end: True to record the front end of the run.
+        front_end: Folder of the run whose recorded front end is used, relative to `out`; empty to
+            run the front end.
+        staging: Folder for recordings and results of running processes.
+        max_staged_bytes: Limit of all staged recordings on one machine.
+        repeats: True to replace finished results.
+        version: Version of LDO-SLAM that must process the recording.
+    """
+
+    recording: Recording
+    plan: RunPlan
+    out: str
+    folder: str
+    key: str
+    keeps_front_end: bool = False
+    front_end: str = ""
+    staging: str
+    max_staged_bytes: int = 0
+    repeats: bool = False
+    version: str = __version__
+
+
+class Costs(msgspec.Struct, frozen=True, kw_only=True):
+    """Resources that the process of a recording used."""
+
+    wall_s: float  # The time until the results are published.
+    cpu_s: float  # The whole process with all threads, including its start.
+    run_cpu_s: float  # The run itself, a part of `cpu_s`.
+    evaluation_cpu_s: float
+    peak_rss_mb: float
+    source_bytes: int
+    result_bytes: int
+    recording_s: float  # Time from the first to the last used frame.
+    host: str
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """Outcome of a recording.
+
+    Attributes:
+        source: Path or address of the recording.
+        name: Name of the recording.
+        folder: Folder of the result, relative to the folder of all results.
+        status: "done" in this call, "kept" from an earlier call, "failed", or "missing" if the
+            batch was interrupted.
+        error: Why the recording failed, one line; empty unless it did.
+        notes: Warnings of the run and of its evaluation.
+        digest: Digest of all results that do not depend on timing; see `results.digest_of`.
+        summary: Counts and scores for the table.
+        costs: Resources; None unless there are results.
+        pictures: File names of pictures in the folder.
+    """
+
+    source: str
+    name: str
+    folder: str
+    status: str
+    error: str = ""
+    notes: tuple[str, ...] = ()
+    digest: str = ""
+    summary: dict[str, Any] = {}
+    costs: Costs | None = None
+    pictures: tuple[str, ...] = ()
+
+    @property
+    def has_results(self) -> bool:
+        """True if the folder contains finished results."""
+        return self.status in ("done", "kept")
+
+
+def failed(job: BatchJob, error: str, status: str = "failed") -> Outcome:
+    """Return the outcome of a recording without results.
+
+    Args:
+        job: The recording.
+        error: The reason; it is shortened to one line.
+        status: "failed" or "missing".
+    """
+    return Outcome(
+        source=job.recording.source,
+        name=job.recording.name,
+        folder=job.folder,
+        status=status,
+        error=" ".join(error.split()),
+    )
+
+
+def key_of(recording: Recording, plan: RunPlan, **others: Any) -> str:
+    """Return the digest of everything that the results of a recording depend on, hexadecimal.
+
+    It covers the content of the recording, the configuration with the networks, the options of the
+    plan except its number of threads, and the version of LDO-SLAM. The path of the recording is not
+    part of it.
+
+    Args:
+        recording: The recording.
+        plan: The work.
+        others: Further values that the results depend on.
+    """
+    config = plan.config
+    about = {
+        "format": FORMAT,
+        "content": recording.content,
+        "config": config_yaml(replace(config, mapper=replace(config.mapper, threads=0))),
+        "networks": [_network(name) for name in (config.detector.model, config.vlm_labeller.model)],
+        "stride": plan.stride,
+        "max_frames": plan.max_frames,
+        "refine": plan.refine,
+        "exports": sorted(plan.exports),
+        "ldo": __version__,
+        **others,
+    }
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+
+
+@cache
+def _network(model: str) -> str:
+    """Return the digest of the files of a network, or its name if there are no files."""
+    models = Models()
+    path = models.folder / model if model in models.names else Path(model).expanduser()
+    if not model or not path.exists():
+        return model
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    return hashlib.sha256("".join(map(sha256, files)).encode()).hexdigest()

@@ -1,0 +1,220 @@
+"""Folders on disk or in a bucket, read and written through fsspec."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import fsspec
+from fsspec.implementations.local import LocalFileSystem
+from fsspec.registry import known_implementations
+
+from ldo_service.errors import ConfigError, DataError, did_you_mean, install_command
+from ldo_service.storage.atomic_write import write_atomically
+
+EXTRAS = {"s3": "s3", "s3a": "s3"}  # Extras of this package by the protocol that they add.
+# Fields of a listing that identify the content of a file, by preference. All are checksums that the
+# store computes when a file is written.
+CHECKSUMS = ("ETag", "etag", "md5Hash", "content_md5", "crc32c", "checksum")
+MODIFIED = ("LastModified", "updated", "last_modified", "mtime", "created")
+
+
+@dataclass(frozen=True, slots=True)
+class StoredFile:
+    """File of a store.
+
+    Attributes:
+        name: Path relative to the listed folder, with slashes.
+        size_bytes: Size of the file.
+        mark: Text that changes with the content: a checksum, or without one the time of the last
+            change.
+    """
+
+    name: str
+    size_bytes: int
+    mark: str
+
+
+@dataclass(frozen=True, slots=True)
+class Store:
+    """A folder, or a file, that fsspec reaches.
+
+    Attributes:
+        url: The address: an absolute path, or PROTOCOL://PATH.
+        system: File system of fsspec.
+        path: Path in the file system.
+    """
+
+    url: str
+    system: Any
+    path: str
+
+    @property
+    def is_local(self) -> bool:
+        """True if the store is on a disk of this machine."""
+        return isinstance(self.system, LocalFileSystem)
+
+    @property
+    def local(self) -> Path:
+        """Path of a local store."""
+        assert self.is_local
+        return Path(self.path)
+
+    @property
+    def name(self) -> str:
+        """Last part of the path."""
+        return PurePosixPath(self.path).name
+
+    def at(self, *parts: str) -> "Store":
+        """Return a folder or a file below this one."""
+        below = "/".join(parts)
+        url, path = (f"{whole.rstrip('/')}/{below}" for whole in (self.url, self.path))
+        return Store(url, self.system, path)
+
+    def exists(self) -> bool:
+        """Return whether the folder or the file exists."""
+        with self._reported("read"):
+            self.system.invalidate_cache()
+            return self.system.exists(self.path)
+
+    def is_file(self) -> bool:
+        """Return whether the path is a file."""
+        with self._reported("read"):
+            return self.system.isfile(self.path)
+
+    def matches(self) -> list["Entry"]:
+        """Return everything that the path matches as a pattern, sorted."""
+        with self._reported("read"):
+            found = self.system.glob(self.path, detail=True)
+        return self._entries(found.values())
+
+    def entries(self) -> list["Entry"]:
+        """Return all folders and files directly in the folder, sorted."""
+        with self._reported("read"):
+            return self._entries(self.system.ls(self.path, detail=True))
+
+    def _entries(self, found: Iterable[dict[str, Any]]) -> list["Entry"]:
+        entries = []
+        for info in sorted(found, key=lambda info: info["name"]):
+            path = info["name"].rstrip("/")
+            if path.strip("/") != self.path.strip("/"):
+                url = path if self.is_local else self.system.unstrip_protocol(path)
+                entries.append(Entry(Store(url, self.system, path), info["type"] == "file"))
+        return entries
+
+    def files(self) -> list[StoredFile]:
+        """Return all files below the folder, or the file itself with its name; sorted."""
+        with self._reported("read"):
+            self.system.invalidate_cache()
+            found = self.system.find(self.path, detail=True)
+        is_itself = list(found) == [self.path]
+        base = str(PurePosixPath(self.path).parent) if is_itself else self.path
+        return [
+            StoredFile(path[len(base) :].strip("/"), int(info["size"] or 0), _mark(info))
+            for path, info in sorted(found.items())
+        ]
+
+    def read(self) -> bytes | None:
+        """Return the content of the file; None if it does not exist."""
+        try:
+            self.system.invalidate_cache()
+            return self.system.cat_file(self.path)
+        except FileNotFoundError:
+            return None
+        except Exception as error:
+            raise _as_data_error(self.url, "read", error) from error
+
+    def write(self, content: bytes) -> None:
+        """Write or replace the file; a reader sees the old or the new content."""
+        with self._reported("written"):
+            if self.is_local:
+                self.local.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(self.local, content)
+            else:
+                self.system.pipe_file(self.path, content)
+
+    def download(self, target: Path) -> None:
+        """Copy the folder or the file to a local path, which does not exist."""
+        with self._reported("read"):
+            if self.system.isfile(self.path):
+                self.system.get_file(self.path, str(target))
+            else:
+                self.system.get(self.path.rstrip("/") + "/", str(target), recursive=True)
+
+    def upload(self, file: Path) -> None:
+        """Write the content of a local file to this path."""
+        with self._reported("written"):
+            self.system.put_file(str(file), self.path)
+
+    def remove(self) -> None:
+        """Remove the file or the folder, if it exists."""
+        with self._reported("written"):
+            self.system.invalidate_cache()
+            if self.system.exists(self.path):
+                self.system.rm(self.path, recursive=True)
+
+    @contextmanager
+    def _reported(self, access: str) -> Iterator[None]:
+        """Convert every error inside the context to a DataError that names the address.
+
+        The libraries behind fsspec raise exceptions of many unrelated classes.
+        """
+        try:
+            yield
+        except Exception as error:
+            raise _as_data_error(self.url, access, error) from error
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Folder or file in a listing."""
+
+    store: Store
+    is_file: bool
+
+
+def open_store(url: str) -> Store:
+    """Open a folder or a file by its path or its address PROTOCOL://PATH.
+
+    Nothing is read or created.
+
+    Raises:
+        ConfigError: The protocol is unknown, or a package that it needs is not installed.
+    """
+    protocol, mark, _ = url.partition("://")
+    if not mark:
+        path = str(Path(url).expanduser().absolute())
+        return Store(path, LocalFileSystem(), path)
+    name = protocol.split("::")[-1]
+    if name not in known_implementations and name not in fsspec.available_protocols():
+        hint = did_you_mean(name, known_implementations, "Examples are s3:// and gs://.")
+        raise ConfigError(f"{url}: the protocol {name}:// is unknown. {hint}")
+    try:
+        system, path = fsspec.url_to_fs(url)
+    except ImportError as error:
+        extra = EXTRAS.get(name)
+        how = install_command(extra) if extra else known_implementations[name].get("err", error)
+        advice = f"the extra `{extra}`: {how}" if extra else f"another package: {how}"
+        raise ConfigError(f"{url}: {name}:// needs {advice}.") from error
+    except Exception as error:
+        raise ConfigError(f"{url} cannot be opened: {_reason(error)}.") from error
+    return Store(url.rstrip("/"), system, path.rstrip("/"))
+
+
+def _mark(info: dict[str, Any]) -> str:
+    name = next((name for name in (*CHECKSUMS, *MODIFIED) if info.get(name)), None)
+    return "" if name is None else f"{name}={info[name]}"
+
+
+def _as_data_error(url: str, access: str, error: Exception) -> DataError:
+    if isinstance(error, DataError):
+        return error
+    return DataError(f"{url} cannot be {access}: {_reason(error)}.")
+
+
+def _reason(error: Exception) -> str:
+    """Return the text of an error on one line, without its final period."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return (" ".join(str(error).split()) or type(error).__name__).removesuffix(".")

@@ -1,0 +1,217 @@
+"""Work of a batch on one recording: stage, run, evaluate, export and publish."""
+
+import json
+import logging
+import resource
+import socket
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+
+from ldo_service import __version__
+from ldo_service.config import Config, actor_parameters
+from ldo_service.errors import LdoError
+from ldo_service.evaluation.results import Results, evaluate_run, to_json
+from ldo_service.geometry.sequence import Sequence
+from ldo_service.runs.export import export_map
+from ldo_service.runs.finished import newest_map, read_run
+from ldo_service.runs.folder import EXPORTED, RunWriter
+from ldo_service.runs.front_end import FrontEnd
+from ldo_service.runs.job import RunOptions
+from ldo_service.runs.networks import labelled_by, require_usable_networks
+from ldo_service.runs.offline import run_offline
+from ldo_service.runs.source import Selection, open_source
+
+from .job import BatchJob, Costs, Outcome, failed
+from .results import EVALUATION, ResultFolder
+from .sources import SYNTHETIC
+from .staging import staging_folder
+from .store import open_store
+
+MAX_NOTES = 20
+SUMMARY = ("frames", "frames_rejected", "status", "keyframes", "gaussians", "objects", "fps")
+
+
+class _Notes(logging.Handler):
+    """Collector of the warnings of a run."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.found: list[str] = []
+
+    def add(self, text: str) -> None:
+        """Keep a warning, unless there are too many."""
+        if len(self.found) < MAX_NOTES:
+            self.found.append(" ".join(str(text).split()))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a warning of the log."""
+        self.add(record.getMessage())
+
+
+def process(job: BatchJob) -> Outcome:
+    """Process a recording and publish its results.
+
+    The function runs in a process of its own. It raises nothing: a failure is an outcome with one
+    line of text, so that it neither stops the batch nor is retried.
+    """
+    if job.version != __version__:
+        return failed(
+            job,
+            f"{socket.gethostname()} has LDO-SLAM {__version__}, but the batch was started with "
+            f"{job.version}. Install the same version on all hosts.",
+        )
+    cv2.setNumThreads(job.plan.threads or cv2.getNumberOfCPUs())
+    try:
+        folder = ResultFolder.of(job)
+        # A worker may be lost after it has published its results; then the retry has nothing to do.
+        kept = None if job.repeats else folder.finished()
+        return kept or _process(job, folder)
+    except LdoError as error:
+        return failed(job, str(error))
+    except MemoryError:
+        return failed(job, "the memory of the host is exhausted. Use fewer --workers.")
+    except OSError as error:
+        return failed(job, f"{error}. Free some disk space, or choose another --staging.")
+    except Exception as error:
+        unexpected = failed(job, f"unexpected {type(error).__name__}: {error}")
+        return msgspec.structs.replace(unexpected, notes=(traceback.format_exc(),))
+
+
+def _process(job: BatchJob, folder: ResultFolder) -> Outcome:
+    started_s = time.perf_counter()
+    source = job.recording.source
+    is_remote = not source.startswith(SYNTHETIC) and not open_store(source).is_local
+    staged_bytes = job.recording.size_bytes if is_remote else 0
+    with (
+        staging_folder(Path(job.staging), staged_bytes, job.max_staged_bytes) as work,
+        _collected_notes() as notes,
+    ):
+        if is_remote:
+            source = _download(source, work / "source")
+        made = work / "result"
+        made.mkdir()
+        outcome = _run(job, source, made, notes, started_s)
+        return folder.publish(made, outcome)
+
+
+def _download(source: str, target: Path) -> str:
+    """Copy a recording to the folder `target`, and return its local path, which keeps its name."""
+    store = open_store(source)
+    target.mkdir()
+    store.download(target / store.name)
+    return str(target / store.name)
+
+
+def _run(job: BatchJob, source: str, made: Path, notes: _Notes, started_s: float) -> Outcome:
+    """Run, evaluate and export a recording; write all files to the folder `made`."""
+    plan = job.plan
+    config = replace(plan.config, mapper=replace(plan.config.mapper, threads=plan.threads))
+    require_usable_networks(config)
+    sequence, selection = (
+        open_source(source, config.dataset.options()),
+        Selection(plan.stride, plan.max_frames),
+    )
+    before_s = time.process_time()
+    record = run_offline(_options(job, sequence, selection, made, notes, config), _ignored)
+    run_s = time.process_time()
+    results = _evaluate(made, sequence, config, notes)
+    evaluated_s = time.process_time()
+    for format in plan.exports:
+        target = made / EXPORTED[format][0]
+        export_map(newest_map(made), format, target, run=made, threads=plan.threads or None)
+    used = selection.indices(sequence)
+    return Outcome(
+        source=job.recording.source,
+        name=job.recording.name,
+        folder=job.folder,
+        status="done",
+        notes=tuple(notes.found),
+        summary=_summary(record, results),
+        pictures=tuple(path.name for path in results.pictures) if results else (),
+        costs=Costs(
+            wall_s=round(time.perf_counter() - started_s, 3),
+            cpu_s=round(time.process_time(), 3),
+            run_cpu_s=round(run_s - before_s, 3),
+            evaluation_cpu_s=round(evaluated_s - run_s, 3),
+            peak_rss_mb=round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            source_bytes=job.recording.size_bytes,
+            result_bytes=0,  # Known when the results are published.
+            recording_s=round(float(sequence.stamps_ns[used[-1]] - sequence.stamps_ns[0]) / 1e9, 3),
+            host=socket.gethostname(),
+        ),
+    )
+
+
+def _options(
+    job: BatchJob,
+    sequence: Sequence,
+    selection: Selection,
+    made: Path,
+    notes: _Notes,
+    config: Config,
+) -> RunOptions:
+    reused = None
+    if job.front_end:
+        reused = FrontEnd.open(Path(job.out) / job.front_end, config, sequence, selection)
+    return RunOptions(
+        *(sequence, made, config, selection, notes.add),
+        refine=job.plan.refine,
+        front_end=reused,
+        keep_front_end=job.keeps_front_end,
+    )
+
+
+def _evaluate(made: Path, sequence: Sequence, config: Config, notes: _Notes) -> Results | None:
+    """Evaluate the run and write eval.json; a run that cannot be evaluated gets a note instead."""
+    threads = actor_parameters(config).mapper.thread_count()
+    try:
+        run = read_run(made)
+        run.require_source(sequence)
+        results = evaluate_run(run, sequence, _ignored, threads=threads)
+    except LdoError as error:
+        notes.add(f"The run cannot be evaluated: {error}")
+        return None
+    about = {
+        "pictures": [path.name for path in results.pictures],
+        "lpips": None,
+        "labelled_by": labelled_by(config),
+    }
+    (made / EVALUATION).write_text(json.dumps({**to_json(results), **about}, indent=1))
+    return results
+
+
+def _summary(record: RunWriter, results: Results | None) -> dict[str, Any]:
+    """Return the values of the table: counts of the run, and the scores of its newest map."""
+    summary = {name: record.summary[name] for name in SUMMARY}
+    if results and results.trajectories:
+        newest = [name for name in ("final", "refined") if name in results.trajectories][-1]
+        summary["ate_m"] = results.trajectories[newest].ate_m.rmse
+    if results and results.renderings:
+        held_out = [row for row in results.renderings if row.protocol == "A held out"]
+        row = (held_out or results.renderings)[-1]
+        summary |= {"psnr_db": row.mean("psnr_db"), "psnr_protocol": row.protocol}
+    return summary
+
+
+@contextmanager
+def _collected_notes() -> Iterator[_Notes]:
+    notes, log = _Notes(), logging.getLogger("ldo_service")
+    log.addHandler(notes)
+    propagate, log.propagate = log.propagate, False
+    try:
+        yield notes
+    finally:
+        log.removeHandler(notes)
+        log.propagate = propagate
+
+
+def _ignored(_done: int, _total: int | None = None, /) -> None:
+    pass
