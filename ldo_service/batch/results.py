@@ -17,7 +17,7 @@ from ldo_service.runs.folder import WRITTEN
 from ldo_service.storage.atomic_write import UNFINISHED
 
 from .job import BatchJob, Outcome
-from .store import Store, open_store
+from .store import Store, open_store, reason_of
 
 RESULT, EVALUATION = "result.json", "eval.json"
 ENTRY = "entry.json"  # Written instead of result.json up to version 0.1.
@@ -122,7 +122,10 @@ class ResultFolder:
                     target.rename(Path(temporary) / "old")
                 complete.rename(target)
         except OSError as error:
-            raise DataError(f"{target} cannot be written: {error.strerror}.") from error
+            raise DataError(
+                f"{target} cannot be written: {reason_of(error)}. Free some disk space, or choose "
+                "another --out."
+            ) from error
 
     def _upload(self, made: Path, files: dict[str, ResultFile], content: bytes) -> None:
         self.store.at(RESULT).remove()

@@ -1,5 +1,6 @@
 """Folders on disk or in a bucket, read and written through fsspec."""
 
+import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -198,7 +199,7 @@ def open_store(url: str) -> Store:
         advice = f"the extra `{extra}`: {how}" if extra else f"another package: {how}"
         raise ConfigError(f"{url}: {name}:// needs {advice}.") from error
     except Exception as error:
-        raise ConfigError(f"{url} cannot be opened: {_reason(error)}.") from error
+        raise ConfigError(f"{url} cannot be opened: {reason_of(error)}.") from error
     return Store(url.rstrip("/"), system, path.rstrip("/"))
 
 
@@ -210,11 +211,13 @@ def _mark(info: dict[str, Any]) -> str:
 def _as_data_error(url: str, access: str, error: Exception) -> DataError:
     if isinstance(error, DataError):
         return error
-    return DataError(f"{url} cannot be {access}: {_reason(error)}.")
+    return DataError(f"{url} cannot be {access}: {reason_of(error)}.")
 
 
-def _reason(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
     """Return the text of an error on one line, without its final period."""
+    if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list):
+        return str(error.args[0][0][-1])  # Files that were not copied: source, target and reason.
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return (" ".join(str(error).split()) or type(error).__name__).removesuffix(".")

@@ -33,7 +33,7 @@ from .job import BatchJob, Costs, Outcome, failed
 from .results import EVALUATION, ResultFolder
 from .sources import SYNTHETIC
 from .staging import staging_folder
-from .store import open_store
+from .store import open_store, reason_of
 
 MAX_NOTES = 20
 SUMMARY = ("frames", "frames_rejected", "status", "keyframes", "gaussians", "objects", "fps")
@@ -79,7 +79,9 @@ def process(job: BatchJob) -> Outcome:
     except MemoryError:
         return failed(job, "the memory of the host is exhausted. Use fewer --workers.")
     except OSError as error:
-        return failed(job, f"{error}. Free some disk space, or choose another --staging.")
+        return failed(
+            job, f"{reason_of(error)}. Free some disk space, or choose another --staging."
+        )
     except Exception as error:
         unexpected = failed(job, f"unexpected {type(error).__name__}: {error}")
         return msgspec.structs.replace(unexpected, notes=(traceback.format_exc(),))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -157,6 +158,18 @@ def test_file_that_no_batch_wrote_is_not_replaced(
     (outcome,) = run(batch(), part)
     assert "thesis.tex, which no run wrote" in outcome.error
     assert (folder / "thesis.tex").read_text() == "years of work"
+
+
+def test_full_disk_of_the_results_is_one_line(
+    batch: MakeBatch, part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(source: Path, target: Path) -> None:
+        raise shutil.Error([(str(source), str(target), "[Errno 28] No space left on device")])
+
+    monkeypatch.setattr(shutil, "move", full)
+    (outcome,) = run(batch(), part)
+    assert "cannot be written: [Errno 28] No space left on device. Free some" in outcome.error
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_other_version_on_a_worker_is_refused(batch: MakeBatch, part: Path) -> None:

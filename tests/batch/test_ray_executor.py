@@ -66,13 +66,22 @@ def cluster(
         "object_store_memory": 80 * 10**6,
         "node_ip_address": "127.0.0.1",
     }
-    nodes = Cluster(
-        initialize_head=True,
-        head_node_args={**local, "include_dashboard": False, "gcs_server_port": free_port()},
-    )
-    nodes.add_node(**local)
+    nodes = Cluster()
+    _add_node(nodes, **local, include_dashboard=False)
+    _add_node(nodes, **local)
     yield nodes
     nodes.shutdown()
+
+
+def _add_node(nodes, **arguments) -> None:
+    """Start a node; Ray gives up after 30 s, which is too short for a busy machine."""
+    for _ in range(4):
+        try:
+            nodes.add_node(**arguments)
+            return
+        except Exception as error:
+            problem = error
+    pytest.fail(f"Ray does not start: {problem}")
 
 
 @pytest.mark.parametrize("count", [4, 12])
