@@ -312,7 +312,7 @@ def view_of(
         posed: The map.
         frame: The frame of the run.
         threads: Threads of the renderer.
-        valid: Pixels that show the camera image, [H, W] bool; None for all.
+        valid: Pixels where the rectified image has content, [H, W] bool; None for all.
 
     Raises:
         DataError: If the frame has no pose.
