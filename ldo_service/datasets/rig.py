@@ -1,13 +1,15 @@
 """Color and depth cameras of a sensor, and registration between them."""
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import Camera, se3
+from ldo_service.geometry import Camera, RawFrame, Trajectory, se3
 from ldo_service.geometry.registration import register_depth, resample_color
+from ldo_service.geometry.sequence import Sequence
 
 from .files import is_rigid
 
@@ -106,3 +108,56 @@ class SequenceOptions:
         names = ("color_camera", "depth_camera", "T_color_depth")
         values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value is not None}
+
+
+class RigSequence(Sequence):
+    """Sequence of two cameras, whose images are brought to one pixel grid.
+
+    Color is resampled to the depth image if both cameras have equal center and orientation, and
+    depth does not change. Otherwise, or with `SequenceOptions.register_depth`, depth is registered
+    to the color camera. The poses of a data set are assumed to be those of the depth camera.
+
+    Attributes:
+        rig: Cameras of the images in the data set.
+    """
+
+    def __init__(
+        self, name: str, rig: Rig, stamps_ns: np.ndarray, options: SequenceOptions
+    ) -> None:
+        self.rig = options.over(rig)
+        self._is_registering = options.register_depth or not self.rig.is_one_view
+        camera = self.rig.color_camera if self._is_registering else self.rig.depth_camera
+        super().__init__(name, camera, stamps_ns)
+        self.registration = "reader" if self._is_registering else "source"
+
+    @abstractmethod
+    def read_images(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return color [Hc, Wc, 3] uint8 RGB, depth [Hd, Wd] uint16, and its units per meter.
+
+        Raises:
+            FrameError: An image cannot be read.
+        """
+
+    @abstractmethod
+    def read_depth_poses(self) -> Trajectory | None:
+        """Return `T_world_camera` of the depth camera, or None if no frame has a pose.
+
+        Raises:
+            DataError: A pose cannot be read.
+        """
+
+    def read(self, index: int) -> RawFrame:
+        """Return a frame; see `Sequence.read`."""
+        images = self.rig.on_one_grid(*self.read_images(index), self._is_registering)
+        return RawFrame(index, int(self.stamps_ns[index]), *images, self.raw_camera)
+
+    def truth(self) -> Trajectory | None:
+        """Return the ground-truth trajectory, or None if no frame has a pose.
+
+        If depth is registered to the color camera, the poses are those of the color camera, else
+        those of the depth camera.
+        """
+        poses = self.read_depth_poses()
+        if poses is None or not self._is_registering:
+            return poses
+        return replace(poses, T_world_camera=self.rig.T_world_color(poses.T_world_camera))

@@ -14,14 +14,12 @@ depth image, and depth does not change. With other extrinsics, or with
 to be those of the depth camera. In an aligned export, the poses of both cameras are equal.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ldo_service.errors import DataError
-from ldo_service.geometry import RawFrame, Trajectory, se3
-from ldo_service.geometry.sequence import Sequence
+from ldo_service.geometry import Trajectory, se3
 
 from .files import (
     name_of,
@@ -32,12 +30,12 @@ from .files import (
     read_transform,
 )
 from .images import first_size, read_color, read_depth
-from .rig import Rig, SequenceOptions
+from .rig import Rig, RigSequence, SequenceOptions
 
 DEPTH_SCALE = 1000.0  # Units per meter in all exports.
 
 
-class ScanNetSequence(Sequence):
+class ScanNetSequence(RigSequence):
     """ScanNet sequence: frames with both color and depth, in the order of their numbers."""
 
     def __init__(self, folder: Path, options: SequenceOptions) -> None:
@@ -56,34 +54,18 @@ class ScanNetSequence(Sequence):
                 "239.5, 1]}, column by column."
             )
         sizes = first_size(self._files.color), first_size(self._files.depth)
-        self._rig = options.over(_rig(folder / "intrinsic", *sizes))
-        self._is_registering = options.register_depth or not self._rig.is_one_view
-        camera = self._rig.color_camera if self._is_registering else self._rig.depth_camera
-        super().__init__(name_of(folder), camera, self._files.stamps_ns)
-        self.registration = "reader" if self._is_registering else "source"
+        rig = _rig(folder / "intrinsic", *sizes)
+        super().__init__(name_of(folder), rig, self._files.stamps_ns, options)
 
-    def read(self, index: int) -> RawFrame:
-        """Return a frame; see `Sequence.read`."""
-        color, depth, depth_scale = self._rig.on_one_grid(
-            read_color(self._files.color[index]),
-            read_depth(self._files.depth[index]),
-            DEPTH_SCALE,
-            self._is_registering,
-        )
-        stamp_ns = int(self.stamps_ns[index])
-        return RawFrame(index, stamp_ns, color, depth, depth_scale, self.raw_camera)
+    def read_images(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return color, depth, and its units per meter; see `RigSequence.read_images`."""
+        color, depth = read_color(self._files.color[index]), read_depth(self._files.depth[index])
+        return color, depth, DEPTH_SCALE
 
-    def truth(self) -> Trajectory | None:
-        """Return the ground-truth trajectory, or None if there are no poses.
-
-        If depth is registered to the color camera, the poses are those of the color camera, else
-        those of the depth camera.
-        """
+    def read_depth_poses(self) -> Trajectory | None:
+        """Return the poses of the depth camera; see `RigSequence.read_depth_poses`."""
         paths = [self._folder / "pose" / f"{path.stem}.txt" for path in self._files.color]
-        depth = read_trajectory(self.stamps_ns, paths)
-        if depth is None or not self._is_registering:
-            return depth
-        return replace(depth, T_world_camera=self._rig.T_world_color(depth.T_world_camera))
+        return read_trajectory(self.stamps_ns, paths)
 
 
 def _rig(folder: Path, color_size: tuple[int, int], depth_size: tuple[int, int]) -> Rig:

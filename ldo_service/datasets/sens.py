@@ -11,8 +11,8 @@ All numbers are little-endian, and matrices are 4x4 float32 by rows:
     microseconds; uint64 bytes of color, bytes of depth; color; depth
 
 Color is raw RGB, PNG or JPEG; depth is uint16, raw or compressed by zlib. What follows the frames,
-such as inertial measurements, is not read. Cameras, registration and poses are treated as those of
-the exported files, see `scannet`.
+such as inertial measurements, is not read. `RigSequence` says how cameras, registration and poses
+are treated.
 """
 
 import logging
@@ -25,12 +25,11 @@ from typing import BinaryIO
 import numpy as np
 
 from ldo_service.errors import DataError, FrameError
-from ldo_service.geometry import Camera, RawFrame, Trajectory, se3
-from ldo_service.geometry.sequence import Sequence
+from ldo_service.geometry import Camera, Trajectory, se3
 
 from .files import FRAME_RATE_HZ, LAST_STAMP_NS, Calibration, is_rigid
 from .images import MAX_PIXELS, decode_color
-from .rig import Rig, SequenceOptions
+from .rig import Rig, RigSequence, SequenceOptions
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +63,7 @@ class _Index:
     sizes: np.ndarray  # [N, 2] int64, bytes of color and depth.
 
 
-class SensSequence(Sequence):
+class SensSequence(RigSequence):
     """Sequence of a file .sens. Frames are read when they are asked for."""
 
     def __init__(self, path: Path, options: SequenceOptions) -> None:
@@ -76,14 +75,11 @@ class SensSequence(Sequence):
                 self._index = _index(file, path, self._header.frames)
         except OSError as error:
             raise DataError(f"{path} cannot be read: {error}.") from error
-        self._rig = options.over(self._header.rig)
-        self._is_registering = options.register_depth or not self._rig.is_one_view
-        camera = self._rig.color_camera if self._is_registering else self._rig.depth_camera
-        super().__init__(path.stem, camera, _stamps_ns(self._index.stamps_us, path))
-        self.registration = "reader" if self._is_registering else "source"
+        stamps_ns = _stamps_ns(self._index.stamps_us, path)
+        super().__init__(path.stem, self._header.rig, stamps_ns, options)
 
-    def read(self, index: int) -> RawFrame:
-        """Return a frame; see `Sequence.read`."""
+    def read_images(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return color, depth, and its units per meter; see `RigSequence.read_images`."""
         source = f"{self._path}, frame {index}"
         color_size, depth_size = map(int, self._index.sizes[index])
         try:
@@ -92,28 +88,15 @@ class SensSequence(Sequence):
                 color, depth = file.read(color_size), file.read(depth_size)
         except OSError as error:
             raise FrameError(f"{source} cannot be read: {error}.") from error
-        color, depth, depth_scale = self._rig.on_one_grid(
-            self._color(color, source),
-            self._depth(depth, source),
-            self._header.depth_scale,
-            self._is_registering,
-        )
-        stamp_ns = int(self.stamps_ns[index])
-        return RawFrame(index, stamp_ns, color, depth, depth_scale, self.raw_camera)
+        return self._color(color, source), self._depth(depth, source), self._header.depth_scale
 
-    def truth(self) -> Trajectory | None:
-        """Return the ground-truth trajectory, or None if no frame has a pose.
-
-        If depth is registered to the color camera, the poses are those of the color camera, else
-        those of the depth camera.
-        """
+    def read_depth_poses(self) -> Trajectory | None:
+        """Return the poses of the depth camera; see `RigSequence.read_depth_poses`."""
         poses = self._index.T_world_camera
         known = np.flatnonzero([is_rigid(T) for T in poses])
         if not len(known):
             return None
         T_world_camera = np.array([se3.orthonormalize(T) for T in poses[known]])
-        if self._is_registering:
-            T_world_camera = self._rig.T_world_color(T_world_camera)
         return Trajectory(self.stamps_ns[known] / 1e9, T_world_camera)
 
     def _color(self, data: bytes, source: str) -> np.ndarray:
