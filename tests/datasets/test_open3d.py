@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import SequenceOptions, open_sequence
+from ldo_service.datasets.open3d import REDWOOD_CAMERA
 from ldo_service.errors import ConfigError, DataError, FrameError
+from ldo_service.geometry import RawFrame
 
 from .recordings import small_frames, write_image, write_open3d
 
@@ -32,6 +34,39 @@ def test_frames_are_those_of_the_folder(tmp_path: Path, name: str, intrinsics: s
         assert np.array_equal(raw.depth, expected.depth)
         assert raw.depth_scale == 1000.0
     assert sequence.truth() is None
+
+
+@pytest.mark.parametrize("name", ["image", "rgb"])
+def test_redwood_may_name_the_color_folder_otherwise(folder: Path, name: str) -> None:
+    (folder / "color").rename(folder / name)
+    sequence = open_sequence(str(folder))
+    assert np.array_equal(sequence.read(2).color, FRAMES[2].color)
+
+
+@pytest.mark.parametrize(
+    ("color", "name"), [("image", "{:06d}"), ("rgb", "{:07d}-000000033333"), ("rgb", "{:06d}")]
+)
+def test_redwood_without_intrinsics_has_those_of_a_primesense(
+    tmp_path: Path, color: str, name: str
+) -> None:
+    frame = RawFrame(
+        0, 0, np.zeros((480, 640, 3), np.uint8), np.ones((480, 640), np.uint16), 1e3, REDWOOD_CAMERA
+    )
+    folder = write_open3d(tmp_path / "redwood", [frame], name)
+    (folder / "intrinsic.json").unlink()
+    (folder / "color").rename(folder / color)
+    if (color, name) == ("rgb", "{:06d}"):  # Many programs write such folders.
+        with pytest.raises(DataError, match="no known layout"):
+            open_sequence(str(folder))
+        return
+    assert open_sequence(str(folder)).raw_camera == REDWOOD_CAMERA
+
+
+def test_images_of_another_size_need_intrinsics(folder: Path) -> None:
+    (folder / "intrinsic.json").unlink()
+    (folder / "color").rename(folder / "image")
+    with pytest.raises(DataError, match=r"have 64x48 pixels, not 640x480.*camera_intrinsic\.json"):
+        open_sequence(str(folder))
 
 
 def test_image_of_another_size_is_one_bad_frame(folder: Path) -> None:
