@@ -12,7 +12,6 @@ The poses of the metadata come from ARKit. They are another estimate and no grou
 
 import json
 import re
-import struct
 import zipfile
 import zlib
 from contextlib import suppress
@@ -27,6 +26,7 @@ from ldo_service.geometry.sequence import Sequence
 
 from .files import FRAME_RATE_HZ, LAST_STAMP_NS, number
 from .images import MAX_PIXELS, decode_color
+from .lzfse import decoded_bytes
 from .phone_images import PhoneGrid, scaled, without_doubt
 
 MAX_BYTES = 1 << 27  # Maximum size of a file in the archive; the poses of an hour have 30 MB.
@@ -126,10 +126,8 @@ class Record3DSequence(Sequence):
         """
         data, (height, width) = self._frame_bytes(name), self._depth_shape
         size = height * width * np.dtype(dtype).itemsize
-        # The header is checked first, because the decoder allocates the size that it declares.
-        declared = struct.unpack_from("<I", data, 4)[0] if len(data) >= 12 else -1
-        try:
-            content = self._lzfse.decompress(data) if 0 < declared <= size else b""
+        try:  # The headers are checked first, because the decoder has no limit of its own.
+            content = self._lzfse.decompress(data) if decoded_bytes(data) == size else b""
         except (self._lzfse.error, MemoryError):
             content = b""
         if len(content) != size:
