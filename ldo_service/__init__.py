@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .client import connect
     from .config import Config, load_config
+    from .datasets import open_sequence
     from .geometry import Camera, Trajectory
     from .geometry import RgbdFrame as Frame
     from .library.maps import FoundObject, Map, MapArrays, MapView
     from .library.run import Run
     from .library.slam import Pose, Slam
-    from .runs.source import open_source as open_sequence
 
 LIBRARIES = (
     *("numpy", "scipy", "scikit-image", "gtsam", "small-gicp", "onnxruntime"),
@@ -65,7 +65,7 @@ LAZY = {
     "Trajectory": ("geometry", "Trajectory"),
     "connect": ("client", "connect"),
     "load_config": ("config", "load_config"),
-    "open_sequence": ("runs.source", "open_source"),
+    "open_sequence": ("datasets", "open_sequence"),
 }
 
 

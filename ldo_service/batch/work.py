@@ -17,6 +17,7 @@ import msgspec
 
 from ldo_service import __version__
 from ldo_service.config import Config, actor_parameters
+from ldo_service.datasets import open_sequence
 from ldo_service.errors import LdoError
 from ldo_service.evaluation.results import Results, evaluate_run, to_json
 from ldo_service.geometry.sequence import Sequence
@@ -27,7 +28,7 @@ from ldo_service.runs.front_end import FrontEnd
 from ldo_service.runs.job import RunOptions
 from ldo_service.runs.networks import labelled_by, require_usable_networks
 from ldo_service.runs.offline import run_offline
-from ldo_service.runs.source import Selection, open_source
+from ldo_service.runs.source import Selection
 
 from .job import BatchJob, Costs, Outcome, failed
 from .results import EVALUATION, ResultFolder
@@ -118,7 +119,7 @@ def _run(job: BatchJob, source: str, made: Path, notes: _Notes, started_s: float
     config = replace(plan.config, mapper=replace(plan.config.mapper, threads=plan.threads))
     require_usable_networks(config)
     sequence, selection = (
-        open_source(source, config.dataset.options()),
+        open_sequence(source, config.dataset.options()),
         Selection(plan.stride, plan.max_frames),
     )
     before_s = time.process_time()

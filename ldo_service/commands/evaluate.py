@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, actor_parameters, load_config
+from ldo_service.datasets import open_sequence
 from ldo_service.evaluation import loops, semantics, trajectory, views
 from ldo_service.evaluation.label_measures import DetectionCounts
 from ldo_service.evaluation.loops import LoopErrors
@@ -22,7 +23,6 @@ from ldo_service.evaluation.trajectory import TrajectoryErrors
 from ldo_service.evaluation.views import RenderingErrors
 from ldo_service.runs.finished import read_run, require_file
 from ldo_service.runs.networks import labelled_by
-from ldo_service.runs.source import open_source
 
 from .options import Json, Source, argument, progress
 
@@ -122,7 +122,7 @@ def evaluate(
     threads = actor_parameters(config).mapper.thread_count()
     distance = Lpips(lpips, threads=threads) if lpips else None
     run = read_run(folder, has_map=not config.tracker.localization_map)
-    sequence = open_source(source, config.dataset.options())
+    sequence = open_sequence(source, config.dataset.options())
     run.require_source(sequence)
     with progress("eval", work(run, sequence), Console(stderr=True)) as advance:
         results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)

@@ -10,8 +10,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from ldo_service.config import load_config
+from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
-from ldo_service.runs.source import layout_of, open_source
+from ldo_service.runs.source import layout_of
 from ldo_service.runs.source_info import SourceInfo, describe, estimated_run_s
 
 from .options import ConfigFile, Json, Settings, Source, argument
@@ -46,7 +47,7 @@ def info(
         raise ConfigError(f"--probe {probe} must be at least 1.")
     layout = layout_of(source)
     settings = load_config(config, set)
-    sequence = open_source(source, settings.dataset.options())
+    sequence = open_sequence(source, settings.dataset.options())
     found = describe(sequence)
     run_s = None if probe is None else estimated_run_s(sequence, settings, probe)
     if json_:

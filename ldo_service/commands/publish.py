@@ -13,9 +13,10 @@ from ldo_service.cameras import realsense
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
 from ldo_service.conversions.frames import raw_frame_to_message
+from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry.sequence import Sequence
-from ldo_service.runs.source import Selection, open_source
+from ldo_service.runs.source import Selection
 from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
 from ldo_service.transport.keys import TlsKeys
 
@@ -96,7 +97,7 @@ def publish(
         return
     if rate is not None and not 0 < rate < float("inf"):
         raise ConfigError(f"--rate {rate:g}: must be positive.")
-    sequence = open_source(source, load_config(config, set).dataset.options())
+    sequence = open_sequence(source, load_config(config, set).dataset.options())
     indices = Selection(stride, max_frames).indices(sequence)
     with (
         connect(robot, endpoint, keys) as service,

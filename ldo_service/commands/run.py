@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, checked, load_config
+from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 from ldo_service.geometry.sequence import Sequence
@@ -18,7 +19,7 @@ from ldo_service.runs.job import Advance, RunOptions, require_held_out
 from ldo_service.runs.networks import require_usable_networks
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.realtime import run_realtime
-from ldo_service.runs.source import Selection, open_source
+from ldo_service.runs.source import Selection
 
 from .options import (
     ConfigFile,
@@ -119,7 +120,7 @@ def run(
     require_usable_networks(settings)
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
-    sequence = open_source(source, settings.dataset.options())
+    sequence = open_sequence(source, settings.dataset.options())
     job = RunOptions(
         *(sequence, out, settings, selection, console.print),
         refine=refine_iterations,

@@ -8,9 +8,10 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import load_config
+from ldo_service.datasets import open_sequence
 from ldo_service.runs.networks import require_usable_networks
 from ldo_service.runs.simulation import ActorDigest, simulate_graph
-from ldo_service.runs.source import Selection, open_source
+from ldo_service.runs.source import Selection
 
 from .options import (
     ConfigFile,
@@ -46,7 +47,7 @@ def simulate(
     console = Console(stderr=True, highlight=False)
     settings = with_options(load_config(config, set), hold_out=None, threads=threads)
     require_usable_networks(settings)
-    sequence = open_source(source, settings.dataset.options())
+    sequence = open_sequence(source, settings.dataset.options())
     selection = Selection(stride, max_frames)
     with progress("simulate", len(selection.indices(sequence)), console) as advance:
         made = simulate_graph(sequence, settings, selection, console.print, advance)

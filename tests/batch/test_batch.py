@@ -15,10 +15,11 @@ from ldo_service.batch.batch import Batch
 from ldo_service.batch.results import ResultFolder
 from ldo_service.batch.sources import measure
 from ldo_service.config import config_yaml, load_config
+from ldo_service.datasets import open_sequence
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.job import RunOptions
 from ldo_service.runs.offline import run_offline
-from ldo_service.runs.source import Selection, open_source
+from ldo_service.runs.source import Selection
 from tests.batch.slices import write_slice
 
 MakeBatch = Callable[..., Batch]
@@ -50,7 +51,7 @@ def test_results_in_a_process_are_those_of_a_run_and_are_kept(
     assert (outcome.status, outcome.error, outcome.notes) == ("done", "", ())
     folder = tmp_path / "out" / outcome.folder
     prepare(tmp_path / "run", overwrite=False)
-    config, sequence = load_config(settings=("mapper.iterations=1",)), open_source(str(part))
+    config, sequence = load_config(settings=("mapper.iterations=1",)), open_sequence(str(part))
     job = RunOptions(sequence, tmp_path / "run", config, Selection(), pytest.fail)
     run_offline(job, lambda *_: None)
     for name in ("map.ply", "trajectory.txt", "trajectory_online.txt", "keyframe_database.msgpack"):

@@ -28,6 +28,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ldo_service.datasets import open_sequence
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.model_registry import open_detector
 from ldo_service.detection.vocabulary import Vocabulary
@@ -48,7 +49,6 @@ from ldo_service.regions.foreground import (
     surfaces,
 )
 from ldo_service.regions.region_proposals import RegionProposalConfig
-from ldo_service.runs.source import open_source
 from ldo_service.semantics.gaussian_labels import BACKGROUND, LabelConfig, new_labels, top_labels
 from ldo_service.semantics.label_assignment import AssignmentConfig
 from ldo_service.semantics.semantic_fusion import (
@@ -83,7 +83,7 @@ class Scene:
 
     @staticmethod
     def of(source: str, most: int | None, background: Sequence[str]) -> "Scene":
-        sequence = open_source(source)
+        sequence = open_sequence(source)
         poses, truth = sequence.truth(), sequence.true_labels()
         assert poses is not None, f"{source} has no true poses"
         assert truth is not None, f"{source} has no true labels"

@@ -26,9 +26,8 @@ from ldo_service.actors.topology import make_actors
 from ldo_service.config import actor_parameters, latency_frames, load_config
 from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.conversions.poses import pose_to_message
-from ldo_service.datasets import Sequence
+from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.pictures import save_picture
-from ldo_service.runs.source import open_source
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.runtime.stage_metrics import resident_mb
 from ldo_service.schemas import (
@@ -176,7 +175,7 @@ def main() -> None:
     arguments = parser.parse_args()
     config = load_config(settings=arguments.set)
     config = replace(config, mapper=replace(config.mapper, threads=1))
-    sequence = open_source(arguments.source)
+    sequence = open_sequence(arguments.source)
     per_lap = len(range(0, len(sequence), arguments.stride))
     poses = true_poses(sequence)[:: arguments.stride] if arguments.true_poses else None
     parameters = actor_parameters(config)

@@ -18,9 +18,9 @@ from ldo_service.gaussians.model import new_labels
 from ldo_service.geometry import Camera, codecs
 from ldo_service.recordings.mcap_file import RecordConfig, RecordingFile
 from ldo_service.runs.finished import MapFolder, read_run, vlm_calls
+from ldo_service.runs.recorded_sequence import RecordingSequence
 from ldo_service.runs.records import OBJECTS, read_loops, read_objects, write_objects
 from ldo_service.runs.replayed import open_recording
-from ldo_service.runs.source import RecordingSequence
 from ldo_service.runtime.journal import Started, StepRecord, checksum
 from ldo_service.schemas import CameraRgbd, MapObjects
 from ldo_service.semantics.semantics_file import read_semantics, write_semantics

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from ldo_service.conversions.frames import raw_frame_to_message
-from ldo_service.datasets import Sequence
+from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.recordings.mcap_file import RecordConfig, RecordingFile
-from ldo_service.runs.source import RecordingSequence, open_source
+from ldo_service.runs.recorded_sequence import RecordingSequence
 from ldo_service.schemas import CameraColor, CameraDepth
 from tests.commands.test_cli import ldo
 from tests.runs.conftest import FRAMES, ROUGH
 
 
 def test_frames_of_a_recording_equal_those_of_the_camera(recording: Path, room: Sequence) -> None:
-    sequence = open_source(str(recording))
+    sequence = open_sequence(str(recording))
     assert len(sequence) == FRAMES
     assert sequence.raw_camera == room.raw_camera
     np.testing.assert_array_equal(sequence.stamps_ns, room.stamps_ns[:FRAMES])
@@ -83,13 +83,13 @@ def test_damaged_first_frame_does_not_hide_the_others(recording_copy: Path) -> N
 def test_a_recording_without_camera_is_bad_data(recording_copy: Path) -> None:
     (recording_copy / "frame_source.mcap").unlink()
     with pytest.raises(DataError, match="camera/rgbd"):
-        open_source(str(recording_copy))
+        open_sequence(str(recording_copy))
 
 
 def test_sources_other_than_recordings_are_opened_or_refused(tmp_path: Path) -> None:
-    assert open_source("synthetic:room").truth() is not None
+    assert open_sequence("synthetic:room").truth() is not None
     with pytest.raises(DataError, match="no known layout"):
-        open_source(str(tmp_path))
+        open_sequence(str(tmp_path))
 
 
 def test_separate_color_and_depth_images_are_read_as_frames(room: Sequence, tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_separate_color_and_depth_images_are_read_as_frames(room: Sequence, tmp_
                 body = msgspec.msgpack.encode(image)
                 file.add(topic, type(image), body, 2 * index, image.stamp_ns)
     file.close()
-    sequence = open_source(str(tmp_path))
+    sequence = open_sequence(str(tmp_path))
     np.testing.assert_array_equal(sequence.stamps_ns, room.stamps_ns[[0, 1, 3]])
     read, expected = sequence.read(2), room.read(3)
     assert read.index == 2

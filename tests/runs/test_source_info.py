@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.datasets import Sequence
+from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.errors import FrameError
 from ldo_service.geometry import RawFrame, Trajectory
-from ldo_service.runs.source import layout_of, open_source
+from ldo_service.runs.source import layout_of
 from ldo_service.runs.source_info import describe, estimated_run_s
 from tests.datasets.bags import entries_of, write_bag
 from tests.runs.jobs import job
@@ -73,8 +73,8 @@ def test_layout_is_named(
     }
     for source, layout in expected.items():
         assert layout_of(source) == layout
-    assert len(open_source(str(bag))) == 3
-    assert describe(open_source(str(recording))).depth.registration == "source"
+    assert len(open_sequence(str(bag))) == 3
+    assert describe(open_sequence(str(recording))).depth.registration == "source"
 
 
 def test_probe_estimates_the_time_of_a_run(room: Sequence, tmp_path: Path) -> None:
