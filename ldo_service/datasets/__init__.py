@@ -1,5 +1,6 @@
 """Sequences of RGB-D frames: recordings in common layouts, and synthetic scenes."""
 
+import re
 from pathlib import Path
 
 from ldo_service.errors import ConfigError, DataError
@@ -37,7 +38,7 @@ LAYOUTS = (
     ),
     Layout(
         "Open3D and Redwood",
-        "color/*.jpg, depth/*.png and camera_intrinsic.json",
+        "color/ (or image/, rgb/), depth/ and camera_intrinsic.json",
         Open3dSequence.matches,
         lambda path, _options: Open3dSequence(path),
     ),
@@ -116,18 +117,12 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     path = Path(source).expanduser()
     if not path.exists():
         raise DataError(
-            f"{source} does not exist. Check the path. A source is a recording in one of these "
-            f"layouts: {_known()}."
+            f"{source} does not exist. Check the path, or give a built-in scene synthetic:NAME, "
+            f"where NAME is {', '.join(SCENES)}."
         )
     if layout := find_layout(path):
         return layout.open_sequence(path, options)
-    if parts := sorted(part.parent.name for part in path.glob("seq-*/frame-000000.color.*")):
-        raise DataError(
-            f"{path} contains several sequences of 7-Scenes. Give one of them, such as "
-            f"{path / parts[0]}."
-        )
-    kind = "folder" if path.is_dir() else "file"
-    raise DataError(f"the {kind} {path} has no known layout. Known layouts: {_known()}.")
+    raise DataError(_unknown(path))
 
 
 def find_layout(path: Path) -> Layout | None:
@@ -142,8 +137,28 @@ def find_layout(path: Path) -> Layout | None:
     return None
 
 
-def _known() -> str:
-    listed = "; ".join(
-        f"{layout.name} ({layout.files})" for layout in (*LAYOUTS, *registered_layouts())
+def _unknown(path: Path) -> str:
+    """Return the error of a path that has no known layout."""
+    if parts := sorted(part.parent.name for part in path.glob("seq-*/frame-000000.color.*")):
+        return (
+            f"{path} contains several sequences of 7-Scenes. Give one of them, such as "
+            f"{path / parts[0]}."
+        )
+    layouts = (*LAYOUTS, *registered_layouts())
+    names = [part.name for part in sorted(path.iterdir())] if path.is_dir() else [path.name]
+    similar = [layout for layout in layouts if any(_is_listed(n, layout.files) for n in names)]
+    kind = "folder" if path.is_dir() else "file"
+    advice = (
+        " or ".join(f"{layout.files} ({layout.name})" for layout in similar[:2])
+        if similar
+        else f"the files of one of these: {', '.join(layout.name for layout in layouts)}"
     )
-    return f"{listed}; a built-in scene synthetic:NAME, where NAME is {', '.join(SCENES)}"
+    return (
+        f"the {kind} {path} has no known layout. Expected {advice}. docs/first-steps.md lists the "
+        "files of each layout."
+    )
+
+
+def _is_listed(name: str, files: str) -> bool:
+    """Return whether a text names a file or a folder."""
+    return re.search(rf"(?<![\w./*]){re.escape(name)}(?![\w.])", files) is not None

@@ -31,7 +31,7 @@ def test_unknown_synthetic_name_lists_the_known_ones() -> None:
 
 def test_messages_and_help_list_every_built_in_scene(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs/first-steps.md").read_text()
-    for source in ("synthetic:castle", str(tmp_path)):
+    for source in ("synthetic:castle", str(tmp_path / "nowhere")):
         with pytest.raises(DataError) as caught:
             open_sequence(source)
         assert all(name in str(caught.value) for name in SCENES)
@@ -59,16 +59,23 @@ def test_invalid_seed_is_rejected(seed: str) -> None:
         open_sequence(f"synthetic:room{seed}")
 
 
-def test_folder_of_unknown_layout_lists_the_expected_files(tmp_path: Path) -> None:
+def test_folder_of_unknown_layout_names_the_known_layouts(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(DataError, match=r"no known layout.*TUM.*Replica.*ScanNet.*7-Scenes") as e:
+        open_sequence(str(tmp_path))
+    assert len(str(e.value)) < 700
+
+
+def test_folder_with_a_file_of_a_layout_is_told_the_other_files(tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text("")
     with pytest.raises(
-        DataError, match=r"no known layout.*TUM.*depth\.txt.*Replica.*results/.*ScanNet.*7-Scenes"
+        DataError, match=r"Expected rgb.txt and depth.txt \(TUM RGB-D\)\. docs/first"
     ):
         open_sequence(str(tmp_path))
 
 
 def test_missing_folder_and_file_have_different_messages(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"does not exist.*TUM"):
+    with pytest.raises(DataError, match=r"nowhere does not exist.*synthetic:NAME"):
         open_sequence(str(tmp_path / "nowhere"))
     (tmp_path / "a.txt").touch()
     with pytest.raises(DataError, match=r"the file .*no known layout"):
@@ -175,7 +182,8 @@ def test_layout_of_another_package_opens_its_files(
     assert open_sequence(str(path)) is room
     with pytest.raises(ConfigError, match=r"my rig.*registration options"):
         open_sequence(str(path), SequenceOptions(register_depth=True))
-    with pytest.raises(DataError, match=r"my rig \(\*\.mine\)"):
+    (tmp_path / "other").touch()
+    with pytest.raises(DataError, match=r"no known layout.*my rig"):
         open_sequence(str(tmp_path / "other"))
 
 
