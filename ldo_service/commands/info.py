@@ -15,7 +15,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.runs.source import layout_of
 from ldo_service.runs.source_info import SourceInfo, describe, estimated_run_s
 
-from .options import ConfigFile, Json, Settings, Source, argument
+from .options import ConfigFile, Json, Settings, Source, Topics, argument, with_topics
 
 FIRST_UNIX_S = 946_684_800  # The year 2000. A smaller stamp is no time of day.
 REGISTRATION = {
@@ -29,6 +29,7 @@ def info(
     source: Source,
     config: ConfigFile = None,
     set: Settings = (),
+    topic: Topics = (),
     probe: Annotated[
         int | None, argument(metavar="N", help="estimate the time of a run from N frames")
     ] = None,
@@ -46,7 +47,7 @@ def info(
     if probe is not None and probe < 1:
         raise ConfigError(f"--probe {probe} must be at least 1.")
     layout = layout_of(source)
-    settings = load_config(config, set)
+    settings = load_config(config, with_topics(set, topic))
     sequence = open_sequence(source, settings.dataset.options())
     found = describe(sequence)
     run_s = None if probe is None else estimated_run_s(sequence, settings, probe)

@@ -51,6 +51,15 @@ Source = Annotated[
         f"NAME is {', '.join(SCENES)}",
     ),
 ]
+Topics = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(
+        name="topic",
+        metavar="STREAM=TOPIC",
+        help="topic of color or depth in a bag of ROS, such as color=/camera/color/image_raw; may "
+        "be repeated; replaces dataset.topics",
+    ),
+]
 MaxFrames = Annotated[int | None, argument(metavar="N", help="stop after N frames")]
 Stride = Annotated[int, argument(metavar="N", help="take every N-th frame")]
 Recording = Annotated[
@@ -99,6 +108,11 @@ KeysFolder = Annotated[
 ]
 Overwrite = Annotated[bool, argument(help="replace an earlier run in the folder")]
 Json = Annotated[bool, argument(help="print one JSON document and nothing else")]
+
+
+def with_topics(settings: tuple[str, ...], topics: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the values of --set, and after them the values of --topic as a setting."""
+    return (*settings, f"dataset.topics=[{', '.join(topics)}]") if topics else settings
 
 
 def localizing(config: Config, folder: Path | None) -> Config:

@@ -37,8 +37,10 @@ from .options import (
     Robot,
     Settings,
     Stride,
+    Topics,
     argument,
     progress,
+    with_topics,
 )
 
 FIRST_REALSENSE, NO_TOPICS = RealSenseOptions(), RosOptions()
@@ -67,6 +69,7 @@ def publish(
     ] = False,
     config: ConfigFile = None,
     set: Settings = (),
+    topic: Topics = (),
     usb: RealSenseOptions = FIRST_REALSENSE,
     ros: RosOptions = NO_TOPICS,
 ) -> None:
@@ -85,7 +88,7 @@ def publish(
     """
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     if source in (REALSENSE, ROS2):
-        require_no_sequence(source, rate=rate, config=config, set=set)
+        require_no_sequence(source, rate=rate, config=config, set=set, topic=topic)
         network, chosen = Endpoint(robot, endpoint, TlsKeys.of(keys)), Selection(stride, max_frames)
         live = (
             realsense.frames(usb.stream())
@@ -97,7 +100,7 @@ def publish(
         return
     if rate is not None and not 0 < rate < float("inf"):
         raise ConfigError(f"--rate {rate:g}: must be positive.")
-    sequence = open_sequence(source, load_config(config, set).dataset.options())
+    sequence = open_sequence(source, load_config(config, with_topics(set, topic)).dataset.options())
     indices = Selection(stride, max_frames).indices(sequence)
     with (
         connect(robot, endpoint, keys) as service,

@@ -29,9 +29,11 @@ from .options import (
     Settings,
     Source,
     Stride,
+    Topics,
     argument,
     localizing,
     progress,
+    with_topics,
 )
 
 
@@ -40,6 +42,7 @@ def run(
     out: Annotated[Path, argument(metavar="DIR", help="folder for the results")],
     config: ConfigFile = None,
     set: Settings = (),
+    topic: Topics = (),
     max_frames: MaxFrames = None,
     stride: Stride = 1,
     hold_out_every: Annotated[
@@ -115,7 +118,7 @@ def run(
     require_none_of("--localize", localize, {"--keep-front-end": keep_front_end})
     require_separate(localize, out, refine_iterations)
     console = Console(stderr=True)
-    settings = with_options(load_config(config, set), hold_out_every, threads)
+    settings = with_options(load_config(config, with_topics(set, topic)), hold_out_every, threads)
     settings = localizing(settings, localize)
     require_usable_networks(settings)
     selection = Selection(stride, max_frames)

@@ -20,8 +20,10 @@ from .options import (
     Settings,
     Source,
     Stride,
+    Topics,
     argument,
     progress,
+    with_topics,
 )
 from .run import with_options
 
@@ -30,6 +32,7 @@ def simulate(
     source: Source,
     config: ConfigFile = None,
     set: Settings = (),
+    topic: Topics = (),
     max_frames: MaxFrames = None,
     stride: Stride = 1,
     threads: Annotated[
@@ -45,7 +48,9 @@ def simulate(
       ldo simulate synthetic:room --max-frames 60 --json
     """
     console = Console(stderr=True, highlight=False)
-    settings = with_options(load_config(config, set), hold_out=None, threads=threads)
+    settings = with_options(
+        load_config(config, with_topics(set, topic)), hold_out=None, threads=threads
+    )
     require_usable_networks(settings)
     sequence = open_sequence(source, settings.dataset.options())
     selection = Selection(stride, max_frames)

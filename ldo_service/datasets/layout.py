@@ -59,7 +59,9 @@ class Layout:
                 "registration options."
             )
         if options.topics and not self.has_topics:
-            raise ConfigError(f"{path} ({self.name}) has no topics. Remove dataset.topics.")
+            raise ConfigError(
+                f"{path} ({self.name}) has no topics. Remove --topic (dataset.topics)."
+            )
         return self.open(path, options)
 
 

@@ -182,13 +182,12 @@ def _topic(
         beside: Topic of the same camera; topics that share its namespace are preferred.
     """
     images = [t for t in bag.topics.values() if t.kind in (IMAGE, COMPRESSED_IMAGE) and t.count]
-    setting = f"dataset.topics=[{stream}="
     if given:
         for topic in images:
             if topic.name == given:
                 return topic
         raise ConfigError(
-            f"{setting}{given}] names no topic with images in {bag.path}. "
+            f"--topic {stream}={given} names no topic with images in {bag.path}. "
             f"{_listed('Its topics with images', images)}."
         )
     ranked: dict[tuple[int, int, int], list[Topic]] = {}
@@ -206,15 +205,15 @@ def _topic(
         raise DataError(
             f"{bag.path} has no topic that is known to have {stream} images. "
             f"{_listed('Its topics', [t for t in bag.topics.values() if t.count])}. If one of them "
-            f"has {stream} images (sensor_msgs/Image or CompressedImage), name it by --set "
-            f"'{setting}/TOPIC]'."
+            f"has {stream} images (sensor_msgs/Image or CompressedImage), name it by --topic "
+            f"{stream}=/TOPIC."
         )
     best = ranked[min(ranked)]
     if len(best) > 1:
         raise DataError(
             f"{bag.path} has several topics with {stream} images: "
-            f"{', '.join(topic.name for topic in best)}. Choose one by --set "
-            f"'{setting}{best[0].name}]'."
+            f"{', '.join(topic.name for topic in best)}. Choose one by --topic "
+            f"{stream}={best[0].name}."
         )
     return best[0]
 
@@ -262,7 +261,7 @@ def _camera(bag: BagFile, image: Topic) -> Camera:
         raise DataError(
             f"{bag.path} has no camera info of {image.name}. Expected sensor_msgs/CameraInfo on "
             f"{folder}/camera_info. {_listed('Its topics of this type', infos)}. Record this topic "
-            "too, or choose other images by dataset.topics."
+            "too, or choose other images by --topic."
         )
     is_rectified = "rect" in COMPRESSED.sub("", image.name).rpartition("/")[2]
     try:

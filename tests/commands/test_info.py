@@ -4,7 +4,9 @@ import json
 import shutil
 from pathlib import Path
 
+from ldo_service.datasets import Sequence
 from tests.commands.test_cli import assert_one_paragraph, ldo
+from tests.datasets.bags import entries_of, write_bag
 
 
 def test_command_prints_a_table_and_json(capsys, room_folder: Path) -> None:
@@ -52,3 +54,29 @@ def test_brackets_in_a_path_are_printed(capsys, tmp_path: Path, room_folder: Pat
 def test_probe_without_frames_is_refused(capsys) -> None:
     code, _, err = ldo(capsys, "info", "synthetic:room", "--probe", "0")
     assert (code, "--probe 0 must be at least 1" in err) == (2, True)
+
+
+def test_topic_chooses_between_two_cameras_of_a_bag(capsys, tmp_path: Path, room: Sequence) -> None:
+    """The commands run and simulate share the option; an error of several topics names it."""
+    path = two_cameras(tmp_path, room)
+    code, _, err = ldo(capsys, "info", path)
+    assert code == 3
+    assert_one_paragraph(err)
+    assert "--topic color=/back/color/image_raw" in " ".join(err.split())
+    chosen = "--topic", "color=/front/color/image_raw"
+    assert ldo(capsys, "info", path, *chosen)[0] == 0
+    code, out, _ = ldo(capsys, "simulate", path, *chosen, "--json")
+    assert (code, "tracker" in json.loads(out)) == (0, True)
+    assert ldo(capsys, "run", path, "--out", tmp_path / "run", *chosen)[0] == 0
+    code, _, err = ldo(capsys, "run", path, "--out", tmp_path / "b", "--topic", "color")
+    assert (code, "color=/TOPIC" in err) == (2, True)
+
+
+def two_cameras(folder: Path, sequence: Sequence) -> Path:
+    """Write a bag with the frames of a sequence as those of two cameras."""
+    entries = [
+        (time_ns, topic.replace("/camera/", f"/{name}/"), message)
+        for time_ns, topic, message in entries_of(sequence, range(3))
+        for name in ("front", "back")
+    ]
+    return write_bag(folder, "mcap", entries)

@@ -273,26 +273,24 @@ def test_raw_and_registered_topics_are_preferred(tmp_path: Path) -> None:
     assert topics == [COLOR, DEPTH]
 
 
-def test_topics_of_two_cameras_are_listed_and_a_setting_chooses(tmp_path: Path) -> None:
+def test_topics_of_two_cameras_are_listed_and_an_option_chooses(tmp_path: Path) -> None:
     def renamed(name: str) -> list[tuple[int, str, Any]]:
         return [(t, topic.replace("camera/", f"{name}/", 1), m) for t, topic, m in small()]
 
     front, back = renamed("front"), renamed("back")
     path = str(write_bag(tmp_path, "sqlite3", [*front, *back]))
-    with pytest.raises(
-        DataError, match=r"several .*/back/.*, /front/.*dataset\.topics=\[color=/back"
-    ):
+    with pytest.raises(DataError, match=r"several .*/back/.*, /front/.*--topic color=/back/color"):
         open_sequence(path)
     options = SequenceOptions(topics={"color": "/front/color/image_raw"})
     sequence = open_sequence(path, options)
     depths = [depth.connection.topic for _, depth in sequence._frames]  # type: ignore[attr-defined]
     assert depths == ["/front/aligned_depth_to_color/image_raw"] * 2
-    with pytest.raises(ConfigError, match=r"dataset\.topics=\[depth=/x\] names no .*/front/color"):
+    with pytest.raises(ConfigError, match=r"--topic depth=/x names no .*/front/color"):
         open_sequence(path, SequenceOptions(topics={"depth": "/x"} | dict(options.topics)))
 
 
 def test_topics_are_rejected_by_layouts_without_topics(tum_folder: Callable[..., Path]) -> None:
-    with pytest.raises(ConfigError, match=r"has no topics\. Remove dataset\.topics"):
+    with pytest.raises(ConfigError, match=r"has no topics\. Remove --topic"):
         open_sequence(str(tum_folder(["1"], ["1"])), SequenceOptions(topics={"color": "/a"}))
 
 
@@ -456,7 +454,7 @@ def test_folder_whose_metadata_are_no_metadata_is_rejected(tmp_path: Path) -> No
         ),
         (
             {"color": ""},
-            r"no topic that is known to have color images.*set 'dataset\.topics=\[color=/TOPIC",
+            r"no topic that is known to have color images.*--topic color=/TOPIC",
         ),
         ({"info": ""}, r"no camera info of /camera/color/image_raw.*of this type: none"),
     ],
