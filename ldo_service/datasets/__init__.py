@@ -7,6 +7,9 @@ from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import Cached, Sequence
 from ldo_service.synthetic import SCENES, open_synthetic
 
+from .azure_kinect import SUFFIX, AzureKinectSequence
+from .icl_nuim import IclNuimSequence
+from .kitti import KittiSequence
 from .layout import Layout, registered_layouts
 from .nerfstudio import NerfstudioSequence
 from .open3d import Open3dSequence
@@ -57,6 +60,18 @@ LAYOUTS = (
         has_options=True,
     ),
     Layout(
+        "ICL-NUIM",
+        "associations.txt, rgb/ and depth/, or scene_*.png and scene_*.depth",
+        IclNuimSequence.matches,
+        lambda path, _options: IclNuimSequence(path),
+    ),
+    Layout(
+        "KITTI odometry",
+        "image_2/ and image_3/ (or image_0/ and image_1/), and calib.txt",
+        KittiSequence.matches,
+        lambda path, _options: KittiSequence(path),
+    ),
+    Layout(
         "Stray Scanner",
         "rgb.mp4, depth/ and odometry.csv",
         lambda path: (path / "rgb.mp4").is_file(),
@@ -67,6 +82,12 @@ LAYOUTS = (
         "a file .r3d",
         lambda path: path.is_file() and path.suffix.lower() == ".r3d",
         lambda path, _options: Record3DSequence(path),
+    ),
+    Layout(
+        "Azure Kinect",
+        "a file .mkv",
+        lambda path: path.is_file() and path.suffix.lower() == SUFFIX,
+        lambda path, _options: AzureKinectSequence(path),
     ),
     Layout(
         "nerfstudio",

@@ -21,12 +21,17 @@ class Video:
     keyframe before. At most one decoded frame is held. Reading is safe in several threads.
 
     Attributes:
+        stamps_ns: Stamps of the frames from the beginning of the file, [N] int64, ascending.
         width: Width of the frames in pixels.
         height: Height of the frames in pixels.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, stream: int = 0) -> None:
         """Open a file and list its frames, without decoding them.
+
+        Args:
+            path: The file.
+            stream: Number of the stream among the video streams of the file.
 
         Raises:
             ConfigError: PyAV is not installed.
@@ -43,7 +48,7 @@ class Video:
         self._path, self._error = path, FFmpegError
         try:
             self._container = av.open(str(path))
-            self._stream: Any = self._container.streams.video[0]
+            self._stream: Any = self._container.streams.video[stream]
             self.width, self.height = int(self._stream.width), int(self._stream.height)
             packets = [
                 (packet.pts, packet.is_keyframe)
@@ -64,6 +69,9 @@ class Video:
                 f"{path} has {len(packets)} frames of {self.width}x{self.height} pixels, expected "
                 f"at least one frame and at most {MAX_PIXELS} pixels. Export the recording again."
             )
+        unit = self._stream.time_base
+        stamps_ns = [stamp * unit.numerator * 10**9 // unit.denominator for stamp in self._stamps]
+        self.stamps_ns = np.array(stamps_ns, np.int64)
         self._frames: Iterator[Any] | None = None  # Decoded frames from `_next` on.
         self._next = 0
         self._missing = range(0)  # Frames before `_next` that the decoder did not deliver.
@@ -72,8 +80,8 @@ class Video:
     def __len__(self) -> int:
         return len(self._stamps)
 
-    def read(self, index: int) -> np.ndarray:
-        """Return a frame [H, W, 3] uint8 RGB.
+    def read(self, index: int, encoding: str = "rgb24") -> np.ndarray:
+        """Return a frame [H, W, 3] uint8 RGB, or of another encoding of FFmpeg.
 
         Raises:
             FrameError: The frame cannot be decoded.
@@ -85,7 +93,7 @@ class Video:
                     f"{self._path}, frame {index}, cannot be decoded. Export or copy the recording "
                     "again."
                 )
-            return frame.to_ndarray(format="rgb24")
+            return frame.to_ndarray(format=encoding)
 
     def _decoded(self, index: int) -> Any:
         """Return the decoded frame with an index, or None if the decoder does not deliver it."""

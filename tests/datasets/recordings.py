@@ -4,7 +4,7 @@ import json
 import struct
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import av
@@ -12,7 +12,7 @@ import cv2
 import liblzfse
 import numpy as np
 
-from ldo_service.geometry import Camera, RawFrame
+from ldo_service.geometry import Camera, RawFrame, se3
 
 DEPTH_SIZE = 256, 192  # Width and height of the depth of an iPhone.
 
@@ -69,14 +69,18 @@ def write_stray(
     depth_size: tuple[int, int] = DEPTH_SIZE,
     enlarged: int = 1,
     gop: int = 30,
+    T_world_camera: np.ndarray | None = None,
 ) -> Path:
     """Write a folder of Stray Scanner; color is `enlarged` times as wide as in the frames."""
+    poses = np.tile(np.eye(4), (len(frames), 1, 1)) if T_world_camera is None else T_world_camera
     lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
     for k, frame in enumerate(frames):
         depth = millimeters(frame, depth_size)
         write_image(folder / f"depth/{k:06d}.png", depth)
         write_image(folder / f"confidence/{k:06d}.png", np.where(depth > 0, 2, 0).astype(np.uint8))
-        lines.append(f"{frame.stamp_ns / 1e9:.6f}, {k:06d}, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0")
+        w, *imaginary = se3.quaternion(poses[k][:3, :3])
+        numbers = ", ".join(map(str, (*poses[k][:3, 3], *imaginary, w)))
+        lines.append(f"{frame.stamp_ns / 1e9:.6f}, {k:06d}, {numbers}")
     (folder / "odometry.csv").write_text("\n".join(lines) + "\n")
     images = [np.repeat(np.repeat(f.color, enlarged, 0), enlarged, 1) for f in frames]
     write_video(folder / "rgb.mp4", images, gop)
@@ -92,6 +96,18 @@ def enlarged_matrix(camera: Camera, factor: int) -> np.ndarray:
     K[:2, 2] = (np.array([camera.cx, camera.cy]) + 0.5) * factor - 0.5
     K[2, 2] = 1
     return K
+
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # Axes of OpenGL's camera, in those of this project.
+
+
+def record3d_poses(T_world_camera: np.ndarray) -> list[list[float]]:
+    """Return poses [N, 4, 4] as Record3D writes them: qx, qy, qz, qw, x, y, z, axes of OpenGL."""
+    poses = []
+    for T in T_world_camera @ OPENGL:
+        w, *imaginary = se3.quaternion(T[:3, :3])
+        poses.append([*map(float, (*imaginary, w, *T[:3, 3]))])
+    return poses
 
 
 def write_r3d(
@@ -136,9 +152,13 @@ def change_archive(path: Path, changed: dict[str, bytes | None]) -> None:
 
 
 def write_nerfstudio(
-    folder: Path, frames: list[RawFrame], depth_size: tuple[int, int] | None = None
+    folder: Path,
+    frames: list[RawFrame],
+    depth_size: tuple[int, int] | None = None,
+    T_world_camera: np.ndarray | None = None,
 ) -> Path:
     """Write a folder of nerfstudio; depth is in the unit of the frames unless it is resampled."""
+    poses = np.tile(np.eye(4), (len(frames), 1, 1)) if T_world_camera is None else T_world_camera
     camera = frames[0].camera
     content = {
         "camera_model": "OPENCV",
@@ -153,7 +173,7 @@ def write_nerfstudio(
             {
                 "file_path": f"images/frame_{k:05d}.png",
                 "depth_file_path": f"depth/frame_{k:05d}.png",
-                "transform_matrix": np.eye(4).tolist(),
+                "transform_matrix": (poses[k] @ OPENGL).tolist(),
             }
             for k in range(len(frames))
         ],
@@ -224,3 +244,149 @@ def write_open3d(
     }
     (folder / intrinsics).write_text(json.dumps(content))
     return folder
+
+
+def write_kitti(
+    folder: Path,
+    pairs: Iterable[tuple[np.ndarray, np.ndarray]],
+    camera: Camera,
+    baseline_m: float,
+    stamps_ns: np.ndarray,
+    T_world_camera: np.ndarray,
+    offset_m: float = 0.06,
+) -> Path:
+    """Write a folder of KITTI: left and right images as cameras 2 and 3.
+
+    Camera 0, whose poses the files contain, is `offset_m` to the right of camera 2.
+    """
+    for k, (left, right) in enumerate(pairs):
+        write_image(folder / f"image_2/{k:06d}.png", left)
+        write_image(folder / f"image_3/{k:06d}.png", right)
+    lines = []
+    for name, x_m in (("P0", 0.0), ("P1", 0.5), ("P2", -offset_m), ("P3", baseline_m - offset_m)):
+        P = np.hstack([camera.matrix, camera.matrix @ [[-x_m], [0], [0]]])
+        lines.append(f"{name}: " + " ".join(f"{n:.12e}" for n in P.ravel()))
+    (folder / "calib.txt").write_text("\n".join(lines) + "\n")
+    (folder / "times.txt").write_text("".join(f"{t / 1e9:.9e}\n" for t in stamps_ns))
+    T_camera_camera0 = np.eye(4)
+    T_camera_camera0[0, 3] = offset_m
+    rows = (T_world_camera @ T_camera_camera0)[:, :3].reshape(-1, 12)
+    (folder / "poses.txt").write_text(
+        "".join(" ".join(f"{n:.12e}" for n in row) + "\n" for row in rows)
+    )
+    return folder
+
+
+def write_icl_nuim(
+    folder: Path, frames: list[RawFrame], T_world_camera: np.ndarray, first: int = 0
+) -> Path:
+    """Write a folder of ICL-NUIM with TUM-compatible PNGs; the images count from `first`."""
+    numbers = range(first, first + len(frames))
+    for k, frame in zip(numbers, frames, strict=True):
+        write_image(folder / f"rgb/{k}.png", frame.color)
+        depth = np.round(frame.depth_m() * 5000).astype(np.uint16)
+        write_image(folder / f"depth/{k}.png", depth)
+    lines = [f"{k} depth/{k}.png {k} rgb/{k}.png\n" for k in numbers]
+    (folder / "associations.txt").write_text("".join(lines))
+    write_freiburg(folder / "livingRoom0.gt.freiburg", numbers, T_world_camera)
+    return folder
+
+
+def write_icl_nuim_rendered(
+    folder: Path, frames: list[RawFrame], T_world_camera: np.ndarray
+) -> Path:
+    """Write a folder of ICL-NUIM with the files of its renderer."""
+    for k, frame in enumerate(frames):
+        write_image(folder / f"scene_00_{k:04d}.png", frame.color)
+        norms = np.linalg.norm(frame.camera.rays(), axis=-1)
+        distances = (frame.depth_m() * norms).ravel()
+        text = " ".join(f"{distance:.7f}" for distance in distances)
+        (folder / f"scene_00_{k:04d}.depth").write_text(text + " ")
+    write_freiburg(folder / "livingRoom0.gt.freiburg", range(len(frames)), T_world_camera)
+    return folder
+
+
+def write_freiburg(path: Path, numbers: Iterable[int], T_world_camera: np.ndarray) -> None:
+    """Write poses as ICL-NUIM does: in left-handed coordinates, with y up."""
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    lines = []
+    for k, T in zip(numbers, mirror @ T_world_camera @ mirror, strict=True):
+        w, *imaginary = se3.quaternion(T[:3, :3])
+        lines.append(f"{k} " + " ".join(f"{n:.9f}" for n in (*T[:3, 3], *imaginary, w)) + "\n")
+    path.write_text("".join(lines))
+
+
+AZURE_DEPTH_SIZE = 320, 288  # Mode NFOV_2X2BINNED.
+T_COLOR_DEPTH = se3.exp(np.array([0.02, -0.01, 0.005, -0.032, -0.002, 0.004]))
+
+
+def azure_calibration(color: Camera, depth: Camera) -> dict[str, object]:
+    """Return the calibration of an Azure Kinect whose images have these cameras."""
+
+    def entry(name: str, camera: Camera, whole: tuple[float, float], corner: np.ndarray) -> object:
+        k1, k2, p1, p2, k3, k4, k5, k6 = camera.distortion or (0.0,) * 8
+        center = np.array([camera.cx, camera.cy]) + 0.5 + corner
+        values = (*center / whole, camera.fx / whole[0], camera.fy / whole[1])
+        T = T_COLOR_DEPTH if name == "PV0" else np.eye(4)
+        return {
+            "Location": f"CALIBRATION_CameraLocation{name}",
+            "Intrinsics": {
+                "ModelParameterCount": 14,
+                "ModelParameters": [*values, k1, k2, k3, k4, k5, k6, 0, 0, p2, p1],
+                "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
+            },
+            "Rt": {
+                "Rotation": T[:3, :3].ravel().tolist(),
+                "Translation": T[:3, 3].tolist(),
+            },
+        }
+
+    whole = color.width * 3 / 4
+    rows = np.array([0, (whole - color.height) / 2])
+    return {
+        "CalibrationInformation": {
+            "Cameras": [
+                entry("D0", depth, (512, 512), np.array([96, 90])),
+                entry("PV0", color, (color.width, whole), rows),
+            ]
+        }
+    }
+
+
+def write_azure(
+    path: Path,
+    images: Sequence[tuple[np.ndarray, np.ndarray]],
+    calibration: dict[str, object] | None,
+    codec: str = "mjpeg",
+    pixel_format: str = "yuvj422p",
+) -> Path:
+    """Write a file of k4arecorder by PyAV: color [H, W, 3] and depth [Hd, Wd] in millimeters.
+
+    PyAV leaves out the FOURCC of depth, thus it is written into the header afterwards.
+    """
+    with av.open(str(path), "w", options={"allow_raw_vfw": "1"}) as container:
+        streams = []
+        for name, image in zip(("COLOR", "DEPTH"), images[0], strict=True):
+            stream = container.add_stream(codec if name == "COLOR" else "rawvideo", rate=30)
+            stream.height, stream.width = image.shape[:2]
+            stream.pix_fmt = pixel_format if name == "COLOR" else "gray16be"
+            if codec == "mjpeg" and name == "COLOR":
+                stream.options = {"qmin": "1", "qmax": "2"}
+            stream.metadata["title"] = name
+            streams.append(stream)
+        if calibration is not None:
+            body = json.dumps(calibration).encode()
+            container.add_attachment("calibration.json", "application/octet-stream", body)
+        for k, (color, depth) in enumerate(images):
+            frames = (
+                av.VideoFrame.from_ndarray(color, format="rgb24").reformat(format=pixel_format),
+                av.VideoFrame.from_ndarray(depth.astype(np.uint16), format="gray16be"),
+            )
+            for stream, frame in zip(streams, frames, strict=True):
+                frame.pts = k
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode(None))
+    header = b"\1\0\x10\0"  # One plane of 16 bits per pixel in BITMAPINFOHEADER.
+    path.write_bytes(path.read_bytes().replace(header + bytes(4), header + b"b16g", 1))
+    return path

@@ -11,12 +11,17 @@ from zipfile import ZipFile
 import cv2
 import numpy as np
 
-from ldo_service.datasets import open_sequence
+from ldo_service.datasets import icl_nuim, open_sequence
 from ldo_service.geometry import Camera, RawFrame
 from tests.datasets.bags import COLOR_INFO, info_of, lossless, write_bag
 from tests.datasets.recordings import (
+    AZURE_DEPTH_SIZE,
+    azure_calibration,
     change_archive,
     small_frames,
+    write_azure,
+    write_icl_nuim,
+    write_kitti,
     write_nerfstudio,
     write_r3d,
     write_sens,
@@ -112,14 +117,38 @@ OPEN3D = {
         }
     ).encode(),
 }
+POSES = np.tile(np.eye(4), (2, 1, 1))
+STAMPS_NS = np.array([0, 10**8])
+KITTI = written(
+    lambda folder: write_kitti(
+        folder, [(COLOR, COLOR)] * 2, Camera(WIDTH, HEIGHT, **PINHOLE), 0.5, STAMPS_NS, POSES
+    )
+)
+BLACK = np.zeros((480, 640, 3), np.uint8)  # The camera of ICL-NUIM has 640x480 pixels.
+ICL_FRAME = RawFrame(0, 0, BLACK, np.ones((480, 640)), 1.0, icl_nuim.CAMERA)
+ICL_NUIM = written(lambda folder: write_icl_nuim(folder, [ICL_FRAME], POSES[:1]))
+RENDERED = {
+    "scene_00_0000.png": png(BLACK),
+    "scene_00_0000.depth": b"1 " * (640 * 480),
+    "a.gt.freiburg": TRAJECTORY,
+}
+[AZURE] = written(
+    lambda folder: write_azure(
+        folder / "a.mkv",
+        [(COLOR, np.full(AZURE_DEPTH_SIZE[::-1], 1500))] * 2,
+        azure_calibration(Camera(WIDTH, HEIGHT, **PINHOLE), Camera(320, 288, 250, 250, 160, 144)),
+    )
+).values()
 LAYOUTS = {"TUM": TUM, "Replica": REPLICA, "ScanNet": SCANNET, "7-Scenes": SEVEN_SCENES}
 LAYOUTS |= {"Stray Scanner": STRAY, "nerfstudio": NERFSTUDIO, "Open3D": OPEN3D}
+LAYOUTS |= {"KITTI": KITTI, "ICL-NUIM": ICL_NUIM, "ICL-NUIM, rendered": RENDERED}
 
 
 def frames_of(folder: Path) -> None:
     """Read all that a run reads from a data set."""
     sequence = open_sequence(str(folder))
     sequence.truth()
+    sequence.odometry()
     labels = sequence.true_labels()
     for index in range(min(len(sequence), 2)):
         if labels is not None:
@@ -171,5 +200,6 @@ TARGETS = [
 TARGETS += [
     Target("Record3D", as_file("a.r3d", frames_of), [R3D]),
     *(in_r3d(name) for name in ("metadata", "rgbd/0.jpg", "rgbd/0.depth", "rgbd/0.conf")),
+    Target("Azure Kinect", as_file("a.mkv", frames_of), [AZURE]),
     Target(".sens", as_file("a.sens", frames_of), [SENS, SENS_RAW]),
 ]

@@ -15,7 +15,11 @@ from .mutation import mutated
 from .target import Target
 from .targets import TARGETS
 
-SLOW = {"ONNX", "config.yaml"}  # Tens of milliseconds per body.
+SLOW = {
+    "ONNX",
+    "config.yaml",
+    "ICL-NUIM, rendered: scene_00_0000.depth",
+}  # Tens of milliseconds per body.
 
 
 @pytest.fixture(autouse=True)
