@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from .geometry import Camera, Trajectory
     from .geometry import RgbdFrame as Frame
     from .library.maps import FoundObject, Map, MapArrays, MapView
+    from .library.pose import Pose
     from .library.run import Run
-    from .library.slam import Pose, Slam
+    from .library.slam import Slam
 
 LIBRARIES = (
     *("numpy", "scipy", "scikit-image", "gtsam", "small-gicp", "onnxruntime"),
@@ -59,7 +60,7 @@ LAZY = {
     "Map": ("library.maps", "Map"),
     "MapArrays": ("library.maps", "MapArrays"),
     "MapView": ("library.maps", "MapView"),
-    "Pose": ("library.slam", "Pose"),
+    "Pose": ("library.pose", "Pose"),
     "Run": ("library.run", "Run"),
     "Slam": ("library.slam", "Slam"),
     "Trajectory": ("geometry", "Trajectory"),

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from ldo_service.config import Config, actor_parameters, load_config
 from ldo_service.datasets import open_sequence
+from ldo_service.errors import DataError
 from ldo_service.evaluation import loops, semantics, trajectory, views
 from ldo_service.evaluation.label_measures import DetectionCounts
 from ldo_service.evaluation.loops import LoopErrors
@@ -21,6 +22,7 @@ from ldo_service.evaluation.results import Results, evaluate_run, to_json, work
 from ldo_service.evaluation.semantics import GATES, LabelErrors
 from ldo_service.evaluation.trajectory import TrajectoryErrors
 from ldo_service.evaluation.views import RenderingErrors
+from ldo_service.geometry.sequence import OdometryAsTruth
 from ldo_service.runs.finished import read_run, require_file
 from ldo_service.runs.networks import labelled_by
 
@@ -99,6 +101,13 @@ def evaluate(
             "two inputs, float32 [1, 3, H, W], RGB in -1..1; one output with a single number",
         ),
     ] = None,
+    odometry_as_truth: Annotated[
+        bool,
+        argument(
+            help="compare with the odometry that the source contains, such as the poses of a "
+            "phone, instead of ground truth"
+        ),
+    ] = False,
     protocol: Annotated[
         bool, argument(help="print the definition of the metrics above each table")
     ] = False,
@@ -124,6 +133,10 @@ def evaluate(
     run = read_run(folder, has_map=not config.tracker.localization_map)
     sequence = open_sequence(source, config.dataset.options())
     run.require_source(sequence)
+    if odometry_as_truth:
+        if sequence.odometry() is None:
+            raise DataError(f"{source} contains no odometry. Remove --odometry-as-truth.")
+        sequence = OdometryAsTruth(sequence)
     with progress("eval", work(run, sequence), Console(stderr=True)) as advance:
         results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)
     if json_:

@@ -85,6 +85,7 @@ def _rows(layout: str, found: SourceInfo) -> dict[str, str]:
         if depth.valid_ratio is None
         else f"{depth.valid_ratio:.1%} of the pixels, median {depth.median_m or 0:.2f} m",
         **({"unreadable": unreadable} if found.unreadable_frames else {}),
+        "odometry": f"{found.odometry_poses} poses" if found.odometry_poses else "none",
         "ground truth": f"{found.true_poses} poses" if found.true_poses else "none",
         **({"true labels": "yes"} if found.has_true_labels else {}),
     }

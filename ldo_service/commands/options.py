@@ -46,7 +46,8 @@ Source = Annotated[
     argument(
         metavar="SOURCE",
         help="data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet, one seq-XX of 7-Scenes, Open3D, "
-        "nerfstudio, Stray Scanner or Record3D, recognized by its files), a bag of ROS, a "
+        "ICL-NUIM, KITTI, nerfstudio, Stray Scanner, Record3D or Azure Kinect, recognized by its "
+        "files), a bag of ROS, a "
         "recording, or a built-in scene synthetic:NAME; "
         f"NAME is {', '.join(SCENES)}",
     ),
@@ -56,8 +57,8 @@ Topics = Annotated[
     tyro.conf.arg(
         name="topic",
         metavar="STREAM=TOPIC",
-        help="topic of color or depth in a bag of ROS, such as color=/camera/color/image_raw; may "
-        "be repeated; replaces dataset.topics",
+        help="topic of color, depth or odometry in a bag of ROS, such as color=/front/image_raw; "
+        "may be repeated; replaces dataset.topics",
     ),
 ]
 MaxFrames = Annotated[int | None, argument(metavar="N", help="stop after N frames")]

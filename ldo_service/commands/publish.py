@@ -16,7 +16,7 @@ from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry.sequence import Sequence
-from ldo_service.runs.source import Selection
+from ldo_service.runs.source import PriorSource, Selection, recorded_prior
 from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
 from ldo_service.transport.keys import TlsKeys
 
@@ -100,14 +100,16 @@ def publish(
         return
     if rate is not None and not 0 < rate < float("inf"):
         raise ConfigError(f"--rate {rate:g}: must be positive.")
-    sequence = open_sequence(source, load_config(config, with_topics(set, topic)).dataset.options())
+    settings = load_config(config, with_topics(set, topic))
+    sequence = open_sequence(source, settings.dataset.options())
     indices = Selection(stride, max_frames).indices(sequence)
+    prior = PriorSource(recorded_prior(sequence, indices, settings, console.print))
     with (
         connect(robot, endpoint, keys) as service,
         progress("publish", len(indices), console) as advance,
     ):
         service.wait_for_subscriber()
-        camera = SequencePublisher(service, sequence, restamp, console.print)
+        camera = SequencePublisher(service, sequence, prior, restamp, console.print)
         for done, index in enumerate(paced(sequence, indices, rate), 1):
             camera.send(index)
             advance(done)
@@ -130,19 +132,23 @@ class SequencePublisher:
     """
 
     def __init__(
-        self, service: Client, sequence: Sequence, restamp: bool, notify: Callable[[str], None]
+        self,
+        service: Client,
+        sequence: Sequence,
+        prior: PriorSource,
+        restamp: bool,
+        notify: Callable[[str], None],
     ) -> None:
-        self._service, self._sequence, self._restamp, self._notify = (
-            service,
-            sequence,
-            restamp,
-            notify,
-        )
+        self._service, self._sequence, self._prior = service, sequence, prior
+        self._restamp, self._notify = restamp, notify
         self._had_subscriber = True
         self.sent = self.bad = self.unreceived = 0
 
     def send(self, index: int) -> None:
-        """Send one frame; a frame that cannot be read is counted in `bad` and skipped."""
+        """Send one frame, and before it the poses of the odometry prior up to its stamp.
+
+        A frame that cannot be read is counted in `bad` and skipped.
+        """
         self._notice_listeners()
         try:
             message = raw_frame_to_message(self._sequence.read(index))
@@ -151,9 +157,10 @@ class SequencePublisher:
                 self._notify(f"{error} The frame is skipped; further bad frames are only counted.")
             self.bad += 1
             return
-        if self._restamp:
-            message = msgspec.structs.replace(message, stamp_ns=time.time_ns())
-        self._service.send(message)
+        shift_ns = time.time_ns() - message.stamp_ns if self._restamp else 0
+        for pose in self._prior.until(message.stamp_ns):
+            self._service.publish_prior(pose.T_prior_base, pose.stamp_ns + shift_ns)
+        self._service.send(msgspec.structs.replace(message, stamp_ns=message.stamp_ns + shift_ns))
         self.sent += 1
         self.unreceived += not self._had_subscriber
 

@@ -19,7 +19,7 @@ from ldo_service.runs.job import Advance, RunOptions, require_held_out
 from ldo_service.runs.networks import require_usable_networks
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.realtime import run_realtime
-from ldo_service.runs.source import Selection
+from ldo_service.runs.source import Selection, recorded_prior
 
 from .options import (
     ConfigFile,
@@ -124,10 +124,14 @@ def run(
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_sequence(source, settings.dataset.options())
+    recorded = None
+    if odometry_prior is None and reuse_front_end is None:
+        indices = selection.indices(sequence)
+        recorded = recorded_prior(sequence, indices, settings, console.print)
     job = RunOptions(
         *(sequence, out, settings, selection, console.print),
         refine=refine_iterations,
-        prior=Trajectory.load(odometry_prior) if odometry_prior else None,
+        prior=Trajectory.load(odometry_prior) if odometry_prior else recorded,
         front_end=kept_front_end(reuse_front_end, out, settings, sequence, selection),
         keep_front_end=keep_front_end,
     )

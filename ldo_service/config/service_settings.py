@@ -40,16 +40,19 @@ class DatasetSettings:
     # Transform from depth to color coordinates: the 16 numbers of the 4x4 matrix, row by row, with
     # the translation in meters. Empty uses the transform of the data set.
     T_color_depth: tuple[float, ...] = ()
-    # Topics of the images in a bag of ROS, such as `[color=/a/image_raw, depth=/b/image_raw]`. A
+    # Topics in a bag of ROS, such as `[color=/a/image_raw, depth=/b/image_raw, odometry=/odom]`. A
     # topic that is not listed is found by type and name.
     topics: tuple[str, ...] = ()
+    # True sends the odometry that a recording contains, such as the poses of a phone, to the
+    # tracker as odometry prior.
+    odometry_prior: bool = False
 
     def __post_init__(self) -> None:
         for topic in self.topics:
-            if not re.fullmatch(r"(color|depth)=/\S+", topic):
+            if not re.fullmatch(r"(color|depth|odometry)=/\S+", topic):
                 raise ConfigError(
-                    f"dataset.topics={list(self.topics)} must be a list of color=/TOPIC and "
-                    "depth=/TOPIC."
+                    f"dataset.topics={list(self.topics)} must be a list of color=/TOPIC, "
+                    "depth=/TOPIC and odometry=/TOPIC."
                 )
         if len(self.T_color_depth) not in (0, 16):
             raise ConfigError(

@@ -202,6 +202,27 @@ def read_trajectory(stamps_ns: np.ndarray, paths: list[Path]) -> Trajectory | No
     return Trajectory(stamps_ns[known] / 1e9, np.array([poses[k] for k in known]))
 
 
+def from_opengl(T_world_camera: np.ndarray) -> np.ndarray:
+    """Return camera poses [..., 4, 4] of x right, y down, z forward from those of OpenGL and ARKit.
+
+    Their cameras have y up and z backward.
+    """
+    return T_world_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def valid_trajectory(stamps_ns: np.ndarray, poses: list[np.ndarray | None]) -> Trajectory | None:
+    """Return the poses that are rigid transforms as a trajectory, or None if there is none.
+
+    Args:
+        stamps_ns: Stamps, [N] int64, ascending.
+        poses: Transforms [4, 4], one per stamp; None where unknown.
+    """
+    valid = {k: se3.orthonormalize(T) for k, T in enumerate(poses) if T is not None and is_rigid(T)}
+    if not valid:
+        return None
+    return Trajectory(stamps_ns[list(valid)] / 1e9, np.array(list(valid.values())))
+
+
 def is_rigid(T: np.ndarray) -> bool:
     """Return whether T [4, 4] is a rigid transform, within the precision of text files."""
     if T.shape != (4, 4) or not np.all(np.isfinite(T)):

@@ -1,14 +1,15 @@
 """Sequences in the layout of nerfstudio, as Polycam and `ns-process-data` export them.
 
 transforms.json      fl_x fl_y cx cy [w h] [k1 k2 p1 p2 k3], for all frames or for single ones;
-                     frames: file_path, depth_file_path; optional: camera_model,
+                     frames: file_path, depth_file_path, and transform_matrix, camera to world with
+                     the axes of OpenGL; optional: camera_model,
                      depth_unit_scale_factor, meters per unit of depth, default 0.001
 images/ depth/       the files of the frames; depth has the field of view of color, at any size
 
 The principal point is in pixels from the corner of the image; here it is from the center of the
 first pixel. The frames have no stamps: they are taken as 30 Hz in the order of the file. The poses
-come from COLMAP or from a phone. They are another estimate and no ground truth, thus `truth` is
-None, and they are not read.
+come from COLMAP or from a phone. They are another estimate and no ground truth: `odometry`, not
+`truth`.
 """
 
 import logging
@@ -21,7 +22,17 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.sequence import Sequence
 
-from .files import FRAME_RATE_HZ, Calibration, inside, name_of, number, pinhole, read_json
+from .files import (
+    FRAME_RATE_HZ,
+    Calibration,
+    from_opengl,
+    inside,
+    name_of,
+    number,
+    pinhole,
+    read_json,
+    valid_trajectory,
+)
 from .images import first_size, read_color, read_depth
 from .phone_images import PhoneGrid, scaled
 
@@ -55,6 +66,7 @@ class NerfstudioSequence(Sequence):
             (_file(path, frame["file_path"]), _file(path, frame["depth_file_path"]))
             for frame in frames
         ]
+        self._poses = [_pose(frame.get("transform_matrix")) for frame in frames]
         size = first_size([color for color, _ in self._files])
         self._cameras = [_camera({**content, **frame}, size, path) for frame in frames]
         self._grid = PhoneGrid(self._cameras[0])
@@ -81,6 +93,19 @@ class NerfstudioSequence(Sequence):
     def truth(self) -> Trajectory | None:
         """Return None; the poses of transforms.json are an estimate."""
         return None
+
+    def odometry(self) -> Trajectory | None:
+        """Return the poses of transforms.json, or None if no frame has a valid one."""
+        return valid_trajectory(self.stamps_ns, self._poses)
+
+
+def _pose(matrix: Any) -> np.ndarray | None:
+    """Return the transform [4, 4] of a value of the file; None if it is no matrix of numbers."""
+    try:
+        T_world_camera = np.array(matrix, float)
+    except (TypeError, ValueError):
+        return None
+    return from_opengl(T_world_camera) if T_world_camera.shape == (4, 4) else None
 
 
 def _has_depth(frame: Any) -> bool:

@@ -1,13 +1,14 @@
 """Recordings of the app Record3D for iPhones and iPads: a file `.r3d`, which is a ZIP archive.
 
 metadata                 JSON: K (column by column, for w x h), w, h, dw, dh, and fps
-                         or frameTimestamps in seconds; perFrameIntrinsicCoeffs [fx, fy, cx, cy]
+                         or frameTimestamps in seconds; perFrameIntrinsicCoeffs [fx, fy, cx, cy];
+                         poses [qx, qy, qz, qw, x, y, z], camera to world, with the axes of OpenGL
 rgbd/0.jpg               color
 rgbd/0.depth             float32 meters, [dh, dw], LZFSE; registered to color; NaN where unknown
 rgbd/0.conf              optional: uint8, [dh, dw], LZFSE, 0 to 2; see MIN_CONFIDENCE
 
-The poses of the metadata come from ARKit. They are another estimate and no ground truth, thus
-`truth` is None, and they are not read.
+The poses of the metadata come from ARKit. They are another estimate and no ground truth:
+`odometry`, not `truth`.
 """
 
 import json
@@ -21,10 +22,10 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError, DataError, FrameError, install_command
-from ldo_service.geometry import Camera, RawFrame, Trajectory
+from ldo_service.geometry import Camera, RawFrame, Trajectory, se3
 from ldo_service.geometry.sequence import Sequence
 
-from .files import FRAME_RATE_HZ, LAST_STAMP_NS, number
+from .files import FRAME_RATE_HZ, LAST_STAMP_NS, from_opengl, number, valid_trajectory
 from .images import MAX_PIXELS, decode_color
 from .lzfse import decoded_bytes
 from .phone_images import PhoneGrid, scaled, without_doubt
@@ -89,6 +90,13 @@ class Record3DSequence(Sequence):
     def truth(self) -> Trajectory | None:
         """Return None; the poses of the phone are an estimate."""
         return None
+
+    def odometry(self) -> Trajectory | None:
+        """Return the poses of the phone, or None if the metadata have none."""
+        listed = self._metadata.get("poses")
+        poses = listed if isinstance(listed, list) else []
+        found = [_pose(poses[k]) if k < len(poses) else None for k in self._numbers]
+        return valid_trajectory(self.stamps_ns, found)
 
     def _bytes(self, name: str) -> bytes:
         """Return the content of a file in the archive; the errors are UNREADABLE."""
@@ -183,6 +191,19 @@ class Record3DSequence(Sequence):
 
 def _conf(k: int) -> str:
     return f"rgbd/{k}.conf"
+
+
+def _pose(numbers: Any) -> np.ndarray | None:
+    """Return the transform [4, 4] of qx, qy, qz, qw, x, y, z; None if they are no pose."""
+    try:
+        x, y, z, w, *translation = (float(number) for number in numbers)
+        q = np.array([w, x, y, z])
+        norm = float(np.linalg.norm(q))
+    except (TypeError, ValueError, OverflowError):
+        return None
+    if len(translation) != 3 or not 0.9 < norm < 1.1:
+        return None
+    return from_opengl(se3.from_quaternion(np.array(translation), q / norm))
 
 
 def _size(metadata: dict[str, Any], key: str, path: Path) -> int:

@@ -81,13 +81,14 @@ class SequenceOptions:
     color_camera: Camera | None = None
     depth_camera: Camera | None = None
     T_color_depth: np.ndarray | None = None  # Depth to color coordinates, [4, 4], meters.
-    # Topics in a bag, by stream ("color" or "depth"); others are found by type and name.
+    # Topics in a bag, by stream ("color", "depth" or "odometry"); others are found by type and
+    # name.
     topics: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if unknown := sorted(self.topics.keys() - {"color", "depth"}):
+        if unknown := sorted(self.topics.keys() - {"color", "depth", "odometry"}):
             raise ConfigError(
-                f"topics names the stream {unknown[0]!r}. Known streams: color, depth."
+                f"topics names the stream {unknown[0]!r}. Known streams: color, depth, odometry."
             )
         if self.T_color_depth is not None and not is_rigid(self.T_color_depth):
             raise ConfigError(

@@ -6,16 +6,14 @@ sensor_msgs/CompressedImage. Each color image has the nearest depth image within
 
 Depth is registered to color in the file if both images have the same size and the same frame, or
 if the name of the depth topic says so. Otherwise, depth is registered here, with the camera info of
-depth and the transform between both frames in /tf_static. Imu, odometry and moving transforms are
-not used.
+depth and the transform between both frames in /tf_static. nav_msgs/Odometry is the recorded
+odometry, if /tf_static connects its base with the camera. Imu and moving transforms are not used.
 """
 
 import logging
 import re
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from msgspec import structs
@@ -35,6 +33,13 @@ from ldo_service.geometry.frames import in_meters
 from ldo_service.geometry.sequence import Sequence
 
 from .bag_file import BagFile, StoredMessage, Topic, is_bag
+from .bag_frames import (
+    matrix_of,
+    odometry_topic,
+    read_odometry,
+    readable_messages,
+    static_transform,
+)
 from .files import name_of
 from .rig import Rig, SequenceOptions
 
@@ -44,7 +49,6 @@ log = logging.getLogger(__name__)
 
 # Maximum stamp difference of paired color and depth images, as for TUM sequences.
 MAX_SKEW_NS = 20_000_000
-MAX_STATIC = 1000  # Maximum number of messages that are read of a topic with constant content.
 TRIES = 10  # Number of first images of a topic of which one must be readable.
 
 # Names of topics, without the suffix of compressed images. An earlier pattern is preferred.
@@ -97,7 +101,10 @@ class RosBagSequence(Sequence):
             )
         self._frames = [(colors[i], depths[j]) for i, j in pairs]
         camera = options.color_camera or _camera(bag, color)
-        self._rig = _rig(bag, color, depth, self._first_images(), camera, options)
+        images = self._first_images()
+        self._rig = _rig(bag, color, depth, images, camera, options)
+        self._frame_id = images[0].frame_id.lstrip("/")
+        self._odometry = odometry_topic(bag, options.topics.get("odometry", ""))
         self._units_per_m = _realsense_units_per_m(bag, depth)
         super().__init__(name_of(path), camera, stamps_ns[pairs[:, 0]])
         self.depth_offsets_ns = depth_stamps_ns[pairs[:, 1]] - self.stamps_ns
@@ -120,6 +127,16 @@ class RosBagSequence(Sequence):
     def truth(self) -> Trajectory | None:
         """Return None, because a bag has no ground truth."""
         return None
+
+    def odometry(self) -> Trajectory | None:
+        """Return the recorded odometry, or None if there is none.
+
+        Raises:
+            DataError: /tf_static does not connect its base with the camera.
+        """
+        if self._odometry is None:
+            return None
+        return read_odometry(self._bag, self._odometry, self._frame_id)
 
     def _images(self, index: int) -> tuple[RosImage, RosImage]:
         color, depth = self._frames[index]
@@ -314,7 +331,7 @@ def _transform(
     color_frame, depth_frame = (image.frame_id.lstrip("/") for image in images)
     if color_frame == depth_frame:
         return np.eye(4)
-    T_color_depth = _static_transform(bag, color_frame, depth_frame)
+    T_color_depth = static_transform(bag, color_frame, depth_frame)
     if T_color_depth is None:
         raise DataError(
             f"{bag.path}: the depth of {depth.name} is not registered to color. Its frame is "
@@ -325,33 +342,12 @@ def _transform(
     return T_color_depth
 
 
-def _static_transform(bag: BagFile, target: str, source: str) -> np.ndarray | None:
-    """Return the transform [4, 4] from one frame to another in /tf_static, or None."""
-    edges: dict[str, dict[str, np.ndarray]] = {}
-    for message in _all_messages(bag, lambda topic: topic.name == "/tf_static"):
-        for stamped in getattr(message, "transforms", ()):
-            parent = stamped.header.frame_id.lstrip("/")
-            child = stamped.child_frame_id.lstrip("/")
-            T_parent_child = _matrix(stamped.transform)
-            if T_parent_child is not None:
-                edges.setdefault(child, {})[parent] = T_parent_child
-                edges.setdefault(parent, {})[child] = se3.inverse(T_parent_child)
-    found = {source: np.eye(4)}  # Transforms from `source` to each reached frame.
-    frames = [source]
-    for frame in frames:
-        for following, T_following_frame in edges.get(frame, {}).items():
-            if following not in found:
-                found[following] = T_following_frame @ found[frame]
-                frames.append(following)
-    return found.get(target)
-
-
 def _realsense_extrinsics(bag: BagFile, image: Topic) -> np.ndarray | None:
     """Return the transform from the reference to a stream of RealSense Viewer (ROS 1), or None."""
     base = COMPRESSED.sub("", image.name).removesuffix("/image/data")
     topics = re.compile(re.escape(base) + r"/tf/\d+")
-    for message in _all_messages(bag, lambda topic: bool(topics.fullmatch(topic.name))):
-        return _matrix(message) if hasattr(message, "rotation") else None
+    for message in readable_messages(bag, lambda topic: bool(topics.fullmatch(topic.name))):
+        return matrix_of(message) if hasattr(message, "rotation") else None
     return None
 
 
@@ -361,7 +357,7 @@ def _realsense_units_per_m(bag: BagFile, depth: Topic) -> float | None:
     if sensor is None:
         return None
     name = f"{sensor[0]}option/Depth_Units/value"
-    for message in _all_messages(bag, lambda topic: topic.name == name):
+    for message in readable_messages(bag, lambda topic: topic.name == name):
         try:
             # A float32, or text; rounding restores the decimal value.
             unit_m = round(float(message.data), 9)
@@ -369,23 +365,3 @@ def _realsense_units_per_m(bag: BagFile, depth: Topic) -> float | None:
             return None
         return 1 / unit_m if 0 < unit_m < 1 else None
     return None
-
-
-def _all_messages(bag: BagFile, is_wanted: Callable[[Topic], bool]) -> Iterator[Any]:
-    """Yield the messages of topics that can be read, at most MAX_STATIC of each."""
-    for topic in filter(is_wanted, bag.topics.values()):
-        for message in bag.messages([topic], MAX_STATIC):
-            try:
-                yield bag.read(message)
-            except FrameError as error:
-                log.warning("%s; no action needed if depth is registered.", error)
-
-
-def _matrix(transform: Any) -> np.ndarray | None:
-    """Return the matrix [4, 4] of a geometry_msgs/Transform, or None if it is invalid."""
-    q, t = transform.rotation, transform.translation
-    quaternion, translation = np.array([q.w, q.x, q.y, q.z]), np.array([t.x, t.y, t.z])
-    norm = float(np.linalg.norm(quaternion))
-    if not (0.9 < norm < 1.1 and np.all(np.isfinite(translation))):
-        return None
-    return se3.from_quaternion(translation, quaternion / norm)

@@ -6,20 +6,22 @@ confidence/000000.png    optional: 8 bits, 0 to 2; see MIN_CONFIDENCE
 camera_matrix.csv        3x3 by rows, for the size of the video
 odometry.csv             lines of `timestamp, frame, x, y, z, qx, qy, qz, qw` after a header
 
-The poses of odometry.csv come from ARKit. They are another estimate and no ground truth, thus
-`truth` is None, and they are not read.
+The poses of odometry.csv come from ARKit, with the axes of this project: the app turns its cameras
+to x right, y down, z forward. They are another estimate and no ground truth: `odometry`, not
+`truth`.
 """
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ldo_service.errors import DataError
-from ldo_service.geometry import Camera, RawFrame, Trajectory
+from ldo_service.geometry import Camera, RawFrame, Trajectory, se3
 from ldo_service.geometry.sequence import Sequence
 
-from .files import name_of, numbered, parse_stamp
+from .files import name_of, numbered, parse_stamp, valid_trajectory
 from .images import read_depth, read_labels
 from .phone_images import PhoneGrid, without_doubt
 from .video import Video
@@ -29,29 +31,38 @@ log = logging.getLogger(__name__)
 DEPTH_SCALE = 1000.0  # Units per meter.
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Line:
+    """Line of odometry.csv."""
+
+    stamp_ns: int
+    T_world_camera: np.ndarray | None  # [4, 4]; None if the numbers are missing or no pose.
+
+
 class StrayScannerSequence(Sequence):
     """Recording of Stray Scanner: frames with stamp, color and depth."""
 
     def __init__(self, folder: Path) -> None:
         """Open the recording of a folder."""
         self._video = Video(folder / "rgb.mp4")
-        stamps_ns = _stamps_ns(folder / "odometry.csv")
+        lines = _lines(folder / "odometry.csv")
         depth = numbered(folder / "depth", r"(\d+)\.png")
         self._confidence = numbered(folder / "confidence", r"(\d+)\.png")
-        numbers = [k for k in stamps_ns if k in depth and k < len(self._video)]
+        numbers = [k for k in lines if k in depth and k < len(self._video)]
         if not numbers:
             raise DataError(
                 f"{folder} has {len(self._video)} color images, {len(depth)} depth images and "
-                f"{len(stamps_ns)} lines in odometry.csv, but no frame has all three. Export the "
+                f"{len(lines)} lines in odometry.csv, but no frame has all three. Export the "
                 "recording again, with depth."
             )
-        if len(numbers) < max(len(self._video), len(depth), len(stamps_ns)):
+        if len(numbers) < max(len(self._video), len(depth), len(lines)):
             log.info("%s: %d frames have color, depth and a stamp.", folder, len(numbers))
         if not self._confidence:
             log.info("%s has no confidence images; all depth is used.", folder)
         self._frames = [(k, depth[k]) for k in numbers]
         self._grid = PhoneGrid(_camera(folder / "camera_matrix.csv", self._video))
-        stamps = np.array([stamps_ns[k] for k in numbers], np.int64)
+        self._poses = [lines[k].T_world_camera for k in numbers]
+        stamps = np.array([lines[k].stamp_ns for k in numbers], np.int64)
         super().__init__(name_of(folder), self._grid.camera, stamps)
 
     def read(self, index: int) -> RawFrame:
@@ -67,6 +78,10 @@ class StrayScannerSequence(Sequence):
     def truth(self) -> Trajectory | None:
         """Return None; the poses of the phone are an estimate."""
         return None
+
+    def odometry(self) -> Trajectory | None:
+        """Return the poses of the phone, or None if no line has one."""
+        return valid_trajectory(self.stamps_ns, self._poses)
 
 
 def _camera(path: Path, video: Video) -> Camera:
@@ -89,8 +104,8 @@ def _camera(path: Path, video: Video) -> Camera:
         raise DataError(f"{path}: {error}") from error
 
 
-def _stamps_ns(path: Path) -> dict[int, int]:
-    """Read the stamp of each frame in nanoseconds, by the number of the frame.
+def _lines(path: Path) -> dict[int, _Line]:
+    """Read the stamp and the pose of each frame, by the number of the frame.
 
     Raises:
         DataError: The file cannot be read, a line is invalid, or the stamps do not ascend.
@@ -99,7 +114,7 @@ def _stamps_ns(path: Path) -> dict[int, int]:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read: {error}.") from error
-    stamps: dict[int, int] = {}
+    found: dict[int, _Line] = {}
     last = (-1, -(2**63))
     for line_number, line in enumerate(lines[1:], 2):
         if not line.strip():
@@ -117,6 +132,18 @@ def _stamps_ns(path: Path) -> dict[int, int]:
                 f"{path}, line {line_number}: frame {number} at {words[0].strip()} s must be later "
                 "than the frame before. Export the recording again."
             )
-        stamps[number] = stamp
+        found[number] = _Line(stamp, _pose(words[2:]))
         last = number, stamp
-    return stamps
+    return found
+
+
+def _pose(words: list[str]) -> np.ndarray | None:
+    """Return the transform [4, 4] of x, y, z, qx, qy, qz, qw; None if they are no pose."""
+    try:
+        x, y, z, *imaginary, real = (float(word) for word in words)
+        q = np.array([real, *imaginary])
+        norm = float(np.linalg.norm(q))
+        is_pose = len(q) == 4 and 0.9 < norm < 1.1 and bool(np.isfinite([x, y, z]).all())
+        return se3.from_quaternion(np.array([x, y, z]), q / norm) if is_pose else None
+    except ValueError:
+        return None

@@ -70,6 +70,17 @@ class Sequence(ABC):
     def truth(self) -> Trajectory | None:
         """Return the ground-truth `T_world_camera` in the data set's world frame, or None."""
 
+    def odometry(self) -> Trajectory | None:
+        """Return `T_odom_camera` of another odometry that was recorded with the frames, or None.
+
+        It is an estimate, such as that of a phone or of wheels, and no ground truth. Its stamps are
+        of the clock of the frames, and the camera is that of the color images.
+
+        Raises:
+            DataError: The recorded poses are invalid.
+        """
+        return None
+
     def true_labels(self) -> TrueLabels | None:
         """Return the ground-truth labels, or None if the sequence has none.
 
@@ -114,6 +125,32 @@ class Cached(Sequence):
     def truth(self) -> Trajectory | None:
         """Return the ground-truth trajectory, or None."""
         return self._sequence.truth()
+
+    def odometry(self) -> Trajectory | None:
+        """Return the recorded poses of another odometry, or None."""
+        return self._sequence.odometry()
+
+    def true_labels(self) -> TrueLabels | None:
+        """Return the ground-truth labels, or None."""
+        return self._sequence.true_labels()
+
+
+class OdometryAsTruth(Sequence):
+    """Sequence whose recorded odometry takes the place of the ground truth."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns)
+        self.depth_offsets_ns = sequence.depth_offsets_ns
+        self.registration = sequence.registration
+        self._sequence = sequence
+
+    def read(self, index: int) -> RawFrame:
+        """Return a frame; see `Sequence.read`."""
+        return self._sequence.read(index)
+
+    def truth(self) -> Trajectory | None:
+        """Return the recorded poses of another odometry, or None."""
+        return self._sequence.odometry()
 
     def true_labels(self) -> TrueLabels | None:
         """Return the ground-truth labels, or None."""

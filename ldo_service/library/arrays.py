@@ -4,8 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import FrameError
-from ldo_service.geometry import Trajectory
+from ldo_service.datasets.files import is_rigid
+from ldo_service.errors import FrameError, LdoError
+from ldo_service.geometry import Trajectory, se3
 
 FrameArray = Any  # An array that supports DLPack or the buffer protocol.
 
@@ -47,3 +48,28 @@ def read_only_array(array: np.ndarray) -> np.ndarray:
     """Return an array after it was made read-only."""
     array.flags.writeable = False
     return array
+
+
+def rigid_transform(name: str, value: object, error: type[LdoError]) -> np.ndarray:
+    """Return a transform that a caller gave, as a rigid transform [4, 4] float64.
+
+    Args:
+        name: Name of the argument, for the error.
+        value: The argument.
+        error: Type of the error.
+
+    Raises:
+        LdoError: The value is no rigid transform; the error has the type `error`.
+    """
+    try:
+        T = np.asarray(value, float)
+    except (TypeError, ValueError) as cause:
+        raise error(f"{name} is a {type(value).__name__}, must be an array [4, 4].") from cause
+    if T.shape != (4, 4):
+        raise error(f"{name} has the shape {T.shape}, must have the shape (4, 4).")
+    if not is_rigid(T):
+        raise error(
+            f"{name} is not a rigid transform: it must be finite, its rotation orthonormal without "
+            "a reflection, and its last row 0 0 0 1."
+        )
+    return se3.orthonormalize(T)

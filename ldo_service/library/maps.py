@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ldo_service.conversions.poses import pose_from_message
-from ldo_service.datasets.files import is_rigid
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.renderer import render
 from ldo_service.geometry import Camera, se3
@@ -16,7 +15,7 @@ from ldo_service.schemas import MapObjects
 from ldo_service.semantics.gaussian_labels import distribution
 from ldo_service.semantics.semantic_fusion import label_image
 
-from .arrays import read_only_array
+from .arrays import read_only_array, rigid_transform
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -159,7 +158,7 @@ class Map:
             raise ConfigError(f"threads={threads} must be at least 1, or None for all cores.")
         if labels and self._labels is None:
             raise ConfigError("the map has no labels, because the run had no detector.")
-        T_camera_map = se3.inverse(_rigid("T_map_camera", T_map_camera))
+        T_camera_map = se3.inverse(_map_pose("T_map_camera", T_map_camera))
         count = threads or os.cpu_count() or 1
         shown = render(self._rows, camera, T_camera_map, threads=count, contributions=labels)
         label_ids = None
@@ -201,25 +200,12 @@ def find(
     ]
 
 
-def _rigid(name: str, value: object) -> np.ndarray:
-    """Return a pose that a caller gave, as a rigid transform [4, 4] float64.
+def _map_pose(name: str, value: object) -> np.ndarray:
+    """Return a pose in the map that a caller gave, as a rigid transform [4, 4] float64.
 
     Raises:
         ConfigError: The value is no rigid transform.
     """
     if value is None:
         raise ConfigError(f"{name} is None. A frame that is LOST has no pose in the map.")
-    try:
-        T = np.asarray(value, float)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(
-            f"{name} is a {type(value).__name__}, must be an array [4, 4]."
-        ) from error
-    if T.shape != (4, 4):
-        raise ConfigError(f"{name} has the shape {T.shape}, must have the shape (4, 4).")
-    if not is_rigid(T):
-        raise ConfigError(
-            f"{name} is not a rigid transform: it must be finite, its rotation orthonormal without "
-            "a reflection, and its last row 0 0 0 1."
-        )
-    return se3.orthonormalize(T)
+    return rigid_transform(name, value, ConfigError)

@@ -15,64 +15,32 @@ give the same poses and the same map, bit for bit.
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from operator import index
 from os import PathLike
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from ldo_service.config import Config, load_config
 from ldo_service.conversions.frames import camera_from_message, raw_frame_to_message
-from ldo_service.conversions.poses import pose_from_message
+from ldo_service.conversions.poses import pose_to_message
 from ldo_service.errors import ConfigError, FrameError, StageError
-from ldo_service.geometry import Camera, RawFrame, Trajectory
+from ldo_service.geometry import Camera, RawFrame, Trajectory, se3
 from ldo_service.runs.actor_run import ActorRun, refinements
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.networks import require_usable_networks
+from ldo_service.runs.source import T_base_camera
 from ldo_service.runs.summary import Usage
-from ldo_service.schemas import Keyframe, Message, TrackedPose
+from ldo_service.schemas import Keyframe, Message, OdometryPrior, TrackedPose
 from ldo_service.schemas.message import LAST_INTEGER
 
-from .arrays import FrameArray, array_of, read_only, read_only_array
+from .arrays import FrameArray, array_of, read_only, rigid_transform
 from .interrupts import interrupts_delayed
 from .maps import FoundObject, Map, find
+from .pose import Pose, pose_of
 
 FilePath = str | PathLike[str]
 DONE = object()  # Result of `next` for an iterator without further items.
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Pose:
-    """Pose of the camera at a frame. Arrays are float64 and read-only.
-
-    Attributes:
-        frame: Number of the frame, counted from 0 by the calls of `Slam.track`.
-        stamp_ns: Time of the exposure, ns.
-        status: Tracking status: OK, WEAK (uncertain, not mapped) or LOST.
-        T_map_camera: [4, 4], camera to map, with all corrections so far. None while LOST, and in a
-            submap that is not merged with the map yet.
-        T_odom_camera: [4, 4], camera to odometry. It is continuous while the status is not LOST.
-            While LOST, it is the last pose.
-        reference: Id of the keyframe that the frame was aligned to; None before the first keyframe.
-        T_reference_camera: [4, 4], camera to this keyframe.
-        covariance: [6, 6], covariance of T_reference_camera for a perturbation on the right:
-            rotation in rad, then translation in m. Zeros if unknown.
-        keyframe: Id of the keyframe that was made of the frame; None if none was made.
-        submap: Number of the submap; 0 is the map itself.
-    """
-
-    frame: int
-    stamp_ns: int
-    status: Literal["OK", "WEAK", "LOST"]
-    T_map_camera: np.ndarray | None
-    T_odom_camera: np.ndarray
-    reference: int | None
-    T_reference_camera: np.ndarray
-    covariance: np.ndarray
-    keyframe: int | None
-    submap: int
 
 
 class Slam:
@@ -125,6 +93,7 @@ class Slam:
         self.camera, self.depth_scale = camera, float(depth_scale)
         self.config = _configured(config, settings)
         require_usable_networks(self.config)
+        self._T_camera_base = se3.inverse(T_base_camera(self.config))
         self._run = ActorRun(self.config, None, observe=self._observe)
         self._frames = self._rejected = self._refined = 0
         self._used = Usage(0.0, 0.0)  # Time of all steps.
@@ -146,7 +115,13 @@ class Slam:
         return f"Slam with {self._frames} frames and {self._run.record.keyframes} keyframes"
 
     # --- frames -----------------------------------------------------------------------------------
-    def track(self, color: FrameArray, depth: FrameArray, stamp_ns: int) -> Pose:
+    def track(
+        self,
+        color: FrameArray,
+        depth: FrameArray,
+        stamp_ns: int,
+        prior: FrameArray | None = None,
+    ) -> Pose:
         """Track a frame, and map it if it becomes a keyframe.
 
         The arrays may be of NumPy, of another library with DLPack such as torch on the CPU, or
@@ -157,6 +132,9 @@ class Slam:
             depth: Depth z registered to the color image, [H, W] float32, float64 or uint16 in
                 1/depth_scale meters; 0, NaN or infinity where not measured.
             stamp_ns: Time of the exposure in ns, later than that of the last frame.
+            prior: T_odom_camera [4, 4] of another odometry at the time of the exposure, such as
+                that of a phone; None if unknown. Only the motion between two priors is used, as an
+                initial guess, and while tracking is lost.
 
         Returns:
             The pose of the frame.
@@ -174,19 +152,21 @@ class Slam:
             number, self._frames = self._frames, self._frames + 1
             try:
                 frame = self._raw_frame(number, color, depth, stamp_ns)
+                pose_before = None if prior is None else self._prior(prior, frame.stamp_ns)
             except FrameError:
                 self._rejected += 1
                 raise
             self._last_stamp_ns = frame.stamp_ns
             with self._step():
-                self._run.tick(raw_frame_to_message(frame, compress_depth=False))
+                message = raw_frame_to_message(frame, compress_depth=False)
+                self._run.tick(message if pose_before is None else (pose_before, message))
         pose = self._last_pose
         if pose is None or pose.frame != number:
             raise FrameError(
                 f"frame {number} was rejected. The log of ldo_service has the reason; "
                 "logging.basicConfig() shows it."
             )
-        return _pose(pose)
+        return pose_of(pose)
 
     def finish(self, refine_iterations: int = 0) -> None:
         """Wait for the mapping of all frames, close the last loops, and refit the moved keyframes.
@@ -309,6 +289,16 @@ class Slam:
             )
         return RawFrame(number, stamp, *images, self.depth_scale, self.camera)
 
+    def _prior(self, value: FrameArray, stamp_ns: int) -> OdometryPrior:
+        """Return the message of a pose T_odom_camera of another odometry.
+
+        Raises:
+            FrameError: The value is no rigid transform.
+        """
+        T_odom_camera = rigid_transform("prior", array_of("prior", value), FrameError)
+        T_odom_base = T_odom_camera @ self._T_camera_base
+        return OdometryPrior(stamp_ns=stamp_ns, T_prior_base=pose_to_message(T_odom_base))
+
     def _end(self) -> Iterator[None]:
         """Do the work of `finish`, one step per item: end the stream, then refit the map."""
         self._run.end_stream()
@@ -371,22 +361,3 @@ def _configured(config: Config | FilePath | None, settings: Mapping[str, object]
             "Single settings are given as settings={...}."
         )
     return load_config(None if config is None else Path(config).expanduser(), values=settings)
-
-
-def _pose(message: TrackedPose) -> Pose:
-    T_odom_camera = pose_from_message(message.T_odom_camera)
-    T_map_camera = None
-    if message.status != "LOST" and message.submap == 0:
-        T_map_camera = read_only_array(pose_from_message(message.T_map_odom) @ T_odom_camera)
-    return Pose(
-        message.frame,
-        message.stamp_ns,
-        message.status,
-        T_map_camera,
-        read_only_array(T_odom_camera),
-        message.reference,
-        read_only_array(pose_from_message(message.T_reference_camera)),
-        read_only_array(np.array(message.covariance).reshape(6, 6)),
-        message.keyframe,
-        message.submap,
-    )

@@ -12,7 +12,7 @@ from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import Message, encode
 
 from .job import Advance
-from .source import FrameReader, Selection, Warn
+from .source import FrameReader, Selection, Warn, interleave_prior, recorded_prior
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,11 @@ def simulate_graph(
         DataError: No frame can be read.
         StageError: An actor fails.
     """
-    reader = FrameReader(sequence, selection.indices(sequence), warn)
+    indices = selection.indices(sequence)
+    reader, prior = (
+        FrameReader(sequence, indices, warn),
+        recorded_prior(sequence, indices, config, warn),
+    )
     actors = make_actors(actor_parameters(config))
     digests = Digests([actor.name for actor in actors])
     with LogicalClock(
@@ -63,7 +67,7 @@ def simulate_graph(
         latency_frames(config),
         lambda actor, message, _step_ms: digests.observe(actor, message),
     ) as clock:
-        for done in clock.run(reader):
+        for done in clock.run(interleave_prior(reader, prior)):
             advance(done + 1 + reader.rejected)
         clock.finish()
     made = digests.made()

@@ -4,26 +4,21 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
-from ldo_service.conversions.frames import (
-    raw_frame_to_message,
-)
+from ldo_service.config import Config, actor_parameters
+from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.conversions.poses import pose_to_message
 from ldo_service.datasets import find_layout
 from ldo_service.errors import ConfigError, DataError, FrameError
-from ldo_service.geometry import Trajectory
+from ldo_service.geometry import Trajectory, se3
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.schemas import CameraRgbd, Message, OdometryPrior
 
 # Frames that are decoded in advance: one is being decoded, one is queued, and one is in reserve.
 READ_AHEAD = 3
 MAX_NAMED = 5  # Number of bad frames that are reported one by one.
-
-M = TypeVar("M", bound=Message)
-
 
 Warn = Callable[[str], None]
 
@@ -87,6 +82,41 @@ class FrameReader:
             return None
 
 
+def recorded_prior(
+    sequence: Sequence, indices: range, config: Config, warn: Warn
+) -> Trajectory | None:
+    """Return the odometry that was recorded with a sequence as poses T_odom_base, or None.
+
+    The poses are None if `dataset.odometry_prior` is false, or if the sequence has none at the time
+    of the selected frames, of which the user is warned.
+
+    Args:
+        sequence: The sequence.
+        indices: Indices of the selected frames.
+        config: Configuration, with the pose of the camera on the base.
+        warn: Function that receives warnings for the user.
+
+    Raises:
+        DataError: The recorded odometry cannot be read.
+    """
+    if not config.dataset.odometry_prior:
+        return None
+    camera = sequence.odometry()
+    if camera is None or not _overlaps(camera, sequence, indices):
+        warn(
+            f"{sequence.name} has no odometry at the time of its frames, so "
+            "dataset.odometry_prior has no effect; no action needed."
+        )
+        return None
+    T_camera_base = se3.inverse(T_base_camera(config))
+    return Trajectory(camera.stamps_s, camera.T_world_camera @ T_camera_base)
+
+
+def T_base_camera(config: Config) -> np.ndarray:
+    """Return the configured pose of the camera on the base of the robot, [4, 4]."""
+    return actor_parameters(config).tracker.T_base_camera.matrix()
+
+
 def interleave_prior(
     frames: Iterable[CameraRgbd], prior: Trajectory | None
 ) -> Iterator[tuple[Message, ...]]:
@@ -102,17 +132,31 @@ def interleave_prior(
     Yields:
         For each frame: the messages of the poses, then the frame.
     """
-    poses = iter(() if prior is None else map(_prior_message, prior.stamps_s, prior.T_world_camera))
-    last_ns = -1
+    source = PriorSource(prior)
     for frame in frames:
-        news: list[Message] = []
-        while last_ns < frame.stamp_ns and (pose := next(poses, None)) is not None:
+        yield (*source.until(frame.stamp_ns), frame)
+
+
+class PriorSource:
+    """Messages of an odometry prior in the order of their stamps."""
+
+    def __init__(self, prior: Trajectory | None) -> None:
+        """Begin with the first of the poses T_odom_base; None has no poses."""
+        stamps_s, poses = ((), ()) if prior is None else (prior.stamps_s, prior.T_world_camera)
+        self._poses = iter(map(prior_message, stamps_s, poses))
+        self._last_ns = -1
+
+    def until(self, stamp_ns: int) -> list[OdometryPrior]:
+        """Return the remaining poses up to and including the first one not older than a stamp."""
+        news = []
+        while self._last_ns < stamp_ns and (pose := next(self._poses, None)) is not None:
             news.append(pose)
-            last_ns = pose.stamp_ns
-        yield (*news, frame)
+            self._last_ns = pose.stamp_ns
+        return news
 
 
-def _prior_message(stamp_s: float, T_odom_base: np.ndarray) -> OdometryPrior:
+def prior_message(stamp_s: float, T_odom_base: np.ndarray) -> OdometryPrior:
+    """Return the message of a pose T_odom_base [4, 4] at a time in seconds."""
     return OdometryPrior(stamp_ns=round(1e9 * stamp_s), T_prior_base=pose_to_message(T_odom_base))
 
 
@@ -122,13 +166,25 @@ def require_overlap(prior: Trajectory, sequence: Sequence, indices: range) -> No
     Raises:
         DataError: The prior has no such pose.
     """
-    first_s, last_s = (1e-9 * float(sequence.stamps_ns[indices[end]]) for end in (0, -1))
-    if not np.any((prior.stamps_s >= first_s) & (prior.stamps_s <= last_s)):
+    if not _overlaps(prior, sequence, indices):
+        first_s, last_s = _times_s(sequence, indices)
         raise DataError(
             f"the odometry prior has no pose between {first_s:.3f} s and {last_s:.3f} s, the first "
             f"and the last frame of {sequence.name}. The stamps of prior and frames must come from "
             "the same clock."
         )
+
+
+def _overlaps(prior: Trajectory, sequence: Sequence, indices: range) -> bool:
+    """Return whether a prior has a pose between the first and the last selected frame."""
+    first_s, last_s = _times_s(sequence, indices)
+    return bool(np.any((prior.stamps_s >= first_s) & (prior.stamps_s <= last_s)))
+
+
+def _times_s(sequence: Sequence, indices: range) -> tuple[float, float]:
+    """Return the times of the first and the last selected frame, s."""
+    first_ns, last_ns = sequence.stamps_ns[[indices[0], indices[-1]]]
+    return 1e-9 * float(first_ns), 1e-9 * float(last_ns)
 
 
 def layout_of(source: str) -> str:

@@ -1,5 +1,6 @@
-"""Description of a source of frames: rate, gaps, calibration, depth, and ground truth."""
+"""Description of a source of frames: rate, gaps, calibration, depth, odometry and ground truth."""
 
+import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -8,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from ldo_service.config import Config
-from ldo_service.errors import FrameError
+from ldo_service.errors import DataError, FrameError
 from ldo_service.geometry.sequence import Sequence
 
 from .job import RunOptions
 from .offline import run_offline
 from .source import Selection
+
+log = logging.getLogger(__name__)
 
 MIN_GAP_PERIODS = 1.5  # An interval longer than this many median intervals is a gap.
 SAMPLES = 5  # Number of frames that are read, evenly spaced.
@@ -56,6 +59,7 @@ class SourceInfo:
     unreadable_frames: int  # Number of sampled frames that cannot be read.
     why_unreadable: str | None  # Problem of the first of these; None if there is none.
     true_poses: int  # Number of poses of the ground truth; 0 if there is none.
+    odometry_poses: int  # Number of poses of a recorded odometry; 0 if there is none.
     has_true_labels: bool
 
 
@@ -79,6 +83,7 @@ def describe(sequence: Sequence) -> SourceInfo:
         unreadable_frames=len(reasons),
         why_unreadable=reasons[0] if reasons else None,
         true_poses=0 if truth is None else len(truth.stamps_s),
+        odometry_poses=_odometry_poses(sequence),
         has_true_labels=sequence.true_labels() is not None,
     )
 
@@ -102,6 +107,16 @@ def estimated_run_s(sequence: Sequence, config: Config, frames: int) -> float:
         job = RunOptions(sequence, Path(name), config, selection, lambda _: None)
         summary = run_offline(job, lambda *_: None).summary
     return len(sequence) / summary["fps"]
+
+
+def _odometry_poses(sequence: Sequence) -> int:
+    """Return the number of poses of the recorded odometry; 0 if it cannot be used."""
+    try:
+        odometry = sequence.odometry()
+    except DataError as error:
+        log.warning("%s", error)
+        return 0
+    return 0 if odometry is None else len(odometry)
 
 
 def _depth_m(sequence: Sequence, index: int) -> np.ndarray | str:

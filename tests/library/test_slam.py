@@ -207,6 +207,47 @@ def test_wrong_frame_names_the_argument_and_tracking_continues(
         assert slam.track(**good).status == "OK"
 
 
+def test_prior_finds_a_fast_camera_at_once_after_it_was_covered(frames: list[Frame]) -> None:
+    """The camera moves three times as fast, so alignment needs the motion of the other odometry."""
+    sequence = open_sequence("synthetic:room")
+    truth = sequence.truth()
+    assert truth is not None
+    T_other = np.linalg.inv(truth.T_world_camera[5]) @ truth.T_world_camera  # Any other origin.
+    mount = {"tracker.T_base_camera.translation_m": [0.1, 0.2, 0.3]}
+    covered = range(4, 9)
+    with Slam(sequence.camera, settings=mount) as slam:
+        for k in range(11):
+            frame = sequence[3 * k]
+            images = (frame.color, frame.depth_m)
+            if k in covered:
+                images = tuple(map(np.zeros_like, images))
+            pose = slam.track(*images, frames[k].stamp_ns, prior=T_other[3 * k])
+            assert pose.status == ("LOST" if k in covered else "OK")
+    moved = np.linalg.inv(truth.T_world_camera[0]) @ truth.T_world_camera[30]
+    np.testing.assert_allclose(pose.T_odom_camera, moved, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        ("x", "prior is a str, must be an array"),
+        (np.eye(3), r"prior has the shape \(3, 3\), must have the shape \(4, 4\)"),
+        (2 * np.eye(4), "prior is not a rigid transform"),
+        (np.full((4, 4), np.nan), "prior is not a rigid transform"),
+        ([[1, 0], [0, 1]], "prior is a list, must be an array"),
+    ],
+)
+def test_wrong_prior_is_named_and_tracking_continues(
+    frames: list[Frame], prior: object, message: str
+) -> None:
+    first, second = frames[:2]
+    with Slam(first.camera) as slam:
+        slam.track(first.color, first.depth_m, first.stamp_ns)
+        with pytest.raises(FrameError, match=message):
+            slam.track(second.color, second.depth_m, second.stamp_ns, prior=prior)
+        assert slam.track(second.color, second.depth_m, second.stamp_ns + 1).status == "OK"
+
+
 def test_wrong_settings_and_cameras_are_refused(tmp_path: Path) -> None:
     camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
     with pytest.raises(ConfigError, match=r"mapper\.iteration"):

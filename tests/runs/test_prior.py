@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence
 from ldo_service.errors import DataError
 from ldo_service.geometry import RawFrame, Trajectory
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.realtime import run_realtime
-from ldo_service.runs.source import FrameReader, interleave_prior
+from ldo_service.runs.source import FrameReader, interleave_prior, recorded_prior
 from ldo_service.schemas import CameraRgbd, OdometryPrior
 
 from .jobs import job
@@ -89,3 +90,46 @@ def test_a_prior_of_another_clock_is_refused(
     later = Trajectory(prior.stamps_s + 1e6, prior.T_world_camera)
     with pytest.raises(DataError, match="must come from the same clock"):
         job(fast_camera, tmp_path / "out", frames=FRAMES, prior=later)
+
+
+# --- odometry in the recording --------------------------------------------------------------------
+class WithOdometry(Cached):
+    """Sequence with a recorded odometry."""
+
+    def __init__(self, sequence: Sequence, odometry: Trajectory | None) -> None:
+        super().__init__(sequence)
+        self._poses = odometry
+
+    def odometry(self) -> Trajectory | None:
+        return self._poses
+
+
+WITH_PRIOR = "dataset.odometry_prior=true"
+MOUNT = "tracker.T_base_camera.translation_m=[0.1, 0.2, 0.3]"
+
+
+def test_recorded_odometry_of_the_camera_becomes_that_of_the_base(
+    room: Sequence, prior: Trajectory
+) -> None:
+    config = load_config(None, [WITH_PRIOR, MOUNT])
+    found = recorded_prior(WithOdometry(room, prior), range(4), config, pytest.fail)
+    assert found is not None
+    T_base_camera = np.eye(4)
+    T_base_camera[:3, 3] = 0.1, 0.2, 0.3
+    np.testing.assert_allclose(found.T_world_camera @ T_base_camera, prior.T_world_camera)
+
+
+def test_recorded_odometry_is_used_only_if_asked_for(room: Sequence, prior: Trajectory) -> None:
+    sequence = WithOdometry(room, prior)
+    assert recorded_prior(sequence, range(4), load_config(None), pytest.fail) is None
+
+
+@pytest.mark.parametrize("shift_s", [None, 1e6])
+def test_missing_odometry_is_only_a_warning(
+    room: Sequence, prior: Trajectory, shift_s: float | None
+) -> None:
+    odometry = None if shift_s is None else replace(prior, stamps_s=prior.stamps_s + shift_s)
+    warnings: list[str] = []
+    sequence, config = WithOdometry(room, odometry), load_config(None, [WITH_PRIOR])
+    assert recorded_prior(sequence, range(4), config, warnings.append) is None
+    assert "has no odometry at the time of its frames" in warnings[0]
