@@ -55,17 +55,33 @@ class Restamped(Sequence):
 
 
 class Selected(Sequence):
-    """The first frames of a sequence."""
+    """Every n-th frame of a sequence, at most `count`, at the stamps of successive frames.
 
-    def __init__(self, sequence: Sequence, count: int) -> None:
-        super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns[:count])
+    The camera is thus n times as fast.
+    """
+
+    def __init__(self, sequence: Sequence, stride: int, count: int) -> None:
+        self._indices = range(0, len(sequence), stride)[:count]
+        stamps_ns = sequence.stamps_ns[: len(self._indices)]
+        super().__init__(sequence.name, sequence.raw_camera, stamps_ns)
         self._sequence = sequence
 
     def read(self, index: int) -> RawFrame:
-        return self._sequence.read(index)
+        raw = self._sequence.read(self._indices[index])
+        return replace(raw, index=index, stamp_ns=int(self.stamps_ns[index]))
 
     def truth(self) -> Trajectory | None:
-        return self._sequence.truth()
+        """Return the true poses of the selected frames, interpolated, at their new stamps."""
+        truth = self._sequence.truth()
+        if truth is None:
+            return None
+        times_s = self._sequence.stamps_ns[list(self._indices)] * 1e-9
+        after = np.clip(np.searchsorted(truth.stamps_s, times_s), 1, len(truth) - 1)
+        before = after - 1
+        span_s = truth.stamps_s[after] - truth.stamps_s[before]
+        share = (times_s - truth.stamps_s[before]) / span_s
+        poses = truth.T_world_camera
+        return Trajectory(self.stamps_ns / 1e9, se3.interpolate(poses[before], poses[after], share))
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +163,10 @@ def disturbed(T_world_camera: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     longer[:, :3, 3] *= 1.05
     yield "5 % too long", integrated(longer)
     noise = random.normal(0, 1, (len(steps), 6)) * [*[0.005] * 3, *[0.005] * 3]
-    yield "noise of 0.3 degrees and 5 mm per frame", integrated(steps @ se3.exp(noise))
+    yield (
+        "noise of 0.3 degrees and 5 mm per frame",
+        integrated(steps @ np.array(list(map(se3.exp, noise)))),
+    )
     jumps = steps.copy()
     jumps[::40, :3, 3] += 0.5
     yield "jump of 0.9 m every 40 frames", integrated(jumps)
@@ -159,10 +178,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("source")
     parser.add_argument("--max-frames", type=int, default=200)
+    parser.add_argument("--stride", type=int, default=1, help="make the camera N times as fast")
     parser.add_argument("--only", default="", help="part of the name of the formats to run")
     parser.add_argument("--priors", action="store_true", help="run with odometries instead")
     options = parser.parse_args()
-    sequence = Selected(open_sequence(options.source), options.max_frames)
+    sequence = Selected(open_sequence(options.source), options.stride, options.max_frames)
     truth = sequence.truth()
     assert truth is not None, "the ground truth is needed"
     original = track(sequence, truth)

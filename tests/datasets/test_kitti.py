@@ -117,7 +117,7 @@ def test_gray_cameras_are_read_if_there_are_no_color_cameras(
     sequence = open_sequence(str(folder))
     truth = sequence.truth()
     assert truth is not None
-    poses = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)  # Of camera 0, the left gray one.
+    poses = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)  # Camera 0 is the left gray one.
     np.testing.assert_allclose(truth.T_world_camera[:, :3], poses, atol=1e-9)
     assert sequence.read(0).depth_m().any()
 
