@@ -63,7 +63,7 @@ def static_transform(bag: BagFile, target: str, source: str) -> np.ndarray | Non
 
 
 def odometry_topic(bag: BagFile, given: str) -> Topic | None:
-    """Return the topic of odometry, or None if there is none, or if several are not told apart.
+    """Return the topic of odometry, or None if there is none, or if there are several.
 
     Args:
         bag: The bag.

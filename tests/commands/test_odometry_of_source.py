@@ -52,7 +52,7 @@ def test_info_counts_the_poses(capsys, scan: Path, room_folder: Path) -> None:
 
 
 class FakeService:
-    """Client that keeps what it is told to send."""
+    """Client that keeps the messages instead of sending them."""
 
     has_subscriber = True
 

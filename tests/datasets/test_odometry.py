@@ -47,8 +47,10 @@ def test_frame_without_a_valid_pose_has_no_odometry(tmp_path: Path) -> None:
     folder = write_stray(tmp_path / "desk", FRAMES, (32, 24), T_world_camera=POSES)
     path = folder / "odometry.csv"
     lines = path.read_text().splitlines()
-    lines[2] = ",".join(lines[2].split(",")[:2])  # Only stamp and number.
-    lines[3] = ",".join([*lines[3].split(",")[:5], *["0", "0", "0", "0"]])  # No rotation.
+    lines[2] = ",".join(lines[2].split(",")[:2])  # The line ends after stamp and number.
+    lines[3] = ",".join(
+        [*lines[3].split(",")[:5], *["0", "0", "0", "0"]]
+    )  # The quaternion is zero.
     path.write_text("\n".join(lines))
     odometry = open_sequence(str(folder)).odometry()
     assert odometry is not None
