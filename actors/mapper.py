@@ -22,11 +22,7 @@ import numpy as np
 
 from ldo_service.actors.mapper_config import MapperConfig
 from ldo_service.conversions.frames import frame_from_message, mask_from_array
-from ldo_service.conversions.objects import (
-    detections_from_message,
-    label_request_to_message,
-    observations_to_messages,
-)
+from ldo_service.conversions.objects import detections_from_message, observations_to_messages
 from ldo_service.conversions.poses import (
     keyframe_poses_from_correction,
     pose_from_message,
@@ -36,10 +32,10 @@ from ldo_service.gaussians.loop_refit import LoopRefit
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.maps.label_queue import LabelRequestQueue
+from ldo_service.maps.label_queue import LabelRequestQueue, LabelRequests
 from ldo_service.maps.publisher import MapPublisher, MessageContext, ObjectPublisher
 from ldo_service.maps.relative_measurements import RelativeMeasurements
-from ldo_service.regions.region import Region, RegionLabelResult
+from ldo_service.regions.region import RegionLabelResult
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime.actor import UNLIMITED
 from ldo_service.schemas import (
@@ -71,10 +67,14 @@ from ldo_service.schemas.topics import (
     MAP_VIEW,
     OBJECT_OBSERVATION,
 )
-from ldo_service.semantics.semantic_map import KeyframeSemantics, SemanticMap
+from ldo_service.semantics.observations import KeyframeSemantics
+from ldo_service.semantics.ordered_semantics import OrderedSemantics
 
 # Idle steps between two messages with changed Gaussians: some seconds of work, up to 4 MB.
 IDLE_STEPS_PER_DELTA = 8
+# Time without messages after which the camera stands still, seconds. Late labels are then corrected
+# with the finished map of all keyframes; in shorter pauses, the result would depend on the pauses.
+STILL_AFTER_S = 5.0
 
 MapOutput = MapRendering | MapDelta | MapSnapshot | MapObjects
 Output = MapOutput | LabelRequest | ObjectObservation | KeyframeRefinement
@@ -112,16 +112,17 @@ class Mapper(Actor):
         folder = Path(self.config.folder) if self.config.folder else None
         threads = self.config.thread_count()
         self._map = MapBuilder(self.config.builder, folder=folder, threads=threads)
-        self._semantics = SemanticMap(
+        self._ordered = OrderedSemantics(
             self._map, self.config.semantics, has_labeller=has_labeller, threads=threads
         )
+        self._semantics = self._ordered.live
         self._object_publisher = ObjectPublisher()
         self._poses = KeyframePoses()
         self._links = RelativeMeasurements(self._poses, self.config.measured_keyframes)
         self._publisher = MapPublisher(self._map, self.config.publish)
         self._newest: tuple[int, int] = (0, -1)  # Stamp in ns and id of the newest keyframe.
         self._refit = LoopRefit(self._map, self.config.refit)
-        self._label_queue = LabelRequestQueue()
+        self._requests = LabelRequests(self._ordered, self._map)
         self._idle_steps = 0  # Idle steps since the last published changes.
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
@@ -157,7 +158,7 @@ class Mapper(Actor):
         frame = frame_from_message(message)
         moving = mask_from_array(message.dynamic_mask)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
-        fused = self._semantics.on_keyframe_mapped(message.keyframe)
+        fused = self._ordered.on_keyframe_mapped(message.keyframe)
         self._refit.with_keyframe(is_behind=self._waiting() > 0)
         yield from self._refinement()
         yield from self._publisher.on_keyframe(self._message_context())
@@ -186,12 +187,8 @@ class Mapper(Actor):
     def _refine(self, message: RefineMap) -> Iterator[Output]:
         self._refit.refine(message.iterations, (message.initial_rate, message.final_rate))
         self._semantics.refresh()
-        # The next snapshot is a new checkpoint. Otherwise up to half a minute of work stays unsaved
-        # if no keyframe follows.
-        self._checkpoint = {}
         yield from self._refinement()
-        yield from self._publisher.deltas(self._message_context(), with_changed=True)
-        yield from self._objects()
+        yield from self._publish_changes()
 
     def _refinement(self) -> Iterator[KeyframeRefinement]:
         refinement = self._links.refined(self._map.refined(), self._newest[0])
@@ -206,12 +203,12 @@ class Mapper(Actor):
         """
         vocabulary = self._semantics.vocabulary
         detections = detections_from_message(message, vocabulary) if message.network else None
-        fused = self._semantics.add_detections(message.keyframe, detections)
+        fused = self._ordered.add_detections(message.keyframe, detections)
         yield from self._publish_semantics(fused, message.stamp_ns)
 
     def _take_label(self, message: LabelResult) -> Iterator[Output]:
         answer = RegionLabelResult(message.label, message.confidence, message.alternatives)
-        if self._semantics.apply_label(message.region, message.keyframe, answer):
+        if self._ordered.apply_label(message.region, message.keyframe, answer):
             yield from self._objects()
         yield from self._label_requests()
 
@@ -221,21 +218,13 @@ class Mapper(Actor):
         if fused is not None:
             names = self._semantics.names
             yield from observations_to_messages(fused.observed, names, fused.keyframe, stamp_ns)
-            for region in fused.requested:
-                self._queue_label_request(region, stamp_ns)
+            self._requests.add(fused.requested, stamp_ns)
             yield from self._label_requests()
             yield from self._objects()
 
-    def _queue_label_request(self, region: Region, stamp_ns: int) -> None:
-        request = label_request_to_message(region, stamp_ns)
-        surface_m2 = region.surface_m2(self._map.views.cameras[region.keyframe])
-        for one in self._label_queue.add(request, surface_m2):
-            assert self._semantics.naming is not None
-            self._semantics.naming.withdraw(one.region, one.keyframe)
-
     def _label_requests(self) -> Iterator[LabelRequest]:
         """Yield the label requests for which the labeller has room."""
-        yield from self._label_queue.take(self.situation.credits.get(LABEL_REQUEST, UNLIMITED))
+        yield from self._requests.take(self.situation.credits.get(LABEL_REQUEST, UNLIMITED))
 
     def _objects(self) -> Iterator[MapObjects]:
         """Yield all objects in one message; yield nothing before the first detections."""
@@ -259,7 +248,7 @@ class Mapper(Actor):
         if motions:
             T_new_old = {m.keyframe: pose_from_message(m.T_new_old) for m in motions}
             self._map.move_keyframes(T_new_old)
-            self._semantics.objects.move(T_new_old)
+            self._ordered.move(T_new_old)
             yield self._publisher.delta(self._message_context(), motions=motions)
             yield from self._objects()
 
@@ -298,15 +287,25 @@ class Mapper(Actor):
             yield from self._publisher.publish_snapshot(self._message_context())
             yield from self._objects()
 
+    @property
+    def idle_after_s(self) -> float:  # type: ignore[override]
+        """Time without messages after which idle work starts, seconds."""
+        return super().idle_after_s if self._has_urgent_idle_work() else STILL_AFTER_S
+
+    def _has_urgent_idle_work(self) -> bool:
+        can_request = self.has_credit(LABEL_REQUEST) and len(self._requests.queue) > 0
+        return can_request or self._refit.has_work()
+
     def has_idle_work(self) -> bool:
-        has_room = self.situation.credits.get(LABEL_REQUEST, UNLIMITED) > 0
-        return self._refit.has_work() or (has_room and len(self._label_queue) > 0)
+        return self._has_urgent_idle_work() or self._ordered.has_work()
 
     def on_idle(self) -> Iterator[Output]:
-        """Refit the map after corrections, and send waiting label requests."""
+        """Refit the map after corrections, send label requests, and correct late labels."""
         yield from self._label_requests()
         if self._refit.has_work():
             yield from self._refit_idly()
+        elif self._ordered.has_work():
+            yield from self._order_labels()
 
     def _refit_idly(self) -> Iterator[Output]:
         self._refit.while_idle(self.config.idle_thread_count())
@@ -316,10 +315,21 @@ class Mapper(Actor):
             self._semantics.refresh()
         yield from self._refinement()
         if is_done or self._idle_steps >= IDLE_STEPS_PER_DELTA:
-            self._idle_steps = 0
-            self._checkpoint = {}  # A restart repeats at most so many idle steps.
-            yield from self._publisher.deltas(self._message_context(), with_changed=True)
-            yield from self._objects()
+            yield from self._publish_changes()
+
+    def _order_labels(self) -> Iterator[Output]:
+        step = self._ordered.step()
+        self._idle_steps += 1
+        self._requests.add(step.requests, self._newest[0])
+        yield from self._label_requests()
+        if step.is_done or self._idle_steps >= IDLE_STEPS_PER_DELTA:
+            yield from self._publish_changes()
+
+    def _publish_changes(self) -> Iterator[Output]:
+        self._idle_steps = 0
+        self._checkpoint = {}  # The next snapshot is a new checkpoint. A restart repeats less work.
+        yield from self._publisher.deltas(self._message_context(), with_changed=True)
+        yield from self._objects()
 
     def on_stop(self) -> Iterator[Output]:
         """Publish the final map after removing duplicate Gaussians of the newest keyframes."""
@@ -354,12 +364,12 @@ class Mapper(Actor):
         self._checkpoint = {
             "newest": self._newest,
             "map": self._map.snapshot(),
-            "semantics": self._semantics.snapshot(),
+            "semantics": self._ordered.snapshot(),
             "poses": self._poses.snapshot(),
             "links": self._links.snapshot(),
             "publisher": self._publisher.snapshot(),
             "refit": self._refit.snapshot(),
-            "label_queue": self._label_queue.pack(),
+            "label_queue": self._requests.queue.pack(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
@@ -367,20 +377,20 @@ class Mapper(Actor):
         stamp_ns, keyframe = saved["newest"]
         self._newest = (int(stamp_ns), int(keyframe))
         self._map.restore(saved["map"])
-        self._semantics.restore(saved["semantics"])
+        self._ordered.restore(saved["semantics"])
         self._poses.restore(saved["poses"])
         self._links.restore(saved["links"])
         self._publisher.restore(saved["publisher"])
         self._refit.restore(saved["refit"])
-        self._label_queue = LabelRequestQueue.unpack(saved["label_queue"])
+        self._requests.queue = LabelRequestQueue.unpack(saved["label_queue"])
 
     def metrics(self) -> dict[str, float]:
         return {
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
             # Requests that wait until the labeller has room.
-            "label_requests_waiting": len(self._label_queue),
+            "label_requests_waiting": len(self._requests.queue),
             **self._refit.metrics(),
             **self._map.metrics(),
-            **self._semantics.metrics(),
+            **self._ordered.metrics(),
         }

@@ -279,16 +279,18 @@ class MapBuilder:
 
         Offloaded Gaussians that may be visible in the keyframe are loaded first.
         """
-        self._load_visible(self.views.placed(keyframe))
+        self.load_visible(keyframe)
         shown = self.render_keyframe(keyframe, contributions=True).contributions
         assert shown is not None
         return shown
 
+    def load_visible(self, keyframe: int) -> None:
+        """Load the offloaded Gaussians that may be visible in a keyframe."""
+        self._load_visible(self.views.placed(keyframe))
+
     def mark_relabeled(self, indices: np.ndarray) -> None:
         """Record that the labels of these rows have changed, so that they are published again."""
-        mask = np.zeros(len(self.gaussians), bool)
-        mask[indices] = True
-        self._log.changed(mask)
+        self._log.changed(np.isin(np.arange(len(self.gaussians)), indices))
 
     # --- offloading -------------------------------------------------------------------------------
     @property

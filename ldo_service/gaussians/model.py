@@ -117,6 +117,11 @@ class GaussianMap:
         return self._labels[: self._size]
 
     @property
+    def next_id(self) -> int:
+        """Id of the next new Gaussian."""
+        return self._next_id
+
+    @property
     def _arrays(self) -> GaussianBatch:
         """Allocated arrays of all fields, which are longer than the N Gaussians in use."""
         return GaussianBatch(self._ids, self._rows, self._anchors, self._labels)

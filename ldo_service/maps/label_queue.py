@@ -1,9 +1,13 @@
 """Label requests that wait until the labeller has room for them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
+from ldo_service.conversions.objects import label_request_to_message
+from ldo_service.gaussians.map_builder import MapBuilder
+from ldo_service.regions.region import Region
 from ldo_service.schemas import LabelRequest, decode, encode
+from ldo_service.semantics.ordered_semantics import OrderedSemantics
 
 # Maximum number of waiting requests, some 10 kB each. It equals the maximum number of requests that
 # the map keeps pending, three for each of 32 regions.
@@ -35,6 +39,9 @@ class LabelRequestQueue:
 
     def __len__(self) -> int:
         return len(self._waiting)
+
+    def __contains__(self, region: int) -> bool:
+        return region in self._waiting
 
     def add(self, request: LabelRequest, surface_m2: float) -> list[LabelRequest]:
         """Add a request, and return the requests that are dropped from the queue.
@@ -90,3 +97,36 @@ class LabelRequestQueue:
             out._waiting[request.region] = WaitingRequest(request, surface_m2)
         out._shown_m2 = {int(region): float(shown_m2) for region, shown_m2 in packed["shown"]}
         return out
+
+
+class LabelRequests:
+    """Label requests of the semantics of a map, on their way to the labeller.
+
+    Attributes:
+        queue: Requests that wait until the labeller has room.
+    """
+
+    def __init__(self, semantics: OrderedSemantics, map_: MapBuilder) -> None:
+        """Start without requests.
+
+        Args:
+            semantics: Semantics that make the requests.
+            map_: The map, with the cameras of its keyframes.
+        """
+        self.queue = LabelRequestQueue()
+        self._semantics, self._map = semantics, map_
+
+    def add(self, regions: Iterable[Region], stamp_ns: int) -> None:
+        """Queue requests for regions, and withdraw the requests that are dropped for them."""
+        for region in regions:
+            request = label_request_to_message(region, stamp_ns)
+            surface_m2 = region.surface_m2(self._map.views.cameras.get(region.keyframe))
+            for one in self.queue.add(request, surface_m2):
+                is_replaced = one.region in self.queue
+                self._semantics.withdraw(one.region, one.keyframe, is_replaced=is_replaced)
+
+    def take(self, room: int) -> Iterator[LabelRequest]:
+        """Remove and yield at most `room` requests to send now."""
+        for request in self.queue.take(room):
+            self._semantics.mark_sent(request.region)
+            yield request

@@ -348,3 +348,8 @@ class RegionDetections:
         """Return the labels by the detector and by the labeller, [M, 2] int; -1 if missing."""
         sources = (self.labels, self.confidences), (self.open_labels, self.open_confidences)
         return np.stack([np.where(sure > 0, one.astype(int), -1) for one, sure in sources], axis=1)
+
+    def pack(self) -> list[np.ndarray]:
+        """Return the arrays of detections that have no masks yet, for a checkpoint."""
+        labels = self.labels, self.confidences, self.open_labels, self.open_confidences
+        return [self.boxes, *labels]

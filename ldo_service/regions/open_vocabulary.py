@@ -257,6 +257,10 @@ class OpenVocabularyLabeling:
         return normalized(name) not in self.config.structure
 
     # --- state ------------------------------------------------------------------------------------
+    def adopt(self, other: "OpenVocabularyLabeling") -> None:
+        """Take over regions and pending requests from another instance; the counters stay."""
+        self._regions, self._open = other._regions, other._open
+
     def pack(self) -> dict[str, Any]:
         """Return regions and pending requests as plain values and arrays, for a checkpoint."""
         return {

@@ -177,12 +177,12 @@ class Region:
     answer: RegionLabelResult | None = None
     is_supported: bool = False
 
-    def surface_m2(self, camera: Camera) -> float:
+    def surface_m2(self, camera: Camera | None) -> float:
         """Return the area in the best view in m^2, as if the surface faced the camera.
 
-        The area is 0 without a view.
+        The area is 0 without a view, or if the camera of the view is unknown.
         """
-        return self.best.surface_m2(camera) if self.best else 0.0
+        return self.best.surface_m2(camera) if self.best and camera else 0.0
 
     def view_quality_gain(self) -> float:
         """Return the gain in summed view quality since the last label request."""

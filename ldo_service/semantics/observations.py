@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ldo_service.regions.foreground import RegionDetections
+from ldo_service.regions.region import Region
+
 from .data_association import MapView
 from .label_assignment import HIDDEN
 from .object_landmarks import (
@@ -47,6 +50,16 @@ class ObjectUpdate:
     # Pairs of a removed id and the id of the object that it was merged into.
     merged: tuple[tuple[int, int], ...] = ()
     removed: tuple[int, ...] = ()  # Ids of objects removed after misses.
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class KeyframeSemantics:
+    """Result of fusing the detections of a keyframe."""
+
+    keyframe: int
+    detections: RegionDetections | None  # The detections as received; None if no detector ran.
+    observed: ObjectUpdate  # Changes of the objects.
+    requested: tuple[Region, ...] = ()  # Regions to send to the labeller.
 
 
 def one_each(members: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Labels of the Gaussians of a map, and its objects."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from ldo_service.regions.region import Region, RegionLabelResult
 from .data_association import MapView
 from .gaussian_labels import BACKGROUND, MAX_LABELS, Disagreement, top_labels
 from .objects import Objects
-from .observations import ObjectUpdate
+from .observations import KeyframeSemantics
 from .semantic_fusion import (
     FusionResult,
     assign_detections,
@@ -26,15 +26,6 @@ from .semantic_fusion import (
     reliable_label_mask,
 )
 from .semantic_map_config import SemanticMapConfig
-
-
-@dataclass(frozen=True, slots=True)
-class KeyframeSemantics:
-    """Result of fusing the detections of a keyframe."""
-
-    keyframe: int
-    observed: ObjectUpdate  # Changes of the objects.
-    requested: tuple[Region, ...] = ()  # Regions to send to the labeller.
 
 
 class SemanticMap:
@@ -53,6 +44,8 @@ class SemanticMap:
         *,
         has_labeller: bool = False,
         threads: int = 1,
+        before_fusion: Callable[[], None] = lambda: None,
+        changes_map: bool = True,
     ) -> None:
         """Create the semantics of a map.
 
@@ -61,6 +54,8 @@ class SemanticMap:
             config: Settings.
             has_labeller: True if a labeller receives label requests.
             threads: Number of threads.
+            before_fusion: Called before the detections of a keyframe are fused.
+            changes_map: False: nothing but the labels of the map changes, and no change is marked.
         """
         self.config = config or SemanticMapConfig()
         self.vocabulary = Vocabulary(self.config.max_names)
@@ -70,6 +65,7 @@ class SemanticMap:
             OpenVocabularyLabeling(self.config.naming, is_fused=is_fused) if has_labeller else None
         )
         self._map, self._threads = map_, threads
+        self._before_fusion, self._changes_map = before_fusion, changes_map
         self._by_detector, self._by_labeller = set[int](), set[int]()  # Labels given by each.
         self._done: dict[int, None] = {}  # Newest fused keyframes, in the order of fusion.
         # Detections of keyframes that are not mapped yet, the oldest first.
@@ -131,6 +127,7 @@ class SemanticMap:
         If the images of the keyframe are no longer stored, the Gaussians in the boxes cannot be
         found. The keyframe is then counted, its detections are dropped, and None is returned.
         """
+        self._before_fusion()
         self._done[keyframe] = None
         self._labelled += 1
         while len(self._done) > self.config.max_remembered:
@@ -139,6 +136,7 @@ class SemanticMap:
             self._without_images += 1
             return None
         # Remove dynamic classes.
+        received = found
         found = found and self._remove_dynamic(keyframe, found)
         # Find the Gaussians that contribute to the image.
         view, made_by = self._seen(keyframe)
@@ -152,9 +150,8 @@ class SemanticMap:
         self._disagreement = labelled.disagreement
         # Update the objects.
         seen = self._map_view(view, made_by.indices, labelled.assigned.regions, detections)
-        return KeyframeSemantics(
-            keyframe, self.objects.observe(seen, self._undetectable_labels()), requested
-        )
+        observed = self.objects.observe(seen, self._undetectable_labels())
+        return KeyframeSemantics(keyframe, received, observed, requested)
 
     def _seen(self, keyframe: int) -> tuple[TrainingView, Contributions]:
         """Return a keyframe with completed depth, and the Gaussians that contribute to its image.
@@ -174,7 +171,7 @@ class SemanticMap:
         names, sure = self.config.movable.classes, self.config.movable_confidence
         kinds = [self.vocabulary.name(int(label)) for label in found.labels]
         is_movable = np.isin(kinds, names) & (found.confidences >= sure)
-        if is_movable.any():
+        if is_movable.any() and self._changes_map:
             boxes = [Box(kinds[i], *(found.boxes[i] + 0.5)) for i in np.flatnonzero(is_movable)]
             depth_m = self._map.views[keyframe].depth_m
             pixels = dynamic_class_mask(boxes, depth_m, self.config.movable)
@@ -243,7 +240,8 @@ class SemanticMap:
             threads=self._threads,
         )
         is_new = np.any(gaussians.labels[indices] != before, axis=1)
-        self._map.mark_relabeled(indices[is_new])
+        if self._changes_map:
+            self._map.mark_relabeled(indices[is_new])
         return labelled
 
     def _map_view(
@@ -334,6 +332,14 @@ class SemanticMap:
         self.objects.refresh(*known, seen_from=seen_from)
 
     # --- state ------------------------------------------------------------------------------------
+    def adopt(self, other: "SemanticMap", objects: Objects) -> None:
+        """Take over regions and labels from another instance, and objects; the counters stay."""
+        assert self.naming is not None
+        assert other.naming is not None
+        self.objects = objects
+        self.naming.adopt(other.naming)
+        self._by_detector, self._by_labeller = other._by_detector, other._by_labeller
+
     def snapshot(self) -> dict[str, Any]:
         """Return the state without the labels, which are stored in the map."""
         return {
@@ -341,7 +347,7 @@ class SemanticMap:
             "objects": self.objects.pack(),
             "done": list(self._done),
             "labelled": self._labelled,
-            "waiting": [(k, _packed(found)) for k, found in self._waiting.items()],
+            "waiting": [(k, found.pack() if found else []) for k, found in self._waiting.items()],
             "naming": self.naming and self.naming.pack(),
             "given": [sorted(self._by_detector), sorted(self._by_labeller)],
         }
@@ -390,9 +396,3 @@ class SemanticMap:
             # Label results for keyframes without stored images.
             "answers_without_images": self._results_without_images,
         }
-
-
-def _packed(detections: RegionDetections | None) -> list[np.ndarray]:
-    """Return the arrays of a keyframe's detections; an empty list if no detector ran."""
-    names = [f.name for f in fields(RegionDetections) if f.name not in ("parts", "replaces_labels")]
-    return [getattr(detections, name) for name in names] if detections else []

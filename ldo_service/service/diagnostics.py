@@ -191,6 +191,11 @@ def notes(seen: ActorStatus) -> Iterator[str]:
             "keyframe arrives; let the robot stand still, or run "
             f"`ldo control refine --iterations {min(int(due), MAX_ITERATIONS)}`"
         )
+    if late := health.metrics.get("keyframes_to_relabel"):
+        yield (
+            f"will process {late:.0f} keyframes again, because their label results were late; this "
+            "happens while no keyframe arrives; no action needed"
+        )
     for output in health.outputs:
         for consumer, behind in output.behind.items():
             if behind > BEHIND:

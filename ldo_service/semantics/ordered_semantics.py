@@ -1,0 +1,231 @@
+"""Labels and objects of a map that do not depend on when label results arrive.
+
+A label result labels Gaussians, and later keyframes use these labels: for their objects, for the
+names of their regions and for the choice of the next label requests. If keyframes are processed
+before an earlier result has arrived, labels and objects therefore depend on the speed of the
+labeller and of the detector.
+
+The live semantics never wait. If they process a keyframe while a label result is missing, a copy of
+them stays behind. While no message arrives, the copy processes the same keyframes again, each one
+after the results of all earlier requests. Results that are known are not requested again. When the
+copy has processed all keyframes, it replaces the live semantics.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ldo_service.gaussians.map_builder import MapBuilder
+from ldo_service.regions.foreground import RegionDetections
+from ldo_service.regions.region import Region, RegionLabelResult, pack, unpack
+
+from .delayed_copy import DelayedCopy, GaussianLabels, next_id_of, renumbered, request_key
+from .observations import KeyframeSemantics
+from .semantic_map import SemanticMap
+from .semantic_map_config import SemanticMapConfig
+
+# Maximum number of keyframes that wait for the copy, some kB each. If more wait, the live semantics
+# are kept as they are.
+MAX_KEYFRAMES = 1024
+# Maximum number of stored label results, some 100 B each; more than 1024 keyframes request.
+MAX_RESULTS = 4096
+# Regions of the copy have ids from this number on in label requests. The live semantics have
+# regions with the same ids.
+FIRST_REGION = 1 << 32
+
+
+class OrderedSemantics:
+    """Live semantics of a map, and a copy that processes keyframes after all earlier results.
+
+    Attributes:
+        live: The semantics that the map shows.
+    """
+
+    def __init__(
+        self,
+        map_: MapBuilder,
+        config: SemanticMapConfig | None = None,
+        *,
+        has_labeller: bool = False,
+        threads: int = 1,
+    ) -> None:
+        """Create the semantics of a map; the arguments are those of `SemanticMap`."""
+        self._map, self._config = map_, config
+        self._options = {"has_labeller": has_labeller, "threads": threads}
+        self.live = SemanticMap(map_, config, **self._options, before_fusion=self._before_fusion)
+        self._copy: DelayedCopy | None = None
+        # Requests that wait until the labeller has room, by region id of the request.
+        self._waiting: dict[int, Region] = {}
+        # Sent requests without a result, the oldest first.
+        self._sent: list[Region] = []
+        self._results: dict[bytes, RegionLabelResult] = {}  # Keys are from `request_key`.
+        self._replaced = self._abandoned = 0
+
+    # --- live semantics ---------------------------------------------------------------------------
+    def add_detections(
+        self, keyframe: int, detections: RegionDetections | None
+    ) -> KeyframeSemantics | None:
+        """Fuse the detections of a keyframe, see `SemanticMap.add_detections`."""
+        return self._noted(self.live.add_detections(keyframe, detections))
+
+    def on_keyframe_mapped(self, keyframe: int) -> KeyframeSemantics | None:
+        """Fuse the stored detections of a just mapped keyframe; return None if there are none."""
+        return self._noted(self.live.on_keyframe_mapped(keyframe))
+
+    def apply_label(self, region: int, keyframe: int, answer: RegionLabelResult) -> bool:
+        """Store a label result, and fuse it if the live semantics requested it.
+
+        Returns:
+            True if the label was fused.
+        """
+        sent = [one for one in self._sent if (one.id, one.keyframe) == (region, keyframe)]
+        if sent:
+            self._sent.remove(sent[0])
+            if self._copy is not None:
+                self._results[request_key(sent[0])] = answer
+                while len(self._results) > MAX_RESULTS:
+                    del self._results[next(iter(self._results))]
+        return region < FIRST_REGION and self.live.apply_label(region, keyframe, answer)
+
+    def mark_sent(self, region: int) -> None:
+        """Record that the waiting label request of a region was sent."""
+        self._sent.append(self._waiting.pop(region))
+
+    def withdraw(self, region: int, keyframe: int, *, is_replaced: bool) -> None:
+        """Drop a label request that was not sent; the copy requests it again if it needs it.
+
+        Args:
+            region: Id of the region in the request.
+            keyframe: Keyframe of the request.
+            is_replaced: True if a newer request of the region waits.
+        """
+        if not is_replaced:
+            self._waiting.pop(region, None)
+        if self.live.naming is not None and region < FIRST_REGION:
+            self.live.naming.withdraw(region, keyframe)
+
+    def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
+        """Move the objects after a correction of keyframe poses, see `Objects.move`."""
+        self.live.objects.move(T_new_old)
+        if self._copy is not None:
+            self._copy.semantics.objects.move(T_new_old)
+
+    def _before_fusion(self) -> None:
+        """Copy the live semantics if they fuse a keyframe before an earlier result arrives."""
+        pending = [*self._sent, *self._waiting.values()]
+        if self._copy is None and pending:
+            first_object = next_id_of(self.live.objects)
+            labels = GaussianLabels.of(self._map.gaussians)
+            semantics = self._new_semantics(self.live.snapshot())
+            self._copy = DelayedCopy(semantics, labels, first_object, pending)
+
+    def _new_semantics(self, state: Mapping[str, Any]) -> SemanticMap:
+        semantics = SemanticMap(self._map, self._config, **self._options, changes_map=False)
+        semantics.restore(state)
+        semantics.vocabulary = self.live.vocabulary
+        return semantics
+
+    def _noted(self, fused: KeyframeSemantics | None) -> KeyframeSemantics | None:
+        """Store the requests of a keyframe, and its detections if a copy needs them."""
+        if fused is None:
+            return None
+        self._wait(fused.requested)
+        if self._copy is not None:
+            self._copy.keyframes[fused.keyframe] = fused.detections
+            if len(self._copy.keyframes) > MAX_KEYFRAMES:
+                self._copy = None
+                self._results.clear()
+                self._abandoned += 1
+        return fused
+
+    def _wait(self, requests: Iterable[Region]) -> None:
+        for region in requests:
+            self._waiting.pop(region.id, None)
+            self._waiting[region.id] = region
+
+    # --- copy -------------------------------------------------------------------------------------
+    def has_work(self) -> bool:
+        """Return whether the copy can do a step: it exists, and no result is missing."""
+        return self._copy is not None and not self._waiting and not self._sent
+
+    def step(self) -> "OrderedStep":
+        """Apply one label result in the copy, or let it process one keyframe.
+
+        At the end, the copy replaces the live semantics.
+        """
+        copy, gaussians = self._copy, self._map.gaussians
+        assert copy is not None
+        for keyframe in copy.keyframes_of_step():
+            if self._map.views.is_readable(keyframe):
+                self._map.load_visible(keyframe)
+        with copy.labels.in_map(gaussians):
+            missing = copy.step(self._results)
+            is_done = not (missing or copy.results_due or copy.keyframes)
+            if is_done:
+                copy.semantics.refresh()
+        requests = [replace(region, id=FIRST_REGION + region.id) for region in missing]
+        self._wait(requests)
+        if is_done:
+            self._replace_live(copy)
+        return OrderedStep(tuple(requests), is_done)
+
+    def _replace_live(self, copy: "DelayedCopy") -> None:
+        self._map.mark_relabeled(copy.labels.write(self._map.gaussians))
+        objects = renumbered(copy.semantics.objects, self.live.objects, copy.first_object)
+        self.live.adopt(copy.semantics, objects)
+        self._copy = None
+        self._results.clear()
+        self._replaced += 1
+
+    # --- state ------------------------------------------------------------------------------------
+    def snapshot(self) -> dict[str, Any]:
+        """Return the state of both semantics without the labels of the map."""
+        return {
+            **self.live.snapshot(),
+            "requests": [
+                [pack(region) for region in self._waiting.values()],
+                [pack(region) for region in self._sent],
+            ],
+            "results": [(key, *packed_result(result)) for key, result in self._results.items()],
+            "copy": self._copy and self._copy.snapshot(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Restore a state that `snapshot` returned."""
+        self.live.restore(state)
+        waiting, sent = ([unpack(row) for row in rows] for rows in state["requests"])
+        self._waiting, self._sent = {region.id: region for region in waiting}, sent
+        self._results = {key: unpacked_result(*values) for key, *values in state["results"]}
+        saved = state["copy"]
+        self._copy = saved and DelayedCopy.restored(saved, self._new_semantics(saved["semantics"]))
+
+    def metrics(self) -> dict[str, float]:
+        """Return the counters of the live semantics and of the copies."""
+        return {
+            **self.live.metrics(),
+            # Keyframes that are processed again in idle time, after their label results.
+            "keyframes_to_relabel": len(self._copy.keyframes) + 1 if self._copy else 0,
+            "labels_reordered": self._replaced,
+            # Copies that were dropped because too many keyframes waited.
+            "label_copies_dropped": self._abandoned,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class OrderedStep:
+    """Result of a step of the copy."""
+
+    requests: tuple[Region, ...]  # Regions to send to the labeller.
+    is_done: bool  # True if the copy has replaced the live semantics.
+
+
+def packed_result(result: RegionLabelResult) -> Sequence[Any]:
+    """Return a label result as plain values."""
+    return result.label, result.confidence, result.others
+
+
+def unpacked_result(label: str, confidence: float, others: Sequence[Any]) -> RegionLabelResult:
+    """Restore a label result from `packed_result`."""
+    return RegionLabelResult(label, confidence, tuple((name, sure) for name, sure in others))
