@@ -133,9 +133,9 @@ class Monitor:
         healths = list(self.health.values())
         queued = sum(i.queued for health in healths for i in health.inputs)
         busy = any(health.current_step_s > 0 for health in healths)
-        pending = self.health["mapper"].metrics.get("label_requests_pending", 0)
-        refit = self.health["mapper"].metrics.get("iterations_pending", 0)
-        return not (sum(self.behind().values()) or queued or busy or pending or refit)
+        kinds = "label_requests_pending", "keyframes_to_relabel", "iterations_pending"
+        pending = sum(self.health["mapper"].metrics.get(kind, 0) for kind in kinds)
+        return not (sum(self.behind().values()) or queued or busy or pending)
 
     def mapped(self) -> int:
         (count,) = [i for i in self.health["mapper"].inputs if i.topic == "keyframe/new"]
