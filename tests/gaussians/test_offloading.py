@@ -80,7 +80,7 @@ def test_chunk_is_restored_bitwise_equal() -> None:
 
 
 def test_chunk_of_an_earlier_version_raises_with_the_reason() -> None:
-    with pytest.raises(DataError, match="4 Gaussians without labels. An earlier version"):
+    with pytest.raises(DataError, match="4 Gaussians without labels"):
         unpack(pack(Chunk(7, np.arange(4), rows_of(4), labels_of(0))))
 
 
