@@ -15,6 +15,7 @@ from .executors import Executor
 from .job import KEY_DIGITS, BatchJob, Outcome, RunPlan, key_of
 from .results import ResultFolder
 from .sources import Recording, measure
+from .staging import remove_abandoned
 from .store import Store
 
 # Threads that read local recordings for their digest, or wait for answers of a bucket.
@@ -61,8 +62,11 @@ class Batch:
             else:
                 yield found
         begun(jobs)
-        with closing(executor.outcomes(jobs)) as outcomes:
-            yield from outcomes
+        try:
+            with closing(executor.outcomes(jobs)) as outcomes:
+                yield from outcomes
+        finally:
+            remove_abandoned(self.staging)
 
     def _looked_up(self, sources: Iterable[str]) -> Iterator[BatchJob | Outcome]:
         """Yield a job for each source without results, and the outcome of the others."""

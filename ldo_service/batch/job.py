@@ -34,6 +34,8 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
         refine: Iterations of the Gaussian optimizer after the last frame.
         exports: Formats of `ldo export`.
         threads: Threads of one process; 0 for all cores.
+        evaluates_all: True to evaluate the renderings of recordings without ground truth like those
+            of the others. False to render only a few of their frames.
 
     Raises:
         ConfigError: An option is out of its range, or two options exclude each other.
@@ -45,6 +47,7 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
     refine: int = 0
     exports: tuple[ExportFormat, ...] = ()
     threads: int = 1
+    evaluates_all: bool = False
 
     def __post_init__(self) -> None:
         if self.threads < 0:
@@ -173,6 +176,7 @@ def key_of(recording: Recording, plan: RunPlan, **others: Any) -> str:
         "max_frames": plan.max_frames,
         "refine": plan.refine,
         "exports": sorted(plan.exports),
+        "evaluates_all": plan.evaluates_all,
         "ldo": __version__,
         **others,
     }

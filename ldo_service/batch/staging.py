@@ -53,20 +53,36 @@ def staging_folder(root: Path, size_bytes: int, max_bytes: int) -> Iterator[Path
         os.close(lock)
 
 
+def remove_abandoned(root: Path) -> None:
+    """Remove the folders of processes that have ended without removing them."""
+    try:
+        with _gate(root):
+            _staged_bytes(root)
+    except OSError:  # There is no staging folder, or it cannot be written.
+        return
+
+
+@contextmanager
+def _gate(root: Path) -> Iterator[None]:
+    """Hold the lock that allows to look at the folders of all processes, and to add one."""
+    gate = os.open(root / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        fcntl.flock(gate, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(gate)
+
+
 def _admitted(root: Path, size_bytes: int, max_bytes: int) -> tuple[Path, int]:
     """Create the folder and lock it, as soon as the limit allows it."""
     while True:
-        gate = os.open(root / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(gate, fcntl.LOCK_EX)
+        with _gate(root):
             if _staged_bytes(root) + size_bytes <= max_bytes or size_bytes == 0:
                 folder = Path(tempfile.mkdtemp(prefix="job-", dir=root))
                 lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 (folder / SIZE).write_text(str(size_bytes))
                 return folder, lock
-        finally:
-            os.close(gate)
         time.sleep(WAIT_S)
 
 

@@ -111,10 +111,9 @@ class Store:
             found = self.system.find(self.path, detail=True)
         is_itself = list(found) == [self.path]
         base = str(PurePosixPath(self.path).parent) if is_itself else self.path
-        return [
-            StoredFile(path[len(base) :].strip("/"), int(info["size"] or 0), _mark(info))
-            for path, info in sorted(found.items())
-        ]
+        named = [(path[len(base) :].strip("/"), info) for path, info in sorted(found.items())]
+        # Some programs write an empty file with the name of a folder into a bucket.
+        return [StoredFile(n, int(info["size"] or 0), _mark(info)) for n, info in named if n]
 
     def read(self) -> bytes | None:
         """Return the content of the file; None if it does not exist."""

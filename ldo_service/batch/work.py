@@ -6,7 +6,7 @@ import resource
 import socket
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +14,16 @@ from typing import Any
 
 import cv2
 import msgspec
+import numpy as np
 
 from ldo_service import __version__
 from ldo_service.config import Config, actor_parameters
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import LdoError
+from ldo_service.evaluation.finished_run import RunFrame
 from ldo_service.evaluation.results import Results, evaluate_run, to_json
+from ldo_service.evaluation.sheet import VIEWS
+from ldo_service.evaluation.views import EvaluatedFrames
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.runs.export import export_map
 from ldo_service.runs.finished import newest_map, read_run
@@ -125,7 +129,7 @@ def _run(job: BatchJob, source: str, made: Path, notes: _Notes, started_s: float
     before_s = time.process_time()
     record = run_offline(_options(job, sequence, selection, made, notes, config), _ignored)
     run_s = time.process_time()
-    results = _evaluate(made, sequence, config, notes)
+    results = _evaluate(made, sequence, config, notes, evaluates_all=plan.evaluates_all)
     evaluated_s = time.process_time()
     for format in plan.exports:
         target = made / EXPORTED[format][0]
@@ -172,23 +176,44 @@ def _options(
     )
 
 
-def _evaluate(made: Path, sequence: Sequence, config: Config, notes: _Notes) -> Results | None:
-    """Evaluate the run and write eval.json; a run that cannot be evaluated gets a note instead."""
+def _evaluate(
+    made: Path, sequence: Sequence, config: Config, notes: _Notes, *, evaluates_all: bool
+) -> Results | None:
+    """Evaluate the run, and save its pictures.
+
+    The evaluation of all frames takes a quarter of the CPU time of a recording. Without ground
+    truth, only a few frames are rendered therefore, unless `evaluates_all` is set, and there is no
+    eval.json. A run that cannot be evaluated gets a note instead.
+    """
     threads = actor_parameters(config).mapper.thread_count()
     try:
         run = read_run(made)
         run.require_source(sequence)
-        results = evaluate_run(run, sequence, _ignored, threads=threads)
+        is_whole = evaluates_all or sequence.truth() is not None
+        frames = None if is_whole else sample(run.frames, VIEWS)
+        results = evaluate_run(run, sequence, _ignored, threads=threads, evaluated=frames)
     except LdoError as error:
         notes.add(f"The run cannot be evaluated: {error}")
         return None
-    about = {
-        "pictures": [path.name for path in results.pictures],
-        "lpips": None,
-        "labelled_by": labelled_by(config),
-    }
-    (made / EVALUATION).write_text(json.dumps({**to_json(results), **about}, indent=1))
+    if is_whole:
+        about = {
+            "pictures": [path.name for path in results.pictures],
+            "lpips": None,
+            "labelled_by": labelled_by(config),
+        }
+        (made / EVALUATION).write_text(json.dumps({**to_json(results), **about}, indent=1))
     return results
+
+
+def sample(frames: Iterable[RunFrame], count: int) -> EvaluatedFrames:
+    """Select some frames with a pose at even intervals: held-out ones if there are any."""
+    whole = EvaluatedFrames.of(frames)
+    held_out = tuple(frame for frame in whole.held_out if not frame.is_lost)
+    training = tuple(frame for frame in whole.training if not frame.is_lost)
+    chosen = held_out or training
+    places = np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)
+    some = tuple(chosen[place] for place in places)
+    return EvaluatedFrames(some, ()) if held_out else EvaluatedFrames((), some)
 
 
 def _summary(record: RunWriter, results: Results | None) -> dict[str, Any]:
@@ -200,7 +225,11 @@ def _summary(record: RunWriter, results: Results | None) -> dict[str, Any]:
     if results and results.renderings:
         held_out = [row for row in results.renderings if row.protocol == "A held out"]
         row = (held_out or results.renderings)[-1]
-        summary |= {"psnr_db": row.mean("psnr_db"), "psnr_protocol": row.protocol}
+        summary |= {
+            "psnr_db": row.mean("psnr_db"),
+            "psnr_protocol": row.protocol,
+            "psnr_frames": len(row.views),
+        }
     return summary
 
 

@@ -188,6 +188,7 @@ def _execute(
         report = report_of(list(outcomes.values()), wall_s, is_interrupted=is_interrupted)
         save_report(work.out, report)
 
+    console.print(f"batch: looking for results of {len(found)} recordings")
     save(is_interrupted=True)  # A folder that cannot be written is found before hours of runs.
     is_interrupted = True
     try:

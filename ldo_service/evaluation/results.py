@@ -48,6 +48,7 @@ def evaluate_run(
     *,
     distance: Distance | None = None,
     threads: int = 1,
+    evaluated: EvaluatedFrames | None = None,
 ) -> Results:
     """Evaluate trajectories, loops, maps and labels of a run, and save pictures of them.
 
@@ -58,12 +59,13 @@ def evaluate_run(
             the total.
         distance: LPIPS, see `views.evaluate_rendering`; None to omit LPIPS.
         threads: Threads of the renderer.
+        evaluated: Frames whose renderings are evaluated; None for those of both protocols.
 
     Raises:
         DataError: If a file of the run does not fit the sequence, or nothing can be evaluated.
         ConfigError: If a picture cannot be written.
     """
-    evaluated, truth = EvaluatedFrames.of(run.frames), sequence.truth()
+    evaluated, truth = evaluated or EvaluatedFrames.of(run.frames), sequence.truth()
     if truth is None and not (evaluated.posed and run.maps):
         missing = "pose to render from" if run.maps else "map"
         raise DataError(

@@ -135,6 +135,7 @@ class SuiteRunner:
             max_frames=suite.max_frames,
             refine=suite.refine,
             threads=0 if self.workers == 1 else 1,
+            evaluates_all=True,
         )
 
     def _outcome(self, entry: SuiteRun, source: Recording | str, failure: str) -> Outcome:

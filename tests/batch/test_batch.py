@@ -14,8 +14,10 @@ from ldo_service.batch import LocalExecutor, Outcome, executors, process
 from ldo_service.batch.batch import Batch
 from ldo_service.batch.results import ResultFolder
 from ldo_service.batch.sources import measure
+from ldo_service.batch.work import sample
 from ldo_service.config import config_yaml, load_config
 from ldo_service.datasets import open_sequence
+from ldo_service.evaluation.finished_run import RunFrame
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.job import RunOptions
 from ldo_service.runs.offline import run_offline
@@ -85,6 +87,32 @@ def test_digest_is_the_same_from_a_bucket_and_with_other_threads(
     assert (again.status, again.digest) == ("done", here.digest)
     for folder in ("/robots", "/results"):
         bucket.rm(folder, recursive=True)
+
+
+def test_recording_without_truth_gets_pictures_of_a_few_frames(
+    batch: MakeBatch, room_folder: Path, tmp_path: Path
+) -> None:
+    part = write_slice(room_folder, tmp_path / "part", 0, 16)
+    (part / "groundtruth.txt").unlink()
+    (few,) = run(batch(stride=1), part)
+    (every,) = run(batch(evaluates_all=True), part)
+    assert (few.summary["psnr_frames"], every.summary["psnr_frames"]) == (4, 4)
+    assert few.pictures == every.pictures == ("trajectory.png", "rendering.png")
+    assert "ate_m" not in few.summary
+    assert not (tmp_path / "out" / few.folder / "eval.json").exists()
+    assert (tmp_path / "out" / every.folder / "eval.json").exists()
+
+
+@pytest.mark.parametrize(("hold_out", "expected"), [(4, [3, 11, 19]), (0, [0, 10, 20])])
+def test_sample_is_spread_over_the_frames_with_a_pose(hold_out: int, expected: list[int]) -> None:
+    frames = [
+        RunFrame(k, k, "LOST" if k > 20 else "OK", bool(hold_out) and k % hold_out == hold_out - 1)
+        for k in range(30)
+    ]
+    chosen = sample(frames, 3)
+    assert [frame.index for frame in chosen.posed] == expected
+    assert [frame.index for frame in chosen.held_out] == (expected if hold_out else [])
+    assert sample(frames[21:], 3).posed == []
 
 
 @pytest.mark.parametrize("damage", ["truncated", "missing", "unfinished", "garbled"])

@@ -47,6 +47,9 @@ def test_folder_of_a_killed_process_is_removed_by_the_next_one(tmp_path: Path) -
     (left,) = tmp_path.glob("job-*")
     with staging_folder(tmp_path, 60, 100) as folder:
         assert list(tmp_path.glob("job-*")) == [folder] != [left]
+        staging.remove_abandoned(tmp_path)
+        assert folder.is_dir()
+    staging.remove_abandoned(tmp_path / "absent")
 
 
 def test_recording_beyond_the_limit_and_unwritable_folder_are_refused(tmp_path: Path) -> None:

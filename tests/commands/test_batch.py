@@ -117,6 +117,7 @@ def test_interrupted_batch_keeps_finished_results_and_leaves_no_process(
     assert [row["status"] for row in report["recordings"]] == ["done", "missing"]
     assert report["is_interrupted"]
     assert [path.parent.name[:5] for path in where.rglob("result.json")] == ["desk-"]
+    assert not list(where.glob(".staging/job-*"))
     assert not _processes_with(str(where))
 
 
