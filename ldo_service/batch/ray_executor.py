@@ -16,6 +16,7 @@ from .work import process
 
 RETRIES = 3  # Retries of a recording whose worker or host was lost.
 CONNECT_S = 10.0  # Time limit of a connection to the cluster.
+LOOPBACK = ("127.0.0.1", "localhost")
 GB = 10**9
 
 
@@ -52,7 +53,7 @@ class RayExecutor:
             ConfigError: Ray is not installed, the cluster cannot be reached, or no host has the
                 resources that a recording needs.
         """
-        ray = _ray()
+        ray = _ray(self.address)
         _connect(ray, self.address)
         try:
             self._require_host(ray)
@@ -129,7 +130,13 @@ def _visible(outcome: Outcome, job: BatchJob) -> Outcome:
     )
 
 
-def _ray() -> ModuleType:
+def _ray(address: str) -> ModuleType:
+    """Import Ray, which reads its variables of the environment when it is imported."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if address.partition(":")[0] in LOOPBACK:
+        # Ray otherwise replaces a loopback address by that of a network interface, where a cluster
+        # on the loopback interface does not answer.
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     try:
         ray = import_module("ray")
         import_module("ray.exceptions")
@@ -142,7 +149,6 @@ def _ray() -> ModuleType:
 
 def _connect(ray: ModuleType, address: str) -> None:
     _require_open_port(address)
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # This variable silences a warning about tasks without GPUs.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:

@@ -58,7 +58,7 @@ def remove_abandoned(root: Path) -> None:
     try:
         with _gate(root):
             _staged_bytes(root)
-    except OSError:  # There is no staging folder, or it cannot be written.
+    except OSError:  # The folder does not exist, or cannot be written.
         return
 
 
