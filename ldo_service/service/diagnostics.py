@@ -191,10 +191,10 @@ def notes(seen: ActorStatus) -> Iterator[str]:
             "keyframe arrives; let the robot stand still, or run "
             f"`ldo control refine --iterations {min(int(due), MAX_ITERATIONS)}`"
         )
-    if late := health.metrics.get("keyframes_to_relabel"):
+    if dropped := health.metrics.get("label_copies_dropped"):
         yield (
-            f"will process {late:.0f} keyframes again, because their label results were late; this "
-            "happens while no keyframe arrives; no action needed"
+            f"kept labels that depend on the speed of the labeller {dropped:.0f} times, because "
+            "too many keyframes waited for label results; let the robot stand still now and then"
         )
     for output in health.outputs:
         for consumer, behind in output.behind.items():
