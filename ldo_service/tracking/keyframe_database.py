@@ -30,8 +30,7 @@ from .tracking_quality import ResidualHistory
 
 # Columns and rows of a thumbnail. It is so coarse that a camera motion of 10 cm changes it little.
 THUMBNAIL = 20, 15
-# Thumbnail values per standard deviation of the gray level. The correlation of two thumbnails, a
-# sum of 300 products of int8, is exact in float32.
+# Thumbnail values per standard deviation of gray. Sums of 300 int8 products are exact in float32.
 CONTRAST = 32.0
 # 16 bits reach 32 m in steps of half a millimeter, which is below the noise of any sensor.
 DEPTH_STEPS_PER_M = 2000.0
