@@ -195,10 +195,8 @@ class Tracker(Actor):
         hold_out = self.config.hold_out
         is_held_out = hold_out > 0 and frame.index % hold_out == hold_out - 1
         may_map = not is_held_out and self.has_credit(KEYFRAME_NEW)
-        may_be_biased = self._calibration.is_undecided
-        result = self._odometry.process(
-            frame, self._prior, may_map=may_map, may_be_biased=may_be_biased
-        )
+        known = self._calibration.knowledge
+        result = self._odometry.process(frame, self._prior, may_map=may_map, camera=known)
         self._shutter = result.shutter
         self._count(frame, result, is_held_out)
         is_lost = result.status is TrackingStatus.LOST

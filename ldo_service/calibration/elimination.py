@@ -90,18 +90,19 @@ def student_weight(residual: np.ndarray, sigma: np.ndarray | float) -> np.ndarra
     return (STUDENT_FREEDOM + 1) / (STUDENT_FREEDOM + (residual / sigma) ** 2) / sigma**2
 
 
-def solve(blocks: Sequence[Reduced], prior: float, now: np.ndarray) -> np.ndarray:
-    """Minimize the sum of weight (residual + shared dc + own dx)^2, plus prior |now + dc|^2.
+def solve(blocks: Sequence[Reduced], prior: np.ndarray | float, now: np.ndarray) -> np.ndarray:
+    """Minimize the sum of weight (residual + shared dc + own dx)^2, plus prior (now + dc)^2.
 
     Args:
         blocks: Reduced normal equations.
-        prior: Weight of the coefficients.
+        prior: Weight of the coefficients: a matrix [K, K], or one weight for all.
         now: Coefficients at which the blocks are linearized, [..., K].
 
     Returns:
         The step dc of the coefficients, [..., K].
     """
-    H, g = prior * np.eye(now.shape[-1]), prior * now
+    H = _weights(prior, now)
+    g = now @ H
     for block in blocks:
         H, g = H + block.H, g + block.g
     return -np.linalg.solve(H, g[..., None])[..., 0]
@@ -120,7 +121,10 @@ def held_out(
 
 
 def covariance(
-    blocks: Sequence[Reduced], prior: float, now: np.ndarray, left_out: Sequence[Set[int]]
+    blocks: Sequence[Reduced],
+    prior: np.ndarray | float,
+    now: np.ndarray,
+    left_out: Sequence[Set[int]],
 ) -> np.ndarray:
     """Return the covariance [K, K] of the coefficients.
 
@@ -129,11 +133,11 @@ def covariance(
 
     Args:
         blocks: Reduced normal equations.
-        prior: Weight of the coefficients.
+        prior: Weight of the coefficients: a matrix [K, K], or one weight for all.
         now: Coefficients at which the blocks are linearized, [K].
         left_out: Groups of indices of blocks; the jackknife leaves out each of them once.
     """
-    H = prior * np.eye(len(now)) + sum(block.H for block in blocks)
+    H = _weights(prior, now) + sum(block.H for block in blocks)
     steps = np.array(
         [
             solve([block for i, block in enumerate(blocks) if i not in group], prior, now)
@@ -142,6 +146,11 @@ def covariance(
     )
     apart = steps - steps.mean(axis=0)
     return np.linalg.inv(H) + (len(steps) - 1) / len(steps) * apart.T @ apart
+
+
+def _weights(prior: np.ndarray | float, now: np.ndarray) -> np.ndarray:
+    """Return the weights of coefficients [..., K] as a matrix [K, K]."""
+    return np.asarray(prior) if np.ndim(prior) else prior * np.eye(now.shape[-1])
 
 
 def check(

@@ -1,11 +1,17 @@
-"""Estimation of depth bias and vignetting from pairs of views, by least squares.
+"""Estimation of depth bias, shutter timing and vignetting from pairs of views, by least squares.
 
 Depth. The surface points of the first view of a pair, transformed into the second view, must lie on
-the tangent planes of its surface. The unknowns are the bias coefficients and the relative pose of
-each pair. The reprojection errors of features constrain the poses too, because the image positions
-of features have no bias. Residual and derivatives contain the same noisy depths. A derivative at
-the mean of both depths has no noise in common with the residual, which contains their difference:
-otherwise the noise of a Kinect would shift the y^2 coefficient by up to 0.01/m.
+the tangent planes of its surface. The unknowns are the bias coefficients, the times of the shutter
+and the relative pose of each pair. The reprojection errors of features constrain the poses too,
+because the image positions of features have no bias.
+
+Times. A row that is recorded at another time than the middle row of color is displaced by the
+velocity of the camera. Bias and times are estimated together: without the times, the distortion by
+a rolling shutter would enter the bias.
+
+Noise. Residual and derivatives contain the same noisy depths. A derivative at the mean of both
+depths has no noise in common with the residual, which contains their difference: otherwise the
+noise of a Kinect would shift the y^2 coefficient by up to 0.01/m.
 
 Color. The log ratio of the brightness of one surface point in two views equals the difference of
 log V at its two pixels, apart from a change of the exposure. The gain and the offset of this change
@@ -14,67 +20,46 @@ are unknowns of each pair.
 
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
-from ldo_service.geometry import Camera, se3
-from ldo_service.kernels import _surfaces
+from ldo_service.geometry import se3
 
-from .correction import (
-    BIAS_TERMS,
-    VIGNETTING_TERMS,
-    bias_basis,
-    unbiased_depth,
-    vignetting_basis,
+from .comparison import (
+    BIAS,
+    TIMES,
+    CommonPoints,
+    ComparedPair,
+    color_block,
+    depth_block,
+    feature_block,
+    view_surface,
 )
-from .elimination import (
-    Block,
-    Check,
-    Reduced,
-    check,
-    covariance,
-    solve,
-    student_weight,
-)
-from .views import (
-    SURFACE_STEP_M,
-    SURFACE_STEP_RATIO,
-    CalibrationView,
-    ViewPair,
-    block_centers,
-    reprojection,
-)
+from .correction import BIAS_TERMS, VIGNETTING_TERMS
+from .elimination import Block, Check, Reduced, check, covariance, solve, student_weight
+from .views import CalibrationView, ViewPair
 
-# Depth noise of structured light, meters (Nguyen et al., 2012): s0 + s1 (z - z0)^2.
-DEPTH_SIGMA = (0.0012, 0.0019, 0.4)
-# Weight of a depth residual relative to a feature; low, because neighboring points share errors.
-DEPTH_WEIGHT = 0.12
-FEATURE_SIGMA_PX = 1.0
-# Depth difference, as a fraction of depth, beyond which two points are on different surfaces.
-MAX_STEP_RATIO = 0.08
 # Inverse variances of the coefficients' prior around 0: 0.01/m for the depth bias, the
 # size of that of an Xtion.
 DEPTH_PRIOR, VIGNETTING_PRIOR = 1e4, 5e1
+# Prior of the times of the shutter, seconds: a readout of color of 20 ms, a readout of depth that
+# differs from it by 10 ms, and a delay of 10 ms (standard deviations around 0).
+TIME_COMBINATIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+TIME_SIGMAS_S = np.array([0.02, 0.01, 0.01])
+SHARED_PRIOR = np.zeros((TIMES.stop, TIMES.stop))
+SHARED_PRIOR[BIAS, BIAS] = DEPTH_PRIOR * np.eye(BIAS_TERMS)
+SHARED_PRIOR[TIMES, TIMES] = TIME_COMBINATIONS.T @ (TIME_COMBINATIONS / TIME_SIGMAS_S[:, None] ** 2)
+# Standard deviations that are added to those of the times, seconds: errors that more views do not
+# reduce, because blur and occlusion displace edges. They are about the errors on the simulated
+# camera of `room-handheld` and `tour-handheld` with 30 views.
+TIME_FLOOR_S = (0.0015, 0.004, 0.001)
 # Gauss-Newton steps of the first estimate, and of later ones, which start from its result.
 FIRST_ROUNDS, LATER_ROUNDS = 3, 2
 COLOR_ROUNDS = 2
 VIEW_GROUPS = 5  # Groups of views for the jackknife.
-BLOCK_STRIDE = 3  # Every third block along each axis is compared; neighbors are alike.
-COLOR_STRIDE = 2  # Colors are compared at every second of these; neighbors have the same color.
-MIN_COMMON = 200  # Minimum number of compared colors; a pair with fewer is skipped for vignetting.
-CELLS = 8  # Cells of the image along its width.
 GRAY_SIGMA = 1.0  # Minimum noise of a blurred color, gray levels.
 # Work of the steps below; a unit is about 1 ms on one core of an AMD EPYC.
 SURFACE_WORK, PAIR_WORK, COLOR_PAIR_WORK, COLOR_ROUND_WORK = 0.3, 0.5, 0.3, 0.3
-
-
-@dataclass(frozen=True, slots=True)
-class _Common:
-    """Surface points that both views of a pair show, as indices into their blocks."""
-
-    there: np.ndarray  # [N] in the first view.
-    here: np.ndarray  # [N] in the second one.
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +68,8 @@ class Estimate:
 
     depth_bias: np.ndarray  # [3] 1/m
     depth_bias_covariance: np.ndarray  # [3, 3] 1/m^2
+    times_s: np.ndarray  # [3] in the order of `ShutterTiming`.
+    times_covariance: np.ndarray  # [3, 3] s^2
     vignetting: np.ndarray  # [3, 3] channel by term
     pairs: list[ViewPair]  # Pairs with their relative poses, estimated jointly with the bias.
     depth_check: Check  # Held-out residuals of the dense depth alone, without features.
@@ -91,7 +78,8 @@ class Estimate:
     @property
     def is_finite(self) -> bool:
         """True if no coefficient is NaN or infinite, as degenerate pairs can make it."""
-        return bool(np.isfinite(self.depth_bias).all() and np.isfinite(self.vignetting).all())
+        values = self.depth_bias, self.times_s, self.vignetting
+        return all(np.isfinite(value).all() for value in values)
 
     @property
     def depth_ratio(self) -> float:
@@ -109,9 +97,10 @@ def estimate(
     views: Mapping[int, CalibrationView],
     pairs: Sequence[ViewPair],
     depth_bias: np.ndarray,
+    times_s: np.ndarray,
     vignetting: np.ndarray,
 ) -> Generator[float, None, Estimate]:
-    """Estimate depth bias, relative poses and vignetting by Gauss-Newton steps.
+    """Estimate depth bias, times, relative poses and vignetting by Gauss-Newton steps.
 
     The generator yields after each small step, such as the comparison of one pair, so that the
     caller can spread the work over frames. It yields the amount of work, about 1 per millisecond.
@@ -120,20 +109,31 @@ def estimate(
         views: Views by number.
         pairs: Pairs of these views, in the order of time.
         depth_bias: Initial coefficients of the depth bias, [3].
+        times_s: Initial times of the shutter, [3], in the order of `ShutterTiming`.
         vignetting: Initial coefficients of the vignetting, [3, 3].
     """
-    linear = yield from _linearized(views, pairs, depth_bias)
-    for _ in range((LATER_ROUNDS if depth_bias.any() else FIRST_ROUNDS) - 1):
-        step = solve(linear.reduced, DEPTH_PRIOR, depth_bias)
-        depth_bias, pairs = depth_bias + step, _moved(pairs, linear, step)
-        linear = yield from _linearized(views, pairs, depth_bias)
-    before, step = depth_bias, solve(linear.reduced, DEPTH_PRIOR, depth_bias)
-    depth_bias, pairs = depth_bias + step, _moved(pairs, linear, step)
-    uncertainty = covariance(linear.reduced, DEPTH_PRIOR, before, _pairs_of_views(pairs))
+    shared = np.concatenate([depth_bias, times_s])
+    linear = yield from _linearized(views, pairs, shared)
+    for _ in range((LATER_ROUNDS if shared.any() else FIRST_ROUNDS) - 1):
+        step = solve(linear.reduced, SHARED_PRIOR, shared)
+        shared, pairs = shared + step, _moved(pairs, linear, step)
+        linear = yield from _linearized(views, pairs, shared)
+    before, step = shared, solve(linear.reduced, SHARED_PRIOR, shared)
+    shared, pairs = shared + step, _moved(pairs, linear, step)
+    uncertainty = covariance(linear.reduced, SHARED_PRIOR, before, _pairs_of_views(pairs))
     dense = [Reduced.of(block.products, BIAS_TERMS) for block in linear.dense]
-    (depth_check,) = yield from check(linear.dense, dense, DEPTH_PRIOR, before)
+    (depth_check,) = yield from check(linear.dense, dense, DEPTH_PRIOR, before[BIAS])
     colors, color_checks = yield from _vignetting(views, pairs, linear.common, vignetting)
-    return Estimate(depth_bias, uncertainty, colors, pairs, depth_check, color_checks)
+    return Estimate(
+        shared[BIAS],
+        uncertainty[BIAS, BIAS],
+        shared[TIMES],
+        uncertainty[TIMES, TIMES] + np.diag(np.square(TIME_FLOOR_S)),
+        colors,
+        pairs,
+        depth_check,
+        color_checks,
+    )
 
 
 def _pairs_of_views(pairs: Sequence[ViewPair]) -> list[set[int]]:
@@ -149,40 +149,33 @@ def _pairs_of_views(pairs: Sequence[ViewPair]) -> list[set[int]]:
     ]
 
 
-@lru_cache(maxsize=2)
-def _grid(camera: Camera, block: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rays, bias basis and vignetting basis of the blocks of a view, each [h w, 3]."""
-    u, v = block_centers(camera, block)
-    bases = bias_basis(u, v, camera), vignetting_basis(u, v, camera)
-    rays, bias, vignetting = (b.reshape(-1, 3) for b in (camera.rays_at(u, v), *bases))
-    return rays, bias, vignetting
-
-
 # --- depth ----------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class _Linearized:
     """Equations of all pairs, linearized at given coefficients and poses."""
 
     reduced: list[Reduced]  # Dense depth and features.
-    dense: list[Block]
-    common: list[_Common]
+    dense: list[Block]  # Dense depth at the given times, which are no unknowns.
+    common: list[CommonPoints]
 
 
 def _linearized(
-    views: Mapping[int, CalibrationView], pairs: Sequence[ViewPair], coefficients: np.ndarray
+    views: Mapping[int, CalibrationView], pairs: Sequence[ViewPair], shared: np.ndarray
 ) -> Generator[float, None, _Linearized]:
     surfaces: dict[int, np.ndarray] = {}
     linear = _Linearized([], [], [])
     for p in pairs:
-        view = views[p.first]
         for number in (p.first, p.second):
             if number not in surfaces:
-                surfaces[number] = _surface(views[number], coefficients)
+                surfaces[number] = view_surface(views[number], shared[BIAS])
                 yield SURFACE_WORK
-        block, points = _depth_block(view, surfaces[p.first], surfaces[p.second], p)
-        features = _feature_block(view.camera, p, coefficients)
-        linear.reduced.append(Reduced.of(block.products + features.products, BIAS_TERMS))
-        linear.dense.append(block)
+        compared = ComparedPair(views[p.first], views[p.second], p, shared)
+        block, points = depth_block(compared, surfaces[p.first], surfaces[p.second])
+        features = feature_block(compared, surfaces[p.first])
+        products = block.products + features.products
+        linear.reduced.append(Reduced.of(products, len(shared)))
+        at_times = np.delete(block.rows, np.r_[TIMES], axis=1)
+        linear.dense.append(replace(block, rows=at_times))
         linear.common.append(points)
         yield PAIR_WORK
     return linear
@@ -196,77 +189,17 @@ def _moved(pairs: Sequence[ViewPair], linear: _Linearized, step: np.ndarray) -> 
     ]
 
 
-def _surface(view: CalibrationView, coefficients: np.ndarray) -> np.ndarray:
-    """Return points and normals [h w, 6] of a view; see `_surfaces.surfaces`."""
-    rays, basis, _ = _grid(view.camera, view.block)
-    bias = (basis @ coefficients).reshape(view.depth_m.shape)
-    depth_m = unbiased_depth(view.depth_m.astype(np.float64), bias)
-    result = np.empty((len(rays), 6))
-    _surfaces.surfaces(depth_m, rays, SURFACE_STEP_RATIO, SURFACE_STEP_M, result)
-    return result
-
-
-def _depth_block(
-    view: CalibrationView, there: np.ndarray, here: np.ndarray, pair: ViewPair
-) -> tuple[Block, _Common]:
-    """Compare the surfaces of both views of a pair; see `_surfaces.compare`."""
-    height, width = view.depth_m.shape
-    most = -(-height // BLOCK_STRIDE) * -(-width // BLOCK_STRIDE)
-    rows, depths, indices = np.empty((most, 10)), np.empty(most), np.empty((most, 2), np.int64)
-    count = _surfaces.compare(
-        there,
-        here,
-        _grid(view.camera, view.block)[1],
-        pair.T_second_first,
-        (view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy),
-        view.block,
-        width,
-        BLOCK_STRIDE,
-        MAX_STEP_RATIO,
-        rows,
-        depths,
-        indices,
-    )
-    rows, depths, (a, b) = rows[:count], depths[:count], indices[:count].T
-    s0, s1, z0 = DEPTH_SIGMA
-    sigma_m, residual = s0 + s1 * (depths - z0) ** 2, rows[:, -1]
-    spread = max(1.48 * np.median(abs(residual / sigma_m)), 0.5) if count else 1.0
-    weight = DEPTH_WEIGHT * student_weight(residual, sigma_m * spread)
-    return Block(rows, weight, _cells(b, width)), _Common(a, b)
-
-
-def _cells(blocks: np.ndarray, width: int) -> np.ndarray:
-    """Return the number of the cell of each block, given as a flat index into rows of `width`."""
-    row, column = np.divmod(blocks, width)
-    return (row * CELLS // width) * CELLS + column * CELLS // width
-
-
-def _feature_block(camera: Camera, pair: ViewPair, coefficients: np.ndarray) -> Block:
-    """Return the linearized reprojection errors of the features in pixels; u and v alternate."""
-    u, v = pair.pixels_first.T
-    basis = bias_basis(u, v, camera)
-    z = unbiased_depth(pair.depth_first_m, basis @ coefficients)
-    errors, by_point, points = reprojection(
-        camera, pair.T_second_first, camera.rays_at(u, v) * z[:, None], pair.pixels_second
-    )
-    # A point on a ray moves by -z^2 ray = -z point per unit of the bias.
-    turned = points - pair.T_second_first[:3, 3]
-    by_bias = -(by_point[..., 3:] @ turned[..., None]) * z[:, None, None] * basis[:, None]
-    rows = np.concatenate([by_bias, by_point, errors[..., None]], axis=-1).reshape(-1, 10)
-    return Block(rows, student_weight(rows[:, -1], FEATURE_SIGMA_PX), np.zeros(0, int))
-
-
 # --- color ----------------------------------------------------------------------------------------
 def _vignetting(
     views: Mapping[int, CalibrationView],
     pairs: Sequence[ViewPair],
-    common: Sequence[_Common],
+    common: Sequence[CommonPoints],
     start: np.ndarray,
 ) -> Generator[float, None, tuple[np.ndarray, list[Check]]]:
     """Estimate the coefficients of the vignetting, [3, 3], and check each channel."""
     compared: list[Block] = []
     for p, points in zip(pairs, common, strict=True):
-        block = _color_block(views[p.first], views[p.second], points)
+        block = color_block(views[p.first], views[p.second], points)
         if block is not None:
             compared.append(block)
         yield COLOR_PAIR_WORK
@@ -300,26 +233,3 @@ def _color_weight(rows: np.ndarray, now: np.ndarray, own: np.ndarray | None) -> 
         rest = rest + (rows[..., 3:5] @ own[..., None])[..., 0]
     sigma = np.maximum(1.48 * np.median(abs(rest), axis=1, keepdims=True), GRAY_SIGMA)
     return student_weight(rest, sigma)
-
-
-def _color_block(first: CalibrationView, second: CalibrationView, points: _Common) -> Block | None:
-    """Compare the colors of two views at their common points.
-
-    Returns:
-        A block of the three channels, whose weights are 1. Its own unknowns are gain and offset.
-        None if there are fewer than MIN_COMMON points.
-    """
-    is_exposed = first.is_exposed.reshape(-1)[points.there]
-    is_exposed &= second.is_exposed.reshape(-1)[points.here]
-    a, b = points.there[is_exposed][::COLOR_STRIDE], points.here[is_exposed][::COLOR_STRIDE]
-    if len(a) < MIN_COMMON:
-        return None
-    there = first.color.reshape(-1, 3)[a].T.astype(np.float64)
-    here = second.color.reshape(-1, 3)[b].T.astype(np.float64)
-    _, _, basis = _grid(first.camera, first.block)
-    level = (there + here) / 2.0
-    rows = np.empty((3, len(a), VIGNETTING_TERMS + 3))
-    rows[..., :3] = level[..., None] * (basis[a] - basis[b])
-    rows[..., 3], rows[..., 4] = level, 1.0
-    rows[..., 5] = level * np.log(here / there)
-    return Block(rows, np.ones(level.shape), _cells(b, first.depth_m.shape[1]))

@@ -3,8 +3,12 @@
     calibration = SelfCalibration()
     for raw in frames:
         frame = calibration.correction.applied(raw)
-        ...  # Track the frame.
+        ...  # Track the frame, with `calibration.knowledge`.
         change = calibration.observe(raw, T_odom_camera, motion)
+
+The timing of the shutter is estimated together with the depth bias, since a moving rolling shutter
+distorts the views. It is not part of the correction: tracking compensates it by the motion of each
+frame, and refines it (`ShutterState`).
 
 Each call of `observe` does a bounded part of the work, so that the tracker skips no frame. An
 estimate is used only if held-out pairs of views confirm it: the correction must reduce their
@@ -15,7 +19,6 @@ and costs nothing more.
 import logging
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, replace
-from math import inf
 from typing import Any
 
 import numpy as np
@@ -23,21 +26,21 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import RgbdFrame, se3
 
+from .comparison import TIME_TERMS
 from .correction import BIAS_TERMS, VIGNETTING_TERMS, CameraCorrection, CorrectionChange
-from .estimation import Estimate, estimate
+from .estimation import DEPTH_PRIOR, Estimate, estimate
+from .knowledge import CameraKnowledge
 from .shutter import FrameMotion, ShutterTiming
-from .views import CalibrationView, ViewMaker, ViewPair, pair_of
+from .views import CalibrationView, ViewMaker, ViewPair, median_depth_m, pair_of
 
 log = logging.getLogger(__name__)
 
-DEPTH_STRIDE = 8  # The median depth uses every eighth pixel along each axis.
-# Change of the timing beyond which the views are made again: 0.6 degrees at 60 degrees/s.
-MAX_TIMING_CHANGE_S = 0.01
-# Held-out residual up to which a renewed calibration keeps a part that it does not confirm. It was
-# 0.90 to 0.93 on bonn_crowd, where people walk through the views, and 1.00 where there is no bias.
+# Held-out residual up to which a part that was confirmed before stays in use. It was 0.90 to 0.93
+# on bonn_crowd, where people walk through the views, and 1.00 where there is no bias.
 MAX_KEPT_RATIO = 0.97
 PAIR_DISTANCES = (1, 2, 3, 5, 8)  # A new view is paired with the views this many views before it.
 WORK_PER_FRAME = 12.0  # Work of an estimate in one frame, in the unit of `estimate`: 10 ms.
+VIEW_WORK = 6.0  # Work of making a view, in the same unit.
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +54,11 @@ class SelfCalibrationConfig:
 
     # Numbers of views at which an estimate starts. The estimate at the last number ends the
     # calibration. Empty: no calibration.
-    views: tuple[int, ...] = (6, 9, 15, 30)
+    views: tuple[int, ...] = (4, 6, 9, 15, 30)
     # Minimum image motion from one view to the next, fraction of the image width: 12 px of 640.
     view_motion: float = 12 / 640
     lost_frames: int = 3  # Frames from one view to the next while tracking is LOST.
-    min_pairs: int = 8  # An estimate from fewer pairs of views is skipped.
+    min_pairs: int = 3  # An estimate from fewer pairs of views is skipped.
     # A correction is used if it reduces the residual of held-out pairs to at most this fraction.
     max_depth_ratio: float = 0.86
     max_color_ratio: float = 0.3
@@ -97,19 +100,23 @@ class SelfCalibration:
         self._frames_since_view = 0
         # Initial coefficients of the next estimate: the result of the last one, even if rejected.
         self._depth_bias = np.zeros(BIAS_TERMS)
+        self._times_s = np.zeros(TIME_TERMS)
         self._vignetting = np.zeros((3, VIGNETTING_TERMS))
+        self._timing: np.ndarray | None = None  # See `CameraKnowledge.timing`.
+        # View of the last frame with the velocity before that frame; the next frame tells the
+        # velocity after it.
+        self._new_view: int | None = None
         # Packed parts of the state; a part that has not changed stays the same object.
         self._packed: dict[str, dict[str, Any]] = {"maker": self._maker.pack()}
-        self._timing = ShutterTiming()  # Timing that the views compensate.
         self._has_estimate = False  # True after the first estimate, used or not.
         self._views_estimated = 0  # Number of views of the last estimate.
-        # True after the views were made again with another timing, and if the correction is of an
-        # earlier run. Only an estimate from more views than before may change the correction.
+        # True if the correction is of an earlier run. Only an estimate from the largest number of
+        # views may change it.
         self._is_renewed = False
         self._stage = 0  # Index into `config.views` of the next estimate.
-        # Running estimate, the number of views that it uses, and the number of its parts done.
+        # Running estimate, the number of views that it uses, and the number of its steps done.
         self._running: Generator[float, None, Estimate] | None = None
-        self._views_used = self._parts_done = 0
+        self._views_used = self._steps_done = 0
 
     @staticmethod
     def finished(correction: CameraCorrection) -> "SelfCalibration":
@@ -129,7 +136,7 @@ class SelfCalibration:
         """
         calibration = SelfCalibration(config)
         calibration.correction = replace(correction, timing=ShutterTiming())
-        calibration._timing = correction.timing
+        calibration._times_s = np.array(correction.timing.times_s)
         calibration._depth_bias = np.array(correction.depth_bias)
         calibration._vignetting = np.array(correction.vignetting)
         calibration._has_estimate = calibration._is_renewed = True
@@ -141,6 +148,16 @@ class SelfCalibration:
     def is_undecided(self) -> bool:
         """True until the first estimate tells whether there is a depth bias."""
         return not (self.is_finished or self._has_estimate)
+
+    @property
+    def knowledge(self) -> CameraKnowledge:
+        """Estimates and uncertainty for the tracking of the next frame."""
+        relative = 1.0
+        if not self.is_undecided:
+            covariance = self.depth_bias_covariance * DEPTH_PRIOR
+            is_used = self.correction.has_depth_bias
+            relative = min(float(np.trace(covariance) / BIAS_TERMS) ** 0.5, 1.0) if is_used else 0.0
+        return CameraKnowledge(relative, self._timing)
 
     def observe(
         self,
@@ -154,25 +171,32 @@ class SelfCalibration:
             raw: The frame without correction.
             T_odom_camera: Pose of the frame, [4, 4], which shows how far the camera has moved since
                 the last view; None while tracking is LOST.
-            motion: Motion during the frame, which a view compensates; None if unknown.
+            motion: Mean motion from the last frame to this one; None if unknown.
 
         Returns:
             The change of the correction, which applies from the next frame on; None if the
             correction does not change.
         """
-        is_idle = self._running is None  # A running estimate is completed with the old timing.
-        if is_idle and motion and motion.timing.differs(self._timing, MAX_TIMING_CHANGE_S):
-            self._renew(motion.timing)
         if self.is_finished:
             return None
         self._frames_since_view += 1
-        if self._running is not None:
-            return self._continue()
-        if self._is_view_due(raw, T_odom_camera):
-            self._take_view(raw if motion is None else motion.compensated(raw), T_odom_camera)
-            if len(self._views) >= self.config.views[self._stage]:
-                self._start(len(self._views))
-        return None
+        self._complete_view(motion)
+        if self._running is None and len(self._views) >= self.config.views[self._stage]:
+            self._start(len(self._views))
+        work, is_first = 0.0, self._running is not None and not self._has_estimate
+        if not (self.is_finished or is_first) and self._is_view_due(raw, T_odom_camera):
+            self._take_view(raw, T_odom_camera, motion)
+            work = VIEW_WORK
+        return None if self._running is None else self._continue(work)
+
+    def _complete_view(self, motion: FrameMotion | None) -> None:
+        """Give the view of the last frame the mean of the velocities before and after it."""
+        number, self._new_view = self._new_view, None
+        if number is None or motion is None or number not in self._views:
+            return
+        view = self._views[number]
+        before = view.velocity if view.velocity.any() else motion.velocity
+        self._keep(replace(view, velocity=0.5 * (before + motion.velocity)))
 
     def _is_view_due(self, raw: RgbdFrame, T_odom_camera: np.ndarray | None) -> bool:
         if len(self._views) >= self.config.views[-1]:
@@ -181,16 +205,19 @@ class SelfCalibration:
             return not self._views or self._frames_since_view >= self.config.lost_frames
         T_last_now = se3.inverse(self._T_last_view) @ T_odom_camera
         turned_rad = se3.rotation_angle(T_last_now)
-        parallax_rad = float(se3.distances(T_last_now)) / _median_depth_m(raw)
+        parallax_rad = float(se3.distances(T_last_now)) / median_depth_m(raw)
         moved = (turned_rad + parallax_rad) * raw.camera.fx / raw.camera.width
         return moved >= self.config.view_motion
 
-    def _take_view(self, raw: RgbdFrame, T_odom_camera: np.ndarray | None) -> None:
+    def _take_view(
+        self, raw: RgbdFrame, T_odom_camera: np.ndarray | None, motion: FrameMotion | None
+    ) -> None:
         if self._views and next(iter(self._views.values())).camera != raw.camera:
             self._forget()  # Another camera or resolution.
-        view = self._maker.make(raw, T_odom_camera)
-        self._views[view.number] = view
-        self._packed |= {"maker": self._maker.pack(), f"view_{view.number}": view.pack()}
+        view = self._maker.make(raw, T_odom_camera, None if motion is None else motion.velocity)
+        self._packed |= {"maker": self._maker.pack()}
+        self._keep(view)
+        self._new_view = view.number
         self._T_last_view, self._frames_since_view = T_odom_camera, 0
         for distance in PAIR_DISTANCES:
             earlier = self._views.get(view.number - distance)
@@ -199,21 +226,14 @@ class SelfCalibration:
                 self._pairs.append(pair)
         self._pairs.sort(key=lambda pair: (pair.first, pair.second))
 
-    def _renew(self, timing: ShutterTiming) -> None:
-        """Begin again with views that compensate another timing, if a depth bias is corrected.
-
-        Views of a moving camera with a rolling shutter are distorted, so their bias is wrong by
-        some tens of percent. The correction stays until held-out views confirm a new estimate.
-        """
-        self._timing = timing
-        if self.config.views and self.correction.has_depth_bias:
-            self._is_renewed, self.is_finished = True, False
-            self._forget()
+    def _keep(self, view: CalibrationView) -> None:
+        self._views[view.number] = view
+        self._packed |= {f"view_{view.number}": view.pack()}
 
     def _forget(self) -> None:
         self._maker, self._views, self._pairs = ViewMaker(), {}, []
         self._packed = {"maker": self._maker.pack()}
-        self._running = None
+        self._running = self._new_view = None
         enough = self._views_estimated + 1 if self._is_renewed else 0
         stages = [i for i, number in enumerate(self.config.views) if number >= enough]
         self._stage = min(stages, default=max(len(self.config.views) - 1, 0))
@@ -227,29 +247,32 @@ class SelfCalibration:
         """
         self._views_used = count
         pairs = [pair for pair in self._pairs if pair.second < count]
-        if len(pairs) < max(self.config.min_pairs, count):
+        if len(pairs) < max(self.config.min_pairs, count - 1):
             self._end_stage()
             return
         views = {number: view for number, view in self._views.items() if number < count}
-        self._running = estimate(views, pairs, self._depth_bias, self._vignetting)
-        self._parts_done = 0
+        self._running = estimate(views, pairs, self._depth_bias, self._times_s, self._vignetting)
+        self._steps_done = 0
 
-    def _continue(self) -> CorrectionChange | None:
+    def _continue(self, work: float = 0.0) -> CorrectionChange | None:
+        """Continue the running estimate after some other work in this frame."""
         assert self._running is not None
         try:
-            work = 0.0
             while work < WORK_PER_FRAME:
                 work += next(self._running)
-            self._parts_done += 1
+                self._steps_done += 1
             return None
         except StopIteration as done:
             found: Estimate = done.value
-        self._running, self._parts_done, self._has_estimate = None, 0, True
+        self._running, self._steps_done, self._has_estimate = None, 0, True
         self._views_estimated = self._views_used
         if not found.is_finite:
             self._end_stage()
             return None
         self._depth_bias, self._vignetting = found.depth_bias, found.vignetting
+        self._times_s = found.times_s
+        information = np.linalg.inv(found.times_covariance)
+        self._timing = np.c_[information, information @ found.times_s]
         self.depth_bias_covariance = found.depth_bias_covariance
         self.ratios = found.depth_ratio, found.color_ratio
         poses = {(pair.first, pair.second): pair for pair in found.pairs}
@@ -263,19 +286,23 @@ class SelfCalibration:
     def _confirmed(self, found: Estimate) -> CameraCorrection:
         """Return the correction that has only the confirmed parts of an estimate.
 
-        Held-out pairs confirm the depth bias and the vignetting separately. A part that is not
-        confirmed is 0. In a renewed calibration, it stays unless the pairs tell that there is none.
+        Held-out pairs confirm the depth bias and the vignetting separately. A part that was never
+        confirmed is 0. A part that was confirmed by fewer views follows the estimates unless the
+        pairs tell that there is none. The same holds for a part from an earlier run, but it stays
+        as it is until the pairs confirm another one.
         """
-        nothing = CameraCorrection()
+        nothing, before = CameraCorrection(), self.correction
         depth_bias, vignetting = nothing.depth_bias, nothing.vignetting
+        new_bias = tuple(found.depth_bias.tolist())
+        new_vignetting = tuple(map(tuple, found.vignetting.tolist()))
         if found.depth_ratio <= self.config.max_depth_ratio:
-            depth_bias = tuple(found.depth_bias.tolist())
-        elif self._is_renewed and found.depth_ratio <= MAX_KEPT_RATIO:
-            depth_bias = self.correction.depth_bias
+            depth_bias = new_bias
+        elif before.has_depth_bias and found.depth_ratio <= MAX_KEPT_RATIO:
+            depth_bias = before.depth_bias if self._is_renewed else new_bias
         if found.color_ratio <= self.config.max_color_ratio:
-            vignetting = tuple(map(tuple, found.vignetting.tolist()))
-        elif self._is_renewed and found.color_ratio <= MAX_KEPT_RATIO:
-            vignetting = self.correction.vignetting
+            vignetting = new_vignetting
+        elif before.has_vignetting and found.color_ratio <= MAX_KEPT_RATIO:
+            vignetting = before.vignetting if self._is_renewed else new_vignetting
         return CameraCorrection(depth_bias, vignetting)
 
     def _end_stage(self) -> None:
@@ -310,13 +337,15 @@ class SelfCalibration:
             "T_last_view": self._T_last_view,
             "frames_since_view": self._frames_since_view,
             "stage": self._stage,
-            "timing": self._timing.pack(),
+            "last_times_s": self._times_s,
+            "timing_equations": self._timing,
+            "new_view": self._new_view,
             "has_estimate": self._has_estimate,
             "views_estimated": self._views_estimated,
             "is_renewed": self._is_renewed,
             "is_running": self._running is not None,
             "views_used": self._views_used,
-            "parts_done": self._parts_done,
+            "steps_done": self._steps_done,
             "views": list(self._views),
             "poses": [
                 (pair.first, pair.second, pair.T_second_first.copy()) for pair in self._pairs
@@ -346,19 +375,19 @@ class SelfCalibration:
                 self._pairs.append(pair.at(T_second_first))
         # States of earlier versions lack some of the entries that are read by `get`.
         self._running, self._stage = None, int(now["stage"])
-        self._timing = ShutterTiming.of(now.get("timing", {}))
+        self._times_s = now.get("last_times_s", np.zeros(TIME_TERMS))
+        self._timing, self._new_view = now.get("timing_equations"), now.get("new_view")
         self._has_estimate = bool(now.get("has_estimate", True))
         self._views_estimated = int(now.get("views_estimated", 0))
         self._is_renewed = bool(now.get("is_renewed", False))
         self._views_used = int(now["views_used"])
         if now["is_running"]:
             self._start(self._views_used)
-            # The parts of an earlier version, which lacks "views_estimated", were larger. Its
-            # estimate starts again.
-            parts = int(now["parts_done"]) if "views_estimated" in now else 0
-            for _ in range(parts):
+            # The estimate of an earlier version, which had other steps, starts again.
+            for _ in range(int(now.get("steps_done", 0))):
                 if self._running is not None:
-                    self._continue()
+                    next(self._running)
+                    self._steps_done += 1
 
     def metrics(self) -> dict[str, float]:
         """Return the number of views, and whether each correction is in use, 0 or 1."""
@@ -368,10 +397,3 @@ class SelfCalibration:
             "depth_bias_corrected": float(self.correction.has_depth_bias),
             "vignetting_corrected": float(self.correction.has_vignetting),
         }
-
-
-def _median_depth_m(frame: RgbdFrame) -> float:
-    """Return the median depth of a frame in meters; infinity if it has no depth."""
-    measured_m = frame.depth_m[::DEPTH_STRIDE, ::DEPTH_STRIDE]
-    measured_m = measured_m[measured_m > 0]
-    return float(np.median(measured_m)) if measured_m.size else inf

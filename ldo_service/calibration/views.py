@@ -1,8 +1,9 @@
 """Calibration views, from which vignetting and depth bias are estimated, and pairs of views."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import reduce
+from math import inf
 from typing import Any
 
 import cv2
@@ -12,6 +13,7 @@ from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.pnp import solve_pnp
 
 VIEW_WIDTH = 160  # Pixels; the smooth errors need no finer images.
+DEPTH_STRIDE = 8  # The median depth uses every eighth pixel along each axis.
 MAX_DEPTH_M = 6.0  # Structured light and time of flight measure mostly noise beyond this depth.
 # The pixels of a block, and neighboring blocks, belong to one surface if their depths differ by
 # less than this fraction of the depth plus this length.
@@ -54,10 +56,13 @@ class CalibrationView:
     corners: np.ndarray  # [N, 2] pixels of the full image.
     corner_depth_m: np.ndarray  # [N]; 0 where unknown.
     T_odom_camera: np.ndarray | None = None  # Pose by the tracker, [4, 4]; None if LOST.
+    # Velocity of the camera, [6] rotation in rad/s, then translation in m/s, in the camera frame; 0
+    # if unknown.
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))
 
     def pack(self) -> dict[str, Any]:
         """Return the view as arrays and plain values."""
-        kept = {field.name: getattr(self, field.name) for field in fields(self)}
+        kept = {each.name: getattr(self, each.name) for each in fields(self)}
         return {**kept, "camera": asdict(self.camera)}
 
     @staticmethod
@@ -105,13 +110,19 @@ class ViewMaker:
         maker._next_track, maker._count = int(kept["next_track"]), int(kept["count"])
         return maker
 
-    def make(self, frame: RgbdFrame, T_odom_camera: np.ndarray | None = None) -> CalibrationView:
+    def make(
+        self,
+        frame: RgbdFrame,
+        T_odom_camera: np.ndarray | None = None,
+        velocity: np.ndarray | None = None,
+    ) -> CalibrationView:
         """Reduce an uncorrected frame to a calibration view.
 
         Args:
             frame: The frame.
             T_odom_camera: Its pose, [4, 4], by which the motion of the corners is predicted; None
                 while tracking is LOST.
+            velocity: Velocity of the camera, [6]; None if unknown.
         """
         camera = frame.camera
         block = max(1, camera.width // VIEW_WIDTH)
@@ -140,6 +151,7 @@ class ViewMaker:
             self._corners.astype(np.float64),
             self._corner_depth_m,
             T_odom_camera,
+            np.zeros(6) if velocity is None else velocity,
         )
         self._T_odom_last = T_odom_camera
         self._count += 1
@@ -354,3 +366,10 @@ def _surface_depth(depth_m: np.ndarray, block: int) -> np.ndarray:
     is_surface = (lowest > 0) & (highest < MAX_DEPTH_M)
     is_surface &= highest - lowest < SURFACE_STEP_RATIO * mean + SURFACE_STEP_M
     return np.where(is_surface, mean, np.float32(0.0))
+
+
+def median_depth_m(frame: RgbdFrame) -> float:
+    """Return the median depth of a frame in meters; infinity if it has no depth."""
+    measured_m = frame.depth_m[::DEPTH_STRIDE, ::DEPTH_STRIDE]
+    measured_m = measured_m[measured_m > 0]
+    return float(np.median(measured_m)) if measured_m.size else inf

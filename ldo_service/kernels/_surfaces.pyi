@@ -28,6 +28,9 @@ def compare(
     here: Values,
     basis: Values,
     T_here_there: Values,
+    velocity_there: Values,
+    velocity_here: Values,
+    times_s: tuple[float, float],
     intrinsics: tuple[float, float, float, float],
     block: int,
     width: int,
@@ -47,15 +50,21 @@ def compare(
         there: Result of `surfaces` for the first view, [h w, 6].
         here: The same for the second view.
         basis: Basis functions of the depth bias at the blocks, [h w, 3].
-        T_here_there: Transform from the first camera to the second one, [4, 4].
+        T_here_there: Transform from the first camera to the second one, [4, 4], at the times of
+            the middle rows of their color images.
+        velocity_there: Velocity of the first camera, [6]: rotation in rad/s, then translation in
+            m/s. The camera is at T exp(velocity t) after the time t.
+        velocity_here: Velocity of the second camera, [6].
+        times_s: Readout of depth and delay of depth after color, seconds.
         intrinsics: fx, fy, cx, cy of the full image.
         block: Side of a block, pixels.
         width: Number of blocks in a row, w.
         stride: Distance of compared blocks along each axis, in blocks.
         max_step_ratio: Depth difference, as a fraction of depth, beyond which point and plane are
             different surfaces.
-        rows: Output, [N, 10]: derivatives of the residual by bias, rotation and translation of
-            T_here_there (exp(x) T), and the residual. N is the number of compared blocks.
+        rows: Output, [N, 13]: derivatives of the residual by bias, by the times of the shutter
+            (readout of color, readout of depth, delay of depth), and by rotation and translation of
+            T_here_there (exp(x) T); and the residual. N is the number of compared blocks.
         depths: Output, [N]: mean depth of the moved point and the plane on its ray, meters.
         indices: Output, [N, 2]: blocks there and here.
 

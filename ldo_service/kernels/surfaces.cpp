@@ -30,14 +30,39 @@ int64_t block_of(const SurfaceView& view, const double* p) {
   return inside ? static_cast<int64_t>(row) * view.width + static_cast<int64_t>(column) : -1;
 }
 
+// Velocity of a static point in the camera frame of a view, with the opposite sign.
+void speed_of(const ViewMotion& motion, const double* point, double* result) {
+  cross(motion.velocity, point, result);
+  for (int i = 0; i < 3; ++i) result[i] += motion.velocity[3 + i];
+}
+
+// Time at which depth at the height v of the image is measured, after the middle of color. The row
+// is 0 in the middle, and -0.5 and 0.5 at the ends.
+double depth_time(const SurfaceView& view, const ViewMotion& motion, double v, double* row) {
+  const double last = view.block * static_cast<double>(view.height) - 1;
+  *row = std::clamp(v / last - 0.5, -0.5, 0.5);
+  return motion.delay_s + motion.readout_s * *row;
+}
+
 // Write one row if the point there lies on a surface that the view here shows.
 bool compare_block(const SurfaceView& view, const Comparison& input, int64_t a, double* row,
                    double* depth_m, int64_t* indices) {
   const double* there = input.there + kSurfaceDoubles * a;
   if (!has_normal(there)) return false;
   const double* T = input.T_here_there;
-  double point[3], apart[3];
-  for (int i = 0; i < 3; ++i) point[i] = dot(T + 4 * i, there) + T[4 * i + 3];
+  // Move the point to the time of the color image there, transform it to that of the color image
+  // here, and move it to the time at which depth here is measured.
+  double row_there, row_here, speed_there[3], speed_here[3], at_color[3], point[3];
+  const double v_there = view.block * (static_cast<double>(a / view.width) + 0.5) - 0.5;
+  const double time_there = depth_time(view, input.motion_there, v_there, &row_there);
+  speed_of(input.motion_there, there, speed_there);
+  for (int i = 0; i < 3; ++i) at_color[i] = there[i] + time_there * speed_there[i];
+  for (int i = 0; i < 3; ++i) point[i] = dot(T + 4 * i, at_color) + T[4 * i + 3];
+  if (!(point[2] > 0)) return false;
+  const double v_here = view.fy * point[1] / point[2] + view.cy;
+  const double time_here = depth_time(view, input.motion_here, v_here, &row_here);
+  speed_of(input.motion_here, point, speed_here);
+  for (int i = 0; i < 3; ++i) point[i] -= time_here * speed_here[i];
   const int64_t b = block_of(view, point);
   if (b < 0) return false;
   const double* here = input.here + kSurfaceDoubles * b;
@@ -50,22 +75,27 @@ bool compare_block(const SurfaceView& view, const Comparison& input, int64_t a, 
   // correlates with that of the residual, and the estimate would be biased.
   const double point_share = 0.5 * (point[2] + plane_m) / point[2];
   const double here_share = 0.5 * (point[2] + plane_m) / plane_m;
-  double middle[3], before[3];
+  double middle[3], before[3], apart[3], turned[3];
   for (int i = 0; i < 3; ++i) {
     middle[i] = point_share * point[i];
     before[i] = middle[i] - T[4 * i + 3];
     apart[i] = point[i] - here[i];
+    turned[i] = dot(T + 4 * i, speed_there);
   }
   const double depth_there = T[2] * before[0] + T[6] * before[1] + T[10] * before[2];
   // A point on a ray moves by -z^2 ray = -z point per unit of the bias.
   const double slope_there = dot(before, n) * depth_there;
   const double slope_here = dot(here, n) * here[2] * here_share * here_share;
+  const double moved_there = dot(turned, n), moved_here = dot(speed_here, n);
+  row[3] = 0;
+  row[4] = moved_there * row_there - moved_here * row_here;
+  row[5] = moved_there - moved_here;
   for (int i = 0; i < 3; ++i) {
     row[i] = slope_here * input.basis[3 * b + i] - slope_there * input.basis[3 * a + i];
-    row[6 + i] = n[i];
+    row[9 + i] = n[i];
   }
-  cross(middle, n, row + 3);
-  row[9] = dot(apart, n);
+  cross(middle, n, row + 6);
+  row[12] = dot(apart, n);
   *depth_m = middle[2];
   indices[0] = a;
   indices[1] = b;

@@ -6,13 +6,21 @@ namespace ldo {
 
 // Row of a block: point 0-2, unit normal 3-5. The normal is 0 0 0 where no surface is known.
 constexpr int kSurfaceDoubles = 6;
-// Derivatives of a residual: bias 0-2, rotation 3-5, translation 6-8; then the residual.
-constexpr int kRowDoubles = 10;
+// Derivatives of a residual: bias 0-2, times of the shutter 3-5 (readout of color, readout and
+// delay of depth), rotation 6-8, translation 9-11; then the residual.
+constexpr int kRowDoubles = 13;
 
 struct SurfaceView {
   int64_t height, width;  // Blocks.
   double fx, fy, cx, cy;  // Intrinsics of the full image.
   double block;           // Side of a block, pixels.
+};
+
+// Motion of the camera during a view: it is at T_camera exp(velocity t) after the time t.
+struct ViewMotion {
+  const double* velocity;  // [6] rotation in rad/s, then translation in m/s.
+  double readout_s;        // Time from the first to the last row of depth.
+  double delay_s;          // Time from color to depth, middle rows.
 };
 
 // Comparison of each stride-th block along both axes.
@@ -21,12 +29,13 @@ struct Comparison {
   const double* here;          // [height width, 6]
   const double* basis;         // [height width, 3] of the depth bias.
   const double* T_here_there;  // [4, 4]
+  ViewMotion motion_there, motion_here;
   int64_t stride;
   double max_step_ratio;
 };
 
 struct Compared {
-  double* rows;      // [N, 10]
+  double* rows;      // [N, 13]
   double* depth_m;   // [N] depth of the moved point.
   int64_t* indices;  // [N, 2] blocks there and here.
 };

@@ -48,9 +48,11 @@ void surfaces(const Array& depth_m, const Array& rays, double step_ratio, double
 }
 
 using Intrinsics = std::tuple<double, double, double, double>;
+using DepthTimes = std::tuple<double, double>;  // Readout and delay, seconds.
 
 int64_t compare(const Array& there, const Array& here, const Array& basis,
-                const Array& T_here_there, const Intrinsics& intrinsics, int block, int width,
+                const Array& T_here_there, const Array& velocity_there, const Array& velocity_here,
+                const DepthTimes& times_s, const Intrinsics& intrinsics, int block, int width,
                 int stride, double max_step_ratio, const WritableArray& rows,
                 const WritableArray& depths, const WritableArray& indices) {
   require(there.ndim() == 2 && there.shape(1) == kSurfaceDoubles,
@@ -59,6 +61,8 @@ int64_t compare(const Array& there, const Array& here, const Array& basis,
   require_shape(here, "here", {size, kSurfaceDoubles});
   require_shape(basis, "basis", {size, 3});
   require_shape(T_here_there, "T_here_there", {4, 4});
+  require_shape(velocity_there, "velocity_there", {6});
+  require_shape(velocity_here, "velocity_here", {6});
   require(block >= 1 && stride >= 1, "block and stride must be at least 1.");
   require(width >= 1 && size % static_cast<size_t>(width) == 0, "width must divide the blocks.");
   const auto [fx, fy, cx, cy] = intrinsics;
@@ -71,14 +75,17 @@ int64_t compare(const Array& there, const Array& here, const Array& basis,
   };
   const size_t n = compared(view.height) * compared(view.width);
   require(rows.ndim() == 2 && rows.shape(0) >= n && rows.shape(1) == kRowDoubles,
-          "rows must have shape [N, 10], with a row for each compared block.");
+          "rows must have shape [N, 13], with a row for each compared block.");
   require(depths.ndim() == 1 && depths.shape(0) >= n, "depths must have as many rows as rows.");
   require(indices.ndim() == 2 && indices.shape(0) >= n && indices.shape(1) == 2,
           "indices must have shape [N, 2], with as many rows as rows.");
+  const auto [readout_s, delay_s] = times_s;
   const Comparison input{values_of<double>(there, "there"),
                          values_of<double>(here, "here"),
                          values_of<double>(basis, "basis"),
                          values_of<double>(T_here_there, "T_here_there"),
+                         {values_of<double>(velocity_there, "velocity_there"), readout_s, delay_s},
+                         {values_of<double>(velocity_here, "velocity_here"), readout_s, delay_s},
                          stride,
                          max_step_ratio};
   Compared result{values_of<double>(rows, "rows"), values_of<double>(depths, "depths"),
@@ -93,8 +100,9 @@ NB_MODULE(_surfaces, m) {
   using namespace nb::literals;
   chosen = kernels_for(chosen_isa());
   m.def("surfaces", &surfaces, "depth_m"_a, "rays"_a, "step_ratio"_a, "step_m"_a, "result"_a);
-  m.def("compare", &compare, "there"_a, "here"_a, "basis"_a, "T_here_there"_a, "intrinsics"_a,
-        "block"_a, "width"_a, "stride"_a, "max_step_ratio"_a, "rows"_a, "depths"_a, "indices"_a);
+  m.def("compare", &compare, "there"_a, "here"_a, "basis"_a, "T_here_there"_a, "velocity_there"_a,
+        "velocity_here"_a, "times_s"_a, "intrinsics"_a, "block"_a, "width"_a, "stride"_a,
+        "max_step_ratio"_a, "rows"_a, "depths"_a, "indices"_a);
 }
 
 }  // namespace ldo

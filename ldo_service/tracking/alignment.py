@@ -169,23 +169,28 @@ class AlignConfig:
     # range, where `DepthNoise` is 1.2 mm. It covers depth that is rounded to millimeters.
     min_depth_noise_scale: float = 0.2
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
-    # Lower bound of the geometric noise while the depth may have a smooth bias, as a multiple of
-    # `DepthNoise`. A bias shows no noise, so its residuals would weigh as much as exact ones. With
-    # 5, the ATE of tour-handheld falls from 1.6 to 1.1 cm; without a bias, no sequence changes by
-    # more than 0.04 cm.
+    # Lower bound of the geometric noise while the depth may have an unknown smooth bias, as a
+    # multiple of `DepthNoise`. A bias shows no noise, so its residuals would weigh as much as exact
+    # ones. With 5, the ATE of tour-handheld falls from 1.6 to 1.1 cm; without a bias, no sequence
+    # changes by more than 0.04 cm.
     biased_depth_noise_scale: float = 5.0
-    # Factor on the covariance while the depth may have a smooth bias. The squared errors of the
-    # first 20 frames of two simulated cameras are ten times those of the later frames.
+    # Factor on the covariance while the depth may have an unknown smooth bias. The squared errors
+    # of the first 20 frames of two simulated cameras are ten times those of the later frames.
     biased_covariance_scale: float = 10.0
 
-    def with_bias(self) -> "AlignConfig":
-        """Return the settings for depth that may have a smooth bias."""
-        scale = self.covariance.scale * self.biased_covariance_scale
-        return replace(
-            self,
-            min_depth_noise_scale=self.biased_depth_noise_scale,
-            covariance=replace(self.covariance, scale=scale),
-        )
+    def with_bias(self, relative_sigma: float) -> "AlignConfig":
+        """Return the settings for depth with a bias that is not exactly known.
+
+        Args:
+            relative_sigma: Standard deviation of the bias, as a multiple of that of an unknown
+                camera.
+        """
+        if not relative_sigma:
+            return self
+        noise = max(relative_sigma * self.biased_depth_noise_scale, self.min_depth_noise_scale)
+        factor = 1.0 + (self.biased_covariance_scale - 1.0) * relative_sigma**2
+        covariance = replace(self.covariance, scale=factor * self.covariance.scale)
+        return replace(self, min_depth_noise_scale=noise, covariance=covariance)
 
     def __post_init__(self) -> None:
         if not self.iterations or min(self.iterations) < 1:

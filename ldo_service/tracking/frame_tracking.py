@@ -2,9 +2,8 @@
 
 The tracker aligns a frame from the pose that constant velocity predicts. If the tracking status of
 the result is not OK or the image moved far, the tracker also aligns the frame from all other
-initial guesses. The tracker chooses the best result, whose quality determines the tracking status.
-A LOST camera is relocalized in the keyframe database. The module `odometry` decides whether the
-frame becomes a keyframe. Conventions: `ldo_service.geometry`.
+initial guesses. The quality of the best result determines the tracking status. A LOST camera is
+relocalized. The module `odometry` decides on keyframes. Conventions: `ldo_service.geometry`.
 """
 
 import logging
@@ -12,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ldo_service.calibration.knowledge import CameraKnowledge
 from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.geometry import RgbdFrame, se3
 
@@ -165,11 +165,11 @@ class FrameTracker:
         """Estimated motion of the camera during the last frame; None if it is unknown."""
         return self._compensator.motion
 
-    def expect_bias(self, is_expected: bool) -> None:
-        """Set whether the depth of the next frames may have a smooth bias that is not corrected."""
-        align = self.config.align.with_bias() if is_expected else self.config.align
-        self._guesses = replace(self._guesses, align=align)
-        self._compensator.guesses = self._guesses
+    def use_knowledge(self, camera: CameraKnowledge) -> None:
+        """Use the estimates of the camera for the next frames."""
+        align = self.config.align.with_bias(camera.relative_bias_sigma)
+        self._compensator.guesses = self._guesses = replace(self._guesses, align=align)
+        self.state = self.state.informed(camera, self.config.pyramid, self.config.shutter)
 
     def restore(self, state: OdometryState) -> None:
         """Continue tracking from a saved state."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.calibration.correction import CorrectionChange
-from ldo_service.calibration.shutter import FrameMotion
+from ldo_service.calibration.shutter import FrameMotion, ShutterTiming
 from ldo_service.detection.dynamic_classes import Box, DynamicClassConfig, dynamic_class_mask
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
@@ -173,6 +173,26 @@ class ReferenceKeyframe:
             )
         return replace(
             self, view=build_pyramid(gray, depth_m, camera, config), stored_features=features
+        )
+
+    def retimed(
+        self, timing: ShutterTiming, velocity: np.ndarray, config: PyramidConfig
+    ) -> "ReferenceKeyframe":
+        """Return the keyframe with its motion compensated by another timing of the shutter.
+
+        Args:
+            timing: The new timing.
+            velocity: Velocity of the camera, [6], if `motion` is unknown.
+            config: Settings of the pyramid.
+        """
+        before = self.motion or FrameMotion(velocity, ShutterTiming())
+        times_s = np.subtract(timing.times_s, before.timing.times_s).tolist()
+        change, view = replace(before, timing=ShutterTiming(*times_s)), self.view
+        gray, depth_m = change.warped(view.gray, view.depth_m, view.camera)
+        return replace(
+            self,
+            view=build_pyramid(gray, depth_m, view.camera, config),
+            motion=replace(before, timing=timing),
         )
 
     def pack(self) -> dict[str, Any]:

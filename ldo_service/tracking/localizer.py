@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.calibration.knowledge import CameraKnowledge
 from ldo_service.geometry import RgbdFrame, se3
 
 from .keyframe_database import KeyframeDatabase
@@ -105,7 +106,7 @@ class Localizer(Odometry):
         prior: OdometryPriorBuffer | None = None,
         *,
         may_map: bool = True,  # noqa: ARG002
-        may_be_biased: bool = False,
+        camera: CameraKnowledge | None = None,
     ) -> TrackingResult:
         """Track a frame and localize it in the map.
 
@@ -113,7 +114,8 @@ class Localizer(Odometry):
             frame: The frame.
             prior: The last poses of another odometry, such as wheels.
             may_map: Unused, since nothing is mapped.
-            may_be_biased: True if depth may have a smooth bias that is not corrected.
+            camera: Estimates of the camera that the self-calibration has made so far; None if it
+                is off.
 
         Returns:
             The pose of the frame in odometry and in the map. The status is LOST until the camera is
@@ -121,7 +123,7 @@ class Localizer(Odometry):
         """
         # Track the frame in odometry, against keyframes that are not in the map.
         reading = self._read(prior, frame)
-        self._frames.expect_bias(may_be_biased)
+        self._frames.use_knowledge(camera or CameraKnowledge())
         tracked = self._frames.track(frame, reading)
         if tracked.should_start_submap:
             tracked = self._frames.start_submap(frame)

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.calibration.correction import CorrectionChange
+from ldo_service.calibration.knowledge import CameraKnowledge
 from ldo_service.detection.dynamic_classes import Box
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
@@ -88,7 +89,7 @@ class Odometry:
         prior: OdometryPriorBuffer | None = None,
         *,
         may_map: bool = True,
-        may_be_biased: bool = False,
+        camera: CameraKnowledge | None = None,
     ) -> TrackingResult:
         """Track a frame, and make a keyframe of it if one is needed.
 
@@ -100,14 +101,15 @@ class Odometry:
                 images: a frame is OK only if its images confirm the pose.
             may_map: True allows a new keyframe or submap. If it is False and a keyframe is needed,
                 `TrackingResult.denied_keyframe` names the kind of keyframe.
-            may_be_biased: True if depth may have a smooth bias that is not corrected.
+            camera: Estimates of the camera that the self-calibration has made so far; None if it
+                is off.
 
         Returns:
             The pose of the frame, and the keyframe that was made of it, if any.
         """
         # Track against the reference keyframe; relocalization may find another reference.
         reading = self._read(prior, frame)
-        self._frames.expect_bias(may_be_biased)
+        self._frames.use_knowledge(camera or CameraKnowledge())
         tracked = self._frames.track(frame, reading)
         if tracked.pose_source == "relocalized" and tracked.reference not in self._map:
             self._map.place_reference(tracked)

@@ -80,6 +80,18 @@ class ShutterState:
     # Equations of the last frame, until the next frame tells its velocity.
     pending: BandEquations | None = None
 
+    def informed(self, equations: np.ndarray | None, config: ShutterConfig) -> "ShutterState":
+        """Return the state with the estimate of the self-calibration as the prior of the times.
+
+        Args:
+            equations: Information and right side of the times, [3, 4]; None if unknown.
+            config: Settings.
+        """
+        known = self.evidence.prior
+        if not config.is_on or equations is None or np.array_equal(known, equations):
+            return self
+        return self._estimated(replace(self.evidence, prior=equations), config)
+
     def expected_motion(
         self, before: ConstantVelocity, stamp_ns: int, config: ShutterConfig
     ) -> FrameMotion | None:
@@ -124,6 +136,8 @@ class ShutterState:
                 state = self._with_equations(self.pending.timing_equations(at_last_frame), config)
             if self.has_new_reference:
                 state = replace(state, reference_velocity=at_last_frame)
+        elif self.has_new_reference:  # The first frame, or the first one after an interruption.
+            state = replace(state, reference_velocity=mean)
         return replace(state, mean_velocity=mean, has_new_reference=False, pending=None)
 
     def interrupted(self) -> "ShutterState":
@@ -142,6 +156,9 @@ class ShutterState:
         evidence = self.evidence.extended(equations)
         if evidence.count % config.update_frames:
             return replace(self, evidence=evidence)
+        return self._estimated(evidence, config)
+
+    def _estimated(self, evidence: TimingEvidence, config: ShutterConfig) -> "ShutterState":
         timing = _updated(self.timing, evidence, config)
         if timing.differs(self.timing, config.relinearized_s):
             evidence = evidence.scaled(EARLIER_WEIGHT)

@@ -11,7 +11,7 @@ Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -42,8 +42,8 @@ INDEPENDENT_FRACTION = 2e-3
 # Noise that removes one kind of residuals from the normal equations: gray levels, or a multiple of
 # `DepthNoise`.
 NO_WEIGHT = 1e5
-# Information of a prior: readouts of 0 to 20 ms and delays of 0 to 10 ms are usual.
-PRIOR = np.diag([0.02**-2, 0.02**-2, 0.01**-2])
+# Equations of a prior: readouts of 0 to 20 ms and delays of 0 to 10 ms are usual.
+PRIOR = np.c_[np.diag([0.02**-2, 0.02**-2, 0.01**-2]), np.zeros(3)]
 MIN_GROUPS, MAX_GROUPS = 12, 24  # Groups of the jackknife; two are merged beyond the maximum.
 
 
@@ -191,6 +191,8 @@ class TimingEvidence:
     size: int = 1  # Measurements per complete group.
     in_last: int = 0  # Measurements in the last group.
     count: int = 0
+    # Information and right side, [3, 4], of an estimate from other evidence, or of `PRIOR`.
+    prior: np.ndarray = field(default_factory=PRIOR.copy)
 
     def extended(self, measurement: np.ndarray) -> "TimingEvidence":
         """Return the evidence with one more measurement [3, 4]."""
@@ -203,24 +205,32 @@ class TimingEvidence:
                 last = groups.pop()
                 groups = [a + b for a, b in zip(groups[::2], groups[1::2], strict=True)]
                 groups, size = [*groups, last], 2 * size
-        return TimingEvidence(tuple(groups), size, in_last + 1, self.count + 1)
+        return TimingEvidence(tuple(groups), size, in_last + 1, self.count + 1, self.prior)
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the times [3] of the shutter in seconds, and their standard deviations [3].
 
-        A prior holds times that the frames do not tell near 0. The standard deviations combine two
+        The prior holds times that the frames do not tell. The standard deviations combine two
         estimates: a jackknife over the groups, because the errors of neighboring frames are alike,
         and the information of the equations, because a jackknife over few groups may be small by
-        chance. The result is None if there are too few groups.
+        chance. With too few groups, the result is that of the prior; without an estimate from other
+        evidence, it is None.
         """
         if len(self.groups) < MIN_GROUPS:
-            return None
+            if np.array_equal(self.prior, PRIOR):
+                return None
+            covariance = np.linalg.inv(self.prior[:, :3])
+            return covariance @ self.prior[:, 3], np.sqrt(np.diag(covariance))
         groups = np.array(self.groups) * (INDEPENDENT_FRACTION * NOISE_RATIO**2)
         total = groups.sum(axis=0)
-        parts = np.array([_solved(total - group) for group in groups])
+        parts = np.array([self._solved(total - group) for group in groups])
         jackknife = (len(parts) - 1) * np.var(parts, axis=0)
-        by_information = np.diag(np.linalg.inv(total[:, :3] + PRIOR))
-        return _solved(total), np.sqrt(jackknife + by_information)
+        by_information = np.diag(np.linalg.inv(total[:, :3] + self.prior[:, :3]))
+        return self._solved(total), np.sqrt(jackknife + by_information)
+
+    def _solved(self, equations: np.ndarray) -> np.ndarray:
+        total = equations + self.prior
+        return np.linalg.solve(total[:, :3], total[:, 3])
 
     def scaled(self, weight: float) -> "TimingEvidence":
         """Return the evidence with another weight."""
@@ -233,13 +243,18 @@ class TimingEvidence:
             "size": self.size,
             "in_last": self.in_last,
             "count": self.count,
+            "prior": self.prior,
         }
 
     @staticmethod
     def unpack(kept: Mapping[str, Any]) -> "TimingEvidence":
         """Return the evidence from its packed form."""
         return TimingEvidence(
-            tuple(kept["groups"]), int(kept["size"]), int(kept["in_last"]), int(kept["count"])
+            tuple(kept["groups"]),
+            int(kept["size"]),
+            int(kept["in_last"]),
+            int(kept["count"]),
+            kept.get("prior", PRIOR),  # A state of an earlier version has no prior.
         )
 
 
@@ -276,7 +291,3 @@ def _rows(
     row_there = (points[1] / points[2] * camera.fy + camera.cy - middle) / height
     row_here = (moved[0] / depth_m * camera.fy + camera.cy - middle) / height
     return row_there, row_here, np.abs(row_here) <= 0.5
-
-
-def _solved(equations: np.ndarray) -> np.ndarray:
-    return np.linalg.solve(equations[:, :3] + PRIOR, equations[:, 3])

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from ldo_service.calibration.correction import CorrectionChange
-from ldo_service.calibration.shutter import FrameMotion
+from ldo_service.calibration.knowledge import CameraKnowledge
+from ldo_service.calibration.shutter import FrameMotion, ShutterTiming
 from ldo_service.geometry import se3
 
 from .alignment import Alignment
@@ -22,7 +23,7 @@ from .motion import ConstantVelocity
 from .motion_segmentation import MotionEvidence
 from .odometry_prior import DeadReckoningStart
 from .pyramid import Pyramid, PyramidConfig
-from .shutter import ShutterState
+from .shutter import ShutterConfig, ShutterState
 from .submaps import Submaps
 from .tracking_quality import ResidualHistory, TrackingStatus
 from .tracking_result import KeyframeKind, TrackedFrame
@@ -182,6 +183,31 @@ class OdometryState:
             history=ResidualHistory(),
             shutter=self.shutter.recorrected(),
         )
+
+    def informed(
+        self, camera: CameraKnowledge, pyramid: PyramidConfig, config: ShutterConfig
+    ) -> "OdometryState":
+        """Return the state before a frame, with the estimates of the camera.
+
+        Frames are compensated by the current timing of the shutter. A reference with another timing
+        would be distorted beside them, so it is compensated again.
+
+        Args:
+            camera: Estimates of the self-calibration.
+            pyramid: Settings of the pyramid.
+            config: Settings of the shutter.
+        """
+        keyframe, shutter = self.keyframe, self.shutter.informed(camera.timing, config)
+        state = replace(self, shutter=shutter)
+        if keyframe is None:
+            return state
+        used = ShutterTiming() if keyframe.motion is None else keyframe.motion.timing
+        velocity = shutter.reference_velocity
+        is_known = velocity is not None or keyframe.motion is not None
+        if not is_known or not shutter.timing.differs(used, config.relinearized_s):
+            return state
+        known = np.zeros(6) if velocity is None else velocity
+        return replace(state, keyframe=keyframe.retimed(shutter.timing, known, pyramid))
 
     def _against(self, keyframe: ReferenceKeyframe, T_odom_mapped: np.ndarray) -> "OdometryState":
         return replace(

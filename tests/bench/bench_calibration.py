@@ -54,7 +54,7 @@ def tracked(
         raw = sequence[index]
         start_s = time.process_time()
         corrected = result.calibration.correction.applied(raw)
-        tracked = odometry.process(corrected, may_be_biased=calibration.is_undecided)
+        tracked = odometry.process(corrected, camera=calibration.knowledge)
         middle_s = time.process_time()
         T_odom_camera = None if tracked.status == "LOST" else tracked.T_odom_camera
         change = result.calibration.observe(raw, T_odom_camera, tracked.motion)

@@ -53,7 +53,7 @@ def errors_and_covariances(
     for index in range(min(count, len(sequence))):
         raw = sequence[index]
         frame = calibration.correction.applied(raw)
-        tracked = odometry.process(frame, may_be_biased=calibration.is_undecided)
+        tracked = odometry.process(frame, camera=calibration.knowledge)
         is_lost = tracked.status is TrackingStatus.LOST
         T_odom_camera = None if is_lost else tracked.T_odom_camera
         change = calibration.observe(raw, T_odom_camera, tracked.motion)

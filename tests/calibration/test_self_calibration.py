@@ -18,7 +18,7 @@ from ldo_service.calibration.self_calibration import (
     SelfCalibration,
     SelfCalibrationConfig,
 )
-from ldo_service.calibration.shutter import FrameMotion, ShutterTiming
+from ldo_service.calibration.shutter import ShutterTiming
 from ldo_service.calibration.views import ViewMaker, pair_of, reprojection
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
@@ -118,7 +118,7 @@ def test_estimate_that_runs_over_several_frames_is_restored_bitwise_equal(
     biased, moved = [measured(f, TRUE) for f in frames], poses(room)
     first, second = SelfCalibration(CONFIG), SelfCalibration(CONFIG)
     split = 0
-    while first.snapshot()["now"]["parts_done"] < 2:
+    while first.snapshot()["now"]["steps_done"] < 20:
         assert first.observe(biased[split], moved[split]) is None
         split += 1
     second.restore(decode_state(encode_state(first.snapshot())))
@@ -139,8 +139,8 @@ def test_running_estimate_of_an_earlier_version_starts_again(
         first.observe(biased[split], moved[split])
         split += 1
     state = decode_state(encode_state(first.snapshot()))
-    del state["now"]["views_estimated"]  # The earlier version had no such entry,
-    state["now"]["parts_done"] = 25  # and other parts.
+    del state["now"]["steps_done"]  # The earlier version had other steps, and no times.
+    del state["now"]["last_times_s"], state["now"]["timing_equations"], state["now"]["new_view"]
     second.restore(state)
     assert changes_of(second, biased[split:], moved[split:])
 
@@ -152,7 +152,8 @@ def test_no_step_of_an_estimate_does_more_than_a_frames_work(
     chosen = zip(frames[::6], poses(room)[::6], strict=True)
     views = {n: maker.make(measured(f, TRUE), T) for n, (f, T) in enumerate(chosen)}
     pairs = [pair_of(views[n], views[n + 1]) for n in range(len(views) - 1)]
-    steps = estimate(views, [p for p in pairs if p is not None], np.zeros(3), np.zeros((3, 3)))
+    used = [p for p in pairs if p is not None]
+    steps = estimate(views, used, np.zeros(3), np.zeros(3), np.zeros((3, 3)))
     work = list(steps)
     assert 0 < max(work) <= 1
     assert sum(work) > len(views)
@@ -278,26 +279,33 @@ def test_bias_is_undecided_until_the_first_estimate(
     assert not restored.is_undecided
 
 
-def test_new_timing_renews_a_confirmed_bias_and_keeps_it_meanwhile(
+def test_bias_sigma_falls_from_that_of_an_unknown_camera(
     room: Sequence, frames: list[RgbdFrame]
 ) -> None:
     calibration, moved = SelfCalibration(CONFIG), poses(room)
+    assert calibration.knowledge.relative_bias_sigma == 1.0
+    assert calibration.knowledge.timing is None
     changes_of(calibration, [measured(frame, TRUE) for frame in frames], moved)
-    before = calibration.correction
-    assert before.has_depth_bias
-    assert calibration.is_finished
-    motion = FrameMotion(np.zeros(6), ShutterTiming(0.02))
-    assert calibration.observe(measured(frames[0], TRUE), moved[0], motion) is None
-    assert not calibration.is_finished
-    assert calibration.correction == before
+    assert 0.0 < calibration.knowledge.relative_bias_sigma < 0.3
+    exact = SelfCalibration(CONFIG)
+    changes_of(exact, frames, moved)
+    assert exact.knowledge.relative_bias_sigma == 0.0
 
 
-def test_new_timing_renews_nothing_without_a_bias(room: Sequence, frames: list[RgbdFrame]) -> None:
-    calibration = SelfCalibration(CONFIG)
-    changes_of(calibration, frames, poses(room))
-    assert calibration.is_finished
-    calibration.observe(frames[0], poses(room)[0], FrameMotion(np.zeros(6), ShutterTiming(0.02)))
-    assert calibration.is_finished
+def test_confirmed_bias_is_kept_until_held_out_views_refute_it(
+    room: Sequence, frames: list[RgbdFrame]
+) -> None:
+    seen, moved = [measured(frame, TRUE) for frame in frames], poses(room)
+    strict = SelfCalibration(replace(CONFIG, max_depth_ratio=0.0))
+    assert not [c for c in changes_of(strict, seen, moved) if c.new.has_depth_bias]
+    followed = SelfCalibration(replace(CONFIG, max_depth_ratio=0.0))
+    followed.correction = CameraCorrection((-0.01, 0.0, 0.0))
+    changes_of(followed, seen, moved)
+    assert np.allclose(followed.correction.depth_bias, TRUE.depth_bias, atol=0.003)
+    refuted = SelfCalibration(replace(CONFIG, max_depth_ratio=0.0))
+    refuted.correction = CameraCorrection((-0.01, 0.0, 0.0))
+    changes_of(refuted, frames, moved)
+    assert not refuted.correction.has_depth_bias
 
 
 def test_known_calibration_is_used_from_the_first_frame_on_and_stays_if_it_fits(

@@ -13,6 +13,9 @@ CAMERA, BLOCK, STEP = Camera(160, 120, 130.0, 131.0, 78.0, 61.0), 4, (0.03, 0.01
 H, W = CAMERA.height // BLOCK, CAMERA.width // BLOCK
 INTRINSICS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
 T = se3.exp(np.array([0.02, -0.05, 0.03, 0.1, -0.05, 0.02]))
+VELOCITIES = np.array([0.4, -0.6, 0.2, 0.3, 0.1, -0.2]), np.array([-0.3, 0.5, 0.1, -0.2, 0.2, 0.1])
+TIMES_S = 0.025, 0.015  # Readout and delay of depth.
+STILL = np.zeros(6), np.zeros(6)
 
 
 def grid() -> tuple[np.ndarray, np.ndarray]:
@@ -36,13 +39,18 @@ def surfaces(depth_m: np.ndarray) -> np.ndarray:
 
 
 def compare(
-    there: np.ndarray, here: np.ndarray, T_here_there: np.ndarray, stride: int = 1
+    there: np.ndarray,
+    here: np.ndarray,
+    T_here_there: np.ndarray,
+    stride: int = 1,
+    velocities: tuple[np.ndarray, np.ndarray] = STILL,
+    times_s: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rows, depths = np.empty((H * W, 10)), np.empty(H * W)
+    rows, depths = np.empty((H * W, 13)), np.empty(H * W)
     indices = np.empty((H * W, 2), np.int64)
     count = _surfaces.compare(
-        there, here, grid()[1], T_here_there, INTRINSICS, BLOCK, W, stride, 0.08,
-        rows, depths, indices,
+        there, here, grid()[1], T_here_there, *velocities, times_s, INTRINSICS, BLOCK, W, stride,
+        0.08, rows, depths, indices,
     )  # fmt: skip
     return rows[:count], depths[:count], indices[:count]
 
@@ -58,8 +66,10 @@ def test_surfaces_equal_those_of_numpy() -> None:
 @pytest.mark.parametrize("stride", [1, 3])
 def test_comparison_equals_that_of_numpy(stride: int) -> None:
     there = here = surfaces(bumpy_depth_m())
-    rows, depths, indices = compare(there, here, T, stride)
-    expected = reference.compare(there, here, grid()[1], T, INTRINSICS, BLOCK, W, stride, 0.08)
+    rows, depths, indices = compare(there, here, T, stride, VELOCITIES, TIMES_S)
+    expected = reference.compare(
+        there, here, grid()[1], T, VELOCITIES, TIMES_S, INTRINSICS, BLOCK, W, stride, 0.08
+    )
     assert len(rows) > 300 / stride**2
     assert np.array_equal(indices, expected[2])
     np.testing.assert_allclose(rows, expected[0], atol=1e-12)
@@ -80,7 +90,7 @@ def test_derivatives_equal_finite_differences_where_both_views_agree() -> None:
     there, here = surfaces(depths[0]), surfaces(depths[1])
     rows, _, indices = compare(there, here, T)
     assert len(rows) > 500
-    np.testing.assert_allclose(rows[:, 9], 0, atol=1e-12)
+    np.testing.assert_allclose(rows[:, 12], 0, atol=1e-12)
 
     def difference(changed: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
         """Return rows that were compared in both cases, and the change of their residuals."""
@@ -88,13 +98,13 @@ def test_derivatives_equal_finite_differences_where_both_views_agree() -> None:
         is_same = indices[i, 1] == changed[2][j, 1]
         assert is_same.sum() > 0.9 * len(rows)
         i, j = i[is_same], j[is_same]
-        return i, (changed[0][j, 9] - rows[i, 9]) / 1e-6
+        return i, (changed[0][j, 12] - rows[i, 12]) / 1e-6
 
     for axis in range(6):
         step = np.zeros(6)
         step[axis] = 1e-6
         i, change = difference(compare(there, here, se3.exp(step) @ T))
-        np.testing.assert_allclose(change, rows[i, 3 + axis], atol=1e-4)
+        np.testing.assert_allclose(change, rows[i, 6 + axis], atol=1e-4)
     for axis in range(3):
         bias = 1e-6 * basis[:, axis].reshape(H, W)
         biased = there.copy(), here.copy()
@@ -102,6 +112,11 @@ def test_derivatives_equal_finite_differences_where_both_views_agree() -> None:
             surface[:, :3] = rays * unbiased_depth(depth_m, bias).reshape(-1, 1)
         i, change = difference(compare(*biased, T))
         np.testing.assert_allclose(change, rows[i, axis], atol=1e-4)
+    at_once = compare(there, here, T, velocities=VELOCITIES)
+    np.testing.assert_array_equal(at_once[0][:, 12], rows[:, 12])
+    for axis, times_s in enumerate([(1e-6, 0.0), (0.0, 1e-6)]):
+        i, change = difference(compare(there, here, T, velocities=VELOCITIES, times_s=times_s))
+        np.testing.assert_allclose(change, at_once[0][i, 4 + axis], atol=1e-4)
 
 
 def test_noise_of_the_depth_does_not_bias_the_gradient() -> None:
@@ -111,13 +126,13 @@ def test_noise_of_the_depth_does_not_bias_the_gradient() -> None:
     for _ in range(200):
         there, here = (surfaces(2.0 + 0.01 * rng.normal(size=(H, W))) for _ in range(2))
         rows, _, indices = compare(there, here, roll)
-        gradients.append(np.mean(rows[:, 0] * rows[:, 9]))
+        gradients.append(np.mean(rows[:, 0] * rows[:, 12]))
         # The derivative at the measurement itself, for comparison.
         a, b = indices.T
         basis, n = grid()[1][:, 0], here[b, 3:]
         slope_here = np.sum(here[b, :3] * n, axis=1) * here[b, 2]
         slope_there = np.sum(there[a, :3] @ roll[:3, :3].T * n, axis=1) * there[a, 2]
-        one_sided.append(np.mean((slope_here * basis[b] - slope_there * basis[a]) * rows[:, 9]))
+        one_sided.append(np.mean((slope_here * basis[b] - slope_there * basis[a]) * rows[:, 12]))
 
     def error_in_sigmas(samples: list[float]) -> float:
         return abs(np.mean(samples)) / (np.std(samples) / np.sqrt(len(samples)))
@@ -132,6 +147,6 @@ def test_wrong_shapes_are_rejected() -> None:
     there = surfaces(bumpy_depth_m())
     with pytest.raises(ValueError, match="a row for each compared block"):
         _surfaces.compare(
-            there, there, grid()[1], T, INTRINSICS, BLOCK, W, 1, 0.08,
+            there, there, grid()[1], T, *STILL, TIMES_S, INTRINSICS, BLOCK, W, 1, 0.08,
             np.empty((10, 10)), np.empty(10), np.empty((10, 2), np.int64),
         )  # fmt: skip

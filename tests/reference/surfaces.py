@@ -25,39 +25,64 @@ def compare(
     here: np.ndarray,
     basis: np.ndarray,
     T_here_there: np.ndarray,
+    velocities: tuple[np.ndarray, np.ndarray],
+    times_s: tuple[float, float],
     intrinsics: tuple[float, float, float, float],
     block: int,
     width: int,
     stride: int,
     max_step_ratio: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows [N, 10], depths [N] and indices [N, 2] of the compared blocks."""
+    """Return rows [N, 13], depths [N] and indices [N, 2] of the compared blocks.
+
+    `velocities` are those of both cameras, [6] each. `times_s` has the readout of depth and the
+    delay of depth after color.
+    """
     fx, fy, cx, cy = intrinsics
-    height = len(there) // width
+    height, (readout_s, delay_s) = len(there) // width, times_s
     chosen = np.zeros((height, width), bool)
     chosen[::stride, ::stride] = True
     a = np.flatnonzero(chosen.reshape(-1) & there[:, 3:].any(axis=1))
     R, t = T_here_there[:3, :3], T_here_there[:3, 3]
-    points = there[a, :3] @ R.T + t
+
+    def rows_of(v: np.ndarray) -> np.ndarray:
+        return np.clip(v / (block * height - 1) - 0.5, -0.5, 0.5)
+
+    def speeds(points: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        return np.cross(velocity[:3], points) + velocity[3:]
+
+    row_there = rows_of(block * (a // width + 0.5) - 0.5)
+    speed_there = speeds(there[a, :3], velocities[0])
+    at_color = there[a, :3] + speed_there * (delay_s + readout_s * row_there)[:, None]
+    points = at_color @ R.T + t
+    row_here = rows_of(fy * points[:, 1] / points[:, 2] + cy)
+    speed_here = speeds(points, velocities[1])
+    points = points - speed_here * (delay_s + readout_s * row_here)[:, None]
+    moved = np.c_[speed_there @ R.T, speed_here, row_there, row_here]
     ahead = points[:, 2] > 0.1
-    a, points = a[ahead], points[ahead]
+    a, points, moved = a[ahead], points[ahead], moved[ahead]
     column = np.floor((fx * points[:, 0] / points[:, 2] + cx + 0.5) / block).astype(int)
     row = np.floor((fy * points[:, 1] / points[:, 2] + cy + 0.5) / block).astype(int)
     seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    a, points, b = (x[seen] for x in (a, points, row * width + column))
+    a, points, moved, b = (x[seen] for x in (a, points, moved, row * width + column))
     seen = here[b, 3:].any(axis=1)
-    a, points, b = (x[seen] for x in (a, points, b))
+    a, points, moved, b = (x[seen] for x in (a, points, moved, b))
     place, n = here[b, :3], here[b, 3:]
     z = points[:, 2]
     plane_m = z * np.sum(place * n, axis=1) / np.sum(points * n, axis=1)
     seen = abs(z - plane_m) < max_step_ratio * z
-    a, points, b, place, n, z, plane_m = (x[seen] for x in (a, points, b, place, n, z, plane_m))
+    a, points, moved, b, place, n, z, plane_m = (
+        x[seen] for x in (a, points, moved, b, place, n, z, plane_m)
+    )
     mean_m = (z + plane_m) / 2
     middle = points * (mean_m / z)[:, None]
     before = (middle - t) @ R
     slope_there = np.sum((middle - t) * n, axis=1) * before[:, 2]
     slope_here = np.sum(place * n, axis=1) * place[:, 2] * (mean_m / plane_m) ** 2
     by_bias = slope_here[:, None] * basis[b] - slope_there[:, None] * basis[a]
+    along_there, along_here = (np.sum(moved[:, k : k + 3] * n, axis=1) for k in (0, 3))
+    by_readout = along_there * moved[:, 6] - along_here * moved[:, 7]
+    by_times = np.c_[np.zeros(len(a)), by_readout, along_there - along_here]
     residual = np.sum((points - place) * n, axis=1)
-    rows = np.c_[by_bias, np.cross(middle, n), n, residual]
+    rows = np.c_[by_bias, by_times, np.cross(middle, n), n, residual]
     return rows, middle[:, 2], np.stack([a, b], axis=1)

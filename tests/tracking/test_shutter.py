@@ -6,14 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ldo_service.calibration.knowledge import CameraKnowledge
 from ldo_service.calibration.shutter import FrameMotion, ShutterTiming
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import Odometry, OdometryConfig
 from ldo_service.tracking.alignment import align
+from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.motion import image_motion_rad
-from ldo_service.tracking.pyramid import build_reference, pyramid_of
+from ldo_service.tracking.pyramid import Pyramid, build_reference, pyramid_of
 from ldo_service.tracking.shutter import ShutterConfig, ShutterState
 from ldo_service.tracking.shutter_timing import MIN_GROUPS, TimingEvidence, band_equations
 from tests.moving_camera import MovingCamera
@@ -21,6 +23,7 @@ from tests.moving_camera import MovingCamera
 TIMING = ShutterTiming(0.024, 0.012, 0.010)
 RATE_HZ, COUNT = 30, 70
 CONFIG = OdometryConfig()
+SHUTTER = ShutterConfig()
 OFF = replace(CONFIG, shutter=ShutterConfig(is_on=False))
 
 
@@ -60,10 +63,11 @@ def test_known_timing_is_used_from_the_first_motion_on(
 ) -> None:
     known = replace(CONFIG, shutter=ShutterConfig(initial=TIMING))
     odometry = Odometry(known)
-    motions = [odometry.process(frame).motion for frame in frames[:20]]
+    # Later frames have enough evidence for an estimate.
+    motions = [odometry.process(frame).motion for frame in frames[:14]]
     assert motions[0] is None
     errors = []
-    for index in range(4, 20):
+    for index in range(4, 14):
         used = motions[index]
         assert used is not None
         assert used.timing == TIMING
@@ -154,6 +158,47 @@ def test_frames_at_2_hz_have_no_known_motion(camera: MovingCamera) -> None:
     odometry = Odometry(CONFIG)
     slow = [replace(camera.frame(i / RATE_HZ, TIMING, i), stamp_ns=i * 500_000_000) for i in (0, 1)]
     assert [odometry.process(frame).motion for frame in slow] == [None, None]
+
+
+def test_estimate_of_the_calibration_is_used_at_once_and_refined(
+    camera: MovingCamera, frames: list[RgbdFrame]
+) -> None:
+    near = ShutterTiming(0.027, 0.017, 0.007)
+    information = np.diag([0.002**-2, 0.004**-2, 0.002**-2])
+    known = CameraKnowledge(timing=np.c_[information, information @ near.times_s])
+    odometry, T_first = Odometry(CONFIG), camera.pose(0.0)
+    for i, frame in enumerate(frames[:40]):
+        result = odometry.process(frame, camera=known if i >= 4 else None)
+        if i == 4:
+            assert timing_of(odometry).times_s == pytest.approx(near.times_s)
+        T_true = se3.inverse(T_first) @ camera.pose(i / RATE_HZ)
+        assert se3.distances(se3.inverse(T_true) @ result.T_odom_camera) < 0.03
+    assert np.abs(np.subtract(timing_of(odometry).times_s, TIMING.times_s)).max() < 0.003
+
+
+def test_uncertain_estimate_of_the_calibration_is_not_used() -> None:
+    information = np.diag([0.01**-2] * 3)
+    state = ShutterState().informed(np.c_[information, information @ [0.02, 0.02, 0.0]], SHUTTER)
+    assert not state.timing
+    assert state.evidence.estimate() is not None
+
+
+def test_reference_follows_a_new_timing(camera: MovingCamera) -> None:
+    time_s = 1.6  # The camera turns by 68 degrees/s.
+    images = [camera.frame(time_s, timing) for timing in (TIMING, ShutterTiming())]
+    recorded, at_once = (pyramid_of(image, CONFIG.pyramid) for image in images)
+    keyframe = ReferenceKeyframe(recorded, np.eye(4), 0)
+    retimed = keyframe.retimed(TIMING, camera.velocity(time_s), CONFIG.pyramid)
+    assert retimed.motion is not None
+    assert retimed.motion.timing == TIMING
+
+    def error(a: Pyramid) -> float:
+        is_shown = (a.gray > 0) & (at_once.gray > 0)
+        return float(np.mean(np.abs(a.gray.astype(float) - at_once.gray)[is_shown]))
+
+    assert error(retimed.view) < 0.4 * error(recorded)
+    again = retimed.retimed(ShutterTiming(), np.zeros(6), CONFIG.pyramid)
+    assert error(again.view) > 0.8 * error(recorded)
 
 
 def test_evidence_keeps_its_sum_when_groups_are_merged() -> None:

@@ -1,0 +1,237 @@
+"""Comparison of two calibration views: depth, features and colors as linearized equations.
+
+The equations of depth and features have the shared unknowns of `BIAS` and `TIMES`, and the relative
+pose of the pair as their own unknowns. Points move with the velocity of the camera between the
+times at which the rows of color and depth are recorded. Conventions: `ldo_service.geometry`.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ldo_service.geometry import Camera
+from ldo_service.kernels import _surfaces
+
+from .correction import (
+    BIAS_TERMS,
+    VIGNETTING_TERMS,
+    bias_basis,
+    unbiased_depth,
+    vignetting_basis,
+)
+from .elimination import Block, student_weight
+from .views import (
+    SURFACE_STEP_M,
+    SURFACE_STEP_RATIO,
+    CalibrationView,
+    ViewPair,
+    block_centers,
+    reprojection,
+)
+
+TIME_TERMS = 3  # Readout of color, readout and delay of depth.
+BIAS = slice(0, BIAS_TERMS)
+TIMES = slice(BIAS_TERMS, BIAS_TERMS + TIME_TERMS)
+# Depth noise of structured light, meters (Nguyen et al., 2012): s0 + s1 (z - z0)^2.
+DEPTH_SIGMA = (0.0012, 0.0019, 0.4)
+# Weight of a depth residual relative to a feature; low, because neighboring points share errors.
+DEPTH_WEIGHT = 0.12
+FEATURE_SIGMA_PX = 1.0
+# Depth difference, as a fraction of depth, beyond which two points are on different surfaces.
+MAX_STEP_RATIO = 0.08
+# The normal of a surface must differ from a right angle to the viewing ray by this cosine. At a
+# smaller one, depth changes too fast along the surface.
+MIN_INCIDENCE = 0.2
+BLOCK_STRIDE = 3  # Every third block along each axis is compared; neighbors are alike.
+COLOR_STRIDE = 2  # Colors are compared at every second of these; neighbors have the same color.
+MIN_COMMON = 200  # Minimum number of compared colors; a pair with fewer is skipped for vignetting.
+CELLS = 8  # Cells of the image along its width.
+COLUMNS = TIMES.stop + 7  # Shared unknowns, relative pose and residual.
+
+
+@dataclass(frozen=True, slots=True)
+class CommonPoints:
+    """Surface points that both views of a pair show, as indices into their blocks."""
+
+    there: np.ndarray  # [N] in the first view.
+    here: np.ndarray  # [N] in the second one.
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedPair:
+    """Pair of views with the shared coefficients at which it is linearized."""
+
+    first: CalibrationView
+    second: CalibrationView
+    pair: ViewPair
+    shared: np.ndarray  # [6] coefficients of the bias, then times of the shutter.
+
+
+@lru_cache(maxsize=2)
+def block_grid(camera: Camera, block: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rays, bias basis and vignetting basis of the blocks of a view, each [h w, 3]."""
+    u, v = block_centers(camera, block)
+    bases = bias_basis(u, v, camera), vignetting_basis(u, v, camera)
+    rays, bias, vignetting = (b.reshape(-1, 3) for b in (camera.rays_at(u, v), *bases))
+    return rays, bias, vignetting
+
+
+def view_surface(view: CalibrationView, coefficients: np.ndarray) -> np.ndarray:
+    """Return points and normals [h w, 6] of a view; see `_surfaces.surfaces`."""
+    rays, basis, _ = block_grid(view.camera, view.block)
+    bias = (basis @ coefficients).reshape(view.depth_m.shape)
+    depth_m = unbiased_depth(view.depth_m.astype(np.float64), bias)
+    result = np.empty((len(rays), 6))
+    _surfaces.surfaces(depth_m, rays, SURFACE_STEP_RATIO, SURFACE_STEP_M, result)
+    return result
+
+
+def depth_block(
+    compared: ComparedPair, there: np.ndarray, here: np.ndarray
+) -> tuple[Block, CommonPoints]:
+    """Compare the surfaces of both views of a pair; see `_surfaces.compare`."""
+    view, (_, depth_readout_s, delay_s) = compared.first, compared.shared[TIMES].tolist()
+    height, width = view.depth_m.shape
+    most = -(-height // BLOCK_STRIDE) * -(-width // BLOCK_STRIDE)
+    rows, depths, indices = np.empty((most, COLUMNS)), np.empty(most), np.empty((most, 2), np.int64)
+    count = _surfaces.compare(
+        there,
+        here,
+        block_grid(view.camera, view.block)[1],
+        compared.pair.T_second_first,
+        view.velocity,
+        compared.second.velocity,
+        (depth_readout_s, delay_s),
+        (view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy),
+        view.block,
+        width,
+        BLOCK_STRIDE,
+        MAX_STEP_RATIO,
+        rows,
+        depths,
+        indices,
+    )
+    rows, depths, (a, b) = rows[:count], depths[:count], indices[:count].T
+    s0, s1, z0 = DEPTH_SIGMA
+    sigma_m, residual = s0 + s1 * (depths - z0) ** 2, rows[:, -1]
+    spread = max(1.48 * np.median(abs(residual / sigma_m)), 0.5) if count else 1.0
+    weight = DEPTH_WEIGHT * student_weight(residual, sigma_m * spread)
+    return Block(rows, weight, _cells(b, width)), CommonPoints(a, b)
+
+
+def _cells(blocks: np.ndarray, width: int) -> np.ndarray:
+    """Return the number of the cell of each block, given as a flat index into rows of `width`."""
+    row, column = np.divmod(blocks, width)
+    return (row * CELLS // width) * CELLS + column * CELLS // width
+
+
+def feature_block(compared: ComparedPair, there: np.ndarray) -> Block:
+    """Return the linearized reprojection errors of the features in pixels; u and v alternate.
+
+    Args:
+        compared: The pair.
+        there: Points and normals of the first view, [h w, 6].
+    """
+    view, pair, camera = compared.first, compared.pair, compared.first.camera
+    (readout_s, depth_readout_s, delay_s), T = compared.shared[TIMES], pair.T_second_first
+    row_there, row_here = (
+        _rows(pixels, camera) for pixels in (pair.pixels_first, pair.pixels_second)
+    )
+    u, v = pair.pixels_first.T
+    rays, basis = camera.rays_at(u, v), bias_basis(u, v, camera)
+    measured_m = unbiased_depth(pair.depth_first_m, basis @ compared.shared[BIAS])
+    # Depth at the time of the color row, at the point at the time of the middle row, transformed
+    # to the second view, at the time of the color row there.
+    z_per_s = _depth_speed(view, there, rays, measured_m, pair.pixels_first)
+    z = measured_m + z_per_s * (delay_s + (depth_readout_s - readout_s) * row_there)
+    points = rays * z[:, None]
+    speed_there = _speed(points, view.velocity)
+    at_middle = points + speed_there * (readout_s * row_there)[:, None]
+    at_middle = at_middle @ T[:3, :3].T + T[:3, 3]
+    speed_here = _speed(at_middle, compared.second.velocity)
+    here = at_middle - speed_here * (readout_s * row_here)[:, None]
+    errors, by_point, _ = reprojection(camera, np.eye(4), here, pair.pixels_second)
+    by_place = by_point[..., 3:]
+    # Directions in which the places move per unit of depth. The small turns by the motion matter,
+    # because a place that moves along its own ray keeps its pixel.
+    along = _turned(rays, view.velocity, readout_s * row_there) @ T[:3, :3].T
+    along = _turned(along, compared.second.velocity, -readout_s * row_here)
+    # The depth of a point on a ray changes by -z^2 per unit of the bias.
+    by_bias = -(by_place @ along[..., None]) * (measured_m**2)[:, None, None] * basis[:, None]
+    by_depth = along * z_per_s[:, None]
+    by_row = by_depth * row_there[:, None]
+    by_readout = (speed_there @ T[:3, :3].T) * row_there[:, None] - speed_here * row_here[:, None]
+    by_times = by_place @ np.stack([by_readout - by_row, by_row, by_depth], axis=-1)
+    columns = [by_bias, by_times, by_point, errors[..., None]]
+    rows = np.concatenate(columns, axis=-1).reshape(-1, COLUMNS)
+    return Block(rows, student_weight(rows[:, -1], FEATURE_SIGMA_PX), np.zeros(0, int))
+
+
+def _rows(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the image rows of pixels [N, 2] as fractions of the height, -0.5..0.5."""
+    return pixels[:, 1] / (camera.height - 1) - 0.5
+
+
+def _speed(points: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Return the velocity [6] of the camera at points [N, 3] in the camera frame, m/s."""
+    return np.cross(velocity[:3], points) + velocity[3:]
+
+
+def _turned(vectors: np.ndarray, velocity: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """Return vectors [N, 3] turned by the rotation of the camera within times [N]."""
+    return vectors + np.cross(velocity[:3], vectors) * times_s[:, None]
+
+
+def _depth_speed(
+    view: CalibrationView,
+    surface: np.ndarray,
+    rays: np.ndarray,
+    depth_m: np.ndarray,
+    pixels: np.ndarray,
+) -> np.ndarray:
+    """Return the difference of depth at pixels per second from color to depth, [N] m/s.
+
+    Depth at the time of color is the measured depth plus this value times the delay of depth after
+    color. The value is that of the tangent plane; 0 where there is no plane.
+
+    Args:
+        view: View.
+        surface: Points and normals of its blocks, [h w, 6].
+        rays: Rays of the pixels, [N, 3].
+        depth_m: Depth of the pixels, [N].
+        pixels: Pixels, [N, 2].
+    """
+    height, width = view.depth_m.shape
+    column, row = ((pixels + 0.5) // view.block).astype(int).T
+    column, row = np.clip(column, 0, width - 1), np.clip(row, 0, height - 1)
+    normals = surface[row * width + column, 3:]
+    incidence = np.sum(normals * rays, axis=1)
+    is_known = abs(incidence) > MIN_INCIDENCE
+    along = np.sum(normals * _speed(rays * depth_m[:, None], view.velocity), axis=1)
+    return np.where(is_known, along / np.where(is_known, incidence, 1.0), 0.0)
+
+
+def color_block(
+    first: CalibrationView, second: CalibrationView, points: CommonPoints
+) -> Block | None:
+    """Compare the colors of two views at their common points.
+
+    Returns:
+        A block of the three channels, whose weights are 1. Its own unknowns are gain and offset.
+        None if there are fewer than MIN_COMMON points.
+    """
+    is_exposed = first.is_exposed.reshape(-1)[points.there]
+    is_exposed &= second.is_exposed.reshape(-1)[points.here]
+    a, b = points.there[is_exposed][::COLOR_STRIDE], points.here[is_exposed][::COLOR_STRIDE]
+    if len(a) < MIN_COMMON:
+        return None
+    there = first.color.reshape(-1, 3)[a].T.astype(np.float64)
+    here = second.color.reshape(-1, 3)[b].T.astype(np.float64)
+    _, _, basis = block_grid(first.camera, first.block)
+    level = (there + here) / 2.0
+    rows = np.empty((3, len(a), VIGNETTING_TERMS + 3))
+    rows[..., :3] = level[..., None] * (basis[a] - basis[b])
+    rows[..., 3], rows[..., 4] = level, 1.0
+    rows[..., 5] = level * np.log(here / there)
+    return Block(rows, np.ones(level.shape), _cells(b, first.depth_m.shape[1]))

@@ -1,0 +1,17 @@
+"""Estimates of a camera that tracking uses beside the correction of its images."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CameraKnowledge:
+    """Estimates of a camera, and their uncertainty, that tracking uses beside the correction."""
+
+    # Standard deviation of the coefficients of the depth bias, as a multiple of that of an unknown
+    # camera; 0 if there is no bias.
+    relative_bias_sigma: float = 0.0
+    # Information [3, 3] in 1/s^2 and right side [3] of the times of the shutter, [3, 4]; their
+    # solution is the estimate in the order of `ShutterTiming`. None before the first estimate.
+    timing: np.ndarray | None = None
