@@ -188,8 +188,8 @@ def _execute(
         report = report_of(list(outcomes.values()), wall_s, is_interrupted=is_interrupted)
         save_report(work.out, report)
 
-    console.print(f"batch: looking for results of {len(found)} recordings")
     save(is_interrupted=True)  # A folder that cannot be written is found before hours of runs.
+    console.print(f"batch: looking for results of {len(found)} recordings")
     is_interrupted = True
     try:
         for outcome in outcomes.values():
