@@ -148,7 +148,8 @@ def _calibration(path: Path, left: int, right: int, images: list[Path]) -> _Ster
     P, P_right = matrices[f"P{left}"], matrices[f"P{right}"]
     K = P[:, :3]
     try:
-        camera = Camera(*first_size(images), *map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+        fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        camera = Camera(*first_size(images), fx, fy, cx, cy)
         T_camera_camera0 = np.eye(4)
         T_camera_camera0[:3, 3] = np.linalg.solve(K, P[:, 3])
         baseline_m = float(P[0, 3] - P_right[0, 3]) / camera.fx

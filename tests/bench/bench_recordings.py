@@ -175,7 +175,7 @@ def disturbed(T_world_camera: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("source")
     parser.add_argument("--max-frames", type=int, default=200)
     parser.add_argument("--stride", type=int, default=1, help="make the camera N times as fast")
