@@ -1,54 +1,91 @@
 """Confirmation of Gaussians: each must be visible in the image of at least one keyframe."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from .fitting import random_for
-from .keyframe_renderer import KeyframeRenderer
 from .keyframe_store import KeyframeStore
-from .model import GaussianMap
 from .pruning import PruningConfig
+from .renderer import VisibleGaussians
 
 
 class Confirmation:
-    """Search for hidden Gaussians, among the Gaussians that are anchored to two keyframes per call.
+    """Choice of the keyframes whose Gaussians are checked with each new keyframe.
 
     Args:
         store: Store of the keyframe images.
-        renderer: Renderer of the map at these keyframes.
         config: Criteria; `confirm_keyframes` and `min_weight_px` are used.
         seed: Seed of the random choice of keyframes.
     """
 
-    def __init__(
-        self, store: KeyframeStore, renderer: KeyframeRenderer, config: PruningConfig, seed: int
-    ) -> None:
-        self._store, self._renderer = store, renderer
-        self._config, self._seed = config, seed
+    def __init__(self, store: KeyframeStore, config: PruningConfig, seed: int) -> None:
+        self._store, self._config, self._seed = store, config, seed
 
-    def hidden_mask(self, gaussians: GaussianMap, newest: int) -> np.ndarray:
-        """Return the mask of the hidden Gaussians that are anchored to either of two keyframes.
+    def start(self, newest: int, gaussians: int) -> "VisibilityCheck":
+        """Start a check of the Gaussians of two keyframes.
 
         The first keyframe is the newest one that has `confirm_keyframes` later keyframes. The
         second one is drawn at random from the first one and all earlier keyframes, since the map
-        around old keyframes also changes. The map is rendered at these two keyframes and at the
-        newest one. A Gaussian is hidden if its blending weights sum to less than `min_weight_px` in
-        each of these images.
+        around old keyframes also changes. There are none while there are too few keyframes, or if
+        `min_weight_px` is 0.
 
         Args:
-            gaussians: The map.
             newest: Id of the newest keyframe.
-
-        Returns:
-            Mask [N] bool. All False while there are too few keyframes, or if `min_weight_px` is 0.
+            gaussians: Number of Gaussians in memory.
         """
         age, min_px = self._config.confirm_keyframes, self._config.min_weight_px
         older = [k for k in self._store.keyframes() if k < newest][: 1 - age or None]
-        if not older or min_px == 0:
-            return np.zeros(len(gaussians), bool)
-        rng = random_for(self._seed, newest, 1)
-        chosen = {older[-1], older[int(rng.integers(len(older)))]}
-        shown = np.zeros(len(gaussians), np.float32)
-        for keyframe in (newest, *sorted(chosen)):
-            made_by = self._renderer.contributions(gaussians, keyframe)
-            shown[made_by.indices] = np.maximum(shown[made_by.indices], made_by.weights)
-        return np.isin(gaussians.anchors, list(chosen)) & (shown < min_px)
+        chosen: set[int] = set()
+        if older and min_px > 0:
+            rng = random_for(self._seed, newest, 1)
+            chosen = {older[-1], older[int(rng.integers(len(older)))]}
+        return VisibilityCheck(newest, sorted(chosen), gaussians, min_px)
+
+
+class VisibilityCheck:
+    """Search for hidden Gaussians, by their blending weights in optimizer iterations.
+
+    The optimizer computes the weights anyway, so the check needs no renderings of its own. Such
+    renderings took 6 % of the mapper's CPU time in the kitchen.
+
+    Args:
+        newest: Id of the newest keyframe.
+        keyframes: Older keyframes whose Gaussians are checked.
+        gaussians: Number N of Gaussians, which must not change during the check.
+        min_weight_px: Least sum of a visible Gaussian's blending weights over an image.
+
+    Attributes:
+        keyframes: As above.
+    """
+
+    def __init__(
+        self, newest: int, keyframes: Sequence[int], gaussians: int, min_weight_px: float
+    ) -> None:
+        self.keyframes = keyframes
+        self._newest, self._min_weight_px = newest, min_weight_px
+        self._seen: set[int] = set()  # Keyframes on which at least one iteration ran.
+        self._largest_px = np.zeros(gaussians, np.float32)
+
+    def observe(self, keyframe: int, visible: VisibleGaussians) -> None:
+        """Record the weights of one iteration; ignore keyframes that are not part of the check."""
+        if keyframe == self._newest or keyframe in self.keyframes:
+            self._seen.add(keyframe)
+            before = self._largest_px[visible.indices]
+            self._largest_px[visible.indices] = np.maximum(before, visible.weights)
+
+    def hidden_mask(self, anchors: np.ndarray) -> np.ndarray:
+        """Return the mask of the hidden Gaussians that are anchored to the checked keyframes.
+
+        A Gaussian is hidden if its blending weights sum to less than `min_weight_px` in each
+        iteration on the newest keyframe and on the checked keyframes. If no iteration ran on its
+        anchor keyframe or on the newest keyframe, it does not count as hidden.
+
+        Args:
+            anchors: Anchor keyframe of each Gaussian, [N].
+
+        Returns:
+            Mask [N] bool.
+        """
+        known = [k for k in self.keyframes if k in self._seen] if self._newest in self._seen else []
+        return np.isin(anchors, known) & (self._largest_px < self._min_weight_px)

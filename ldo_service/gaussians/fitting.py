@@ -12,7 +12,7 @@ from ldo_service.errors import ConfigError, named
 
 from .keyframe_store import KeyframeViews
 from .model import GaussianMap
-from .optimizer import GaussianOptimizer, GaussianOptimizerConfig
+from .optimizer import GaussianOptimizer, GaussianOptimizerConfig, Observer
 from .training_views import TrainingView, covisibility_ratio, sample_training_views, sampled_surface
 
 # Number of random draws per needed keyframe. The additional draws replace drawn keyframes that may
@@ -96,19 +96,20 @@ class Fitting:
         """Drop the moments that the Gaussian optimizer keeps for the pose of a keyframe."""
         self._optimizer.forget_view(keyframe)
 
-    def plan(self, newest: TrainingView, iterations: int) -> list[int]:
+    def plan(self, newest: TrainingView, iterations: int, checked: Sequence[int] = ()) -> list[int]:
         """Choose the keyframe of each iteration that runs after a new keyframe.
 
         Args:
             newest: The new keyframe.
             iterations: Number of iterations.
+            checked: Older keyframes that are used once each, after the first iteration.
 
         Returns:
             Ids of the keyframes, one per iteration.
         """
         window, rng = self._window, random_for(self._seed, newest.keyframe)
         older = [k for k in self._views.store.keyframes() if k != newest.keyframe]
-        return sample_training_views(
+        plan = sample_training_views(
             newest.keyframe,
             self._covisible(newest, older, rng),
             older,
@@ -117,6 +118,7 @@ class Fitting:
             newest_share=window.newest_share,
             covisible_share=window.covisible_share,
         )
+        return [*plan[:1], *checked, *plan[1:]][:iterations]
 
     def _covisible(
         self, newest: TrainingView, older: list[int], rng: np.random.Generator
@@ -165,6 +167,7 @@ class Fitting:
         plan: Iterable[int],
         rates: tuple[float, float] = (1.0, 1.0),
         effort: float = inf,
+        observe: Observer | None = None,
     ) -> np.ndarray:
         """Run one iteration for each usable keyframe of the plan.
 
@@ -176,6 +179,7 @@ class Fitting:
             plan: Keyframes, in the order of the iterations.
             rates: Factors on the learning rates at the first and at the last iteration.
             effort: Limit of the computation; see `GaussianOptimizer.optimize`.
+            observe: Function that receives the visible Gaussians of each iteration.
 
         Returns:
             Mask [N] of the Gaussians that changed.
@@ -187,7 +191,13 @@ class Fitting:
         plan = [k for k in plan if k in usable]
         first = next(iter(self._views.poses), None)
         losses = self._optimizer.optimize(
-            gaussians, self._views, plan, rates=rates, fixed=first, effort=effort
+            gaussians,
+            self._views,
+            plan,
+            rates=rates,
+            fixed=first,
+            effort=effort,
+            observe=observe,
         )
         self.iterations += len(losses)
         return self._optimizer.steps(gaussians) != steps_before

@@ -6,7 +6,7 @@ from ldo_service.geometry import Camera, se3
 
 from .keyframe_store import KeyframeViews
 from .model import GaussianMap
-from .renderer import Contributions, Rendering, RenderMemory, render
+from .renderer import Rendering, RenderMemory, render
 
 
 class KeyframeRenderer:
@@ -65,10 +65,3 @@ class KeyframeRenderer:
                 self.render_from(gaussians, camera, pose, contributions=contributions),
             )
         return self._cached[1]
-
-    def contributions(self, gaussians: GaussianMap, keyframe: int) -> Contributions:
-        """Return the contributions of the Gaussians to the image of a keyframe, without caching."""
-        camera, pose = self._views.cameras[keyframe], self._views.poses[keyframe]
-        shown = self.render_from(gaussians, camera, pose, contributions=True).contributions
-        assert shown is not None
-        return shown

@@ -20,6 +20,7 @@ from .keyframe_store import KeyframeStore, KeyframeViews
 from .map_builder_config import MapBuilderConfig
 from .model import GaussianBatch, GaussianMap
 from .offloading import OffloadedGaussians, iter_all_gaussians
+from .optimizer import Observer
 from .pruning import find_duplicates, prunable_mask
 from .renderer import Contributions, Rendering
 from .training_views import TrainingView, visible_in_mask
@@ -59,9 +60,7 @@ class MapBuilder:
         self.views = KeyframeViews(KeyframeStore(folder and folder / "images", self.config.store))
         self._threads = threads
         self._renderer = KeyframeRenderer(self.views, threads)
-        self._confirmation = Confirmation(
-            self.views.store, self._renderer, self.config.pruning, self.config.seed
-        )
+        self._confirmation = Confirmation(self.views.store, self.config.pruning, self.config.seed)
         self.fitting = Fitting(
             self.config.optimizer,
             self.config.window,
@@ -110,11 +109,13 @@ class MapBuilder:
         for forgotten in self.views.add(view):
             self._published.forget(forgotten)
             self.fitting.forget_view(forgotten)
-        plan = self.fitting.plan(view, MAX_ITERATIONS_PER_EFFORT * iterations)
-        touched = self._fit(plan, effort=iterations)
+        check = self._confirmation.start(keyframe, len(self.gaussians))
+        plan = self.fitting.plan(view, MAX_ITERATIONS_PER_EFFORT * iterations, check.keyframes)
+        touched = self._fit(plan, effort=iterations, observe=check.observe)
+        mask = check.hidden_mask(self.gaussians.anchors)
         if len(self.views) % self.config.prune_keyframes == 0:
-            self._prune_misshapen(touched)
-        self._remove(self._confirmation.hidden_mask(self.gaussians, keyframe))
+            mask |= self._misshapen_mask(touched)
+        self._remove(mask)
 
     def render_from(
         self, camera: Camera, T_map_camera: np.ndarray, *, contributions: bool = False
@@ -222,9 +223,13 @@ class MapBuilder:
         return self.fitting.iterations - before
 
     def _fit(
-        self, plan: Iterable[int], rates: tuple[float, float] = (1.0, 1.0), effort: float = inf
+        self,
+        plan: Iterable[int],
+        rates: tuple[float, float] = (1.0, 1.0),
+        effort: float = inf,
+        observe: Observer | None = None,
     ) -> np.ndarray:
-        touched = self.fitting.fit(self.gaussians, plan, rates, effort)
+        touched = self.fitting.fit(self.gaussians, plan, rates, effort, observe)
         self._log.changed(touched)
         return touched
 
@@ -259,15 +264,11 @@ class MapBuilder:
         return int(np.count_nonzero(mask))
 
     # --- pruning ----------------------------------------------------------------------------------
-    def _prune_misshapen(self, touched: np.ndarray) -> None:
-        """Remove transparent or oversized Gaussians among the rows where `touched` [N] is true.
-
-        Other rows are not checked, so that the computing time does not grow with the map.
-        """
-        among = np.flatnonzero(touched)
-        mask = np.zeros(len(self.gaussians), bool)
-        mask[among] = prunable_mask(self.gaussians.rows[among], self.config.pruning)
-        self._remove(mask)
+    def _misshapen_mask(self, touched: np.ndarray) -> np.ndarray:
+        """Return the mask of transparent or oversized rows among the rows in `touched` [N]."""
+        mask = touched.copy()  # Few rows, so the time does not grow with the map.
+        mask[touched] = prunable_mask(self.gaussians.rows[touched], self.config.pruning)
+        return mask
 
     def _remove(self, mask: np.ndarray) -> None:
         self._log.mark_removed(self.gaussians, mask)

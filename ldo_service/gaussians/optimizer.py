@@ -1,6 +1,6 @@
 """Optimization of the map against keyframes: Gaussians, exposures and, optionally, poses."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
 from typing import Protocol
@@ -14,13 +14,16 @@ from .adam import Adam, AdamConfig
 from .exposure import Exposure, estimate_exposure
 from .loss import ImageLoss, LossWeights, image_loss
 from .model import GaussianMap
-from .renderer import Rasterizer
+from .renderer import Rasterizer, VisibleGaussians
 from .training_views import TrainingView
 
 # Constants of Adam for keyframe poses. A pose gets few steps, so its moments average over more
 # steps than those of the Gaussians.
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 WIDTH = 6  # Size of the tangent vector of a pose: rotation, then translation.
+
+
+Observer = Callable[[int, VisibleGaussians], None]
 
 
 class PoseAdam:
@@ -131,12 +134,12 @@ class IterationResult:
     Attributes:
         loss: Loss before the step.
         view: The training view with exposure and pose after the step.
-        reached: Number of Gaussians that may touch the image.
+        visible: Gaussians that may touch the image; valid until the next rendering.
     """
 
     loss: ImageLoss
     view: TrainingView
-    reached: int  # Gaussians that may touch the image
+    visible: VisibleGaussians
 
 
 class Views(Protocol):
@@ -179,6 +182,7 @@ class GaussianOptimizer:
         rates: tuple[float, float] = (1.0, 1.0),
         fixed: int | None = None,
         effort: float = inf,
+        observe: Observer | None = None,
     ) -> list[ImageLoss]:
         """Run one iteration for each training view of a plan.
 
@@ -195,6 +199,8 @@ class GaussianOptimizer:
             effort: Limit of the computing time, in iterations with `usual_reach` visible Gaussians.
                 An iteration with r times as many visible Gaussians counts as (1 + r) / 2. No
                 iteration starts once the sum has reached `effort`.
+            observe: Function that is called after each iteration with the keyframe and the visible
+                Gaussians; None for none.
 
         Returns:
             Loss before each step, for the iterations that were run.
@@ -207,8 +213,10 @@ class GaussianOptimizer:
             step = self.step(gaussians, view, rate=rate, is_fixed=keyframe == fixed)
             if step.view is not view:
                 views[keyframe] = step.view
+            if observe is not None:
+                observe(keyframe, step.visible)
             losses.append(step.loss)
-            spent += (1 + step.reached / self.config.usual_reach) / 2
+            spent += (1 + len(step.visible.indices) / self.config.usual_reach) / 2
         return losses
 
     def step(
@@ -247,7 +255,7 @@ class GaussianOptimizer:
             threads=self.threads,
         )
         # Compute the gradients and take a step.
-        reached = self._adam.step_fused(
+        visible = self._adam.step_fused(
             gaussians,
             self._rasterizer,
             by_planes,
@@ -257,8 +265,8 @@ class GaussianOptimizer:
             max_sigma_px=config.max_sigma_px,
         )
         if not is_fixed:
-            view = self._placed(view, reached.xi, rate)
-        return IterationResult(loss, view, len(reached.indices))
+            view = self._placed(view, visible.xi, rate)
+        return IterationResult(loss, view, visible)
 
     def _room_for(self, planes: np.ndarray) -> np.ndarray:
         if self._by_planes.shape != planes.shape:
