@@ -176,6 +176,7 @@ def run_service(
         session = stack.enter_context(open_session(network))
         monitor = Monitor(session, network)
         assert client.wait_for_subscriber(60)
+        wait_for_actors(monitor)
         stop = threading.Event()
         camera = threading.Thread(target=stream, args=(client, sequence, options.hz, stop))
         camera.start()
@@ -213,6 +214,15 @@ def connect_patiently(stack: ExitStack, network: Endpoint) -> Client:
         except ConfigError:  # The router of the service is not open yet.
             time.sleep(0.5)
     raise SystemExit(f"no service at {network.endpoint}")
+
+
+def wait_for_actors(monitor: Monitor) -> None:
+    """Wait until the mapper and all back ends have started."""
+    for _ in range(240):
+        if {"mapper", *SLOW_BACKENDS["all"]} <= monitor.health.keys():
+            return
+        time.sleep(0.5)
+    raise SystemExit(f"only these actors have started: {sorted(monitor.health)}")
 
 
 def stream(client: Client, sequence: Sequence, hz: float, stop: threading.Event) -> None:
