@@ -24,11 +24,12 @@ from .inlet import Delivery
 from .journal import Journal, Kind, close_journal
 from .mailbox import Mailbox
 from .outlets import OutletOpener, Outlets
+from .restoring import ActorRestorer, FailureLog
 from .stage_commands import CommandReceiver, StageCommand
 from .stage_metrics import StageMetrics
 from .state_saver import StateSaver, UnsavedStateError
 from .step import MessageDecoder, Produced, produce
-from .supervision_policy import RestartBudget, SupervisionConfig
+from .supervision_policy import SupervisionConfig
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +73,7 @@ class Stage:
             journal: Receiver of the journal entries.
             heartbeat: Heartbeat of this process; None if no parent process reads it.
         """
-        self._make, self._transport = make, transport
+        self._transport = transport
         self._config = config = config or SupervisionConfig()
         store = store or MemoryStore()
         self._checkpointer = Checkpointer(store)
@@ -80,13 +81,17 @@ class Stage:
             transport, config, store, expected or {}, with_backlog or {}, on_evicted
         )
         self._journal = journal or Journal()
-        self._actor = self._restored_actor()
-        self.name = self._actor.name
-        self._epoch = new_epoch()
         self._metrics = StageMetrics(heartbeat)
-        self._budget = RestartBudget.of(self.name, config)
+        self._restorer = ActorRestorer(
+            make, self._checkpointer, self._journal, self._metrics, config
+        )
+        self._actor = self._restorer.restore()
+        self.name = self._actor.name
+        self._restorer.open_budget(self.name)
+        self._epoch = new_epoch()
         self._drain_requested = False
         self._is_idle_failed = False  # The last idle work failed.
+        self._failure_log = FailureLog()
         self._mailbox: Mailbox | None = None
         self._reader = MessageDecoder(self.name)
         self._outlets = Outlets()
@@ -211,17 +216,15 @@ class Stage:
 
     async def _step(self, message: Message, delivery: Delivery) -> None:
         self._is_idle_failed = False
-        for _attempt in range(2):
+        for attempt in range(2):
             if await self._try(message, delivery):
+                if attempt:
+                    self._restorer.charge()  # The fault was not in the message.
                 return
         self._metrics.dead_lettered += 1
         self._journal.record_step("dead_lettered", FlowStatus())
         await self._saver.save(self._actor, delivery)
-        log.error(
-            "%s: message %s (stamp %d ns) failed twice and is discarded as a dead letter. The "
-            "traceback is above; please report it with the recording.",
-            self.name, type(message).__name__, message.stamp_ns,
-        )  # fmt: skip
+        self._failure_log.dead_lettered(self.name, message, self._metrics.dead_lettered)
 
     async def _try(self, message: Message, delivery: Delivery) -> bool:
         """Handle a message; return False if the handler failed."""
@@ -273,9 +276,9 @@ class Stage:
         except UnsavedStateError:
             raise
         except Exception as error:
-            log.exception("%s: %s failed; restoring the actor.", self.name, what)
+            self._failure_log.step_failed(self.name, what, is_of_message=delivery is not None)
             self._journal.record_step(kinds[1], self._actor.situation, error=repr(error))
-            await self._restart()
+            await self._restart(is_charged=delivery is None)
             return None
         self._journal.record_step(kinds[0], self._actor.situation, produced)
         await self._outlets.release(is_saved=is_saved)
@@ -340,50 +343,40 @@ class Stage:
     async def _reset(self, mailbox: Mailbox) -> None:
         """Replace the actor by a new, empty one under a new epoch; other actors connect again."""
         self._checkpointer.forget(self.name)
-        self._actor = await self._worker.run(self._restored_actor)
+        self._actor = await self._worker.run(self._restorer.restore)
         self._epoch = new_epoch()
         self._metrics.facts = {}
         mailbox.reset()
         self._outlets.restart_numbering(self._epoch)
         await self._saver.save(self._actor)
 
-    # --- in the actor's thread ------------------------------------------------------------------
-    def _restored_actor(self) -> Actor:
-        self._journal.record_files()  # First, because the new actor changes these files.
-        actor = self._checkpointer.restore_actor(self._make)
-        self._journal.record_start(self._checkpointer.past.of_actor or None)
-        return actor
-
-    async def _restart(self) -> None:
-        """Restore the actor's last saved state, after a delay that doubles with each failure."""
-        while True:
-            self._metrics.failures += 1
-            await asyncio.sleep(self._budget.record_failure(asyncio.get_running_loop().time()))
-            try:
-                self._actor = await self._worker.run(self._restored_actor)
-            except Exception:
-                log.exception(
-                    "%s: restoring its last state failed; retrying within the restart budget. If "
-                    "the service ends, start with an empty map in another folder (--state).",
-                    self.name,
-                )
-                continue
-            self._metrics.restarts += 1
-            self._outlets.discard()
-            await self._publish_restored()
-            return
+    async def _restart(self, *, is_charged: bool) -> None:
+        """Restore the actor's last saved state; see `ActorRestorer.restart`."""
+        self._actor = await self._restorer.restart(self._worker, is_charged=is_charged)
+        self._outlets.discard()
+        await self._publish_restored()
 
     # --- health ---------------------------------------------------------------------------------
     async def _heartbeat_loop(self, mailbox: Mailbox) -> None:
         while True:
-            mailbox.send_credits()
-            self._outlets.check_windows()
-            header = Header(self.name, self._epoch, 0, self._metrics.last_stamp_ns)
-            self._health.post(encode_link(header), encode(self.health()))
+            self._metrics.clock.tick(self._config.heartbeat_s)
+            try:
+                mailbox.send_credits()
+                self._outlets.check_windows()
+                self._publish_health()
+            except Exception:
+                # A heartbeat reports on the actor, so its own failure must not end the actor.
+                self._metrics.failures += 1
+                log.exception("%s: a heartbeat failed; the actor continues. Please report the "
+                              "traceback.", self.name)  # fmt: skip
             limit_s, setting = self._config.step_limit(self._actor.is_backend)
             if self._metrics.busy_s > limit_s:
                 raise StageStalled(self.name, self._metrics.busy_s, setting)
             await asyncio.sleep(self._config.heartbeat_s)
+
+    def _publish_health(self) -> None:
+        header = Header(self.name, self._epoch, 0, self._metrics.last_stamp_ns)
+        self._health.post(encode_link(header), encode(self.health()))
 
     def health(self) -> Health:
         """Return the current health message."""

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from ldo_service.schemas import Health, Message
 
 from ._heartbeat import Heartbeat
 from .process import resident_mb
+from .supervision_policy import RunningClock
 
 
 @dataclass
@@ -35,16 +37,17 @@ class StageMetrics:
     facts: dict[str, float] = field(
         default_factory=dict
     )  # The actor's metrics after its last step.
+    clock: RunningClock = field(default_factory=RunningClock)  # Clock of `started_at_s`.
 
     @contextmanager
     def step(self) -> Iterator[None]:
         """Measure the duration of the step in the block, unless the step raises an exception."""
-        started_s = self.started_at_s = time.monotonic()
+        started_s = self.started_at_s = self.clock.now_s()
         if self.heartbeat is not None:
             self.heartbeat.begin()
         try:
             yield
-            self.last_step_ms = 1e3 * (time.monotonic() - started_s)
+            self.last_step_ms = 1e3 * (self.clock.now_s() - started_s)
         finally:
             self.started_at_s = None
             if self.heartbeat is not None:
@@ -68,7 +71,7 @@ class StageMetrics:
     def busy_s(self) -> float:
         """Seconds since the start of the current step; 0 between steps."""
         started_s = self.started_at_s
-        return 0.0 if started_s is None else time.monotonic() - started_s
+        return 0.0 if started_s is None else max(self.clock.now_s() - started_s, 0.0)
 
     def health(self, **of_the_stage: Any) -> Health:
         """Return the health message; `of_the_stage` has the fields that only the stage knows."""
@@ -87,6 +90,7 @@ class StageMetrics:
             step_ms_p50=float(np.percentile(step_ms, 50)),
             step_ms_p95=float(np.percentile(step_ms, 95)),
             rss_mb=resident_mb(),
-            metrics=self.facts,
+            # A metric that is no number must not suppress the heartbeat.
+            metrics={name: value for name, value in self.facts.items() if isfinite(value)},
             **of_the_stage,
         )

@@ -1,6 +1,8 @@
-"""Limits of supervision: step timeouts, restart budgets and back-off."""
+"""Limits of supervision: step timeouts, restart budgets, back-off and repeated log lines."""
 
+import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from ldo_service.errors import ConfigError, RestartsExhausted, named
@@ -37,12 +39,73 @@ class RestartBudget:
             RestartsExhausted: The budget is used up.
         """
         self._failed_at_s.append(now_s)
-        while self._failed_at_s[0] < now_s - self._window_s:
-            self._failed_at_s.popleft()
-        recent = len(self._failed_at_s)
-        if recent > self._max_restarts:
+        delay_s = self.delay_s(now_s)
+        if (recent := len(self._failed_at_s)) > self._max_restarts:
             raise RestartsExhausted(self._name, recent, self._window_s)
+        return delay_s
+
+    def delay_s(self, now_s: float) -> float:
+        """Return the delay before a restart that does not count, in seconds."""
+        while self._failed_at_s and self._failed_at_s[0] < now_s - self._window_s:
+            self._failed_at_s.popleft()
+        recent = max(len(self._failed_at_s), 1)
         return min(self._delay_s * 2.0 ** min(recent - 1, 60), self._delay_max_s)
+
+
+class LogLimit:
+    """Limit of a log line that outside input can cause: one line per period.
+
+    Args:
+        period_s: Minimum time between two lines, seconds.
+        clock: Monotonic clock, seconds.
+    """
+
+    def __init__(self, period_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._period_s, self._clock = period_s, clock
+        self._due_at_s = float("-inf")
+
+    def is_due(self) -> bool:
+        """Return whether to write the line now."""
+        now_s = self._clock()
+        if now_s < self._due_at_s:
+            return False
+        self._due_at_s = now_s + self._period_s
+        return True
+
+
+class RunningClock:
+    """Monotonic clock that stands still while this process does not run.
+
+    A process does not run while it is suspended (SIGSTOP), while its container is paused, or while
+    its virtual machine is moved. Such a time must not count as a hanging step. The clock notices it
+    because `tick`, which is called periodically, is late.
+    """
+
+    # Delay of `tick` above which the process did not run, seconds. A busy machine delays it less.
+    MAX_LATE_S = 2.0
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._last_s: float | None = None
+        self._stopped_s = 0.0
+
+    def tick(self, period_s: float) -> float:
+        """Note that the process runs; call it every `period_s` seconds.
+
+        Returns:
+            The time since the last call in which the process did not run, seconds; 0 as a rule.
+        """
+        now_s = self._clock()
+        late_s = 0.0 if self._last_s is None else now_s - self._last_s - period_s
+        self._last_s = now_s
+        if late_s <= self.MAX_LATE_S:
+            return 0.0
+        self._stopped_s += late_s
+        return late_s
+
+    def now_s(self) -> float:
+        """Return the time in seconds; only differences have a meaning."""
+        return self._clock() - self._stopped_s
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import msgspec
 
 from ldo_service.schemas import decode
+from ldo_service.schemas.message import LAST_INTEGER
 
 MAX_SEQ = 1 << 62
 ALIVE = "link/alive"  # Key of the liveliness tokens of running actors.
@@ -36,6 +37,14 @@ ALIVE = "link/alive"  # Key of the liveliness tokens of running actors.
 # Maximum number of missing messages that are remembered, because they may still arrive: half a
 # minute of camera frames.
 MAX_MISSING = 1024
+
+# Largest jump of the sequence numbers that counts as lost messages: 124 days at 100 messages per
+# second. After a larger jump, the numbers are taken for a new numbering, because any program may
+# send any number.
+MAX_JUMP = 1 << 30
+
+# Maximum size of an encoded header, bytes. Names of producers and keys have tens of characters.
+MAX_HEADER_BYTES = 4096
 
 
 class Header(msgspec.Struct, frozen=True, array_like=True):
@@ -95,6 +104,13 @@ class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
 
     epoch: int
     starts: dict[str, int]  # Offset of the first message for each known consumer, by name.
+
+    def __post_init__(self) -> None:
+        if self.epoch <= 0 or not all(0 <= start < MAX_SEQ for start in self.starts.values()):
+            raise ValueError(
+                f"hello epoch={self.epoch} must be positive, and all starts must be within "
+                "0..2^62-1"
+            )
 
 
 class UnackedMessage(NamedTuple):
@@ -176,7 +192,8 @@ class SequenceTracker:
     """Counter of lost messages of a topic.
 
     A message that arrives late does not count as lost. A repeated message changes no count: a
-    restarted producer repeats messages that a consumer may not have received.
+    restarted producer repeats messages that a consumer may not have received. The numbers come from
+    other programs, so the count stays within an int64 whatever they are.
     """
 
     def __init__(self) -> None:
@@ -192,13 +209,20 @@ class SequenceTracker:
             self._missing.clear()
         if header.seq < self._next:
             return self._came_late(header.seq)
-        self.lost += header.seq - self._next
+        if header.seq - self._next > MAX_JUMP:
+            self._next = header.seq
+            self._missing.clear()
+        self.add_lost(header.seq - self._next)
         missed = range(max(self._next, header.seq - MAX_MISSING), header.seq)
         self._missing |= dict.fromkeys(missed)
         while len(self._missing) > MAX_MISSING:
             del self._missing[next(iter(self._missing))]
         self._next = header.seq + 1
         return True
+
+    def add_lost(self, count: int) -> None:
+        """Count lost messages; the count stops at the largest int64."""
+        self.lost = min(self.lost + count, LAST_INTEGER)
 
     def _came_late(self, seq: int) -> bool:
         if seq not in self._missing:

@@ -2,16 +2,20 @@
 
 import asyncio
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 from threading import Event
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError, RestartsExhausted, StageStalled
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage, SupervisionConfig, new_epoch
+from ldo_service.runtime.stage_metrics import StageMetrics
+from ldo_service.runtime.supervision_policy import RunningClock
 from ldo_service.schemas import Health, Message, decode
 from ldo_service.storage.state_store import FolderStore, MemoryStore, State
 from ldo_service.transport.interface import MemoryTransport
@@ -163,20 +167,75 @@ async def test_undeclared_output_is_a_failed_step() -> None:
         await eventually(lambda: stage.health().dead_lettered == 1)
 
 
-async def test_too_many_failures_exhaust_the_restarts() -> None:
+async def test_messages_that_always_fail_do_not_end_the_stage() -> None:
+    transport, failing = MemoryTransport(), range(20)
+    config = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=1)
+    stage = Stage(lambda: Adder(_fail_below(20)), transport, config=config)
+    numbers = source(transport, "adder")
+    async with running(stage):
+        for value in (*failing, 20):
+            await send(numbers, number(value))
+        await eventually(lambda: stage.health().steps == 1)
+    assert stage.health().dead_lettered == len(failing)
+
+
+async def test_failures_whose_repetition_succeeds_exhaust_the_restarts() -> None:
     transport = MemoryTransport()
-    config = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=3)
-    stage = Stage(lambda: Adder(_always_fail), transport, config=config)
+    config = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=2)
+    fail = _fail_every_other_time()
+    stage = Stage(lambda: Adder(fail), transport, config=config)
     numbers = source(transport, "adder")
     running_stage = asyncio.create_task(stage.run())
     for value in range(3):
         await send(numbers, number(value))
-    with pytest.raises(RestartsExhausted, match="adder failed 4 times"):
-        await running_stage
+    with pytest.raises(RestartsExhausted, match="adder failed 3 times"):
+        await asyncio.wait_for(running_stage, 15)
 
 
-def _always_fail(_value: int) -> None:
-    raise RuntimeError("always")
+def _fail_below(limit: int) -> Callable[[int], None]:
+    def fail(value: int) -> None:
+        if value < limit:
+            raise RuntimeError("always")
+
+    return fail
+
+
+def _fail_every_other_time() -> Callable[[int], None]:
+    tries = count()
+
+    def fail(_value: int) -> None:
+        if next(tries) % 2 == 0:
+            raise RuntimeError("once")
+
+    return fail
+
+
+async def test_failing_heartbeat_is_counted_and_the_stage_continues() -> None:
+    transport, seen = MemoryTransport(), []
+    stage = collector(transport, seen)
+    numbers = source(transport, "collector")
+    async with running(stage):
+        stage._metrics.facts = {"broken": "not a number"}  # type: ignore[dict-item]
+        await eventually(lambda: stage._metrics.failures > 0)
+        stage._metrics.facts = {"not_finite": float("nan"), "good": 1.0}
+        await send(numbers, number(7))
+        await eventually(lambda: seen == [7])
+    assert stage._metrics.failures > 0
+
+
+async def test_time_without_running_does_not_count_as_a_hanging_step() -> None:
+    now_s = 0.0
+    metrics = StageMetrics(clock=RunningClock(lambda: now_s))
+    metrics.clock.tick(0.5)
+    with metrics.step():
+        now_s = 0.5
+        metrics.clock.tick(0.5)
+        now_s = 100.0  # The process was suspended.
+        assert metrics.clock.tick(0.5) == pytest.approx(99.0)
+        assert metrics.busy_s == pytest.approx(1.0)
+        for now_s in np.arange(101.0, 131.0):  # It runs again, and the step hangs.
+            metrics.clock.tick(0.5)
+        assert metrics.busy_s == pytest.approx(31.0)
 
 
 async def test_unrestorable_state_exhausts_the_restarts() -> None:
