@@ -14,6 +14,10 @@ from ldo_service.schemas.pose import IDENTITY, Pose
 MAX_PIXELS = 1 << 25
 
 
+# Depth from which on a value means "not measured", meters. Depth cameras measure up to 100 m.
+MAX_DEPTH_M = 1000.0
+
+
 class CameraModel(msgspec.Struct, frozen=True, kw_only=True):
     """Pinhole intrinsics in pixels, with pixel centers at integer coordinates."""
 
@@ -41,8 +45,8 @@ class CameraModel(msgspec.Struct, frozen=True, kw_only=True):
 
 
 # rgb8, bgr8: color, 3 bytes per pixel. jpeg: color. png: color of 8 bits, or depth of 16 bits.
-# z16: depth, little-endian uint16. f32: depth, little-endian float32; NaN and infinity mean "not
-# measured", as in ROS. +zstd: the same, compressed.
+# z16: depth, little-endian uint16. f32: depth, little-endian float32; NaN, infinity and 1000 m or
+# more mean "not measured". +zstd: the same, compressed.
 ImageEncoding = Literal["rgb8", "bgr8", "jpeg", "png", "z16", "z16+zstd", "f32", "f32+zstd"]
 BYTES_PER_PIXEL: dict[str, int] = {"rgb8": 3, "bgr8": 3, "z16": 2, "f32": 4}
 
@@ -198,8 +202,8 @@ def require_rgbd(camera: CameraModel, color: Array, depth_m: Array) -> None:
     color.require("color", "u1", (*size, 3))
     depth_m.require("depth_m", "f4", size)
     depth = depth_m.numpy()
-    if not (depth.min() >= 0 and depth.max() < float("inf")):  # NaN fails both comparisons.
+    if not (depth.min() >= 0 and depth.max() < MAX_DEPTH_M):  # NaN fails both comparisons.
         raise ValueError(
-            f"depth_m is {depth.min():g} to {depth.max():g} m, must be finite and at least 0, "
-            "where 0 means not measured"
+            f"depth_m is {depth.min():g} to {depth.max():g} m, must be finite, at least 0 and below "
+            f"{MAX_DEPTH_M:g}, where 0 means not measured"
         )

@@ -9,6 +9,10 @@ from ldo_service.schemas.message import Message, require_count, require_finite
 # Tolerance of a quaternion's norm: float64 rounding, with margin for float32 math in clients.
 QUATERNION_TOLERANCE = 1e-6
 
+# Maximum coordinate of a pose, meters. All coordinates on Earth are below it: geocentric ones reach
+# 6.4e6 m, and those of map projections (UTM) 1e7 m. A float64 still resolves 15 nm there.
+MAX_COORDINATE_M = 1e8
+
 
 class Pose(msgspec.Struct, frozen=True):
     """Rigid transform T_a_b from coordinates in frame b to coordinates in frame a.
@@ -21,6 +25,10 @@ class Pose(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         require_finite("pose", (*self.translation, *self.quaternion))
+        if max(map(abs, self.translation)) > MAX_COORDINATE_M:
+            raise ValueError(
+                f"translation {self.translation} m must be within +-{MAX_COORDINATE_M:g} m"
+            )
         norm = sum(q * q for q in self.quaternion) ** 0.5
         if abs(norm - 1.0) > QUATERNION_TOLERANCE:
             raise ValueError(f"quaternion {self.quaternion} has norm {norm:.9g}, must be 1")

@@ -1,9 +1,10 @@
 """Pinhole camera with lens distortion. Conventions: `ldo_service.geometry`."""
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
-from math import isfinite
+from math import hypot, isfinite
 from typing import Any
 
 import cv2
@@ -16,6 +17,10 @@ MIN_FOCAL_RATIO, NARROWEST = 0.02, 100.0
 
 # Maximum radius in normalized coordinates: 76 degrees from the axis, beyond any pinhole model.
 FARTHEST_RADIUS = 4.0
+
+# Maximum factor by which a lens changes the distance of a point of the image from its center. The widest lens of the pinhole model, a fisheye lens
+# of 76 degrees from the axis, has a factor of 3.3.
+MAX_LENS_FACTOR = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +72,14 @@ class Camera:
                 f"{len(self.distortion)} distortion coefficients are given, expected 0, 4, 5 or 8 "
                 "as in OpenCV's models."
             )
+        across = max(self.cx, self.width - self.cx) / self.fx
+        down = max(self.cy, self.height - self.cy) / self.fy
+        if self.distortion and not _is_lens(self.distortion, hypot(across, down)):
+            raise DataError(
+                f"distortion {self.distortion} is no lens: it changes the distance of a point from "
+                f"the image center by more than a factor of {MAX_LENS_FACTOR:g}. Check the order "
+                "of the coefficients: k1 k2 p1 p2 k3 k4 k5 k6."
+            )
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> "Camera":
@@ -83,15 +96,19 @@ class Camera:
 
         The distortion coefficients do not change, as they act on normalized coordinates.
         """
-        return Camera(
-            self.width // 2,
-            self.height // 2,
-            self.fx / 2,
-            self.fy / 2,
-            (self.cx + 0.5) / 2 - 0.5,
-            (self.cy + 0.5) / 2 - 0.5,
-            self.distortion,
-        )
+        # The values are not checked again: rounding of the size may move a plausible value just
+        # beyond its limit.
+        halved = copy(self)
+        for name, value in (
+            ("width", self.width // 2),
+            ("height", self.height // 2),
+            ("fx", self.fx / 2),
+            ("fy", self.fy / 2),
+            ("cx", (self.cx + 0.5) / 2 - 0.5),
+            ("cy", (self.cy + 0.5) / 2 - 0.5),
+        ):
+            object.__setattr__(halved, name, value)
+        return halved
 
     def rectified(self) -> "Camera":
         """Return the camera without lens distortion."""
@@ -202,14 +219,43 @@ def _turning_r2(camera: Camera) -> float:
 
     If it increases up to FARTHEST_RADIUS, return the square of FARTHEST_RADIUS.
     """
-    k1, k2, _, _, k3, k4, k5, k6 = _coefficients(camera)
+    r, radial = _radial(camera.distortion)
+    turns = np.flatnonzero(np.diff(r * radial) <= 0)
+    return float(r[turns[0]] ** 2) if len(turns) else FARTHEST_RADIUS**2
+
+
+def _radial(distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return radii up to FARTHEST_RADIUS and the radial factor at each, [4001] each."""
+    k1, k2, _, _, k3, k4, k5, k6 = _padded(distortion)
     r = np.linspace(0.0, FARTHEST_RADIUS, 4001)
     r2 = r * r
-    bent = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    turns = np.flatnonzero(np.diff(bent) <= 0)
-    return float(r2[turns[0]]) if len(turns) else FARTHEST_RADIUS**2
+    with np.errstate(all="ignore"):
+        above, below = (
+            (1 + r2 * (a + r2 * (b + r2 * c))) for a, b, c in ((k1, k2, k3), (k4, k5, k6))
+        )
+        return r, above / below
+
+
+@lru_cache(maxsize=16)
+def _is_lens(distortion: tuple[float, ...], corner: float) -> bool:
+    """Return whether the radial factor is plausible inside the image.
+
+    Args:
+        distortion: Coefficients of the lens.
+        corner: Distorted radius of the farthest image corner, in normalized coordinates.
+    """
+    r, radial = _radial(distortion)
+    with np.errstate(all="ignore"):
+        bent = r * radial
+        is_last = ~(np.diff(bent) > 0) | (bent[1:] > corner)
+        used = radial[: 1 + int(np.argmax(is_last))] if is_last.any() else radial
+        return bool(((used >= 1 / MAX_LENS_FACTOR) & (used <= MAX_LENS_FACTOR)).all())
 
 
 def _coefficients(camera: Camera) -> np.ndarray:
     """Return k1 k2 p1 p2 k3 k4 k5 k6 [8]; coefficients that the camera does not have are 0."""
-    return np.r_[camera.distortion, np.zeros(8)][:8]
+    return _padded(camera.distortion)
+
+
+def _padded(distortion: tuple[float, ...]) -> np.ndarray:
+    return np.r_[distortion, np.zeros(8)][:8]

@@ -15,6 +15,11 @@ from ldo_service.errors import FrameError
 from .camera import Camera
 
 
+# Depth from which on a value means "not measured", meters. Depth cameras measure up to 100 m. Some
+# simulators write their far plane, 1e30 or the largest float where they measured nothing.
+MAX_DEPTH_M = 1000.0
+
+
 @dataclass(frozen=True, slots=True)
 class RgbdFrame:
     """Rectified frame: color and depth on one pixel grid.
@@ -42,10 +47,10 @@ class RgbdFrame:
                 f"expected float32{size} to fit the intrinsics."
             )
         lowest, highest = float(self.depth_m.min()), float(self.depth_m.max())
-        if not (lowest >= 0.0 and highest < np.inf):  # NaN fails each comparison.
+        if not (lowest >= 0.0 and highest < MAX_DEPTH_M):  # NaN fails each comparison.
             raise FrameError(
-                f"frame {self.index}: depth of {lowest:g} to {highest:g} m must be finite and at "
-                "least 0. Set pixels without a measurement to 0."
+                f"frame {self.index}: depth of {lowest:g} to {highest:g} m must be finite, at "
+                f"least 0 and below {MAX_DEPTH_M:g}. Set pixels without a measurement to 0."
             )
 
 
@@ -63,8 +68,8 @@ class RawFrame:
     index: int  # Running number of the frame in its source.
     stamp_ns: int  # Time of the exposure.
     color: np.ndarray  # [H, W, 3] uint8 RGB.
-    # [H, W] uint16, float32 or float64, z in 1/depth_scale meters; 0, NaN, infinite or
-    # negative where not measured.
+    # [H, W] uint16, float32 or float64, z in 1/depth_scale meters; 0, negative, NaN or at least
+    # MAX_DEPTH_M where not measured.
     depth: np.ndarray
     depth_scale: float  # Units of `depth` per meter.
     camera: Camera  # Intrinsics with lens distortion.
@@ -102,6 +107,12 @@ class RawFrame:
         return in_meters(self.depth, self.depth_scale)
 
 
+    def too_far(self) -> int:
+        """Return the number of pixels whose depth is finite but at least `MAX_DEPTH_M`."""
+        limit = min(MAX_DEPTH_M * self.depth_scale, float(np.finfo(np.float32).max))
+        return int(np.count_nonzero((self.depth >= limit) & (self.depth < np.inf)))
+
+
 def brightest(color: np.ndarray) -> np.ndarray:
     """Return the largest of the three channels of a color image [H, W, 3], as [H, W]."""
     red, green, blue = cv2.split(color)
@@ -116,11 +127,11 @@ def in_meters(depth: np.ndarray, depth_scale: float) -> np.ndarray:
         depth_scale: Units of `depth` per meter.
 
     Returns:
-        [H, W] float32; 0 where `depth` is not positive and finite.
+        [H, W] float32; 0 where the depth is not positive or not below `MAX_DEPTH_M`.
     """
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         depth_m = depth.astype(np.float32) / np.float32(depth_scale)
-        depth_m[~((depth_m > 0) & (depth_m < np.inf))] = 0.0
+        depth_m[~((depth_m > 0) & (depth_m < MAX_DEPTH_M))] = 0.0
     return depth_m
 
 

@@ -12,6 +12,11 @@ from .camera import Camera, project, rays
 SAME_SURFACE = 0.05  # Maximum difference of neighboring depths on one surface, fraction of depth.
 TIE_PX = 1e-3  # Overlap of neighboring cells, so that float32 rounding leaves no gap.
 MAX_STRETCH = 2.0  # Maximum size of a cell relative to its nominal size.
+# Maximum area of all cells together, relative to the color image plus the depth image. Cameras that
+# belong together reach 1 (measured with random depth and images of 0.05 to 2.8 megapixels).
+MAX_COVER = 4.0
+# Maximum nominal size of a cell, pixels. A depth image of 80x60 pixels in a 4K image has 48.
+MAX_CELL_PX = 64.0
 
 
 def register_depth(
@@ -42,12 +47,19 @@ def register_depth(
         camera, so rectify it together with the color image.
 
     Raises:
-        FrameError: The size of the depth image differs from that of `depth_camera`.
+        FrameError: The size of the depth image differs from that of `depth_camera`, or the cells
+            are too large for the two cameras to belong together.
     """
     if depth_m.shape != (depth_camera.height, depth_camera.width):
         raise FrameError(
             f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} pixels and its camera "
             f"{depth_camera.width}x{depth_camera.height}. Give the intrinsics for this image size."
+        )
+    cell_px = max(color_camera.fx / depth_camera.fx, color_camera.fy / depth_camera.fy)
+    if cell_px > MAX_CELL_PX:
+        raise FrameError(
+            f"a depth pixel is {cell_px:.0f} color pixels wide, must be at most {MAX_CELL_PX:g}. "
+            "Check that each focal length is in pixels of its own image."
         )
     depth_m = np.asarray(depth_m, np.float32)
     x, y, z = _points(depth_m, depth_camera, T_color_depth)
@@ -147,6 +159,7 @@ def _nearest(
 ) -> np.ndarray:
     """Return the smallest z of the cells that cover each pixel; 0 where no cell does."""
     is_inside = is_seen & (columns[0] <= columns[1]) & (rows[0] <= rows[1])
+    _require_bounded(columns, rows, is_inside, shape)
     z, u, last_u, v, last_v = (a[is_inside] for a in (z, *columns, *rows))
     nearest = np.full(shape[0] * shape[1], np.inf, np.float32)
     while len(z):
@@ -155,6 +168,24 @@ def _nearest(
         z, u, last_u, v, last_v = z[more], u[more], last_u[more], v[more] + 1, last_v[more]
     nearest[np.isinf(nearest)] = 0.0
     return nearest.reshape(shape)
+
+
+def _require_bounded(
+    columns: tuple[np.ndarray, np.ndarray],
+    rows: tuple[np.ndarray, np.ndarray],
+    is_inside: np.ndarray,
+    shape: tuple[int, int],
+) -> None:
+    """Raise FrameError if the cells cover so many pixels that the cameras do not fit together."""
+    wide, high = (1.0 + last - first for first, last in (columns, rows))
+    covered = float((wide * high)[is_inside].sum())
+    pixels = shape[0] * shape[1] + is_inside.size
+    if covered > MAX_COVER * pixels:
+        raise FrameError(
+            f"the depth pixels cover the color image {covered / (shape[0] * shape[1]):.0f} times, "
+            "so the two cameras do not belong together. Check intrinsics, distortion and "
+            "T_color_depth of color and depth image."
+        )
 
 
 def _cover_row(nearest: np.ndarray, z: np.ndarray, pixel: np.ndarray, more: np.ndarray) -> None:

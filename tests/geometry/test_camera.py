@@ -62,3 +62,24 @@ def test_halving_keeps_the_lens_and_rectifying_removes_it() -> None:
 def test_impossible_intrinsics_are_named(values: tuple, word: str) -> None:
     with pytest.raises(DataError, match=word):
         Camera(*values)
+
+
+@pytest.mark.parametrize("width", [160, 161, 641])
+@pytest.mark.parametrize("cx_ratio", [-1.0, 2.0])
+@pytest.mark.parametrize("focal_ratio", [0.02, 100.0])
+def test_camera_at_the_limits_can_be_halved(
+    width: int, cx_ratio: float, focal_ratio: float
+) -> None:
+    cx = np.nextafter(cx_ratio * width, 0.0)
+    camera = Camera(width, 120, focal_ratio * width, focal_ratio * 120, cx, 60.0)
+    for _ in range(4):
+        camera = camera.halved()
+    assert camera.width == width // 16
+    assert camera.cx == pytest.approx((cx + 0.5) / 16 - 0.5)
+
+
+def test_distortion_that_no_lens_has_is_named() -> None:
+    shrinking = (1e9, 0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 0.0)  # By 1000, and increasing steadily.
+    with pytest.raises(DataError, match="is no lens"):
+        Camera(640, 480, 64000.0, 48000.0, 320.0, 240.0, shrinking)
+    Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))

@@ -157,3 +157,18 @@ def test_missing_depth_registers_to_missing_depth() -> None:
 def test_depth_of_another_size_than_its_camera_is_an_error() -> None:
     with pytest.raises(FrameError, match="depth is 63x48 pixels and its camera 64x48"):
         register_depth(np.ones((48, 63), np.float32), CAMERA, FINER, np.eye(4))
+
+
+def test_cells_that_cover_the_color_image_many_times_are_rejected() -> None:
+    shrinking = (1e9, 0.0, 0.0, 0.0, 0.0, 7.9e9, 0.0, 0.0)  # By 7.9, just below the limit.
+    color_camera = Camera(640, 480, 640.0, 480.0, 320.0, 240.0, shrinking)
+    depth_camera = Camera(640, 480, 160.0, 120.0, 320.0, 240.0)
+    with pytest.raises(FrameError, match="do not belong together"):
+        register_depth(np.ones((480, 640), np.float32), depth_camera, color_camera, np.eye(4))
+
+
+def test_cells_far_larger_than_a_depth_pixel_are_rejected() -> None:
+    color_camera = Camera(640, 480, 64000.0, 48000.0, 320.0, 240.0)
+    depth_camera = Camera(640, 480, 100.0, 75.0, 320.0, 240.0)
+    with pytest.raises(FrameError, match="640 color pixels wide, must be at most 64"):
+        register_depth(np.ones((480, 640), np.float32), depth_camera, color_camera, np.eye(4))

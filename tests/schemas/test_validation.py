@@ -67,6 +67,7 @@ def test_negative_stamp_is_rejected(name: str) -> None:
         ((NAN, 0, 0), (1, 0, 0, 0), "NaN"),
         ((0, INF, 0), (1, 0, 0, 0), "infinity"),
         ((0, 0, 0), (1, 0, NAN, 0), "NaN"),
+        ((0, 0, -1.1e8), (1, 0, 0, 0), "within"),
         ((0, 0, 0), (0, 0, 0, 0), "norm 0"),
         ((0, 0, 0), (1, 0.1, 0, 0), "norm 1.00"),
         ((0, 0, 0), (1e200, 0, 0, 0), "norm inf"),
