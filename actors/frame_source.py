@@ -21,11 +21,12 @@ from ldo_service.conversions.frames import (
 from ldo_service.conversions.poses import pose_from_message
 from ldo_service.errors import ConfigError, DataError, named
 from ldo_service.geometry import codecs
-from ldo_service.geometry.frames import RawFrame, Rectifier, in_meters
+from ldo_service.geometry.frames import MAX_DEPTH_M, RawFrame, Rectifier, in_meters
 from ldo_service.geometry.registration import register_depth
 from ldo_service.geometry.stamps import StreamPairer
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
+from ldo_service.schemas.message import LAST_INTEGER
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD, FRAME_RGBD
 
@@ -34,6 +35,10 @@ log = logging.getLogger(__name__)
 Input = CameraRgbd | CameraColor | CameraDepth
 # Number of unpaired images before the warning: a second of frames, longer than a start-up effect.
 UNPAIRED_WARNING_COUNT = 30
+MAX_RESTART_LINES = 10  # Number of camera restarts after which they are only counted.
+# Maximum size of the images of a stream that wait for their partner, bytes: ten raw color images of
+# 1080p.
+PAIR_BUFFER_BYTES = 64_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +93,7 @@ class FrameSource(Actor):
         self._last_stamp_ns = -1
         self._sessions = 1  # Number of camera starts so far.
         self._rejected = 0
+        self._pixels_too_far = 0  # Pixels whose depth no camera can measure.
         self._is_rejecting = False
         self._has_warned_of_skew = False
 
@@ -139,7 +145,9 @@ class FrameSource(Actor):
         try:
             self._require_later(message)
             self._require_usable(message)
-            frame = self._rectify(decoded())
+            raw = decoded()
+            self._count_too_far(raw)
+            frame = self._rectify(raw)
         except DataError as error:
             self._reject(message, error)
             return
@@ -162,17 +170,24 @@ class FrameSource(Actor):
         """
         back_s = (self._last_stamp_ns - message.stamp_ns) * 1e-9
         if back_s > self.config.restart_after_s:
-            log.warning(
-                "frame_source: stamps went back by %.1f s; assuming that the camera restarted. "
-                "No action needed.",
-                back_s,
-            )
+            if self._sessions < MAX_RESTART_LINES:
+                log.warning(
+                    "frame_source: stamps went back by %.1f s; assuming that the camera restarted. "
+                    "If this repeats, two cameras with different clocks publish frames; stop one "
+                    "of them. The metric camera_sessions counts further restarts.",
+                    back_s,
+                )
             self._sessions += 1
             self._last_stamp_ns = -1
             self._pairing = self._new_pairing()
 
     def _new_pairing(self) -> StreamPairer[CameraColor, CameraDepth]:
-        return StreamPairer(round(self.config.max_skew_s * 1e9), self.config.pair_buffer)
+        return StreamPairer(
+            round(self.config.max_skew_s * 1e9),
+            self.config.pair_buffer,
+            size_of=lambda half: half.image.data.nbytes,
+            max_bytes=PAIR_BUFFER_BYTES,
+        )
 
     def _require_usable(self, message: CameraRgbd | CameraColor) -> None:
         width, height = message.camera.width, message.camera.height
@@ -181,6 +196,18 @@ class FrameSource(Actor):
                 f"the image of {width}x{height} pixels is too small to track: each side must have "
                 f"at least {self.config.min_side_px} pixels (frame_source.min_side_px)."
             )
+
+    def _count_too_far(self, raw: RawFrame) -> None:
+        if not (count := raw.too_far()):
+            return
+        if not self._pixels_too_far:
+            log.warning(
+                "frame_source: frame %d has %d pixels with a depth of %g m or more, which count as "
+                "not measured. No action needed if the camera marks missing depth this way; "
+                "otherwise check depth_scale. Later pixels are only counted.",
+                raw.index, count, MAX_DEPTH_M,
+            )  # fmt: skip
+        self._pixels_too_far = min(self._pixels_too_far + count, LAST_INTEGER)
 
     def _reject(self, message: Input, error: DataError) -> None:
         self._rejected += 1
@@ -206,6 +233,7 @@ class FrameSource(Actor):
         skews_ms = self._pairing.skews_ms() or [0.0]
         return {
             "frames_rejected": self._rejected,
+            "pixels_too_far": self._pixels_too_far,
             "camera_sessions": self._sessions,
             "pairs": self._pairing.pairs,
             "color_unpaired": self._pairing.lost_a,

@@ -16,6 +16,8 @@ from rich.console import Console
 
 from ldo_service.errors import ConfigError, LdoError
 
+from .log_format import OneLineFormatter
+
 # Verbs that keep their partial results when they are interrupted.
 KEEPING = ("batch", "demo", "run", "suite")
 HELP = """\
@@ -56,11 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [OLD_OPTIONS.get(word, word) for word in words if word != "--debug"]
-    logging.basicConfig(
-        level=logging.DEBUG if debug else logging.INFO,
-        format="%(asctime)s %(levelname).1s %(name)s: %(message)s",
-        datefmt="%H:%M:%S",
-    )
+    logging.basicConfig(level=logging.DEBUG if debug else logging.INFO)
+    for handler in logging.getLogger().handlers:
+        handler.setFormatter(OneLineFormatter())
     if not debug:
         for library in ("httpx2", "aiobotocore", "botocore"):  # INFO has a line per request.
             logging.getLogger(library).setLevel(logging.WARNING)

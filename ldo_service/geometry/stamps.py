@@ -4,10 +4,10 @@ Conventions: `ldo_service.geometry`.
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -119,17 +119,27 @@ class StreamPairer(Generic[A, B]):
     Args:
         max_skew_ns: Largest difference between the stamps of a pair, nanoseconds.
         buffer: Largest number of halves of a stream that wait for a partner.
+        size_of: Function that returns the size of a half in bytes.
+        max_bytes: Largest size of the halves of a stream that wait, bytes. The newest half may
+            wait alone whatever its size.
 
     Raises:
         ConfigError: An argument is out of range.
     """
 
-    def __init__(self, max_skew_ns: int, buffer: int) -> None:
+    def __init__(
+        self,
+        max_skew_ns: int,
+        buffer: int,
+        size_of: Callable[[Any], int] = lambda _half: 0,
+        max_bytes: int = 0,
+    ) -> None:
         if max_skew_ns < 0 or buffer < 1:
             raise ConfigError(
                 f"max_skew_ns={max_skew_ns} must be at least 0 and buffer={buffer} at least 1."
             )
         self._max_skew_ns, self._buffer = max_skew_ns, buffer
+        self._size_of, self._max_bytes = size_of, max_bytes
         self._a, self._b = StreamBuffer(), StreamBuffer()
         self._skews_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
         self.pairs = 0
@@ -181,8 +191,13 @@ class StreamPairer(Generic[A, B]):
                 self._skews_ns.append(skew)
                 yield a.popleft(), b.popleft()  # type: ignore[misc]
         for half in (self._a, self._b):
-            while len(half.waiting) > self._buffer:
+            while len(half.waiting) > self._buffer or self._is_too_large(half):
                 half.lose()
+
+    def _is_too_large(self, half: StreamBuffer) -> bool:
+        if len(half.waiting) < 2:
+            return False
+        return sum(map(self._size_of, half.waiting)) > self._max_bytes
 
     @staticmethod
     def _has_nearer(earlier: StreamBuffer, later: StreamBuffer, skew: int) -> bool:

@@ -71,6 +71,16 @@ class Inlet:
             return same[:1]
         return next(iter(by_key.values())) if len(by_key) > policy.max_keys else []
 
+    @property
+    def waiting_bytes(self) -> int:
+        """Size of the queued messages, bytes."""
+        return sum(delivery.body.nbytes for delivery in self.waiting)
+
+    def drop_oldest(self) -> Delivery:
+        """Drop and return the oldest queued message."""
+        self.dropped += 1
+        return self.waiting.popleft()
+
     def done(self, delivery: Delivery, rejected: bool) -> None:  # noqa: ARG002
         """Count a delivery that was handled or rejected."""
         self.delivered += not rejected
@@ -132,7 +142,7 @@ class LosslessInlet(Inlet):
             self.gap = self.gap or is_connecting
             return 0
         lost = start - self.arrived if known else 0
-        self.numbers.lost += lost
+        self.numbers.add_lost(lost)
         if not (known and self.waiting):  # Otherwise `done` advances `handled`.
             self.handled = start
         self.epoch, self.arrived = epoch, start

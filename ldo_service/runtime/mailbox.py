@@ -15,6 +15,7 @@ from ldo_service.schemas import InputCount, decode
 from ldo_service.schemas.topics import Topic
 from ldo_service.transport.flow_control import (
     EXTERNAL_HEADER,
+    MAX_HEADER_BYTES,
     Header,
     InletPosition,
     ProducerHello,
@@ -31,6 +32,10 @@ from .inlet import Delivery, Inlet, LosslessInlet
 from .stage_commands import StageCommand
 
 log = logging.getLogger(__name__)
+
+# Maximum size of all messages of Latest inputs that wait in one mailbox, bytes: two of the largest
+# ones. A burst of four raw frames of 1080p has 33 MB.
+MAX_WAITING_BYTES = 128_000_000
 
 
 class Mailbox:
@@ -132,9 +137,21 @@ class Mailbox:
         for displaced in inlet.offer(delivery):
             self._order.remove(displaced)
         self._order.append(delivery)
+        if not isinstance(inlet, LosslessInlet):
+            self._bound_bytes()
         if not self._wake_pending:  # One notification is enough for any number of messages.
             self._wake_pending = True
             call_soon(self._loop, self._ready.set)
+
+    def _bound_bytes(self) -> None:
+        """Drop the oldest messages of the Latest input that holds most bytes, above the limit.
+
+        The caller holds the lock.
+        """
+        latest = [i for i in self._inlets.values() if not isinstance(i, LosslessInlet)]
+        while sum(inlet.waiting_bytes for inlet in latest) > MAX_WAITING_BYTES:
+            largest = max(latest, key=lambda inlet: inlet.waiting_bytes)
+            self._order.remove(largest.drop_oldest())
 
     def _welcomed(self, inlet: LosslessInlet, body: memoryview) -> None:
         try:
@@ -306,7 +323,9 @@ class Mailbox:
 
 
 def _read_header(raw: bytes) -> Header | None:
-    """Decode a header; return None if it is malformed."""
+    """Decode a header; return None if it is malformed or too long."""
+    if len(raw) > MAX_HEADER_BYTES:
+        return None
     try:
         return decode(raw, Header) if raw else EXTERNAL_HEADER
     except msgspec.DecodeError:

@@ -260,3 +260,58 @@ def test_one_stamp_in_the_far_future_does_not_block_later_frames(room: Sequence)
     future = msgspec.structs.replace(message, stamp_ns=10**18)
     frames = [message, future, raw_frame_to_message(room.read(1))]
     assert len([out for frame in frames for out in source.handle(frame)]) == 3
+
+
+@pytest.mark.parametrize("far", [1000.0, 1e30, float(np.finfo(np.float32).max)])
+def test_depth_beyond_any_camera_counts_as_not_measured(
+    room: Sequence, message: CameraRgbd, far: float
+) -> None:
+    depth_m = room[3].depth_m.copy()
+    depth_m[:10] = far
+    sent = msgspec.structs.replace(message, depth=Image.raw("f32", depth_m), depth_scale=1.0)
+    source = FrameSource()
+    (frame,) = source.handle(sent)
+    assert not frame.depth_m.numpy()[:10].any()
+    np.testing.assert_array_equal(frame.depth_m.numpy()[10:], depth_m[10:])
+    assert source.metrics()["pixels_too_far"] == depth_m[:10].size
+
+
+def test_cameras_that_do_not_belong_together_are_rejected_at_once() -> None:
+    width, height = 640, 480
+    lens = (1e9, 0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 0.0)
+    of_color = CameraModel(
+        width=width, height=height, fx=100.0 * width, fy=100.0 * height, cx=320.0, cy=240.0,
+        distortion=lens,
+    )  # fmt: skip
+    of_depth = CameraModel(width=width, height=height, fx=100.0, fy=75.0, cx=320.0, cy=240.0)
+    source = FrameSource()
+    color = Image.raw("rgb8", np.zeros((height, width, 3), np.uint8))
+    depth = Image.raw("z16", np.full((height, width), 1000, np.uint16))
+    halves = (
+        CameraColor(stamp_ns=1, frame=0, camera=of_color, image=color),
+        CameraDepth(stamp_ns=1, frame=0, camera=of_depth, image=depth, depth_scale=1000.0),
+    )
+    assert [frame for half in halves for frame in source.handle(half)] == []
+    assert source.metrics()["frames_rejected"] == 1
+
+
+def test_unpaired_images_are_bounded_by_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ldo_service.actors.frame_source.PAIR_BUFFER_BYTES", 50_000)
+    source = FrameSource()
+    camera = CameraModel(width=100, height=50, fx=100.0, fy=100.0, cx=50.0, cy=25.0)
+    image = Image.raw("rgb8", np.zeros((50, 100, 3), np.uint8))  # 15,000 bytes.
+    for number in range(8):
+        stamp_ns = number * 10**9
+        list(source.handle(CameraColor(stamp_ns=stamp_ns, frame=0, camera=camera, image=image)))
+    assert source.metrics()["color_unpaired"] == 5
+
+
+def test_two_clocks_in_turn_do_not_fill_the_log(
+    message: CameraRgbd, caplog: pytest.LogCaptureFixture
+) -> None:
+    source = FrameSource()
+    for number in range(100):
+        stamp_ns = 10**10 * (1 + number % 2) + number
+        list(source.handle(msgspec.structs.replace(message, stamp_ns=stamp_ns)))
+    assert sum("went back" in record.message for record in caplog.records) < 10
+    assert source.metrics()["camera_sessions"] == 50

@@ -1,10 +1,13 @@
 """Tests of the mailbox: inputs of policy Latest and messages of other programs."""
 
+import pytest
+
 from ldo_service.runtime import In, Latest, Lossless
 from ldo_service.runtime.inlet import Delivery
 from ldo_service.runtime.mailbox import Mailbox
 from ldo_service.schemas import encode as encode_message
-from ldo_service.transport.flow_control import Header, encode_link
+from ldo_service.schemas.message import LAST_INTEGER
+from ldo_service.transport.flow_control import Header, SequenceTracker, encode_link
 from ldo_service.transport.interface import MemoryTransport
 
 from .fake_actors import DOUBLES, NUMBERS, collector, eventually, number, running
@@ -152,6 +155,31 @@ async def test_rejections_are_logged_once_per_episode_and_each_counted(caplog) -
     assert len([r for r in caplog.records if "rejected" in r.message]) == 2
 
 
+async def test_foreign_sequence_numbers_keep_the_lost_count_within_an_int64() -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Latest(4)),), transport)
+    for epoch in range(1, 6):
+        for seq in (0, 2**62 - 1):
+            header = encode_link(Header("outside", epoch, seq, 0))
+            transport.deliver(NUMBERS.name, header, encode_message(number(0)))
+    assert mailbox.counts()[0].lost == 0, "an impossible jump is a new numbering"
+    tracker = SequenceTracker()
+    tracker.lost = LAST_INTEGER - 1
+    for seq in (0, 5):
+        tracker.observe(Header("outside", 1, seq, 0))
+    assert tracker.lost == LAST_INTEGER
+    mailbox.disconnect()
+
+
+async def test_long_header_is_rejected() -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Latest(4)),), transport)
+    header = encode_link(Header("x" * 8_000_000, 1, 0, 0))
+    transport.deliver(NUMBERS.name, header, encode_message(number(0)))
+    assert mailbox.counts()[0].rejected == 1
+    mailbox.disconnect()
+
+
 async def test_lost_messages_are_counted_from_sequence_numbers() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Latest(64)),), transport)
@@ -169,4 +197,21 @@ async def test_lost_messages_are_counted_from_sequence_numbers() -> None:
     assert lost_after(2, 0, 1, 3) == 2, "a new epoch is counted separately"
     transport.deliver(NUMBERS.name, b"", encode_message(number(0)))
     assert mailbox.counts()[0].lost == 2, "messages without header have no number"
+    mailbox.disconnect()
+
+
+async def test_queued_messages_are_bounded_by_bytes_and_the_largest_input_gives_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ldo_service.runtime.mailbox.MAX_WAITING_BYTES", 10_000)
+    transport = MemoryTransport()
+    ports = (In(NUMBERS, Latest(64)), In(DOUBLES, Latest(64)))
+    mailbox = Mailbox("me", ports, transport)
+    transport.deliver(DOUBLES.name, b"", bytes(100))
+    for _ in range(50):
+        transport.deliver(NUMBERS.name, b"", bytes(4000))
+    numbers, doubles = mailbox.counts()
+    assert (numbers.queued, numbers.dropped) == (2, 48)
+    assert (doubles.queued, doubles.dropped) == (1, 0)
+    assert len(mailbox._order) == 3
     mailbox.disconnect()
