@@ -11,8 +11,9 @@ It listens on loopback by default.
 
 import socket
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from socketserver import ThreadingMixIn
 from threading import Lock, Thread
 from typing import Any
@@ -29,6 +30,9 @@ from ldo_service.transport.endpoint import LOOPBACK
 
 MAX_ACTORS = 64  # Maximum number of actors, because messages may contain any name.
 COMES_BACK_S = 5.0  # Time for an actor to restart after it was killed at its heartbeat timeout.
+
+MAX_CONNECTIONS = 16  # Of the metrics server; Prometheus and a health check use two.
+REQUEST_TIMEOUT_S = 5.0  # Maximum time without data from a client of the metrics server.
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]
 
@@ -225,10 +229,41 @@ def _facts(actors: list[Health]) -> Metric:
 
 
 class _Server(ThreadingMixIn, WSGIServer):
+    """HTTP server with a thread per connection and a limit of connections.
+
+    Beyond the limit it closes the oldest connection. Idle connections therefore cannot keep a new
+    one out, nor take the file descriptors that saving the state needs.
+    """
+
     daemon_threads = True
+    _open: deque[socket.socket]
+    _open_lock: Lock
+
+    def server_activate(self) -> None:
+        self._open, self._open_lock = deque(), Lock()
+        super().server_activate()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        with self._open_lock:
+            self._open.append(request)
+            oldest = self._open.popleft() if len(self._open) > MAX_CONNECTIONS else None
+        if oldest is not None:
+            with suppress(OSError):
+                oldest.shutdown(socket.SHUT_RDWR)  # Its thread wakes up and closes it.
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        with self._open_lock, suppress(ValueError):
+            self._open.remove(request)
+        super().shutdown_request(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore the error of a connection, which its client has caused."""
 
 
 class _Quiet(WSGIRequestHandler):
+    timeout = REQUEST_TIMEOUT_S
+
     def log_message(self, format: str, *args: Any) -> None:
         """Suppress the log line of each request."""
 

@@ -2,11 +2,12 @@
 
 import re
 import socket
+import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 import msgspec
 import pytest
@@ -14,7 +15,12 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import encode
-from ldo_service.service.metrics import COMES_BACK_S, HealthCollector, serve_metrics
+from ldo_service.service.metrics import (
+    COMES_BACK_S,
+    MAX_CONNECTIONS,
+    HealthCollector,
+    serve_metrics,
+)
 from tests.ports import free_port
 from tests.schemas.examples import EXAMPLES
 
@@ -92,6 +98,22 @@ def test_metrics_are_served_on_any_local_address(address: str) -> None:
             assert reply.status == 200
             return
     assert address == "::1", "only IPv6 may be missing"
+
+
+def test_idle_connections_take_no_threads_and_keep_no_reader_out() -> None:
+    port = free_port()
+    with serve_metrics(HealthCollector("mule"), port), ExitStack() as idle:
+        threads = threading.active_count()
+        for number in range(4 * MAX_CONNECTIONS):
+            connection = socket.create_connection(("127.0.0.1", port), timeout=60)
+            idle.callback(connection.close)
+            if number % 2:
+                connection.sendall(b"GET /metrics HT")
+        assert read_healthz(port)[0] == 200
+        until_s = time.monotonic() + 60
+        while threading.active_count() - threads > MAX_CONNECTIONS:
+            assert time.monotonic() < until_s
+            time.sleep(0.01)
 
 
 def test_backlog_of_the_slowest_consumer_is_exported() -> None:
