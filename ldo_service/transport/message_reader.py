@@ -30,15 +30,17 @@ class MessageReader:
     def messages(self, topic: Topic, keep: int) -> Iterator[tuple[Header, Message]]:
         """Yield header and message of each sample on a topic, without end.
 
-        Messages that a restarted producer repeats are skipped. If messages arrive faster than the
+        Messages that a restarted producer repeats are skipped. Samples without a header and
+        malformed messages, which other programs may put on a topic, are skipped too. If messages arrive faster than the
         caller takes them, only the newest `keep` are buffered.
         """
         numbers = SequenceTracker()
         with self._subscriber(topic.subscription_key, keep) as subscriber:
             for sample in subscriber:
-                header = decode(sample.attachment.to_bytes(), Header)
-                if numbers.observe(header):
-                    yield header, _message_of(sample, topic.message)
+                header = _header_of(sample)
+                if header is not None and numbers.observe(header):
+                    for message in _readable((sample,), topic.message):
+                        yield header, message
 
     @contextmanager
     def poller(self, key: str, kind: type[M], keep: int) -> Iterator[Callable[[], list[M]]]:
@@ -88,6 +90,16 @@ class MessageReader:
     def _subscriber(self, key: str, keep: int) -> Any:
         ring = zenoh.handlers.RingChannel(keep)
         return self._session.declare_subscriber(self._network.expression(key), ring)
+
+
+def _header_of(sample: Any) -> Header | None:
+    """Return the header of a sample; None if it has none or a malformed one."""
+    if sample.attachment is None:
+        return None
+    try:
+        return decode(sample.attachment.to_bytes(), Header)
+    except msgspec.DecodeError:
+        return None
 
 
 def _message_of(sample: Any, kind: type[M]) -> M:

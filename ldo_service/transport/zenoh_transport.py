@@ -32,7 +32,8 @@ from .worker import Worker
 
 log = logging.getLogger(__name__)
 
-MAX_QUERIES = 16  # Maximum number of pending queries; further ones get an error.
+# Maximum number of pending queries for values, and of pending commands; further ones get an error.
+MAX_QUERIES = 16
 CONNECT_WITHIN_MS = 3000
 LEAVE_WITHIN_S = 2.0  # Time to send pending messages when a transport closes.
 
@@ -107,9 +108,12 @@ class ZenohTransport:
         self._loop = asyncio.get_running_loop()
         self._declared: list[Any] = []
         self._publishers: list[ZenohPublisher] = []
-        self._answering = Worker("answers")
+        # Readers of values and senders of commands have their own slots and threads, so that slow
+        # readers delay no command.
+        self._answering, self._commanding = Worker("answers"), Worker("commands")
         self._responding: set[asyncio.Task[None]] = set()
         self._query_slots = BoundedSemaphore(MAX_QUERIES)
+        self._command_slots = BoundedSemaphore(MAX_QUERIES)
 
     def publisher(self, key: str) -> "ZenohPublisher":
         """Create a publisher on a key."""
@@ -184,9 +188,9 @@ class ZenohTransport:
             try:
                 with query, suppress(zenoh.ZError):  # The client may have disconnected.
                     body = await respond(request)
-                    await self._answering.run(query.reply, expression, body)
+                    await self._commanding.run(query.reply, expression, body)
             finally:
-                self._query_slots.release()
+                self._command_slots.release()
 
         def start(query: zenoh.Query, request: bytes) -> None:
             task = self._loop.create_task(reply(query, request))
@@ -194,7 +198,7 @@ class ZenohTransport:
             task.add_done_callback(self._responding.discard)
 
         def on_query(query: zenoh.Query) -> None:
-            if self._query_slots.acquire(blocking=False):
+            if self._command_slots.acquire(blocking=False):
                 payload = query.payload
                 request = payload.to_bytes() if payload is not None else b""
                 call_soon(self._loop, start, query, request)
@@ -217,8 +221,9 @@ class ZenohTransport:
                 declared.undeclare()
         self._declared.clear()
         self._answering.close()
+        self._commanding.close()
         until_s = time.monotonic() + LEAVE_WITHIN_S
-        for leaving in (*self._publishers, self._answering):
+        for leaving in (*self._publishers, self._answering, self._commanding):
             leaving.close()
             leaving.join(max(0.0, until_s - time.monotonic()))
 

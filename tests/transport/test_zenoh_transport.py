@@ -18,8 +18,9 @@ from ldo_service.runtime import Latest
 from ldo_service.runtime.actor import Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
-from ldo_service.schemas import Health, decode
-from ldo_service.transport.flow_control import data_key, encode_link
+from ldo_service.schemas import Health, decode, encode
+from ldo_service.transport.flow_control import Header, data_key, encode_link
+from ldo_service.transport.message_reader import MessageReader
 from ldo_service.transport.zenoh_transport import (
     MAX_QUERIES,
     Endpoint,
@@ -149,6 +150,66 @@ async def test_slow_query_does_not_block_messages(network: Endpoint, client: Cli
     assert sum(answer.ok is not None for answer in answers) >= MAX_QUERIES
     assert any(answer.err is not None for answer in answers)
     transport.close()
+
+
+async def test_slow_queries_do_not_delay_commands(network: Endpoint, client: Client) -> None:
+    transport, release = ZenohTransport(client(), network), threading.Event()
+
+    def slow_values() -> list[tuple[bytes, bytes]]:
+        release.wait(60)
+        return [(b"", b"value")]
+
+    async def obey(request: bytes) -> bytes:
+        return request + b" obeyed"
+
+    transport.serve_queries("test/slow", slow_values)
+    transport.respond("test/command", obey)
+    requester = client()
+    many = range(MAX_QUERIES + 5)
+    replies = [requester.get(network.expression("test/slow"), timeout=60.0) for _ in many]
+
+    def command() -> bytes:
+        command = requester.get(
+            network.expression("test/command"), payload=b"pause", timeout=60.0
+        )
+        reply = next(iter(command))
+        return reply.ok.payload.to_bytes() if reply.ok is not None else b"rejected"
+
+    answers = await asyncio.to_thread(lambda: [command() for _ in range(5)])
+    release.set()
+    await asyncio.to_thread(lambda: [next(iter(reply)) for reply in replies])
+    assert answers == [b"pause obeyed"] * 5
+    transport.close()
+
+
+async def test_reader_skips_what_other_programs_put_on_a_topic(
+    network: Endpoint, client: Client
+) -> None:
+    reader, writer, got = MessageReader(client(), network), client(), []
+
+    def read_two() -> None:
+        for header, _ in reader.messages(NUMBERS, 16):
+            got.append(header.seq)
+            if len(got) == 2:
+                return
+
+    reading = asyncio.create_task(asyncio.to_thread(read_two))
+    put, key = writer.put, network.expression(NUMBERS.name)
+
+    def put_all(seq: int) -> None:
+        body = encode(number(seq))
+        put(key, body)
+        put(key, body, attachment=b"\xc1")
+        put(key, b"\xc1", attachment=encode_link(Header("x", 1, 2 * seq, 0)))
+        put(key, body, attachment=encode_link(Header("x", 1, 2 * seq + 1, 0)))
+
+    for seq in range(1000):
+        await asyncio.to_thread(put_all, seq)
+        await asyncio.wait({reading}, timeout=0.05)
+        if reading.done():
+            break
+    await reading
+    assert len(got) == 2 and all(seq % 2 for seq in got)
 
 
 async def test_liveliness_watcher_sees_present_joining_and_leaving_actors(
