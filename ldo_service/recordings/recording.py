@@ -115,15 +115,21 @@ def _files_by_process(folder: Path) -> dict[str, dict[int, Path]]:
 
 
 def prepare_recording(folder: Path) -> None:
-    """Create the folder of a new recording.
+    """Create the folder of a recording, or continue the recording in it.
+
+    A restarted service continues its recording: each of its processes writes new files, as after
+    the restart of an actor.
 
     Raises:
-        ConfigError: The folder is not empty or cannot be written.
+        ConfigError: The folder contains something else, or cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise ConfigError(f"{folder} is not empty. Choose another folder for the recording.")
+        if any(folder.iterdir()) and not _files_by_process(folder):
+            raise ConfigError(
+                f"{folder} is not empty and holds no recording. Choose another folder for the "
+                "recording."
+            )
     except OSError as error:
         raise ConfigError(
             f"{folder} cannot be written: {error.strerror}. Choose another folder for the "

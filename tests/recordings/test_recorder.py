@@ -270,12 +270,14 @@ def test_each_run_of_an_actor_has_a_numbered_file(tmp_path: Path) -> None:
     assert names == {"mapper": ["mapper.mcap", *later], "tracker": ["tracker.mcap"]}
 
 
-def test_recording_needs_an_empty_or_new_folder(tmp_path: Path) -> None:
-    prepare_recording(tmp_path / "new")
+def test_recording_continues_in_its_own_folder_and_in_no_other(tmp_path: Path) -> None:
     prepare_recording(tmp_path / "new")
     (tmp_path / "new" / "tracker.mcap").touch()
-    with pytest.raises(ConfigError, match="not empty"):
-        prepare_recording(tmp_path / "new")
+    prepare_recording(tmp_path / "new")
+    assert new_path(tmp_path / "new", "tracker").name == "tracker.2.mcap"
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(ConfigError, match="is not empty and holds no recording"):
+        prepare_recording(tmp_path)
     with pytest.raises(ConfigError, match="cannot be written"):
         prepare_recording(Path("/proc/nowhere"))
 
