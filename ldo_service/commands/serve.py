@@ -1,7 +1,9 @@
 """Commands `ldo serve` and `ldo record`."""
 
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import tyro
@@ -9,6 +11,7 @@ import tyro
 from ldo_service.config import load_config
 from ldo_service.service.service import Service
 from ldo_service.service.state_folder import state_folder
+from ldo_service.transport.access_control import LOCAL
 from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
 from ldo_service.transport.keys import TlsKeys
 
@@ -64,13 +67,18 @@ def serve(
       ldo publish synthetic:room --rate 15      (in another terminal)
     """
     settings = localizing(load_config(config, set), localize)
-    folder_of_keys = TlsKeys.of(keys or settings.service.keys or None)
+    is_local = endpoint.startswith(f"{LOCAL}/")  # A child process of a service with keys.
+    folder_of_keys = None if is_local else TlsKeys.of(keys or settings.service.keys or None)
     network = Endpoint(robot, endpoint, folder_of_keys, settings.service.max_message_mb)
     is_router = not (actor or client)
     if is_router and not insecure:
         network.require_safe()
     with ExitStack() as stack:
         folder = state_folder(state, stack)
+        if is_router and network.keys:
+            network.keys.warn_of_expiry()
+            private = stack.enter_context(TemporaryDirectory(prefix="ldo-"))  # Mode 0700.
+            network = replace(network, local_socket=f"{private}/link")
         Service(
             settings,
             network,

@@ -251,7 +251,6 @@ class Service:
         command = python_command(
             *("serve", "--actor", box.name, "--robot", self.network.robot),
             *("--endpoint", self.network.local_endpoint),
-            *(("--keys", str(self.network.keys.folder)) if self.network.keys else ()),
             *("--config", str(config), "--state", str(self.state)),
             *(("--record", str(self.recording)) if self.recording else ()),
         )

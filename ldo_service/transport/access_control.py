@@ -41,6 +41,8 @@ from ldo_service.storage.yaml_io import load_yaml
 
 from .flow_control import ALIVE
 
+LOCAL = "unixsock-stream"  # Zenoh's name of the protocol of Unix sockets.
+
 Role = Literal["service", "camera", "odometry", "viewer", "operator"]
 PUTS: dict[Role, Sequence[Topic]] = {
     "camera": FROM_OUTSIDE,
@@ -88,8 +90,14 @@ def read_access(path: Path) -> dict[str, AccessEntry]:
         ) from error
 
 
-def access_control(access: Access) -> dict[str, Any]:
-    """Return the section `access_control` of a router's Zenoh configuration."""
+def access_control(access: Access, local_robot: str = "") -> dict[str, Any]:
+    """Return the section `access_control` of a router's Zenoh configuration.
+
+    Args:
+        access: Role of each certificate.
+        local_robot: Robot whose child processes connect over a Unix socket and perform all
+            operations; empty: none. Only the user of the service can open the socket.
+    """
     parts: dict[tuple[Role, str], list[str]] = {}
     for name, grantee in sorted(access.items()):
         parts.setdefault((grantee.role, grantee.robot), []).append(name)
@@ -100,6 +108,11 @@ def access_control(access: Access) -> dict[str, Any]:
         rules += of_part
         subjects.append({"id": part, "cert_common_names": names})
         policies.append({"rules": [rule["id"] for rule in of_part], "subjects": [part]})
+    if local_robot:
+        (rule,) = (rule.for_robot(local_robot, "this machine") for rule in rules_of("service"))
+        rules.append(rule)
+        subjects.append({"id": "this machine", "link_protocols": [LOCAL]})
+        policies.append({"rules": [rule["id"]], "subjects": ["this machine"]})
     lists = {"rules": rules, "subjects": subjects, "policies": policies}
     return {"enabled": True, "default_permission": "deny", **lists}
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from ldo_service.errors import ConfigError
 from ldo_service.schemas.topics import ROBOT_PREFIX
 
+from .access_control import LOCAL
 from .keys import TlsKeys
 
 # Default address of HTTP servers. They have no access control, so on another address every
@@ -33,6 +34,9 @@ class Endpoint:
     endpoint: str = DEFAULT_ENDPOINT
     keys: TlsKeys | None = None
     max_message_mb: int = MAX_MESSAGE_MB  # Receivers drop larger messages.
+    # Path of a Unix socket on which a router with TLS keys also listens, for its own child
+    # processes; empty: none. A certificate that has expired does not end this link.
+    local_socket: str = ""
 
     def __post_init__(self) -> None:
         require_robot(self.robot)
@@ -61,6 +65,8 @@ class Endpoint:
     @property
     def local_endpoint(self) -> str:
         """Address that processes on the same machine connect to."""
+        if self.local_socket:
+            return f"{LOCAL}/{self.local_socket}"
         reached = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self.address[0])
         if reached is None:
             return self.endpoint
@@ -73,7 +79,8 @@ class Endpoint:
             ConfigError: The endpoint is on another address and has no TLS. Every machine on the
                 network could then read topics, publish messages and send commands.
         """
-        if self.keys is None and not _is_loopback(self.address[0]):
+        is_local = self.endpoint.startswith(f"{LOCAL}/")
+        if self.keys is None and not is_local and not _is_loopback(self.address[0]):
             raise ConfigError(
                 f"endpoint {self.endpoint} would let every machine on the network read the map "
                 "and control the robot. Use tls/ADDRESS:PORT with --keys (created by `ldo keys`), "

@@ -9,8 +9,10 @@ The first three files are named as in a Kubernetes TLS secret, so a folder with 
 works too.
 """
 
+import logging
 import socket
 import ssl
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,17 +21,26 @@ from ldo_service.errors import ConfigError
 
 from .access_control import Access, access_control, read_access
 
+log = logging.getLogger(__name__)
+
 CA, CERTIFICATE, KEY, ACCESS = "ca.crt", "tls.crt", "tls.key", "access.yaml"
+EXPIRY_WARNING_DAYS = 30  # Time before the expiry of a certificate with warnings.
 OTHERS = 0o007  # Bits of a file mode that give access to all users of the machine.
 # Time limit for reading the TLS error of a server, seconds. A server rejects a client in the
 # handshake or one round trip later.
 ALERT_WITHIN_S = 1.0
 
 
-def router_settings(folder: Path, access: Access) -> dict[str, Any]:
-    """Return the Zenoh settings, by path, of a router with its keys in `folder`."""
+def router_settings(folder: Path, access: Access, local_robot: str = "") -> dict[str, Any]:
+    """Return the Zenoh settings, by path, of a router with its keys in `folder`.
+
+    Args:
+        folder: The folder with the keys.
+        access: Role of each certificate.
+        local_robot: Robot whose child processes connect over a Unix socket; empty: none.
+    """
     tls = {"transport/link/tls": _tls(folder, "listen")}
-    return {**tls, "access_control": access_control(access)}
+    return {**tls, "access_control": access_control(access, local_robot)}
 
 
 def _tls(folder: Path, side: str) -> dict[str, Any]:
@@ -69,15 +80,41 @@ class TlsKeys:
             )
         self.context()
 
-    def settings(self, router: bool) -> dict[str, Any]:
+    def settings(self, router: bool, local_robot: str = "") -> dict[str, Any]:
         """Return the Zenoh settings, by path, of a router or a client with these keys.
 
         Args:
             router: True for a router, whose settings include the roles in `access.yaml`.
+            local_robot: Robot whose child processes connect over a Unix socket; empty: none.
         """
         if router:
-            return router_settings(self.folder, read_access(self.folder / ACCESS))
+            return router_settings(self.folder, read_access(self.folder / ACCESS), local_robot)
         return {"transport/link/tls": _tls(self.folder, "connect")}
+
+    def days_left(self) -> float | None:
+        """Return the days until the certificate of this machine expires; None if unknown.
+
+        The result is negative after the expiry, by the clock of this machine.
+        """
+        # The standard library reads a certificate from a file by this function alone.
+        read = getattr(getattr(ssl, "_ssl", None), "_test_decode_cert", None)
+        if read is None:
+            return None
+        until_s = ssl.cert_time_to_seconds(read(str(self.folder / CERTIFICATE))["notAfter"])
+        return (until_s - time.time()) / 86400
+
+    def warn_of_expiry(self) -> None:
+        """Log a warning if the certificate has expired or expires within 30 days."""
+        days = self.days_left()
+        if days is None or days > EXPIRY_WARNING_DAYS:
+            return
+        when = f"expires in {days:.1f} days" if days > 0 else f"expired {-days:.1f} days ago"
+        log.warning(
+            "service: the certificate %s %s by the clock of this machine. Other machines cannot "
+            "connect after that; actors on this machine continue. Run `ldo keys` for new keys, or "
+            "set the clock.",
+            self.folder / CERTIFICATE, when,
+        )  # fmt: skip
 
     def context(self) -> ssl.SSLContext:
         """Create the TLS context of a client with these keys.

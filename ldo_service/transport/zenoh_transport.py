@@ -59,13 +59,14 @@ def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
 
 
 def _session_config(network: Endpoint, router: bool) -> zenoh.Config:
+    local = [network.local_endpoint] if router and network.local_socket else []
     settings = {
         "mode": "router" if router else "client",
-        "listen/endpoints" if router else "connect/endpoints": [network.endpoint],
+        "listen/endpoints" if router else "connect/endpoints": [network.endpoint, *local],
         **CLOSED,
         "transport/link/rx/max_message_size": network.max_message_mb * 1_000_000,
         "connect/timeout_ms": CONNECT_WITHIN_MS,
-        **(network.keys.settings(router) if network.keys else {}),
+        **(network.keys.settings(router, network.robot if local else "") if network.keys else {}),
     }
     config = zenoh.Config()
     for key, value in settings.items():

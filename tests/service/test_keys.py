@@ -1,6 +1,8 @@
 """Test of the service over TLS, with certificates for each role."""
 
 import subprocess
+import urllib.request
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,7 @@ from ldo_service.client import connect
 from ldo_service.schemas import TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
 from ldo_service.transport.certificate_authority import CertificateAuthority
-from tests.ports import free_endpoint
+from tests.ports import free_endpoint, free_port
 from tests.service.conftest import LDO, wait_until
 
 
@@ -43,3 +45,32 @@ def test_poses_are_received_over_tls_and_roles_are_enforced(tmp_path: Path) -> N
     finally:
         service.terminate()
         assert service.wait(60) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shift_days", [-3, 3], ids=["expired", "not valid yet"])
+def test_invalid_certificate_of_the_robot_stops_no_actor(tmp_path: Path, shift_days: int) -> None:
+    authority = CertificateAuthority.new(tmp_path / "keys", days=30)
+    now = datetime.now(UTC) + timedelta(days=shift_days)
+    keys = authority.add("mule", "service", "robot", days=1, now=now)
+    endpoint, port = f"tls/127.0.0.1:{free_port()}", free_port()
+    arguments = ("--endpoint", endpoint, "--keys", str(keys), "--metrics-port", str(port))
+    with subprocess.Popen(
+        [*LDO, "serve", *arguments, "--state", str(tmp_path / "s")],
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as service:
+
+        def is_healthy() -> bool:
+            assert service.poll() is None
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=60):
+                    return True
+            except OSError:
+                return False
+
+        wait_until(is_healthy, 20, "heartbeats of all actors, also of the child process")
+        service.terminate()
+        assert service.wait(60) == 0
+        assert service.stderr is not None
+        assert "the certificate" in service.stderr.read()
