@@ -204,6 +204,6 @@ def require_rgbd(camera: CameraModel, color: Array, depth_m: Array) -> None:
     depth = depth_m.numpy()
     if not (depth.min() >= 0 and depth.max() < MAX_DEPTH_M):  # NaN fails both comparisons.
         raise ValueError(
-            f"depth_m is {depth.min():g} to {depth.max():g} m, must be finite, at least 0 and below "
-            f"{MAX_DEPTH_M:g}, where 0 means not measured"
+            f"depth_m is {depth.min():g} to {depth.max():g} m, must be finite, at least 0 and "
+            f"below {MAX_DEPTH_M:g}, where 0 means not measured"
         )

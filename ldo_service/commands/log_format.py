@@ -6,8 +6,8 @@ import logging
 class OneLineFormatter(logging.Formatter):
     """Formatter that escapes control characters, so that one message is one line.
 
-    Messages may contain text of other programs, which could otherwise forge further lines or control
-    the terminal. Tracebacks keep their lines.
+    Messages may contain text of other programs, which could otherwise forge further lines or
+    control the terminal. Tracebacks keep their lines.
     """
 
     def __init__(self) -> None:

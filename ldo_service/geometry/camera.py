@@ -18,9 +18,12 @@ MIN_FOCAL_RATIO, NARROWEST = 0.02, 100.0
 # Maximum radius in normalized coordinates: 76 degrees from the axis, beyond any pinhole model.
 FARTHEST_RADIUS = 4.0
 
-# Maximum factor by which a lens changes the distance of a point of the image from its center. The widest lens of the pinhole model, a fisheye lens
-# of 76 degrees from the axis, has a factor of 3.3.
+# Maximum factor by which a lens changes the distance of a point of the image from its center. A
+# fisheye lens (equisolid) has a factor of 3.3 at 76 degrees from the axis.
 MAX_LENS_FACTOR = 8.0
+# Maximum distortion coefficient, so that polynomials fit into a float32. Tangential coefficients,
+# which describe a tilted lens, are below 1.
+MAX_COEFFICIENT = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +247,8 @@ def _is_lens(distortion: tuple[float, ...], corner: float) -> bool:
         distortion: Coefficients of the lens.
         corner: Distorted radius of the farthest image corner, in normalized coordinates.
     """
+    if max(map(abs, distortion)) > MAX_COEFFICIENT or max(map(abs, distortion[2:4])) > 1.0:
+        return False
     r, radial = _radial(distortion)
     with np.errstate(all="ignore"):
         bent = r * radial

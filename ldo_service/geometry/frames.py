@@ -14,7 +14,6 @@ from ldo_service.errors import FrameError
 
 from .camera import Camera
 
-
 # Depth from which on a value means "not measured", meters. Depth cameras measure up to 100 m. Some
 # simulators write their far plane, 1e30 or the largest float where they measured nothing.
 MAX_DEPTH_M = 1000.0
@@ -105,7 +104,6 @@ class RawFrame:
     def depth_m(self) -> np.ndarray:
         """Return the depth [H, W] float32 in meters; 0 where not measured."""
         return in_meters(self.depth, self.depth_scale)
-
 
     def too_far(self) -> int:
         """Return the number of pixels whose depth is finite but at least `MAX_DEPTH_M`."""

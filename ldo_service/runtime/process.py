@@ -18,7 +18,7 @@ from ldo_service.transport.flow_control import Header, encode_link
 from ldo_service.transport.interface import Transport, call_soon
 
 from .process_heartbeat import PIPE_VARIABLE, HeartbeatPipe
-from .supervision_policy import RestartBudget
+from .supervision_policy import RestartBudget, RunningClock
 
 log = logging.getLogger(__name__)
 
@@ -224,8 +224,11 @@ class ChildProcess:
         A process that the user suspended (SIGSTOP, a debugger) is killed only when its step timeout
         has expired too.
         """
+        clock, period_s = RunningClock(self._loop.time), self._silent_after_s / 10
         while True:
-            await asyncio.sleep(self._silent_after_s / 10)
+            # The child cannot report while this process does not run either.
+            self._heard_until_s += clock.tick(period_s)
+            await asyncio.sleep(period_s)
             now_s = self._loop.time()
             if self.pid is not None and _is_suspended(self.pid):
                 if self._suspended_at_s is None:

@@ -31,7 +31,7 @@ from ldo_service.transport.endpoint import LOOPBACK
 MAX_ACTORS = 64  # Maximum number of actors, because messages may contain any name.
 COMES_BACK_S = 5.0  # Time for an actor to restart after it was killed at its heartbeat timeout.
 
-MAX_CONNECTIONS = 16  # Of the metrics server; Prometheus and a health check use two.
+MAX_CONNECTIONS = 16  # Connections of the metrics server; two are in use as a rule.
 REQUEST_TIMEOUT_S = 5.0  # Maximum time without data from a client of the metrics server.
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]
@@ -249,7 +249,7 @@ class _Server(ThreadingMixIn, WSGIServer):
             oldest = self._open.popleft() if len(self._open) > MAX_CONNECTIONS else None
         if oldest is not None:
             with suppress(OSError):
-                oldest.shutdown(socket.SHUT_RDWR)  # Its thread wakes up and closes it.
+                oldest.shutdown(socket.SHUT_RDWR)  # The thread of the connection then closes it.
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:

@@ -31,8 +31,8 @@ class MessageReader:
         """Yield header and message of each sample on a topic, without end.
 
         Messages that a restarted producer repeats are skipped. Samples without a header and
-        malformed messages, which other programs may put on a topic, are skipped too. If messages arrive faster than the
-        caller takes them, only the newest `keep` are buffered.
+        malformed messages, which other programs may put on a topic, are skipped too. If messages
+        arrive faster than the caller takes them, only the newest `keep` are buffered.
         """
         numbers = SequenceTracker()
         with self._subscriber(topic.subscription_key, keep) as subscriber:

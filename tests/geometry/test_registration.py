@@ -160,7 +160,7 @@ def test_depth_of_another_size_than_its_camera_is_an_error() -> None:
 
 
 def test_cells_that_cover_the_color_image_many_times_are_rejected() -> None:
-    shrinking = (1e9, 0.0, 0.0, 0.0, 0.0, 7.9e9, 0.0, 0.0)  # By 7.9, just below the limit.
+    shrinking = (1e5, 0.0, 0.0, 0.0, 0.0, 7.9e5, 0.0, 0.0)  # By 7.9, just below the limit.
     color_camera = Camera(640, 480, 640.0, 480.0, 320.0, 240.0, shrinking)
     depth_camera = Camera(640, 480, 160.0, 120.0, 320.0, 240.0)
     with pytest.raises(FrameError, match="do not belong together"):

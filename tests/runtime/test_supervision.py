@@ -3,6 +3,7 @@
 import asyncio
 import subprocess
 import sys
+from itertools import count
 from threading import Event
 
 import pytest
@@ -87,11 +88,14 @@ async def test_stage_that_exceeds_its_drain_time_is_cancelled() -> None:
 
 
 async def test_exhausted_restart_budget_ends_all_stages() -> None:
+    tries = count()
+
     def fail(_value: int) -> None:
-        raise RuntimeError("always")
+        if next(tries) % 2 == 0:
+            raise RuntimeError("once")
 
     transport, stop = MemoryTransport(), StopRequest()
-    config = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=1)
+    config = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=0)
     bad, good = collector(transport, [], fail, config=config), Stage(Doubler, transport)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["collector"])
     service = asyncio.create_task(supervise([good, bad], stop))

@@ -169,9 +169,7 @@ async def test_slow_queries_do_not_delay_commands(network: Endpoint, client: Cli
     replies = [requester.get(network.expression("test/slow"), timeout=60.0) for _ in many]
 
     def command() -> bytes:
-        command = requester.get(
-            network.expression("test/command"), payload=b"pause", timeout=60.0
-        )
+        command = requester.get(network.expression("test/command"), payload=b"pause", timeout=60.0)
         reply = next(iter(command))
         return reply.ok.payload.to_bytes() if reply.ok is not None else b"rejected"
 
@@ -209,7 +207,8 @@ async def test_reader_skips_what_other_programs_put_on_a_topic(
         if reading.done():
             break
     await reading
-    assert len(got) == 2 and all(seq % 2 for seq in got)
+    assert len(got) == 2
+    assert all(seq % 2 for seq in got)
 
 
 async def test_liveliness_watcher_sees_present_joining_and_leaving_actors(
