@@ -61,6 +61,13 @@ Topics = Annotated[
         "may be repeated; replaces dataset.topics",
     ),
 ]
+RecordedOdometry = Annotated[
+    bool,
+    argument(
+        help="send the odometry that the source contains, such as the poses of a phone, to the "
+        "tracker as odometry prior"
+    ),
+]
 MaxFrames = Annotated[int | None, argument(metavar="N", help="stop after N frames")]
 Stride = Annotated[int, argument(metavar="N", help="take every N-th frame")]
 Recording = Annotated[

@@ -34,6 +34,7 @@ from .options import (
     EndpointAddress,
     KeysFolder,
     MaxFrames,
+    RecordedOdometry,
     Robot,
     Settings,
     Stride,
@@ -70,6 +71,7 @@ def publish(
     config: ConfigFile = None,
     set: Settings = (),
     topic: Topics = (),
+    recorded_odometry: RecordedOdometry = False,
     usb: RealSenseOptions = FIRST_REALSENSE,
     ros: RosOptions = NO_TOPICS,
 ) -> None:
@@ -88,7 +90,16 @@ def publish(
     """
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     if source in (REALSENSE, ROS2):
-        require_no_sequence(source, rate=rate, config=config, set=set, topic=topic)
+        require_no_sequence(
+            source,
+            **{
+                "rate": rate,
+                "config": config,
+                "set": set,
+                "topic": topic,
+                "recorded-odometry": recorded_odometry,
+            },
+        )
         network, chosen = Endpoint(robot, endpoint, TlsKeys.of(keys)), Selection(stride, max_frames)
         live = (
             realsense.frames(usb.stream())
@@ -103,7 +114,9 @@ def publish(
     settings = load_config(config, with_topics(set, topic))
     sequence = open_sequence(source, settings.dataset.options())
     indices = Selection(stride, max_frames).indices(sequence)
-    prior = PriorSource(recorded_prior(sequence, indices, settings, console.print))
+    prior = PriorSource(
+        recorded_prior(sequence, indices, settings, console.print) if recorded_odometry else None
+    )
     with (
         connect(robot, endpoint, keys) as service,
         progress("publish", len(indices), console) as advance,

@@ -26,6 +26,7 @@ from .options import (
     Localize,
     MaxFrames,
     Overwrite,
+    RecordedOdometry,
     Settings,
     Source,
     Stride,
@@ -43,6 +44,7 @@ def run(
     config: ConfigFile = None,
     set: Settings = (),
     topic: Topics = (),
+    recorded_odometry: RecordedOdometry = False,
     max_frames: MaxFrames = None,
     stride: Stride = 1,
     hold_out_every: Annotated[
@@ -110,11 +112,13 @@ def run(
     }
     looking = {
         "--odometry-prior": odometry_prior,
+        "--recorded-odometry": recorded_odometry,
         "--localize": localize,
         "--keep-front-end": keep_front_end,
     }
     require_none_of("--realtime", realtime, over_file)
     require_none_of("--reuse-front-end", reuse_front_end, looking)
+    require_none_of("--recorded-odometry", recorded_odometry, {"--odometry-prior": odometry_prior})
     require_none_of("--localize", localize, {"--keep-front-end": keep_front_end})
     require_separate(localize, out, refine_iterations)
     console = Console(stderr=True)
@@ -125,7 +129,7 @@ def run(
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_sequence(source, settings.dataset.options())
     recorded = None
-    if odometry_prior is None and reuse_front_end is None:
+    if recorded_odometry:
         indices = selection.indices(sequence)
         recorded = recorded_prior(sequence, indices, settings, console.print)
     job = RunOptions(

@@ -11,12 +11,13 @@ from ldo_service.config import load_config
 from ldo_service.datasets import open_sequence
 from ldo_service.runs.networks import require_usable_networks
 from ldo_service.runs.simulation import ActorDigest, simulate_graph
-from ldo_service.runs.source import Selection
+from ldo_service.runs.source import Selection, recorded_prior
 
 from .options import (
     ConfigFile,
     Json,
     MaxFrames,
+    RecordedOdometry,
     Settings,
     Source,
     Stride,
@@ -33,6 +34,7 @@ def simulate(
     config: ConfigFile = None,
     set: Settings = (),
     topic: Topics = (),
+    recorded_odometry: RecordedOdometry = False,
     max_frames: MaxFrames = None,
     stride: Stride = 1,
     threads: Annotated[
@@ -54,8 +56,12 @@ def simulate(
     require_usable_networks(settings)
     sequence = open_sequence(source, settings.dataset.options())
     selection = Selection(stride, max_frames)
+    prior = None
+    if recorded_odometry:
+        indices = selection.indices(sequence)
+        prior = recorded_prior(sequence, indices, settings, console.print)
     with progress("simulate", len(selection.indices(sequence)), console) as advance:
-        made = simulate_graph(sequence, settings, selection, console.print, advance)
+        made = simulate_graph(sequence, settings, selection, console.print, advance, prior)
     if json_:
         print(json.dumps({actor: asdict(digest) for actor, digest in made.items()}))
     else:

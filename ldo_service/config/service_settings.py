@@ -43,9 +43,6 @@ class DatasetSettings:
     # Topics in a bag of ROS, such as `[color=/a/image_raw, depth=/b/image_raw, odometry=/odom]`. A
     # topic that is not listed is found by type and name.
     topics: tuple[str, ...] = ()
-    # True sends the odometry that a recording contains, such as the poses of a phone, to the
-    # tracker as odometry prior.
-    odometry_prior: bool = False
 
     def __post_init__(self) -> None:
         for topic in self.topics:

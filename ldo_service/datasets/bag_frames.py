@@ -122,7 +122,7 @@ def read_odometry(bag: BagFile, topic: Topic, camera_frame: str) -> Trajectory |
         raise DataError(
             f"{bag.path}: the odometry of {topic.name} is that of the frame {base_frame!r}, and "
             f"/tf_static does not connect it with the camera's frame {camera_frame!r}. Record "
-            "/tf_static too, or set dataset.odometry_prior=false."
+            "/tf_static too, or remove --recorded-odometry."
         )
     stamps_ns = sorted(poses)
     T_odom_camera = np.array([poses[stamp_ns] @ T_base_camera for stamp_ns in stamps_ns])

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from ldo_service.actors.topology import make_actors
 from ldo_service.config import Config, actor_parameters, latency_frames
 from ldo_service.errors import DataError
+from ldo_service.geometry import Trajectory
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.runtime.journal import digest
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import Message, encode
 
 from .job import Advance
-from .source import FrameReader, Selection, Warn, interleave_prior, recorded_prior
+from .source import FrameReader, Selection, Warn, interleave_prior
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,12 @@ class Digests:
 
 
 def simulate_graph(
-    sequence: Sequence, config: Config, selection: Selection, warn: Warn, advance: Advance
+    sequence: Sequence,
+    config: Config,
+    selection: Selection,
+    warn: Warn,
+    advance: Advance,
+    prior: Trajectory | None = None,
 ) -> dict[str, ActorDigest]:
     """Run all actors over the selected frames and return the digest of each actor, by its name.
 
@@ -55,11 +61,7 @@ def simulate_graph(
         DataError: No frame can be read.
         StageError: An actor fails.
     """
-    indices = selection.indices(sequence)
-    reader, prior = (
-        FrameReader(sequence, indices, warn),
-        recorded_prior(sequence, indices, config, warn),
-    )
+    reader = FrameReader(sequence, selection.indices(sequence), warn)
     actors = make_actors(actor_parameters(config))
     digests = Digests([actor.name for actor in actors])
     with LogicalClock(

@@ -87,8 +87,8 @@ def recorded_prior(
 ) -> Trajectory | None:
     """Return the odometry that was recorded with a sequence as poses T_odom_base, or None.
 
-    The poses are None if `dataset.odometry_prior` is false, or if the sequence has none at the time
-    of the selected frames, of which the user is warned.
+    The poses are None if the sequence has none at the time of the selected frames, of which the
+    user is warned.
 
     Args:
         sequence: The sequence.
@@ -99,13 +99,11 @@ def recorded_prior(
     Raises:
         DataError: The recorded odometry cannot be read.
     """
-    if not config.dataset.odometry_prior:
-        return None
     camera = sequence.odometry()
     if camera is None or not _overlaps(camera, sequence, indices):
         warn(
-            f"{sequence.name} has no odometry at the time of its frames, so "
-            "dataset.odometry_prior has no effect; no action needed."
+            f"{sequence.name} has no odometry at the time of its frames, so --recorded-odometry "
+            "has no effect; no action needed."
         )
         return None
     T_camera_base = se3.inverse(T_base_camera(config))

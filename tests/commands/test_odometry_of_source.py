@@ -30,7 +30,7 @@ def scan(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_poses_of_the_phone_are_truth_only_if_asked(capsys, scan: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    assert ldo(capsys, "run", scan, "--out", run, "--set", "dataset.odometry_prior=true")[0] == 0
+    assert ldo(capsys, "run", scan, "--out", run, "--recorded-odometry")[0] == 0
     code, out, _ = ldo(capsys, "eval", run, scan, "--json")
     assert (code, json.loads(out)["trajectory"]) == (0, None)
     code, out, _ = ldo(capsys, "eval", run, scan, "--json", "--odometry-as-truth")

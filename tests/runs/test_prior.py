@@ -104,24 +104,18 @@ class WithOdometry(Cached):
         return self._poses
 
 
-WITH_PRIOR = "dataset.odometry_prior=true"
 MOUNT = "tracker.T_base_camera.translation_m=[0.1, 0.2, 0.3]"
 
 
 def test_recorded_odometry_of_the_camera_becomes_that_of_the_base(
     room: Sequence, prior: Trajectory
 ) -> None:
-    config = load_config(None, [WITH_PRIOR, MOUNT])
+    config = load_config(None, [MOUNT])
     found = recorded_prior(WithOdometry(room, prior), range(4), config, pytest.fail)
     assert found is not None
     T_base_camera = np.eye(4)
     T_base_camera[:3, 3] = 0.1, 0.2, 0.3
     np.testing.assert_allclose(found.T_world_camera @ T_base_camera, prior.T_world_camera)
-
-
-def test_recorded_odometry_is_used_only_if_asked_for(room: Sequence, prior: Trajectory) -> None:
-    sequence = WithOdometry(room, prior)
-    assert recorded_prior(sequence, range(4), load_config(None), pytest.fail) is None
 
 
 @pytest.mark.parametrize("shift_s", [None, 1e6])
@@ -130,6 +124,6 @@ def test_missing_odometry_is_only_a_warning(
 ) -> None:
     odometry = None if shift_s is None else replace(prior, stamps_s=prior.stamps_s + shift_s)
     warnings: list[str] = []
-    sequence, config = WithOdometry(room, odometry), load_config(None, [WITH_PRIOR])
+    sequence, config = WithOdometry(room, odometry), load_config(None)
     assert recorded_prior(sequence, range(4), config, warnings.append) is None
     assert "has no odometry at the time of its frames" in warnings[0]
