@@ -11,10 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from ldo_service.actors.frame_source import FrameSource
 from ldo_service.datasets import find_layout
 from ldo_service.errors import ConfigError, DataError, LdoError
-from ldo_service.recordings.recording import recorded_actors
 from ldo_service.storage.atomic_write import UNFINISHED
 
 from .store import Entry, open_store
@@ -22,7 +20,7 @@ from .store import Entry, open_store
 SYNTHETIC = "synthetic:"
 PATTERN = frozenset("*?[")
 MAX_MIRRORED = 2000  # Number of names that recognize the layout of a folder in a bucket.
-SUFFIXES = (".bag", ".mcap", ".db3", ".r3d", ".sens")  # Suffixes that a name does not need.
+SUFFIXES = (".bag", ".mcap", ".db3", ".mkv", ".r3d", ".sens")  # Suffixes that a name does not need.
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +153,7 @@ def _is_recording(entry: Entry) -> bool:
     """
     store = entry.store
     if store.is_local:
-        return _has_layout(store.local)
+        return find_layout(store.local) is not None
     with tempfile.TemporaryDirectory(prefix="ldo-names-") as folder:
         mirror = Path(folder) / (store.name or "bucket")
         if entry.is_file:
@@ -165,16 +163,7 @@ def _is_recording(entry: Entry) -> bool:
             for child in store.entries()[:MAX_MIRRORED]:
                 path = mirror / child.store.name
                 path.touch() if child.is_file else path.mkdir()
-        return _has_layout(mirror)
-
-
-def _has_layout(path: Path) -> bool:
-    """Return whether a path has a known layout.
-
-    A folder with other files .mcap than those of the frame source is a folder of bags.
-    """
-    is_recorded = path.is_dir() and FrameSource.name in recorded_actors(path)
-    return is_recorded or find_layout(path) is not None
+        return find_layout(mirror) is not None
 
 
 def _is_remote(word: str) -> bool:

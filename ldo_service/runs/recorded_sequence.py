@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig, join_halves
+from ldo_service.actors.topology import GRAPH
 from ldo_service.conversions.frames import camera_from_message, raw_frame_from_message
 from ldo_service.datasets import Layout
 from ldo_service.datasets.files import name_of
@@ -141,11 +142,16 @@ def _frames(messages: Iterator[RecordedMessage]) -> Iterator[RecordedFrame]:
             continue
 
 
+def _is_recording(path: Path) -> bool:
+    """Return whether a folder has the file of an actor; other files .mcap are bags."""
+    return any(box.name in recorded_actors(path) for box in GRAPH)
+
+
 # Registered as an entry point of the group `ldo.sequences`, because `datasets` may not import the
 # package of recordings.
 LAYOUT = Layout(
     "a recording of `ldo record`",
     "frame_source.mcap",
-    lambda path: bool(recorded_actors(path)),
+    _is_recording,
     lambda path, _options: RecordingSequence(path),
 )
