@@ -48,6 +48,8 @@ EXTRAS = {  # Optional extra of the package: modules that it installs.
     "ros2": ("rosbags",),
     "bags": ("rosbags",),
     "phones": ("av", "liblzfse"),
+    "s3": ("s3fs",),
+    "cluster": ("ray", "s3fs"),
 }
 REINSTALL = "`.venv/bin/pip install -e .` in the clone of LDO-SLAM installs all libraries."
 LISTEN_S = 1.5  # Three heartbeats.

@@ -149,10 +149,12 @@ def test_a_folder_without_a_recording_is_bad_data(tmp_path: Path, capsys) -> Non
     assert_one_paragraph(err)
 
 
-def test_record_command_refuses_to_overwrite_a_recording(recording: Path, capsys) -> None:
-    code, _, err = ldo(capsys, "record", str(recording))
+def test_record_command_refuses_a_folder_with_other_files(tmp_path: Path, capsys) -> None:
+    (tmp_path / "thesis.tex").touch()
+    code, _, err = ldo(capsys, "record", str(tmp_path))
     assert code == 2
     assert_one_paragraph(err)
+    assert "holds no recording" in err
 
 
 # --- in pytest ------------------------------------------------------------------------------------
