@@ -72,8 +72,9 @@ from ldo_service.semantics.ordered_semantics import OrderedSemantics
 
 # Idle steps between two messages with changed Gaussians: some seconds of work, up to 4 MB.
 IDLE_STEPS_PER_DELTA = 8
-# Time without messages after which the camera stands still, seconds. Late labels are then corrected
-# with the finished map of all keyframes; in shorter pauses, the result would depend on the pauses.
+# Time without messages after which the camera stands still, seconds. Late labels are then
+# corrected with the finished map of all keyframes; in shorter pauses, the result would depend on
+# the pauses.
 STILL_AFTER_S = 5.0
 
 MapOutput = MapRendering | MapDelta | MapSnapshot | MapObjects

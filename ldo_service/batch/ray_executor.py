@@ -134,8 +134,8 @@ def _ray(address: str) -> ModuleType:
     """Import Ray, which reads its variables of the environment when it is imported."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if address.partition(":")[0] in LOOPBACK:
-        # Ray otherwise replaces a loopback address by that of a network interface, where a cluster
-        # on the loopback interface does not answer.
+        # Ray otherwise replaces a loopback address by that of a network interface, where a
+        # cluster on the loopback interface does not answer.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     try:
         ray = import_module("ray")

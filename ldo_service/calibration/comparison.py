@@ -141,8 +141,8 @@ def feature_block(compared: ComparedPair, there: np.ndarray) -> Block:
     u, v = pair.pixels_first.T
     rays, basis = camera.rays_at(u, v), bias_basis(u, v, camera)
     measured_m = unbiased_depth(pair.depth_first_m, basis @ compared.shared[BIAS])
-    # Depth at the time of the color row, at the point at the time of the middle row, transformed
-    # to the second view, at the time of the color row there.
+    # Depth at the time of the color row, at the point at the time of the middle row, transformed to
+    # the second view, at the time of the color row there.
     z_per_s = _depth_speed(view, there, rays, measured_m, pair.pixels_first)
     z = measured_m + z_per_s * (delay_s + (depth_readout_s - readout_s) * row_there)
     points = rays * z[:, None]

@@ -35,8 +35,8 @@ from .views import CalibrationView, ViewMaker, ViewPair, median_depth_m, pair_of
 
 log = logging.getLogger(__name__)
 
-# Held-out residual up to which a part that was confirmed before stays in use. It was 0.90 to 0.93
-# on bonn_crowd, where people walk through the views, and 1.00 where there is no bias.
+# Held-out residual up to which a part that was confirmed before stays in use. It was 0.90 to
+# 0.93 on bonn_crowd, where people walk through the views, and 1.00 where there is no bias.
 MAX_KEPT_RATIO = 0.97
 PAIR_DISTANCES = (1, 2, 3, 5, 8)  # A new view is paired with the views this many views before it.
 WORK_PER_FRAME = 12.0  # Work of an estimate in one frame, in the unit of `estimate`: 10 ms.

@@ -21,8 +21,8 @@ FARTHEST_RADIUS = 4.0
 # Maximum factor by which a lens changes the distance of a point of the image from its center. A
 # fisheye lens (equisolid) has a factor of 3.3 at 76 degrees from the axis.
 MAX_LENS_FACTOR = 8.0
-# Maximum distortion coefficient, so that polynomials fit into a float32. Tangential coefficients,
-# which describe a tilted lens, are below 1.
+# Maximum distortion coefficient, so that polynomials fit into a float32. Tangential
+# coefficients, which describe a tilted lens, are below 1.
 MAX_COEFFICIENT = 1e6
 
 
@@ -99,8 +99,8 @@ class Camera:
 
         The distortion coefficients do not change, as they act on normalized coordinates.
         """
-        # The values are not checked again: rounding of the size may move a plausible value just
-        # beyond its limit.
+        # The values are not checked again: rounding of the size may move a plausible value
+        # just beyond its limit.
         halved = copy(self)
         for name, value in (
             ("width", self.width // 2),

@@ -174,8 +174,9 @@ class AlignConfig:
     # ones. With 5, the ATE of tour-handheld falls from 1.6 to 1.1 cm; without a bias, no sequence
     # changes by more than 0.04 cm.
     biased_depth_noise_scale: float = 5.0
-    # Factor on the covariance while the depth may have an unknown smooth bias. The squared errors
-    # of the first 20 frames of two simulated cameras are ten times those of the later frames.
+    # Factor on the covariance while the depth may have an unknown smooth bias. The squared
+    # errors of the first 20 frames of two simulated cameras are ten times those of the later
+    # frames.
     biased_covariance_scale: float = 10.0
 
     def with_bias(self, relative_sigma: float) -> "AlignConfig":
