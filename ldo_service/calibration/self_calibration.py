@@ -103,7 +103,7 @@ class SelfCalibration:
         self._times_s = np.zeros(TIME_TERMS)
         self._vignetting = np.zeros((3, VIGNETTING_TERMS))
         self._timing: np.ndarray | None = None  # See `CameraKnowledge.timing`.
-        # View of the last frame with the velocity before that frame; the next frame tells the
+        # View of the last frame with the velocity before that frame; the next frame gives the
         # velocity after it.
         self._new_view: int | None = None
         # Packed parts of the state; a part that has not changed stays the same object.

@@ -66,7 +66,7 @@ def test_folder_of_unknown_layout_names_the_known_layouts(tmp_path: Path) -> Non
     assert len(str(e.value)) < 700
 
 
-def test_folder_with_a_file_of_a_layout_is_told_the_other_files(tmp_path: Path) -> None:
+def test_error_for_a_folder_with_a_file_of_a_layout_names_its_other_files(tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text("")
     with pytest.raises(
         DataError, match=r"Expected rgb.txt and depth.txt \(TUM RGB-D\)\. docs/first"
