@@ -244,7 +244,7 @@ class FrameSource(Actor):
 
 
 def join_halves(color: CameraColor, depth: CameraDepth) -> RawFrame:
-    """Return the raw frame of a color image and a depth image.
+    """Join a color image and a depth image into one raw frame.
 
     Depth is registered to the color image. The frame has the number, the stamp and the camera of
     the color image.

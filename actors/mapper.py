@@ -224,7 +224,7 @@ class Mapper(Actor):
             yield from self._objects()
 
     def _label_requests(self) -> Iterator[LabelRequest]:
-        """Yield the label requests for which the labeller has room."""
+        """Yield as many waiting label requests as the labeller has granted credit for."""
         yield from self._requests.take(self.situation.credits.get(LABEL_REQUEST, UNLIMITED))
 
     def _objects(self) -> Iterator[MapObjects]:
@@ -389,7 +389,7 @@ class Mapper(Actor):
         return {
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
-            # Requests that wait until the labeller has room.
+            # Label requests that wait until the labeller grants credit.
             "label_requests_waiting": len(self._requests.queue),
             **self._refit.metrics(),
             **self._map.metrics(),

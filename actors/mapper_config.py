@@ -26,10 +26,10 @@ class MapperConfig:
     threads: int = 0  # Threads of the renderer; 0: all cores but one, which the tracker needs.
     publish: PublishConfig = field(default_factory=PublishConfig)
     # Number of newest keyframes for which every relative-pose measurement is updated when the
-    # renderer refines their poses. The pose graph has condensed older keyframes. For these, only
-    # the measurement relative to the reference keyframe is updated.
+    # renderer refines their poses. For an older keyframe, only the measurement relative to its
+    # reference keyframe is updated, because the pose graph no longer has the others.
     measured_keyframes: int = 64
-    # Keyframes between two saved maps. After a crash, at most so many are mapped again.
+    # Keyframes between two saved maps. After a crash, at most this many are mapped again.
     checkpoint_keyframes: int = 5
     # Gaussians move with their anchor keyframe when a correction has moved it by more than this.
     # Smaller motions, below 0.1 px, are not visible.

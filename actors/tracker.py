@@ -187,8 +187,8 @@ class Tracker(Actor):
     def _track(self, raw: RgbdFrame) -> Iterator[TrackedPose | Keyframe | KeyframeMeasurements]:
         """Track a frame; if it becomes a keyframe, yield the keyframe first, then the pose.
 
-        The keyframe has the color and the depth that the self-calibration has corrected, and in
-        which the motion during the frame is compensated.
+        The color and the depth of the keyframe are corrected by the self-calibration. They are also
+        compensated for the motion of the camera during the frame.
         """
         correction = self._calibration.correction
         frame = correction.applied(raw)
@@ -251,7 +251,7 @@ class Tracker(Actor):
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return the state in parts, of which only changed ones are written.
+        """Return the state in parts; only parts that have changed are written to disk.
 
         Each stored keyframe is a part of its own, which never changes.
         """
@@ -260,7 +260,7 @@ class Tracker(Actor):
         return {**self._parts, "prior": self._prior.pack()}
 
     def _tracked_parts(self) -> dict[str, Any]:
-        """Return all parts of the tracker's state after the last frame, correction or detection."""
+        """Return all parts of the tracker's state for a snapshot."""
         state = self._odometry.snapshot()
         records = {record["id"]: record for record in state.pop("places")}
         state["order"] = [*records]  # The most recently used keyframe comes last.

@@ -150,7 +150,7 @@ class VlmLabeller(Actor):
         return LabelNames(stamp_ns=message.stamp_ns, names=names, error=refused)
 
     def _try_to_add(self, name: str) -> str:
-        """Add a name; return the reason if that fails, else an empty string."""
+        """Add a name; return an empty string, or the reason if the name is rejected."""
         if self._labeller is None:
             return "there is no labeller: set vlm_labeller.model or vlm_labeller.url."
         if len(self._labeller.names) >= MAX_NAMES:
