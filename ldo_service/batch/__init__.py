@@ -1,8 +1,8 @@
-"""Batch of recordings: each one run, evaluated and exported in its own process, here or on Ray.
+"""Batch processing of recordings, on this machine or on a Ray cluster.
 
-`find_recordings` finds the sources, `process` does all work of one recording, and an executor
-(`LocalExecutor`, `RayExecutor`) runs `process` for each of them. `ldo batch` and `ldo suite` use
-the same executors.
+`find_recordings` finds the recordings. `process` does all work on one recording: SLAM, evaluation
+and export. An executor (`LocalExecutor`, `RayExecutor`) calls `process` for each recording in a
+process of its own. `ldo batch` and `ldo suite` use the same executors.
 """
 
 from .executors import Executor, LocalExecutor

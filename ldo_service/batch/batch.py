@@ -1,4 +1,4 @@
-"""Batch: its jobs, the results that exist already, and the outcomes of the others."""
+"""Batch of recordings: jobs for those without results, and the outcome of each one."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,7 +18,7 @@ from .sources import Recording, measure
 from .staging import remove_abandoned
 from .store import Store
 
-# Threads that read local recordings for their digest, or wait for answers of a bucket.
+# Threads that compute the digests of recordings. They read local files, or wait for a bucket.
 LOOKUP_THREADS = 4
 
 
@@ -47,7 +47,7 @@ class Batch:
         """Yield the outcome of each recording, those with finished results first.
 
         Args:
-            sources: Sources, each one once.
+            sources: Paths or addresses of the recordings, without repetition.
             executor: Executor of the jobs.
             begun: Function that is called with all jobs to run, before the first one starts.
         """
@@ -69,7 +69,10 @@ class Batch:
             remove_abandoned(self.staging)
 
     def _looked_up(self, sources: Iterable[str]) -> Iterator[BatchJob | Outcome]:
-        """Yield a job for each source without results, and the outcome of the others."""
+        """Yield a job for each source without results, and an outcome for each other source.
+
+        The outcome is that of the finished results, or a failure if the source cannot be read.
+        """
         with ThreadPoolExecutor(LOOKUP_THREADS, "lookup") as threads:
             yield from threads.map(self._look_up, sources)
 
@@ -85,7 +88,10 @@ class Batch:
         )
 
     def job(self, recording: Recording) -> BatchJob:
-        """Return the job of a recording. Its folder is named after the recording and the key."""
+        """Return the job of a recording.
+
+        The folder of its results is named after the recording and the first digits of the key.
+        """
         key = key_of(recording, self.plan)
         return BatchJob(
             recording=recording,

@@ -1,4 +1,4 @@
-"""Execution of jobs: the interface of all executors, and processes of this machine."""
+"""Interface of the executors of batch jobs, and the executor for this machine."""
 
 import os
 import signal
@@ -21,16 +21,16 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Executor(Protocol):
-    """Executor of jobs."""
+    """Interface of the executors of batch jobs."""
 
     def outcomes(self, jobs: Iterable[BatchJob]) -> Generator[Outcome, None, None]:
         """Yield the outcome of each job, in the order in which they finish.
 
-        An exception in the caller, such as KeyboardInterrupt, ends all jobs that are running when
-        the iterator is closed.
+        Closing the iterator ends all running jobs, for example after a KeyboardInterrupt in the
+        caller.
 
         Args:
-            jobs: The jobs; each one is taken when a process is free.
+            jobs: The jobs. The executor takes the next one when a process is free.
         """
         ...
 
@@ -39,9 +39,9 @@ class Executor(Protocol):
 class LocalExecutor:
     """Executor on this machine: each job in a process of its own.
 
-    A pool of the standard library fails as a whole if one of its processes dies. Each job therefore
-    has its own pool of one process, so that a process that the kernel kills takes no other job with
-    it, and each job starts with fresh memory and its own limit of threads.
+    A process pool of the standard library fails as a whole if one of its processes dies. Each job
+    therefore has its own pool of one process. If the kernel kills one process, the other jobs
+    continue. Each job also starts with fresh memory and its own limit of threads.
 
     Attributes:
         workers: Maximum number of jobs at the same time.
@@ -105,8 +105,8 @@ def _end_with_parent(parent: Connection) -> None:
 def _child_environment(threads: int) -> Iterator[None]:
     """Set the environment of a process that is started in the context.
 
-    SIGINT stays blocked in the process. Ctrl-C in a terminal sends it to all processes, but the
-    batch itself ends its processes, without a traceback from each of them.
+    SIGINT stays blocked in the process, because Ctrl-C in a terminal sends it to all processes. The
+    batch ends its processes itself, so none of them prints a traceback.
     """
     limits = {name: str(threads) for name in THREADS if threads and name not in os.environ}
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -1,4 +1,4 @@
-"""Work of a batch on one recording, and its outcome."""
+"""Job of a batch for one recording, and the outcome of this job."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ KEY_DIGITS = 12  # Hexadecimal digits of the key in the name of a folder.
 
 
 class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
-    """Part of the work that is the same for all recordings of a batch.
+    """Settings of the work that are the same for all recordings of a batch.
 
     Attributes:
         config: Configuration of the runs.
@@ -34,8 +34,8 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
         refine: Iterations of the Gaussian optimizer after the last frame.
         exports: Formats of `ldo export`.
         threads: Threads of one process; 0 for all cores.
-        evaluates_all: True to evaluate the renderings of recordings without ground truth like those
-            of the others. False to render only a few of their frames.
+        evaluates_all: True to render all frames of every recording for its evaluation. False to
+            render only a few frames of a recording that has no ground truth.
 
     Raises:
         ConfigError: An option is out of its range, or two options exclude each other.
@@ -67,9 +67,9 @@ class BatchJob(msgspec.Struct, frozen=True, kw_only=True):
         out: Path or address of the folder with all results.
         folder: Folder of this result, relative to `out`.
         key: Digest of the content of the source and of everything that the results depend on.
-        keeps_front_end: True to record the front end of the run.
-        front_end: Folder of the run whose recorded front end is used, relative to `out`; empty to
-            run the front end.
+        keeps_front_end: True to record the outputs of the tracker and the detector.
+        front_end: Folder of an earlier run, relative to `out`. Its recorded outputs replace the
+            tracker and the detector. Empty to start both.
         staging: Folder for recordings and results of running processes.
         max_staged_bytes: Limit of all staged recordings on one machine.
         repeats: True to replace finished results.
@@ -92,9 +92,9 @@ class BatchJob(msgspec.Struct, frozen=True, kw_only=True):
 class Costs(msgspec.Struct, frozen=True, kw_only=True):
     """Resources that the process of a recording used."""
 
-    wall_s: float  # The time until the results are published.
-    cpu_s: float  # The whole process with all threads, including its start.
-    run_cpu_s: float  # The run itself, a part of `cpu_s`.
+    wall_s: float  # Time until the results are published.
+    cpu_s: float  # CPU time of all threads of the process, including its start.
+    run_cpu_s: float  # CPU time of SLAM alone, a part of `cpu_s`.
     evaluation_cpu_s: float
     peak_rss_mb: float
     source_bytes: int
@@ -112,11 +112,11 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
         folder: Folder of the result, relative to the folder of all results.
         status: "done" in this call, "kept" from an earlier call, "failed", or "missing" if the
             batch was interrupted.
-        error: Why the recording failed, one line; empty unless it did.
+        error: Reason of the failure on one line; empty if the recording did not fail.
         notes: Warnings of the run and of its evaluation.
         digest: Digest of all results that do not depend on timing; see `results.digest_of`.
         summary: Counts and scores for the table.
-        costs: Resources; None unless there are results.
+        costs: Resources that were used; None if there are no results.
         pictures: File names of pictures in the folder.
     """
 
@@ -155,7 +155,7 @@ def failed(job: BatchJob, error: str, status: str = "failed") -> Outcome:
 
 
 def key_of(recording: Recording, plan: RunPlan, **others: Any) -> str:
-    """Return the digest of everything that the results of a recording depend on, hexadecimal.
+    """Return a hexadecimal digest of everything that the results of a recording depend on.
 
     It covers the content of the recording, the configuration with the networks, the options of the
     plan except its number of threads, and the version of LDO-SLAM. The path of the recording is not

@@ -33,8 +33,8 @@ class RayNeeds:
 class RayExecutor:
     """Executor on a Ray cluster.
 
-    Ray starts a task where the needs fit, and starts it again elsewhere if its process or its host
-    is lost. A worker process ends after each recording.
+    Ray starts a task on a host that has the needed resources free. If its process or its host is
+    lost, Ray starts the task again on another host. A worker process ends after each recording.
 
     Attributes:
         address: Address of the cluster, such as `auto` or HOST:6379.

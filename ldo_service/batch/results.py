@@ -1,4 +1,4 @@
-"""Finished results of a batch: published whole, recognized as finished only if they are complete.
+"""Folders with the results of a batch: their publication, and the check whether they are complete.
 
 `result.json` is written last. It lists every other file of the folder with its size and its SHA-256
 checksum. Results without it, or with a missing file or another size, are not finished.
@@ -103,7 +103,7 @@ class ResultFolder:
         return outcome
 
     def _require_own(self) -> None:
-        """Check that the folder holds nothing that a batch did not write."""
+        """Check that a batch wrote every file in the folder."""
         foreign = [f.name for f in self.store.files() if f.name.removesuffix(UNFINISHED) not in OWN]
         if foreign:
             raise DataError(
@@ -137,10 +137,10 @@ class ResultFolder:
 
 
 def digest_of(files: dict[str, ResultFile]) -> str:
-    """Return a digest of all files whose content does not depend on timing, hexadecimal.
+    """Return a hexadecimal digest of all files whose content does not depend on timing.
 
-    Two runs of the same recording with the same settings have the same digest, wherever they ran,
-    if the processors support the same instruction set. Pictures belong to it.
+    The digest also covers pictures. Two runs of the same recording with the same settings have the
+    same digest, even on two machines, if the processors support the same instruction set.
 
     Args:
         files: Files by name, with their checksums.

@@ -19,8 +19,9 @@ from .store import Entry, open_store
 
 SYNTHETIC = "synthetic:"
 PATTERN = frozenset("*?[")
-MAX_MIRRORED = 2000  # Number of names that recognize the layout of a folder in a bucket.
-SUFFIXES = (".bag", ".mcap", ".db3", ".mkv", ".r3d", ".sens")  # Suffixes that a name does not need.
+MAX_MIRRORED = 2000  # Maximum number of file names that are read to recognize a folder's layout.
+# Suffixes of files that are cut off the name of a recording.
+SUFFIXES = (".bag", ".mcap", ".db3", ".mkv", ".r3d", ".sens")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,19 +44,20 @@ class Recording:
 def find_recordings(
     words: Iterable[str], note: Callable[[str], None]
 ) -> dict[str, LdoError | None]:
-    """Return the sources that words of the command line stand for, each one once.
+    """Find the recordings that arguments of the command line name.
 
     Args:
-        words: Paths, addresses, patterns and `synthetic:NAME`.
-        note: Function that receives a sentence about everything that is not used.
+        words: The arguments: paths, addresses, patterns and `synthetic:NAME`.
+        note: Function that receives a sentence about entries that are not used.
 
     Returns:
-        None for each source, or the error of a word that stands for no source, in the order of the
-        words. A path that does not exist is an error, as is a pattern without matches, a folder
-        without recordings, or a protocol that is not installed.
+        A dictionary in the order of the arguments, with each recording once. The path or address of
+        a recording has the value None. An argument that names no recording has its error as value:
+        a path that does not exist, a pattern without matches, a folder without recordings, or an
+        address whose protocol is not installed.
 
     Raises:
-        LdoError: No word stands for a source; this is the error of the first word.
+        LdoError: No argument names a recording. The error is that of the first argument.
     """
     found = dict[str, LdoError | None]()
     for word in words:
@@ -171,7 +173,7 @@ def _is_remote(word: str) -> bool:
 
 
 def _folder_name(name: str) -> str:
-    """Return a name with all characters replaced that are unusual in names of folders."""
+    """Convert a name to a folder name: replace every character that is unusual in folder names."""
     plain = PurePosixPath(name).stem if name.endswith(SUFFIXES) else name
     safe = "".join(c if c.isalnum() or c in "._-+@" else "-" for c in plain).strip(".-")
     return safe[:60] or "recording"

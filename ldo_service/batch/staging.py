@@ -24,7 +24,7 @@ GB = 10**9
 def staging_folder(root: Path, size_bytes: int, max_bytes: int) -> Iterator[Path]:
     """Yield an empty folder, and remove it at the end of the context.
 
-    The context waits while the recordings of other processes leave too little of the limit.
+    The function waits until the new recording and those of other processes are within the limit.
 
     Args:
         root: Folder for the folders of all processes of this machine.
@@ -64,7 +64,7 @@ def remove_abandoned(root: Path) -> None:
 
 @contextmanager
 def _gate(root: Path) -> Iterator[None]:
-    """Hold the lock that allows to look at the folders of all processes, and to add one."""
+    """Hold the lock that a process needs to inspect the folders of all processes or to add one."""
     gate = os.open(root / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         fcntl.flock(gate, fcntl.LOCK_EX)
@@ -74,7 +74,11 @@ def _gate(root: Path) -> Iterator[None]:
 
 
 def _admitted(root: Path, size_bytes: int, max_bytes: int) -> tuple[Path, int]:
-    """Create the folder and lock it, as soon as the limit allows it."""
+    """Wait until the limit allows the recording, then create and lock its folder.
+
+    Returns:
+        The folder, and the file descriptor that holds the lock.
+    """
     while True:
         with _gate(root):
             if _staged_bytes(root) + size_bytes <= max_bytes or size_bytes == 0:

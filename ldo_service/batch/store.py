@@ -28,8 +28,8 @@ class StoredFile:
     Attributes:
         name: Path relative to the listed folder, with slashes.
         size_bytes: Size of the file.
-        mark: Text that changes with the content: a checksum, or without one the time of the last
-            change.
+        mark: Text that changes with the content. It is a checksum, or the time of the last change
+            if the store has no checksum.
     """
 
     name: str
@@ -39,7 +39,7 @@ class StoredFile:
 
 @dataclass(frozen=True, slots=True)
 class Store:
-    """A folder, or a file, that fsspec reaches.
+    """Folder or file on disk or in a bucket, accessed through fsspec.
 
     Attributes:
         url: The address: an absolute path, or PROTOCOL://PATH.
@@ -85,7 +85,7 @@ class Store:
             return self.system.isfile(self.path)
 
     def matches(self) -> list["Entry"]:
-        """Return everything that the path matches as a pattern, sorted."""
+        """Return the files and folders that match the path as a pattern, sorted."""
         with self._reported("read"):
             found = self.system.glob(self.path, detail=True)
         return self._entries(found.values())
@@ -105,7 +105,7 @@ class Store:
         return entries
 
     def files(self) -> list[StoredFile]:
-        """Return all files below the folder, or the file itself with its name; sorted."""
+        """Return all files below the folder, sorted; if the path is a file, return it alone."""
         with self._reported("read"):
             self.system.invalidate_cache()
             found = self.system.find(self.path, detail=True)
@@ -135,7 +135,7 @@ class Store:
                 self.system.pipe_file(self.path, content)
 
     def download(self, target: Path) -> None:
-        """Copy the folder or the file to a local path, which does not exist."""
+        """Copy the folder or the file to a local path, which must not exist yet."""
         with self._reported("read"):
             if self.system.isfile(self.path):
                 self.system.get_file(self.path, str(target))

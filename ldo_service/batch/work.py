@@ -1,4 +1,4 @@
-"""Work of a batch on one recording: stage, run, evaluate, export and publish."""
+"""Processing of one recording of a batch, from its copy to the published results."""
 
 import json
 import logging
@@ -64,8 +64,8 @@ class _Notes(logging.Handler):
 def process(job: BatchJob) -> Outcome:
     """Process a recording and publish its results.
 
-    The function runs in a process of its own. It raises nothing: a failure is an outcome with one
-    line of text, so that it neither stops the batch nor is retried.
+    The function runs in a process of its own. It raises no exception: a failure becomes an outcome
+    with one line of text. A failure therefore does not stop the batch, and no executor retries it.
     """
     if job.version != __version__:
         return failed(
@@ -118,7 +118,7 @@ def _download(source: str, target: Path) -> str:
 
 
 def _run(job: BatchJob, source: str, made: Path, notes: _Notes, started_s: float) -> Outcome:
-    """Run, evaluate and export a recording; write all files to the folder `made`."""
+    """Run SLAM on a recording, evaluate and export it; write all files to the folder `made`."""
     plan = job.plan
     config = replace(plan.config, mapper=replace(plan.config.mapper, threads=plan.threads))
     require_usable_networks(config)
@@ -181,9 +181,9 @@ def _evaluate(
 ) -> Results | None:
     """Evaluate the run, and save its pictures.
 
-    The evaluation of all frames takes a quarter of the CPU time of a recording. Without ground
-    truth, only a few frames are rendered therefore, unless `evaluates_all` is set, and there is no
-    eval.json. A run that cannot be evaluated gets a note instead.
+    Evaluating all frames takes a quarter of the CPU time of a recording. If the recording has no
+    ground truth and `evaluates_all` is False, only a few frames are rendered. Such a recording gets
+    no eval.json. If the run cannot be evaluated, a note says why.
     """
     threads = actor_parameters(config).mapper.thread_count()
     try:
@@ -206,7 +206,10 @@ def _evaluate(
 
 
 def sample(frames: Iterable[RunFrame], count: int) -> EvaluatedFrames:
-    """Select some frames with a pose at even intervals: held-out ones if there are any."""
+    """Select at most `count` frames with a pose at even intervals.
+
+    Held-out frames are selected if there are any, otherwise training frames.
+    """
     whole = EvaluatedFrames.of(frames)
     held_out = tuple(frame for frame in whole.held_out if not frame.is_lost)
     training = tuple(frame for frame in whole.training if not frame.is_lost)
