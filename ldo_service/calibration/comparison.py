@@ -40,11 +40,11 @@ DEPTH_WEIGHT = 0.12
 FEATURE_SIGMA_PX = 1.0
 # Depth difference, as a fraction of depth, beyond which two points are on different surfaces.
 MAX_STEP_RATIO = 0.08
-# The normal of a surface must differ from a right angle to the viewing ray by this cosine. At a
-# smaller one, depth changes too fast along the surface.
+# Minimum absolute cosine between the normal of a surface and the viewing ray. At a smaller cosine,
+# depth changes too fast along the surface.
 MIN_INCIDENCE = 0.2
 BLOCK_STRIDE = 3  # Every third block along each axis is compared; neighbors are alike.
-COLOR_STRIDE = 2  # Colors are compared at every second of these; neighbors have the same color.
+COLOR_STRIDE = 2  # Colors are compared at every second common point; neighbors are alike.
 MIN_COMMON = 200  # Minimum number of compared colors; a pair with fewer is skipped for vignetting.
 CELLS = 8  # Cells of the image along its width.
 COLUMNS = TIMES.stop + 7  # Shared unknowns, relative pose and residual.
@@ -141,8 +141,9 @@ def feature_block(compared: ComparedPair, there: np.ndarray) -> Block:
     u, v = pair.pixels_first.T
     rays, basis = camera.rays_at(u, v), bias_basis(u, v, camera)
     measured_m = unbiased_depth(pair.depth_first_m, basis @ compared.shared[BIAS])
-    # Depth at the time of the color row, at the point at the time of the middle row, transformed to
-    # the second view, at the time of the color row there.
+    # First, the depth is corrected to the time at which the color row of the first view was
+    # recorded. The point is then moved to the time of the middle row, transformed to the second
+    # view, and moved to the time of the color row in that view.
     z_per_s = _depth_speed(view, there, rays, measured_m, pair.pixels_first)
     z = measured_m + z_per_s * (delay_s + (depth_readout_s - readout_s) * row_there)
     points = rays * z[:, None]
@@ -153,8 +154,8 @@ def feature_block(compared: ComparedPair, there: np.ndarray) -> Block:
     here = at_middle - speed_here * (readout_s * row_here)[:, None]
     errors, by_point, _ = reprojection(camera, np.eye(4), here, pair.pixels_second)
     by_place = by_point[..., 3:]
-    # Directions in which the places move per unit of depth. The small turns by the motion matter,
-    # because a place that moves along its own ray keeps its pixel.
+    # Directions in which the points move per unit of depth. The small rotations of the camera
+    # matter, because a point that moves along its own ray keeps its pixel.
     along = _turned(rays, view.velocity, readout_s * row_there) @ T[:3, :3].T
     along = _turned(along, compared.second.velocity, -readout_s * row_here)
     # The depth of a point on a ray changes by -z^2 per unit of the bias.
@@ -179,7 +180,7 @@ def _speed(points: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 
 
 def _turned(vectors: np.ndarray, velocity: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-    """Return vectors [N, 3] turned by the rotation of the camera within times [N]."""
+    """Rotate vectors [N, 3] by the rotation of the camera during the times [N]."""
     return vectors + np.cross(velocity[:3], vectors) * times_s[:, None]
 
 
@@ -190,10 +191,11 @@ def _depth_speed(
     depth_m: np.ndarray,
     pixels: np.ndarray,
 ) -> np.ndarray:
-    """Return the difference of depth at pixels per second from color to depth, [N] m/s.
+    """Return the speed at which the depth of fixed pixels decreases, [N] m/s.
 
-    Depth at the time of color is the measured depth plus this value times the delay of depth after
-    color. The value is that of the tangent plane; 0 where there is no plane.
+    Depth is measured some time after color. The depth at the time of color is the measured depth
+    plus this speed times the delay. The speed is that of the tangent plane of the surface; it is 0
+    where no plane is known.
 
     Args:
         view: View.

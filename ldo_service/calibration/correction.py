@@ -110,7 +110,7 @@ class CameraCorrection:
 
 @dataclass(frozen=True, slots=True)
 class CorrectionHistory:
-    """Camera corrections that the keyframes of a run were made with, in the order of time."""
+    """Camera corrections with which the keyframes of a run were made, in order of time."""
 
     stamps_ns: tuple[int, ...] = ()
     corrections: tuple[CameraCorrection, ...] = ()
@@ -177,7 +177,7 @@ class CorrectionChange:
         return {"old": self.old.pack(), "new": self.new.pack()}
 
     def after(self, earlier: "CorrectionChange | None") -> "CorrectionChange":
-        """Return the change from the old correction of an earlier change to the new one of this."""
+        """Combine an earlier change, if there is one, and this change into a single change."""
         return self if earlier is None else replace(self, old=earlier.old)
 
     def depth_m(self, depth_m: np.ndarray, camera: Camera) -> np.ndarray:

@@ -111,7 +111,7 @@ def solve(blocks: Sequence[Reduced], prior: np.ndarray | float, now: np.ndarray)
 def held_out(
     blocks: Sequence[Reduced], prior: float, now: np.ndarray
 ) -> list[tuple[range, np.ndarray]]:
-    """Return groups of successive blocks, each with the step [..., K] by all other blocks."""
+    """Return groups of successive blocks, each with the step [..., K] that all others give."""
     groups = np.array_split(np.arange(len(blocks)), min(GROUPS, len(blocks)))
     ranges = [range(int(group[0]), int(group[-1]) + 1) for group in groups]
     return [
@@ -177,7 +177,7 @@ def check(
 def _cell_means(block: Block, step: np.ndarray, reduced: Reduced) -> list[np.ndarray]:
     """Return the mean residuals of the cells of the image after a step of the coefficients.
 
-    The block's own unknowns take the step that follows from it.
+    The step of the block's own unknowns follows from the step of the coefficients.
 
     Returns:
         The means of each independent system.

@@ -39,8 +39,8 @@ from .correction import BIAS_TERMS, VIGNETTING_TERMS
 from .elimination import Block, Check, Reduced, check, covariance, solve, student_weight
 from .views import CalibrationView, ViewPair
 
-# Inverse variances of the coefficients' prior around 0: 0.01/m for the depth bias, the
-# size of that of an Xtion.
+# Inverse variances of the prior of the coefficients around 0. For the depth bias, the standard
+# deviation is 0.01/m, the size of the bias of an Xtion.
 DEPTH_PRIOR, VIGNETTING_PRIOR = 1e4, 5e1
 # Prior of the times of the shutter, seconds: a readout of color of 20 ms, a readout of depth that
 # differs from it by 10 ms, and a delay of 10 ms (standard deviations around 0).
@@ -137,9 +137,10 @@ def estimate(
 
 
 def _pairs_of_views(pairs: Sequence[ViewPair]) -> list[set[int]]:
-    """Return groups of the indices of all pairs that use any of some successive views.
+    """Group the indices of all pairs by successive views.
 
-    Pairs that share a view share its errors, so the jackknife leaves out whole views.
+    A group has all pairs that use at least one of its views, so a pair may be in two groups. Pairs
+    that share a view share its errors. The jackknife therefore leaves out whole views.
     """
     numbers = sorted({number for p in pairs for number in (p.first, p.second)})
     groups = np.array_split(numbers, min(VIEW_GROUPS, len(numbers)))

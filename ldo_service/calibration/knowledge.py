@@ -1,4 +1,4 @@
-"""Estimates of a camera that tracking uses beside the correction of its images."""
+"""Uncertainty of a camera's depth bias and timing of its shutter, as the tracker uses them."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,10 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CameraKnowledge:
-    """Estimates of a camera, and their uncertainty, that tracking uses beside the correction."""
+    """Uncertainty of a camera's depth bias, and timing of its shutter.
+
+    The tracker uses both to weight its measurements. They do not change the images.
+    """
 
     # Standard deviation of the coefficients of the depth bias, as a multiple of that of an unknown
     # camera; 0 if there is no bias.

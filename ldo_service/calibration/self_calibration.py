@@ -35,8 +35,9 @@ from .views import CalibrationView, ViewMaker, ViewPair, median_depth_m, pair_of
 
 log = logging.getLogger(__name__)
 
-# Held-out residual up to which a part that was confirmed before stays in use. It was 0.90 to
-# 0.93 on bonn_crowd, where people walk through the views, and 1.00 where there is no bias.
+# Maximum held-out residual, relative to that without correction, at which a depth bias or
+# vignetting that was confirmed before stays in use. It was 0.90 to 0.93 on bonn_crowd, where people
+# walk through the views, and 1.00 where there is no bias.
 MAX_KEPT_RATIO = 0.97
 PAIR_DISTANCES = (1, 2, 3, 5, 8)  # A new view is paired with the views this many views before it.
 WORK_PER_FRAME = 12.0  # Work of an estimate in one frame, in the unit of `estimate`: 10 ms.
@@ -284,12 +285,12 @@ class SelfCalibration:
         return None if change.old == new else change
 
     def _confirmed(self, found: Estimate) -> CameraCorrection:
-        """Return the correction that has only the confirmed parts of an estimate.
+        """Return the new correction: the depth bias and the vignetting that are confirmed.
 
-        Held-out pairs confirm the depth bias and the vignetting separately. A part that was never
-        confirmed is 0. A part that was confirmed by fewer views follows the estimates unless the
-        pairs tell that there is none. The same holds for a part from an earlier run, but it stays
-        as it is until the pairs confirm another one.
+        Held-out pairs of views confirm the depth bias and the vignetting separately. One that they
+        confirm takes its new estimate. One that was confirmed before takes it too, unless its
+        held-out residual exceeds `MAX_KEPT_RATIO`. If it comes from an earlier run, it keeps its
+        old value instead. All others become 0.
         """
         nothing, before = CameraCorrection(), self.correction
         depth_bias, vignetting = nothing.depth_bias, nothing.vignetting

@@ -2,8 +2,8 @@
 
 A rolling shutter exposes the rows of an image one after the other, and a depth camera measures at
 another time than the color camera. Both errors grow with the velocity of the camera.
-`FrameMotion.compensated` moves color and depth to where a camera would have recorded them that
-takes the whole frame at once, at the time of its middle row. Conventions: `ldo_service.geometry`.
+`FrameMotion.compensated` converts color and depth to an image whose pixels are all recorded at the
+same time, that of the middle row. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from ldo_service.kernels import _shutter
 CELL_PX = 8
 # Shortest interval between two frames from which a velocity is computed: 100 Hz.
 MIN_INTERVAL_S = 0.01
-# Fastest motion of a camera: 570 degrees/s, of which a rolling shutter leaves no image.
+# Fastest plausible motion of a camera. At 570 degrees/s, a rolling shutter leaves no usable image.
 MAX_RAD_PER_S, MAX_M_PER_S = 10.0, 10.0
 
 
@@ -95,8 +95,9 @@ class FrameMotion:
         return FrameMotion(kept["velocity"], ShutterTiming.of(kept["timing"]))
 
     def compensated(self, frame: RgbdFrame) -> RgbdFrame:
-        """Return the frame as recorded at once; without motion or timing, the frame itself.
+        """Return the frame as if all its pixels were recorded at the time of the middle row.
 
+        If the camera does not move or its shutter has no delays, the frame itself is returned.
         Pixels that the frame does not show become black, and their depth 0.
         """
         if not self.timing or not self.velocity.any():
@@ -107,10 +108,18 @@ class FrameMotion:
     def warped(
         self, image: np.ndarray, depth_m: np.ndarray, camera: Camera
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return an image [H, W] or [H, W, 3] and its depth [H, W] in meters as recorded at once.
+        """Warp an image and its depth as if all pixels were recorded at the time of the middle row.
 
         A pixel (u, v) of the result is read from (u, v) + f t, where f is the image motion per
         second of the surface point at (u, v), and t is the time at which its row was recorded.
+
+        Args:
+            image: Image, [H, W] or [H, W, 3].
+            depth_m: Depth of the image, [H, W] meters; 0 where unknown.
+            camera: Camera of the image.
+
+        Returns:
+            The warped image and the warped depth.
         """
         return _shutter.warp(
             np.ascontiguousarray(image),
@@ -121,10 +130,10 @@ class FrameMotion:
         )
 
     def recorded(self, image: np.ndarray, depth_m: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return a color image [H, W, 3] of the whole frame at once as the camera records it.
+        """Distort a color image as the moving camera with its rolling shutter would record it.
 
         Args:
-            image: Color image, such as a rendering.
+            image: Color image without this distortion, such as a rendering, [H, W, 3].
             depth_m: Its depth, [H, W] meters; 0 where unknown.
             camera: Camera of the image.
         """
@@ -141,7 +150,7 @@ class FrameMotion:
 
 
 def displacement_rad(velocity: np.ndarray, timing: ShutterTiming, depth_m: float) -> float:
-    """Return by how much a velocity [6] moves the image at most during a frame, in rad.
+    """Return an upper bound of the image motion by a velocity [6] while a frame is recorded, rad.
 
     Args:
         velocity: Rotation in rad/s and translation in m/s; or a difference of two velocities.

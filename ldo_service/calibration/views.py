@@ -202,7 +202,8 @@ def _expected(
 ) -> np.ndarray:
     """Return where the corners [N, 2] of the last view are after a motion, [N, 2] float32.
 
-    A corner without depth moves as one at the median depth; without a motion, none moves.
+    A corner without depth moves like a corner at the median depth. If the motion is unknown, the
+    corners stay where they are.
     """
     is_known = depth_m > 0
     if T_now_last is None or not is_known.any():
@@ -219,7 +220,7 @@ def _expected(
 def _follow(
     before: np.ndarray, now: np.ndarray, corners: np.ndarray, expected: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Track corners by pyramidal optical flow, there and back (Lucas and Kanade; Bouguet, 2000).
+    """Track corners by pyramidal optical flow, forward and back (Lucas and Kanade; Bouguet, 2000).
 
     Returns:
         Mask of the corners that were tracked, [N] bool, and the new pixels of all corners,
