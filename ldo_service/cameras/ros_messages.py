@@ -31,8 +31,9 @@ DEPTH_KINDS: dict[str, tuple[ImageEncoding, str, float]] = {
 # Number of bytes before the PNG of compressed depth: a format and two quantization parameters.
 COMPRESSED_DEPTH_HEADER = 12
 PLUMB_BOB, RATIONAL, UNDISTORTED = "plumb_bob", "rational_polynomial", ("", "none")
-# Names of librealsense for plumb_bob. Its "inverse" model undistorts by inverting this polynomial.
-# The pixels of a lens with k1 = -0.06 agree within 0.03 px at 1280x720 (librealsense 2.55).
+# Distortion models of librealsense that are read as plumb_bob. The "inverse" model undistorts by
+# inverting the polynomial of plumb_bob. For a lens with k1 = -0.06 at 1280x720, the pixels of both
+# models agree within 0.03 px (librealsense 2.55).
 REALSENSE_PLUMB_BOB = ("Brown Conrady", "Inverse Brown Conrady")
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
