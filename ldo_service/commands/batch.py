@@ -149,7 +149,7 @@ def _plan(
     exports: tuple[ExportFormat, ...],
     threads: int,
 ) -> RunPlan:
-    """Return the work on each recording, after the check of the networks."""
+    """Check that the networks can be used, and return the plan of the work on each recording."""
     loaded = with_options(load_config(config, settings), hold_out_every, threads)
     require_usable_networks(loaded)
     return RunPlan(
@@ -177,7 +177,7 @@ def _default_staging(out: Store, cluster: str | None) -> Path:
 def _execute(
     work: Batch, found: Mapping[str, LdoError | None], executor: Executor, console: Console
 ) -> list[Outcome]:
-    """Run the batch with a line of progress for each recording, and write the report."""
+    """Run the batch, print a line of progress for each recording, and write the report."""
     progress = _Progress(console, len(found))
     outcomes = {source: _without_results(source, error) for source, error in found.items()}
     sources = [source for source, error in found.items() if error is None]

@@ -22,15 +22,17 @@ from ldo_service.tracking.shutter import ShutterConfig
 from .findings import Finding
 
 DEPTHS_M = 1.0, 3.0  # Depths at which the depth bias is stated.
-# Depth error at 3 m from which the report warns: more than the noise of a Kinect at this depth.
+# Minimum depth error at 3 m that the report warns of: more than the noise of a Kinect there.
 LARGE_DEPTH_ERROR_MM = 30.0
-LARGE_VIGNETTING = 0.8  # Brightness of a corner, relative to the center, up to which it warns.
-# Time from which the report warns. A turn of 60 degrees/s moves the image by 6 of 640 pixels.
+# Maximum brightness of a corner, relative to the center, that the report warns of.
+LARGE_VIGNETTING = 0.8
+# Minimum readout or delay that the report warns of. During this time, a turn of 60 degrees/s moves
+# the image by 6 of 640 pixels.
 LARGE_TIME_MS = 10.0
-# Standard deviation from which the report warns of a time in use: 3 pixels in the same turn.
+# Minimum standard deviation of a time in use that the report warns of: 3 pixels in the same turn.
 UNCERTAIN_TIME_MS = 5.0
-# Held-out residual up to which an unconfirmed depth bias is probable. The kitchen has 0.93, and a
-# correction of its depth does harm.
+# Maximum held-out residual, relative to that without a correction, at which an unconfirmed depth
+# bias is probable. The sequence kitchen has 0.93, and a correction of its depth does harm.
 PROBABLE_RATIO = 0.90
 CHANNELS = "red", "green", "blue"
 TIMES = {  # Names in the metrics, and in the report.
@@ -204,7 +206,10 @@ def _time(
 
 
 def _large(folder: Path, correction: CameraCorrection, camera: Camera) -> Iterator[Finding]:
-    """Warn of large errors, which a run has until it has estimated them."""
+    """Warn of large errors of the camera.
+
+    Each run has these errors until its self-calibration has estimated them.
+    """
     large: list[str] = []
     if np.abs(depth_errors_mm(correction, camera, DEPTHS_M[-1])).max() >= LARGE_DEPTH_ERROR_MM:
         large.append("depth bias (wrong poses and surfaces)")

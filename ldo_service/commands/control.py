@@ -45,8 +45,8 @@ def control(
     pause, resume, save and reset return when every actor has executed them. If an actor did not,
     the message names the actor and the exit code is 4.
 
-    `refine` only sends a request to the mapper and returns at once. The mapper runs the iterations
-    before it takes its next keyframe.
+    `refine` only sends a request to the mapper and returns immediately. The mapper runs the
+    iterations before it takes its next keyframe.
 
       ldo control reset
       ldo control refine --iterations 500

@@ -44,7 +44,10 @@ NO_LPIPS = "LPIPS is not computed; --lpips FILE.onnx adds it."
 
 
 def label_table(rows: list[LabelErrors]) -> Table:
-    """Return a table of label metrics: a row for each map, list of names and entry of GATES."""
+    """Return a table of label metrics.
+
+    It has a row for each combination of a map, a list of names and a minimum class size (`GATES`).
+    """
     table = Table("map", "names", "classes", *FIGURES, "per image", "frames")
     for row in rows:
         for errors in row.lists:

@@ -48,7 +48,7 @@ def export(
 
     The refined map is exported if there is one. `mesh` is a PLY file with colored triangles.
     `occupancy` is an .npz file with a grid of free, occupied and unknown voxels; a floor plan (.pgm
-    and .yaml) for map_server of ROS is written beside it. The map has the axes of the first camera
+    and .yaml) for map_server of ROS is written next to it. The map has the axes of the first camera
     pose, so `--up -y` is right if the camera was level at the start.
 
       ldo export runs/desk --format splat

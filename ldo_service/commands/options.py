@@ -119,7 +119,7 @@ Json = Annotated[bool, argument(help="print one JSON document and nothing else")
 
 
 def with_topics(settings: tuple[str, ...], topics: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the values of --set, and after them the values of --topic as a setting."""
+    """Return the settings of --set, followed by one setting with all topics of --topic."""
     return (*settings, f"dataset.topics=[{', '.join(topics)}]") if topics else settings
 
 

@@ -61,7 +61,7 @@ def serve(
     """Run the service: receive frames on camera/rgbd; publish poses, map, objects and health.
 
     Ctrl-C stops the service after each actor has finished its pending work. A second Ctrl-C stops
-    the service at once.
+    the service immediately.
 
       ldo serve
       ldo publish synthetic:room --rate 15      (in another terminal)
