@@ -18,7 +18,7 @@ from .values import ADVANCED
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Setting of the configuration."""
+    """Setting of a configuration: its path, its value and the comment that explains it."""
 
     path: str
     value: Any
