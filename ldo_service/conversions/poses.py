@@ -88,8 +88,8 @@ def correction_to_message(
         graph_version: Version of the pose graph.
         T_map_keyframe: Corrected poses [4, 4] by id of the keyframe.
         refinements: Number of the last `keyframe/refinement` message that the correction includes.
-        merged: By id of each submap that is merged with older submaps, the id of the oldest one.
-            None if no submap is merged.
+        merged: Maps the id of each merged submap to the id of the oldest submap that it is merged
+            with. None if no submap is merged.
         closures: Accepted loop closures, as pairs of keyframes.
         rejected: Rejected loop closures, as pairs of keyframes.
         landmarks: Objects of the pose graph.
