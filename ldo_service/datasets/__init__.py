@@ -181,5 +181,5 @@ def _unknown(path: Path) -> str:
 
 
 def _is_listed(name: str, files: str) -> bool:
-    """Return whether a text names a file or a folder."""
+    """Return whether `files`, the description of a layout, contains the file name `name`."""
     return re.search(rf"(?<![\w./*]){re.escape(name)}(?![\w.])", files) is not None

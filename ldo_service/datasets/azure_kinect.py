@@ -10,9 +10,9 @@ CALIBRATION_CameraLocationD0. Each has
     Rt.Rotation, Rt.Translation  transform from the depth camera, by rows, meters
 
 The images of a mode are a part of the calibrated image: see `_color_camera` and DEPTH_MODES. Pixel
-centers are at integer coordinates here, and at half ones in the calibration. Color is averaged to a
-grid of about 640 pixels, as that of phones, and depth is registered to it. Infrared images and
-inertial measurements are not read.
+centers have integer coordinates in this project, and coordinates such as 0.5 and 1.5 in the
+calibration. Color is averaged to a grid about 640 pixels wide, as for phones, and depth is
+registered to this grid. Infrared images and inertial measurements are not read.
 """
 
 import json
@@ -131,7 +131,7 @@ def _rig(calibration: bytes, color: Video, depth: Video, path: Path) -> Rig:
     """Return the cameras of the recorded images.
 
     Raises:
-        DataError: The calibration is invalid, or the size of the images is that of no mode.
+        DataError: The calibration is invalid, or no mode of the camera has images of this size.
     """
     source = Path(f"{path}: calibration.json")
     try:
@@ -205,7 +205,7 @@ def _depth_camera(parameters: list[float], width: int, height: int) -> Camera:
     """Return the camera of depth images.
 
     Raises:
-        DataError: The size is that of no mode.
+        DataError: No mode of the depth camera has images of this size.
     """
     if (width, height) not in DEPTH_MODES:
         sizes = ", ".join(f"{w}x{h}" for w, h in DEPTH_MODES)

@@ -31,7 +31,7 @@ REALSENSE_TAIL = 4
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path has the name of a bag, or a folder has the files of one."""
+    """Return whether a file has the suffix of a bag, or a folder contains the files of a bag."""
     if path.is_file():
         return path.suffix.lower() in SUFFIXES
     return (path / METADATA).is_file() or any(path.glob("*.db3"))
@@ -230,7 +230,11 @@ def _chunks(file: Any) -> list[Any]:
 
 
 def _topics(connections: Sequence[Any]) -> dict[str, Topic]:
-    """Return the topics by name; connections of another type than the first one are left out."""
+    """Return the topics by name.
+
+    The first connection of a topic determines its message type. Connections of the topic with
+    another type are skipped.
+    """
     names: dict[str, list[Any]] = {}
     for connection in connections:
         names.setdefault(connection.topic, []).append(connection)

@@ -18,7 +18,7 @@ MAX_STATIC = 1000  # Maximum number of messages that are read of a topic with co
 
 
 def readable_messages(bag: BagFile, is_wanted: Callable[[Topic], bool]) -> Iterator[Any]:
-    """Yield the messages of topics that can be read, at most MAX_STATIC of each."""
+    """Yield the readable messages of the wanted topics, from at most MAX_STATIC of each topic."""
     for topic in filter(is_wanted, bag.topics.values()):
         for message in bag.messages([topic], MAX_STATIC):
             try:
@@ -42,7 +42,10 @@ def _transform_of(q: Any, t: Any) -> np.ndarray | None:
 
 
 def static_transform(bag: BagFile, target: str, source: str) -> np.ndarray | None:
-    """Return the transform [4, 4] from one frame to another in /tf_static, or None."""
+    """Return the transform [4, 4] from the frame `source` to the frame `target`.
+
+    It is a chain of transforms in /tf_static, or None if they do not connect the two frames.
+    """
     edges: dict[str, dict[str, np.ndarray]] = {}
     for message in readable_messages(bag, lambda topic: topic.name == "/tf_static"):
         for stamped in getattr(message, "transforms", ()):
@@ -67,10 +70,10 @@ def odometry_topic(bag: BagFile, given: str) -> Topic | None:
 
     Args:
         bag: The bag.
-        given: Name of the topic in the options; empty searches it.
+        given: Name of the topic from the options; empty to search for a topic with odometry.
 
     Raises:
-        DataError: The topic of the options has no odometry.
+        DataError: The topic that the options name does not contain odometry.
     """
     found = [topic for topic in bag.topics.values() if topic.kind == ODOMETRY and topic.count]
     names = ", ".join(topic.name for topic in found) or "none"

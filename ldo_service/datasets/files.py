@@ -203,15 +203,16 @@ def read_trajectory(stamps_ns: np.ndarray, paths: list[Path]) -> Trajectory | No
 
 
 def from_opengl(T_world_camera: np.ndarray) -> np.ndarray:
-    """Return camera poses [..., 4, 4] of x right, y down, z forward from those of OpenGL and ARKit.
+    """Convert camera poses [..., 4, 4] from the axes of OpenGL and ARKit to those of this project.
 
-    Their cameras have y up and z backward.
+    The camera axes of OpenGL and ARKit are x right, y up, z backward. Those of this project are
+    x right, y down, z forward.
     """
     return T_world_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def valid_trajectory(stamps_ns: np.ndarray, poses: list[np.ndarray | None]) -> Trajectory | None:
-    """Return the poses that are rigid transforms as a trajectory, or None if there is none.
+    """Return a trajectory of the poses that are rigid transforms, or None if no pose is one.
 
     Args:
         stamps_ns: Stamps, [N] int64, ascending.

@@ -68,7 +68,7 @@ class IclNuimSequence(Sequence):
         return RawFrame(index, stamp_ns, color, read_depth(path), DEPTH_SCALE, CAMERA)
 
     def truth(self) -> Trajectory | None:
-        """Return the ground-truth trajectory of the file *.gt.freiburg, or None without one.
+        """Return the ground-truth trajectory of the file *.gt.freiburg; None if it does not exist.
 
         Raises:
             DataError: The file is invalid, or there are several.

@@ -8,7 +8,8 @@ poses.txt                     optional: 12 numbers per image, the first three ro
                               world; else ../../poses/NAME.txt, as the benchmark stores it
 
 The benchmark has no depth images. Depth is computed from each stereo pair by semi-global matching
-of OpenCV. It is the z coordinate in the left camera, whose pose is the ground truth.
+of OpenCV. The depth is the z coordinate in the left camera. The ground truth is the pose of this
+camera.
 """
 
 from dataclasses import dataclass
@@ -45,7 +46,7 @@ class _Stereo:
 
 
 class KittiSequence(Sequence):
-    """Sequence of KITTI: frames of which both images exist, in the order of their numbers."""
+    """KITTI sequence: frames with a left and a right image, in the order of their numbers."""
 
     registration = "reader"
 
@@ -164,7 +165,7 @@ def _calibration(path: Path, left: int, right: int, images: list[Path]) -> _Ster
 
 
 def _matrices(path: Path) -> list[tuple[str, np.ndarray]]:
-    """Return the matrices [3, 4] of calib.txt with their names; other lines are left out."""
+    """Return the matrices [3, 4] of calib.txt with their names; other lines are skipped."""
     found = []
     for line in _lines(path):
         name, _, numbers = line.partition(":")
@@ -216,7 +217,7 @@ def _poses(path: Path) -> np.ndarray:
 
 
 def _row(text: str) -> np.ndarray | None:
-    """Return 12 finite numbers as a matrix [3, 4], or None if they are none."""
+    """Parse a line of 12 numbers as a matrix [3, 4]; return None if it is not 12 finite numbers."""
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:

@@ -32,8 +32,8 @@ class Layout:
         files: Files that a recording has, as a text for error messages.
         matches: Returns whether a path, which exists, has the layout. It looks at names of files,
             or at the first bytes of a file.
-        open: Opens a path that matches. It raises DataError for what is missing or damaged, and
-            ConfigError for options that do not fit.
+        open: Opens a path that matches. It raises DataError if a file is missing or damaged, and
+            ConfigError if the layout does not support the options.
         has_options: True if `open` accepts options other than the defaults. These register the
             depth to the color camera.
         has_topics: True if `open` accepts the options that name topics.

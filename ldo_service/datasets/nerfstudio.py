@@ -6,10 +6,10 @@ transforms.json      fl_x fl_y cx cy [w h] [k1 k2 p1 p2 k3], for all frames or f
                      depth_unit_scale_factor, meters per unit of depth, default 0.001
 images/ depth/       the files of the frames; depth has the field of view of color, at any size
 
-The principal point is in pixels from the corner of the image; here it is from the center of the
-first pixel. The frames have no stamps: they are taken as 30 Hz in the order of the file. The poses
-come from COLMAP or from a phone. They are another estimate and no ground truth: `odometry`, not
-`truth`.
+In the file, the principal point is measured from the corner of the image. In this project, it is
+measured from the center of the first pixel. The frames have no stamps; in the order of the file,
+they get stamps at 30 Hz. The poses come from COLMAP or from a phone. They are an estimate, not
+ground truth, so `odometry` returns them and `truth` returns None.
 """
 
 import logging
@@ -131,7 +131,7 @@ def _camera(fields: dict[str, Any], size: tuple[int, int], path: Path) -> Camera
     """Return the camera of a frame.
 
     Args:
-        fields: Values of the frame, and of all frames where the frame has none.
+        fields: Values of the frame. A value that the frame lacks is the value for all frames.
         size: Width and height of the color images.
         path: File of the values, for errors.
 

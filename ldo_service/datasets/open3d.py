@@ -1,12 +1,12 @@
-"""Sequences in the layout of Open3D's reconstruction system, in which Redwood is published too.
+"""Sequences in the layout of Open3D's reconstruction system, which the Redwood data set also uses.
 
 color/*.jpg depth/*.png    numbered images of one size; depth in millimeters, registered to color.
                            Redwood names the first folder image/ or rgb/
 camera_intrinsic.json      or intrinsic.json: {"width", "height", "intrinsic_matrix"}, the last with
                            9 numbers column by column; Redwood has no such file, see REDWOOD_CAMERA
 
-Names of Redwood have the stamp after the number: 0000001-000000033333.jpg. It is not read: the
-frames are taken as 30 Hz. The layout has no ground truth beside the images, thus `truth` is None.
+File names of Redwood have the stamp after the number: 0000001-000000033333.jpg. This stamp is not
+read: frame k gets the stamp k / 30 s. The layout has no ground truth, so `truth` returns None.
 """
 
 import logging
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 COLOR_FOLDERS = ("color", "image", "rgb")
 INTRINSICS = ("camera_intrinsic.json", "intrinsic.json")
-IMAGE_NAME = r"(\d+)(?:-\d+)?"  # Number, and at Redwood the stamp.
+IMAGE_NAME = r"(\d+)(?:-\d+)?"  # Number, followed by the stamp in file names of Redwood.
 DEPTH_SCALE = 1000.0  # Units per meter; the default of Open3D.
 # Camera of Redwood, whose folders have no intrinsics: the PrimeSense that Open3D assumes too.
 REDWOOD_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)

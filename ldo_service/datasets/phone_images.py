@@ -28,7 +28,7 @@ MIN_CONFIDENCE = 2
 
 @dataclass(frozen=True, slots=True)
 class PhoneGrid:
-    """Pixel grid of a sequence: all frames are brought to it.
+    """Pixel grid to which all frames of a phone recording are resampled.
 
     Attributes:
         color_camera: Camera of the color images of the sequence, at their full size.
@@ -65,7 +65,7 @@ class PhoneGrid:
         depth_scale: float,
         camera: Camera | None = None,
     ) -> RawFrame:
-        """Bring the images of a frame to the grid.
+        """Resample the images of a frame to the grid.
 
         Args:
             index: Number of the frame.
@@ -133,7 +133,7 @@ def enlarge_depth(
         depth: Depth, [Hd, Wd], in any unit; 0 or NaN where not measured.
         size: Height and width of the grid, pixels.
         view: Height and width of the depth image, in pixels of the grid. The grid may be smaller
-            by a part of a pixel.
+            by less than a pixel.
 
     Returns:
         [H, W]. It is `depth` itself if the sizes are equal, else float32 in the same unit.

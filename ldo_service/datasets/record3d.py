@@ -7,8 +7,8 @@ rgbd/0.jpg               color
 rgbd/0.depth             float32 meters, [dh, dw], LZFSE; registered to color; NaN where unknown
 rgbd/0.conf              optional: uint8, [dh, dw], LZFSE, 0 to 2; see MIN_CONFIDENCE
 
-The poses of the metadata come from ARKit. They are another estimate and no ground truth:
-`odometry`, not `truth`.
+The poses of the metadata come from ARKit. They are an estimate, not ground truth, so `odometry`
+returns them and `truth` returns None.
 """
 
 import json
@@ -99,7 +99,10 @@ class Record3DSequence(Sequence):
         return valid_trajectory(self.stamps_ns, found)
 
     def _bytes(self, name: str) -> bytes:
-        """Return the content of a file in the archive; the errors are UNREADABLE."""
+        """Return the content of a file in the archive.
+
+        The method raises one of the exceptions in UNREADABLE if the file cannot be read.
+        """
         entry = self._archive.getinfo(name)
         if entry.file_size > MAX_BYTES:
             raise ValueError(f"{name} has {entry.file_size} bytes, more than {MAX_BYTES}")

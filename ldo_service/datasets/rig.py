@@ -102,7 +102,7 @@ class SequenceOptions:
         return not self.register_depth and not self._given()
 
     def over(self, rig: Rig) -> Rig:
-        """Return `rig` with the cameras and the transform that these options set."""
+        """Return a copy of `rig`, in which the values of these options replace those of `rig`."""
         return replace(rig, **self._given())
 
     def _given(self) -> dict[str, Camera | np.ndarray]:

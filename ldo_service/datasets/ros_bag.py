@@ -158,7 +158,7 @@ class RosBagSequence(Sequence):
 
 
 def _ascending(messages: list[StoredMessage], topic: Topic) -> list[StoredMessage]:
-    """Return the messages of a topic by ascending stamp; the first one of equal stamps."""
+    """Return the messages of a topic by ascending stamp; only the first of those with one stamp."""
     found: dict[int, StoredMessage] = {}
     for message in messages:
         if message.connection.topic == topic.name:
@@ -193,7 +193,7 @@ def _topic(
     Args:
         bag: The bag.
         stream: "color" or "depth".
-        given: Name of the topic in the options; empty searches it.
+        given: Name of the topic from the options; empty to search for the topic.
         names: Patterns of usual names, the preferred one first.
         excluded: Pattern of names that belong to other streams.
         beside: Topic of the same camera; topics that share its namespace are preferred.
@@ -236,7 +236,7 @@ def _topic(
 
 
 def _common_parts(a: str, b: str) -> int:
-    """Return the number of first parts that the names of two topics share."""
+    """Return how many leading parts the names of two topics have in common."""
     parts = zip(a.strip("/").split("/"), b.strip("/").split("/"), strict=False)
     return next((k for k, (x, y) in enumerate(parts) if x != y), 99)
 
@@ -343,7 +343,10 @@ def _transform(
 
 
 def _realsense_extrinsics(bag: BagFile, image: Topic) -> np.ndarray | None:
-    """Return the transform from the reference to a stream of RealSense Viewer (ROS 1), or None."""
+    """Return the transform [4, 4] from the reference stream to a stream.
+
+    RealSense Viewer records it in bags of ROS 1. None if the bag does not contain it.
+    """
     base = COMPRESSED.sub("", image.name).removesuffix("/image/data")
     topics = re.compile(re.escape(base) + r"/tf/\d+")
     for message in readable_messages(bag, lambda topic: bool(topics.fullmatch(topic.name))):
@@ -352,7 +355,7 @@ def _realsense_extrinsics(bag: BagFile, image: Topic) -> np.ndarray | None:
 
 
 def _realsense_units_per_m(bag: BagFile, depth: Topic) -> float | None:
-    """Return the depth units per meter that RealSense Viewer recorded, or None."""
+    """Return the depth units per meter that RealSense Viewer recorded; None if there are none."""
     sensor = re.match(r"/device_\d+/sensor_\d+/", depth.name)
     if sensor is None:
         return None

@@ -10,9 +10,9 @@ All numbers are little-endian, and matrices are 4x4 float32 by rows:
     frames: pose camera to world, -inf where unknown; uint64 stamp of color, stamp of depth, both in
     microseconds; uint64 bytes of color, bytes of depth; color; depth
 
-Color is raw RGB, PNG or JPEG; depth is uint16, raw or compressed by zlib. What follows the frames,
-such as inertial measurements, is not read. `RigSequence` says how cameras, registration and poses
-are treated.
+Color is raw RGB, PNG or JPEG; depth is uint16, raw or compressed by zlib. Data after the frames,
+such as inertial measurements, are not read. The docstring of `RigSequence` explains cameras,
+registration and poses.
 """
 
 import logging
@@ -55,7 +55,7 @@ class _Header:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Index:
-    """Positions of the frames in the file, and the values that are stored beside their images."""
+    """Positions of the frames in the file, and the pose, stamp and sizes of each frame."""
 
     T_world_camera: np.ndarray  # [N, 4, 4] float64; not finite where unknown.
     stamps_us: np.ndarray  # [N] uint64, of color.
@@ -64,7 +64,7 @@ class _Index:
 
 
 class SensSequence(RigSequence):
-    """Sequence of a file .sens. Frames are read when they are asked for."""
+    """Sequence of a .sens file; the images of a frame are read when `read` is called."""
 
     def __init__(self, path: Path, options: SequenceOptions) -> None:
         """Open the sequence of a file, and index its frames."""
@@ -134,7 +134,7 @@ def _exactly(file: BinaryIO, size: int, path: Path, place: str) -> bytes:
     """Read a number of bytes.
 
     Raises:
-        DataError: The file ends before.
+        DataError: The file ends before this number of bytes.
     """
     data = file.read(size)
     if len(data) < size:
@@ -218,7 +218,10 @@ def _index(file: BinaryIO, path: Path, frames: int) -> _Index:
 
 
 def _stamps_ns(stamps_us: np.ndarray, path: Path) -> np.ndarray:
-    """Return stamps [N] int64 that ascend: those of the file, or 30 Hz where these do not."""
+    """Return ascending stamps, [N] int64.
+
+    They are the stamps of the file. If these do not ascend, frame k gets the stamp k / 30 s.
+    """
     if np.all(stamps_us[1:] > stamps_us[:-1]) and stamps_us[-1] <= LAST_STAMP_NS // 1000:
         return stamps_us.astype(np.int64) * 1000
     log.info("%s: the stamps do not ascend; its frames count as %d Hz.", path, FRAME_RATE_HZ)

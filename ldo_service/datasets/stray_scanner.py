@@ -7,8 +7,8 @@ camera_matrix.csv        3x3 by rows, for the size of the video
 odometry.csv             lines of `timestamp, frame, x, y, z, qx, qy, qz, qw` after a header
 
 The poses of odometry.csv come from ARKit, with the axes of this project: the app turns its cameras
-to x right, y down, z forward. They are another estimate and no ground truth: `odometry`, not
-`truth`.
+to x right, y down, z forward. They are an estimate, not ground truth, so `odometry` returns them
+and `truth` returns None.
 """
 
 import logging

@@ -17,8 +17,9 @@ from .images import MAX_PIXELS
 class Video:
     """Frames of a video file in the order of their stamps.
 
-    Frames that are read in order are decoded once. Another order makes the reader go back to the
-    keyframe before. At most one decoded frame is held. Reading is safe in several threads.
+    If frames are read in order, each one is decoded once. If they are read in another order, the
+    reader goes back to the preceding keyframe of the video and decodes frames again. At most one
+    decoded frame is in memory. Several threads may read at the same time.
 
     Attributes:
         stamps_ns: Stamps of the frames from the beginning of the file, [N] int64, ascending.
@@ -114,7 +115,11 @@ class Video:
         self._frames, self._next, self._missing = self._decode(), index, range(0)
 
     def _advance(self, index: int) -> Any:
-        """Decode up to a frame; return None and keep the next one if the frame is missing."""
+        """Decode frames up to the one with an index, and return this frame.
+
+        The result is None if the decoder skips this frame. The next call then continues with the
+        frame after it.
+        """
         assert self._frames is not None
         for frame in self._frames:
             position = bisect_left(self._stamps, frame.pts)
