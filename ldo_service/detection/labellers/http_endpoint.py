@@ -27,8 +27,8 @@ class HttpClientConfig:
     # supervision.backend_step_timeout_s, after which an actor is stopped.
     patience_s: float = 40.0
     per_minute: float = 60.0  # Maximum attempts per minute, evenly spaced.
-    # Time after a failed request in which further requests fail at once, without an attempt. The
-    # time is doubled after each further failure in a row.
+    # Time after a failed request in which further requests fail immediately, without an attempt.
+    # The time is doubled after each further failure in a row.
     pause_s: float = 10.0
     max_pause_s: float = 300.0  # Maximum of the doubled pause_s.
     key_variable: str = ""  # Environment variable with the API key; empty: none.
@@ -103,9 +103,9 @@ class HttpClient:
     def post(self, path: str, body: bytes, until_s: float) -> bytes:
         """Send a POST request, with retries, and return the body of the response.
 
-        After a failed request, further requests fail at once for a while (circuit breaker, see
-        `pause_s`). A request whose deadline passes before the server had `timeout_s` to respond
-        does not count as failed.
+        For some time after a failed request, further requests fail without an attempt (circuit
+        breaker, see `HttpClientConfig.pause_s`). A request whose deadline passes before the server
+        had `timeout_s` to respond does not count as failed.
 
         Args:
             path: Path of the request below the address.
