@@ -18,7 +18,8 @@ from .loops import FoundLoops
 
 # Stamps that differ less are equal: float64 seconds cannot represent the nanoseconds of the files.
 STAMP_TOLERANCE_S = 1e-6
-# Maximum time from the frame before to the frame after one whose motion they tell.
+# Maximum time between the frame before and the frame after a frame, from which the motion of the
+# camera during this frame is computed.
 MAX_MOTION_INTERVAL_S = 0.3
 
 
@@ -119,9 +120,11 @@ class PosedMap:
         return self.trajectory.T_world_camera[gaps_s.argmin()]
 
     def motion(self, frame: RunFrame) -> FrameMotion | None:
-        """Return the motion of the camera during a frame, by the frames before and after it.
+        """Compute the motion of the camera during a frame from the frames before and after it.
 
-        The result is None if a neighbor is missing, or if the camera has no timing to compensate.
+        Returns:
+            The motion. None if one of the two frames is missing, if they are too far apart in time,
+            if the motion is implausible, or if the timing of the shutter is not known.
         """
         timing = self.corrections.at(frame.stamp_ns).timing
         stamps_s = self.trajectory.stamps_s
@@ -139,7 +142,7 @@ class PosedMap:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FinishedRun:
-    """A finished run."""
+    """Frames, trajectories, maps and loop closures of a finished run."""
 
     folder: Path  # Folder of the run; pictures are saved here.
     frames: tuple[RunFrame, ...]  # Tracked frames of the run.

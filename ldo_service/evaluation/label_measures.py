@@ -91,7 +91,10 @@ def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) ->
 
 @dataclass(frozen=True, slots=True)
 class DetectionCounts:
-    """Counts of objects or of pixels with a name, and the recall and precision of the names."""
+    """Counts of correct names, true names and names in the map, with their recall and precision.
+
+    One instance counts objects, or it counts pixels.
+    """
 
     right: int = 0  # Named correctly in the map.
     wanted: int = 0  # Named in the ground truth.
@@ -178,7 +181,10 @@ def is_beyond_coco(name: str) -> bool:
 
 
 def _table(names: Sequence[str]) -> np.ndarray:
-    """Return which of some names denote objects without a COCO class, [256] bool by index."""
+    """Return a table [256] bool, True at the index of each name of an object without a COCO class.
+
+    See `is_beyond_coco`.
+    """
     table = np.zeros(256, bool)
     table[: len(names)] = [is_beyond_coco(name) for name in names]
     return table

@@ -88,12 +88,12 @@ class LoopErrors:
     closures: int
     true_closures: int
     queries: int  # Subgraphs that form a true pair with an older subgraph.
-    closed_queries: int  # Queries with a closure to such an older subgraph.
+    closed_queries: int  # Queries with a closure to an older subgraph of a true pair.
     candidates: int
     position_errors_m: tuple[float, ...]  # One per closure whose keyframes have true poses.
     rotation_errors_deg: tuple[float, ...]  # One per closure whose keyframes have true poses.
     ms: tuple[float, ...]  # Duration of the comparison of each candidate that was timed.
-    retrieved_queries: int = 0  # Queries with such an older subgraph among their candidates.
+    retrieved_queries: int = 0  # Queries with an older subgraph of a true pair as a candidate.
 
     @property
     def precision(self) -> float | None:
@@ -102,7 +102,10 @@ class LoopErrors:
 
     @property
     def recall(self) -> float | None:
-        """Fraction of the queries with a closure to an older subgraph that truly overlaps."""
+        """Fraction of the queries that have a loop closure of a true pair.
+
+        A query is a subgraph that forms a true pair with at least one older subgraph.
+        """
         return self.closed_queries / self.queries if self.queries else None
 
 

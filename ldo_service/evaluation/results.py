@@ -128,7 +128,7 @@ def calls_per_frame(run: FinishedRun) -> float | None:
 
 
 def run_loop_errors(run: FinishedRun, sequence: Sequence, truth: Trajectory) -> LoopErrors | None:
-    """Score the loops of a run; None if loop closing was off."""
+    """Score the loop closures of a run; return None if loop closing was off."""
     if run.loops is None:
         return None
     return evaluate_loops(run.loops, seen_keyframes(run.keyframes, sequence, truth))
