@@ -20,8 +20,8 @@ class AdamConfig:
     """Learning rates of Adam for each parameter of a Gaussian.
 
     A rate approximates the change of its parameter in one step. The rates are 5 to 10 times as high
-    as in 3DGS, because a keyframe gets tens of iterations instead of thousands. On a CPU, the map
-    reaches in 0.35 s the quality that it reaches in 4.5 s with the rates of 3DGS.
+    as in 3DGS, because a keyframe gets tens of iterations instead of thousands. On a CPU, 0.35 s of
+    optimization give the quality that takes 4.5 s with the rates of 3DGS.
     """
 
     mean_m: float = 5e-4

@@ -30,8 +30,9 @@ class Changes:
 class ChangeLog:
     """Unpublished changes of a map. The caller must record every change of the map here.
 
-    New Gaussians are published at once. Changed parameters of published Gaussians are published
-    at intervals, because the Gaussian optimizer changes most visible Gaussians at every keyframe.
+    New Gaussians are published with the next update. Changed parameters of published Gaussians are
+    published less often, because the Gaussian optimizer changes most visible Gaussians at every
+    keyframe.
     Motions of anchor keyframes are not recorded: each map replica applies them to its own copy.
     """
 

@@ -1,4 +1,4 @@
-"""Memory-resident records of the chunks whose Gaussians are on disk or lost."""
+"""Records in memory of the chunks whose Gaussians are on disk or lost."""
 
 from dataclasses import dataclass, replace
 

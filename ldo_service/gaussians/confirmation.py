@@ -27,8 +27,8 @@ class Confirmation:
 
         The first keyframe is the newest one that has `confirm_keyframes` later keyframes. The
         second one is drawn at random from the first one and all earlier keyframes, since the map
-        around old keyframes also changes. There are none while there are too few keyframes, or if
-        `min_weight_px` is 0.
+        around old keyframes also changes. No keyframe is checked while there are too few of them,
+        or if `min_weight_px` is 0.
 
         Args:
             newest: Id of the newest keyframe.
@@ -47,7 +47,7 @@ class VisibilityCheck:
     """Search for hidden Gaussians, by their blending weights in optimizer iterations.
 
     The optimizer computes the weights anyway, so the check needs no renderings of its own. Such
-    renderings took 6 % of the mapper's CPU time in the kitchen.
+    renderings took 6 % of the mapper's CPU time on the sequence kitchen.
 
     Args:
         newest: Id of the newest keyframe.

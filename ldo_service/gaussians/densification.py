@@ -353,8 +353,8 @@ def with_small_holes_filled(depth_m: np.ndarray, radius_px: int) -> np.ndarray:
     """Return depth [H, W] with small holes filled by the farthest depth within `radius_px`.
 
     A hole is filled only if at least 40 % of the pixels within `radius_px` were measured. A hole
-    beside an object is usually background that the sensor's projector cannot reach, so the farthest
-    depth is used.
+    next to an object is usually background that the sensor's projector cannot reach. The farthest
+    depth is used for this reason.
     """
     window = np.ones((2 * radius_px + 1,) * 2, np.uint8)
     measured = depth_m > 0

@@ -123,10 +123,11 @@ class Fitting:
     def _covisible(
         self, newest: TrainingView, older: list[int], rng: np.random.Generator
     ) -> list[int]:
-        """Return the ids of older keyframes that show at least `min_shared` of the same surface.
+        """Return the ids of older keyframes that are covisible with the newest one.
 
-        The last `recent` keyframes and `earlier` random ones before them are checked against the
-        measured surface of the newest keyframe.
+        Such a keyframe shows at least the fraction `min_shared` of the surface that the newest
+        keyframe measured. Only the last `recent` keyframes and `earlier` random ones before them
+        are checked.
         """
         window = self._window
         split = max(0, len(older) - window.recent)

@@ -66,7 +66,8 @@ def image_loss(
     Args:
         planes: Rendering [5, H, W] float32: colors C, weighted depth D in meters, opacity (unused).
         color: Frame [3, H, W] uint8; y = color / 255.
-        depth_m: Depth d of the frame, [H, W] float32; 0 where not measured, which is ignored.
+        depth_m: Depth d of the frame, [H, W] float32. Pixels with 0 were not measured; the depth
+            term ignores them.
         exposure: Gain and bias of the frame relative to the map.
         weights: Weights of the terms.
         by_planes: Output: dL/dplanes, [5, H, W] float32.

@@ -90,7 +90,7 @@ class MapBuilder:
         Args:
             frame: Color and depth of the keyframe.
             T_map_camera: Pose of the keyframe, [4, 4].
-            keyframe: Id of the keyframe, larger than all ids before.
+            keyframe: Id of the keyframe, larger than all earlier ids.
             iterations: Number of iterations if `usual_reach` Gaussians are visible in each. With
                 more visible Gaussians, fewer iterations run, so that the time stays the same.
             dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool; None if none.
@@ -325,7 +325,7 @@ class MapBuilder:
         self._log.mark_all_published(self.gaussians)
 
     def size(self) -> int:
-        """Return the number of Gaussians, resident and offloaded."""
+        """Return the number of Gaussians in memory and on disk together."""
         return len(self.gaussians) + len(self.offloaded)
 
     def batches(self) -> Iterator[GaussianBatch]:

@@ -249,8 +249,9 @@ class GaussianMap:
             labels: [M, 32]; None for Gaussians without observations.
 
         Raises:
-            ValueError: An array has another shape, or the rows hold NaN or infinity. Or an id is
-                in the map already, is given twice, or was never assigned by this map.
+            ValueError: An array has another shape, the rows hold NaN or infinity, or an id is
+                invalid: it is in the map already, is given twice, or was never assigned by this
+                map.
         """
         returned = _piece(ids, rows, anchors, labels).at(np.argsort(ids, kind="stable"))
         # Number of rows of the map before each of these Gaussians.

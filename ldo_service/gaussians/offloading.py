@@ -31,9 +31,9 @@ class OffloadedGaussians:
     """Store of offloaded chunks in `folder`.
 
     Loading restores Gaussians exactly: they are bitwise equal to Gaussians that stayed in memory
-    and moved with their anchor keyframes. A chunk on disk takes less than 1 kB of memory
-    beside its pending motions. If `folder` is None, a temporary folder is used and removed at the
-    end. Not thread-safe.
+    and moved with their anchor keyframes. A chunk on disk takes less than 1 kB of memory, plus
+    the motions that are not yet applied to its file. If `folder` is None, a temporary folder is
+    used and removed at the end. Not thread-safe.
 
     The folder contains the chunks of one map only. `restore` removes all files that are not in the
     snapshot. Without `restore`, the first `put` removes all earlier files. When a chunk is loaded,
@@ -168,7 +168,7 @@ class OffloadedGaussians:
         return [numbers[k] for k in np.flatnonzero(seen)]
 
     def move_anchors(self, T_new_old: Mapping[int, np.ndarray]) -> None:
-        """Move offloaded Gaussians as `GaussianMap.move_anchors` moves resident ones.
+        """Move offloaded Gaussians as `GaussianMap.move_anchors` moves those in memory.
 
         Args:
             T_new_old: Motion [4, 4] in the map frame by id of the anchor keyframe.
@@ -212,7 +212,7 @@ class OffloadedGaussians:
         that exist neither in memory nor on disk, including ids of Gaussians removed earlier.
 
         Args:
-            gaussians: The map with the resident Gaussians.
+            gaussians: The map, with the Gaussians in memory.
         """
         if not self._lost:
             return np.zeros(0, np.int64)
@@ -368,7 +368,7 @@ def _in_order(piece: GaussianBatch) -> GaussianBatch:
 def iter_all_gaussians(
     gaussians: GaussianMap, offloaded: OffloadedGaussians
 ) -> Iterator[GaussianBatch]:
-    """Yield all Gaussians, resident and offloaded, in batches; ids ascend throughout.
+    """Yield all Gaussians, those in memory and those on disk, in batches with ascending ids.
 
     The Gaussians of one anchor keyframe must have consecutive ids. Only the offloaded Gaussians of
     one anchor keyframe are in memory at a time.
