@@ -1,5 +1,7 @@
 """Detection of objects of known classes in each keyframe.
 
+Topics, their messages, the delivery policy of each input (with its queue length), and notes:
+
 in   keyframe/new      Keyframe         Backlog(4)    a lost keyframe would get no detections
 out  detection/boxes   DetectionBoxes                 one for every keyframe, possibly empty
 

@@ -1,5 +1,7 @@
 """Check and rectification of camera frames.
 
+Topics, their messages, the delivery policy of each input (with its queue length), and notes:
+
 in   camera/rgbd    CameraRgbd    Latest(4)   buffers a burst of four; drops older frames
 in   camera/color   CameraColor   Latest(4)   color image of a camera with two topics
 in   camera/depth   CameraDepth   Latest(4)   depth image of such a camera, paired by stamp

@@ -1,5 +1,7 @@
 """Detection of loop closures between subgraphs of keyframes.
 
+Topics, their messages, the delivery policy of each input (with its queue length), and notes:
+
 in   keyframe/new       Keyframe         Backlog(4)    a lost keyframe could never close a loop
 in   detection/boxes    DetectionBoxes   Backlog(16)   object classes in every keyframe
 in   graph/correction   GraphCorrection  Latest(1)     has all poses, so the newest suffices

@@ -1,5 +1,7 @@
 """Mapping with labelled 3D Gaussians and objects.
 
+Topics, their messages, the delivery policy of each input (with its queue length), and notes:
+
 in   keyframe/new          Keyframe             Lossless(8)        the map would lack a lost one
 in   detection/boxes       DetectionBoxes       Lossless(8)        labels come from detections
 in   label/result          LabelResult          Lossless(8)        one result for each request

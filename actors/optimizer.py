@@ -1,5 +1,7 @@
 """Optimization of the pose graph of keyframes and objects.
 
+Topics, their messages, the delivery policy of each input (with its queue length), and notes:
+
 in   keyframe/measurements  KeyframeMeasurements  Backlog(64)   poses relative to earlier keyframes
 in   keyframe/refinement    KeyframeRefinement    Backlog(64)   better relative-pose measurements
 in   loop/closure           LoopClosure           Backlog(64)   rare, and costly to detect

@@ -1,5 +1,7 @@
 """Tracking of the camera pose in RGB-D frames.
 
+Topics, their messages, the delivery policy of each input (with its queue length), and notes:
+
 in   frame/rgbd       FrameRgbd        Latest(1)    a late frame is worth less than the next one
 in   graph/correction GraphCorrection  Latest(1)    has all poses, so the newest suffices
 in   odometry/prior   OdometryPrior    Latest(64)   0.3 s at 200 Hz, the time to track a frame;

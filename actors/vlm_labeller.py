@@ -1,5 +1,7 @@
 """Labelling of regions that the detector does not know.
 
+Topics, their messages, the delivery policy of each input (with its queue length), and notes:
+
 in   label/request   LabelRequest   Backlog(2)             one request waits, one is labelled
 in   label/add       AddLabel       Latest(32)             has priority, because a user waits
 out  label/result    LabelResult                           one for every request, often late
@@ -8,7 +10,7 @@ out  label/names     LabelNames                            one for every label/a
 The actor labels one region at a time. No other actor waits for it, however long a request takes.
 The service continues if the labeller fails or returns invalid answers. Regions then stay without a
 label, and the metrics report the failure. If no labeller is configured, the actor answers every
-request at once with an empty label.
+request immediately with an empty label.
 
 The answers of a labelling server are not reproducible from a journal. A replay therefore skips this
 actor and feeds the recorded results to the mapper.
