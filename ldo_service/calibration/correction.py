@@ -76,8 +76,8 @@ class CameraCorrection:
 
         If this correction changes nothing, the frame itself is returned.
 
-        The colors are darkened to the level of the strongest vignetting rather than brightened to
-        the level of the center, so that the correction clips no pixel.
+        All colors are darkened to the level of the strongest vignetting. If they were brightened to
+        the level of the center instead, bright pixels would be clipped.
 
         Args:
             frame: Rectified frame, which is not changed.

@@ -128,8 +128,8 @@ def covariance(
 ) -> np.ndarray:
     """Return the covariance [K, K] of the coefficients.
 
-    It is the sum of two covariances: that of independent residuals, which the prior limits, and
-    that of the jackknife, which contains errors that many residuals have in common.
+    It is the sum of two covariances. The first one assumes independent residuals and includes the
+    prior. The second one is that of the jackknife; it covers errors common to many residuals.
 
     Args:
         blocks: Reduced normal equations.

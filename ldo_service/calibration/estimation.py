@@ -156,7 +156,7 @@ class _Linearized:
     """Equations of all pairs, linearized at given coefficients and poses."""
 
     reduced: list[Reduced]  # Dense depth and features.
-    dense: list[Block]  # Dense depth at the given times, which are no unknowns.
+    dense: list[Block]  # Dense depth with the times as constants.
     common: list[CommonPoints]
 
 

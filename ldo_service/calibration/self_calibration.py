@@ -147,7 +147,7 @@ class SelfCalibration:
 
     @property
     def is_undecided(self) -> bool:
-        """True until the first estimate tells whether there is a depth bias."""
+        """True until the first estimate shows whether there is a depth bias."""
         return not (self.is_finished or self._has_estimate)
 
     @property
