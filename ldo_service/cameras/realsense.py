@@ -138,9 +138,9 @@ def camera_model(rs: Any, intrinsics: Any) -> CameraModel:
 
 
 def _require_device(rs: Any, serial: str) -> None:
-    """Raise ConfigError at once if the device is not connected.
+    """Raise ConfigError immediately if the device is not connected.
 
-    Without this check, a pipeline would wait 15 s for the device.
+    Without this check, the pipeline of the camera would wait 15 s for the device.
     """
     devices = rs.context().query_devices()
     found = [device.get_info(rs.camera_info.serial_number) for device in devices]
