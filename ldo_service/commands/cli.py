@@ -95,7 +95,7 @@ def _run_verb(words: Sequence[str], known: dict[str, Callable[..., None]]) -> No
 
 
 def _end_on_interrupts() -> None:
-    """Let SIGINT and SIGTERM end the process at once, with exit code 130.
+    """Let SIGINT and SIGTERM end the process immediately, with exit code 130.
 
     These handlers are used while modules are imported, when nothing needs an orderly end. An
     exception is no alternative: raised in the initialization of an extension module, it becomes an

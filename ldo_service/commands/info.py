@@ -17,7 +17,7 @@ from ldo_service.runs.source_info import SourceInfo, describe, estimated_run_s
 
 from .options import ConfigFile, Json, Settings, Source, Topics, argument, with_topics
 
-FIRST_UNIX_S = 946_684_800  # The year 2000. A smaller stamp is no time of day.
+FIRST_UNIX_S = 946_684_800  # The year 2000. A smaller stamp is not a Unix time.
 REGISTRATION = {
     "source": "registered to color in the source",
     "reader": "registered to color when a frame is read",
