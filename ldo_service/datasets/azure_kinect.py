@@ -169,8 +169,8 @@ def _parameters(values: Any, source: Path) -> list[float]:
     """Return the 14 numbers of an intrinsic calibration.
 
     Raises:
-        DataError: A value is no finite number.
-        TypeError: The values are no list of 14.
+        DataError: A value is not a finite number.
+        TypeError: `values` is not a list of 14 items.
     """
     if not isinstance(values, list) or len(values) != 14:
         raise TypeError("ModelParameters are not 14 numbers")
@@ -182,7 +182,7 @@ def _transform(fields: Any) -> np.ndarray:
     """Return the transform [4, 4] from the depth camera.
 
     Raises:
-        ValueError: The numbers are no rigid transform.
+        ValueError: The numbers are not a rigid transform.
     """
     T = np.eye(4)
     T[:3, :3] = np.array(fields["Rt"]["Rotation"], float).reshape(3, 3)

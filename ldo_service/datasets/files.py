@@ -30,7 +30,7 @@ def parse_stamp(seconds: str) -> int:
     """Parse a stamp in seconds, and return it in nanoseconds.
 
     Raises:
-        ValueError: The text is no number, or too large.
+        ValueError: The text is not a number, or the number is too large.
     """
     try:
         # The stamp is parsed as Decimal, because a float cannot hold nanoseconds since 1970.

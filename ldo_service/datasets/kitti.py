@@ -137,7 +137,7 @@ def _calibration(path: Path, left: int, right: int, images: list[Path]) -> _Ster
     """Read the calibration of two cameras from calib.txt.
 
     Raises:
-        DataError: The file cannot be read, or the cameras are no rectified pair.
+        DataError: The file cannot be read, or the cameras are not a rectified stereo pair.
     """
     matrices = dict(_matrices(path))
     missing = [f"P{k}" for k in (left, right) if f"P{k}" not in matrices]

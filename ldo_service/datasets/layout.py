@@ -70,7 +70,7 @@ def registered_layouts() -> tuple[Layout, ...]:
     """Return the layouts of other packages, in the order of their names.
 
     Raises:
-        ConfigError: An entry point cannot be loaded, or is no `Layout`.
+        ConfigError: An entry point cannot be loaded, or is not a `Layout`.
     """
     layouts = []
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda point: point.name):

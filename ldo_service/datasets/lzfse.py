@@ -23,11 +23,11 @@ MIN_BYTES_PER_MATCH = 3
 
 
 def decoded_bytes(data: bytes) -> int | None:
-    """Return the number of bytes that a stream becomes, by the headers of its blocks.
+    """Compute the decompressed size of a stream from the headers of its blocks.
 
     Returns:
-        The number, or None if the stream is damaged, or if a block may become more than
-        MATCH_BYTES / MIN_BYTES_PER_MATCH times the bytes that it declares.
+        The number of bytes. None if the stream is damaged, or if a block could grow to more than
+        MATCH_BYTES / MIN_BYTES_PER_MATCH times the size that its header declares.
     """
     total, position = 0, 0
     try:

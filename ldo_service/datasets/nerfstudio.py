@@ -100,7 +100,7 @@ class NerfstudioSequence(Sequence):
 
 
 def _pose(matrix: Any) -> np.ndarray | None:
-    """Return the transform [4, 4] of a value of the file; None if it is no matrix of numbers."""
+    """Convert a matrix of transforms.json to the axes of this project; None if it is not 4x4."""
     try:
         T_world_camera = np.array(matrix, float)
     except (TypeError, ValueError):

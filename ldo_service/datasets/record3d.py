@@ -197,7 +197,7 @@ def _conf(k: int) -> str:
 
 
 def _pose(numbers: Any) -> np.ndarray | None:
-    """Return the transform [4, 4] of qx, qy, qz, qw, x, y, z; None if they are no pose."""
+    """Return the transform [4, 4] of qx, qy, qz, qw, x, y, z; None if they are not a valid pose."""
     try:
         x, y, z, w, *translation = (float(number) for number in numbers)
         q = np.array([w, x, y, z])

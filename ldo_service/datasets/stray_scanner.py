@@ -138,7 +138,7 @@ def _lines(path: Path) -> dict[int, _Line]:
 
 
 def _pose(words: list[str]) -> np.ndarray | None:
-    """Return the transform [4, 4] of x, y, z, qx, qy, qz, qw; None if they are no pose."""
+    """Return the transform [4, 4] of x, y, z, qx, qy, qz, qw; None if they are not a valid pose."""
     try:
         x, y, z, *imaginary, real = (float(word) for word in words)
         q = np.array([real, *imaginary])
