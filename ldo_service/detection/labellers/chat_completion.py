@@ -258,7 +258,7 @@ class HttpLabeller:
     def metrics(self) -> dict[str, float]:
         """Return the counters of the labeller.
 
-        `answers_refused` counts answers that are no name or not in the list of names.
+        `answers_refused` counts answers that are not a valid name or not in the list of names.
         `answers_none` counts the answer "none", which means that the model cannot recognize the
         object. `answers_without_logprobs` counts answers without log-probabilities; they have the
         confidence `HttpConfig.confidence_untold`.
