@@ -218,7 +218,8 @@ def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
         classes: Number of names, C.
 
     Returns:
-        Pixels by true class and class in the map, [C, C + 1] int64; the last column is unknown.
+        Number of pixels by true class and by class in the map, [C, C + 1] int64. The last column
+        counts pixels with an unknown name in the map.
     """
     counted = truth != VOID
     columns = np.minimum(shown[counted], classes)

@@ -19,8 +19,8 @@ class Lpips:
     Height and width of the network may be dynamic.
 
     Raises:
-        ConfigError: If the file is no network with that layout. The constructor or the first call
-            raises the error.
+        ConfigError: If the file is not a network with these inputs and outputs. The constructor or
+            the first call raises the error.
     """
 
     def __init__(self, path: Path, *, threads: int = 1) -> None:

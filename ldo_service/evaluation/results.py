@@ -139,7 +139,7 @@ def compare(run: FinishedRun, truth: Trajectory) -> dict[str, TrajectoryErrors]:
 
     Returns:
         Errors over all frames with a pose, by name of the estimate. If some of these frames do not
-        have the status OK, the key "NAME, OK frames" has the errors over the frames that do.
+        have the status OK, the key "NAME, OK frames" has the errors over the OK frames alone.
     """
     rows = {}
     for name, estimate in run.estimates.items():
