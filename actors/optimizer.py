@@ -311,7 +311,7 @@ class Optimizer(Actor):
         return self._classes.index(name) if name in self._classes else 0
 
     def _keep_newest(self, waiting: list[Any]) -> list[Any]:
-        """Return the newest `max_early` messages; the excess is counted and discarded."""
+        """Return the newest `max_early` messages; older ones are counted and discarded."""
         excess = max(0, len(waiting) - self.config.max_early)
         self._too_early += excess
         return waiting[excess:]
