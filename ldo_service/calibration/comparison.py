@@ -175,7 +175,7 @@ def _rows(pixels: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _speed(points: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Return the velocity [6] of the camera at points [N, 3] in the camera frame, m/s."""
+    """Return the velocity [N, 3] in m/s of points [N, 3] that move with the camera."""
     return np.cross(velocity[:3], points) + velocity[3:]
 
 

@@ -35,8 +35,8 @@ class CameraCorrection:
         1 / z_true = 1 / z_measured + b1 x^2 + b2 x y + b3 y^2
         color_measured = V(r) color_true,  log V = a1 r^2 + a2 r^4 + a3 r^6 per channel
 
-    The bias has no constant and no linear term: these are a scale of the depth and a tilt, which
-    poses explain as well.
+    The bias has no constant and no linear term. They scale and tilt the depth, and a change of the
+    poses has the same effect.
     """
 
     depth_bias: tuple[float, ...] = (0.0,) * BIAS_TERMS  # b1, b2, b3 in 1/m.
@@ -125,7 +125,7 @@ class CorrectionHistory:
 
     @property
     def last(self) -> CameraCorrection:
-        """Correction of the last keyframe; one that changes nothing if there are no keyframes."""
+        """Correction of the last keyframe; it changes nothing if there is no keyframe."""
         return self.corrections[-1] if self.corrections else CameraCorrection()
 
 

@@ -50,7 +50,8 @@ class Reduced:
         """Eliminate the block's own unknowns.
 
         Args:
-            products: As `Block.products`; those of several blocks of one pair may be added.
+            products: Products of a block, see `Block.products`. Products of several blocks of one
+                pair may be added.
             count: Number K of the shared coefficients.
         """
         K, last = count, products.shape[-1] - 1
@@ -71,8 +72,8 @@ class Reduced:
 class Check:
     """Root mean square of the cells' mean residuals in held-out blocks.
 
-    `rms_without` has all shared coefficients at 0; `rms_with` uses the coefficients estimated from
-    the blocks that were not held out. Within a cell, noise averages out.
+    `rms_without` is computed with all shared coefficients at 0, `rms_with` with the coefficients
+    estimated from the blocks that were not held out. Within a cell, noise averages out.
     """
 
     rms_without: float
@@ -111,7 +112,10 @@ def solve(blocks: Sequence[Reduced], prior: np.ndarray | float, now: np.ndarray)
 def held_out(
     blocks: Sequence[Reduced], prior: float, now: np.ndarray
 ) -> list[tuple[range, np.ndarray]]:
-    """Return groups of successive blocks, each with the step [..., K] that all others give."""
+    """Return groups of successive blocks, each with the step [..., K] by the other groups.
+
+    The step of the shared coefficients is computed from all blocks outside the group.
+    """
     groups = np.array_split(np.arange(len(blocks)), min(GROUPS, len(blocks)))
     ranges = [range(int(group[0]), int(group[-1]) + 1) for group in groups]
     return [

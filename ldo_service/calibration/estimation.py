@@ -9,9 +9,9 @@ Times. A row that is recorded at another time than the middle row of color is di
 velocity of the camera. Bias and times are estimated together: without the times, the distortion by
 a rolling shutter would enter the bias.
 
-Noise. Residual and derivatives contain the same noisy depths. A derivative at the mean of both
-depths has no noise in common with the residual, which contains their difference: otherwise the
-noise of a Kinect would shift the y^2 coefficient by up to 0.01/m.
+Noise. The residual is the difference of two noisy depths. Its derivatives are computed at the mean
+of these depths, because the noise of the mean is independent of that of the difference. Otherwise,
+the noise of a Kinect would shift the y^2 coefficient by up to 0.01/m.
 
 Color. The log ratio of the brightness of one surface point in two views equals the difference of
 log V at its two pixels, apart from a change of the exposure. The gain and the offset of this change
@@ -77,7 +77,7 @@ class Estimate:
 
     @property
     def is_finite(self) -> bool:
-        """True if no coefficient is NaN or infinite, as degenerate pairs can make it."""
+        """True if all coefficients are finite; degenerate pairs of views may make them NaN."""
         values = self.depth_bias, self.times_s, self.vignetting
         return all(np.isfinite(value).all() for value in values)
 
@@ -220,7 +220,7 @@ def _vignetting(
 
 
 def _color_weight(rows: np.ndarray, now: np.ndarray, own: np.ndarray | None) -> np.ndarray:
-    """Return the weights [3, N] of the rows [3, N, 6] of a pair by their residuals.
+    """Compute the weights [3, N] of the rows [3, N, 6] of a pair from their residuals.
 
     Args:
         rows: Derivatives by vignetting, gain and offset, and the residual without vignetting.

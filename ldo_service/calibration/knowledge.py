@@ -7,9 +7,9 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CameraKnowledge:
-    """Uncertainty of a camera's depth bias, and timing of its shutter.
+    """Uncertainty of a camera's depth bias, and estimated timing of its shutter.
 
-    The tracker uses both to weight its measurements. They do not change the images.
+    The tracker weights depth by the uncertainty, and compensates frames by the timing.
     """
 
     # Standard deviation of the coefficients of the depth bias, as a multiple of that of an unknown

@@ -132,8 +132,8 @@ class SelfCalibration:
     ) -> "SelfCalibration":
         """Return a calibration of a camera whose correction is known from an earlier run.
 
-        The correction is used from the first frame on. A part of it changes only if held-out views
-        confirm an estimate from the largest number of views.
+        The correction is used from the first frame on. Its depth bias or its vignetting changes
+        only if held-out views confirm an estimate from the largest number of views.
         """
         calibration = SelfCalibration(config)
         calibration.correction = replace(correction, timing=ShutterTiming())
@@ -191,7 +191,7 @@ class SelfCalibration:
         return None if self._running is None else self._continue(work)
 
     def _complete_view(self, motion: FrameMotion | None) -> None:
-        """Give the view of the last frame the mean of the velocities before and after it."""
+        """Set the velocity of the last frame's view to the mean of those before and after it."""
         number, self._new_view = self._new_view, None
         if number is None or motion is None or number not in self._views:
             return
@@ -256,7 +256,7 @@ class SelfCalibration:
         self._steps_done = 0
 
     def _continue(self, work: float = 0.0) -> CorrectionChange | None:
-        """Continue the running estimate after some other work in this frame."""
+        """Continue the running estimate in one frame, after `work` units of other work."""
         assert self._running is not None
         try:
             while work < WORK_PER_FRAME:
@@ -285,12 +285,12 @@ class SelfCalibration:
         return None if change.old == new else change
 
     def _confirmed(self, found: Estimate) -> CameraCorrection:
-        """Return the new correction: the depth bias and the vignetting that are confirmed.
+        """Return a correction with the confirmed parts of an estimate; other parts are 0.
 
-        Held-out pairs of views confirm the depth bias and the vignetting separately. One that they
-        confirm takes its new estimate. One that was confirmed before takes it too, unless its
-        held-out residual exceeds `MAX_KEPT_RATIO`. If it comes from an earlier run, it keeps its
-        old value instead. All others become 0.
+        The parts are the depth bias and the vignetting. A part takes its new estimate if held-out
+        pairs of views confirm it. A part that was confirmed before stays in use, unless its
+        held-out residual exceeds `MAX_KEPT_RATIO`. It then takes its new estimate too, or keeps its
+        value if it comes from an earlier run.
         """
         nothing, before = CameraCorrection(), self.correction
         depth_bias, vignetting = nothing.depth_bias, nothing.vignetting

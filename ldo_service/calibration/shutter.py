@@ -150,7 +150,7 @@ class FrameMotion:
 
 
 def displacement_rad(velocity: np.ndarray, timing: ShutterTiming, depth_m: float) -> float:
-    """Return an upper bound of the image motion by a velocity [6] while a frame is recorded, rad.
+    """Return the largest image motion that a velocity [6] causes during a frame, in rad.
 
     Args:
         velocity: Rotation in rad/s and translation in m/s; or a difference of two velocities.
