@@ -280,7 +280,7 @@ def _compressed_depth(message: Any) -> RosImage:
     """Wrap compressed depth in millimeters, or decode compressed depth in meters.
 
     The transport `compressedDepth` stores float depth as the 16-bit integers A / depth + B. Its
-    header has a format and the float32 numbers A and B. An integer of 0 means not measured.
+    header has a format and the float32 numbers A and B. The integer 0 marks an unmeasured pixel.
 
     Raises:
         FrameError: The format is not supported, or the data are invalid.
