@@ -103,8 +103,9 @@ def batch(
 
     Each recording has its own process and its own folder WHERE/NAME-KEY. The key is a digest of the
     content of the recording, the configuration and the version. If you repeat the command, finished
-    recordings are not repeated; failed and interrupted ones are. A failed recording does not stop
-    the others. WHERE/batch.json and WHERE/index.html list all recordings of the last call.
+    recordings are skipped, and failed or interrupted ones are processed again. A failed recording
+    does not stop the others. WHERE/batch.json and WHERE/index.html list all recordings of the last
+    call.
 
       ldo batch ~/night/* --out runs/night
       ldo batch s3://robots/night s3://robots/day/*.mcap --out s3://results/night --export splat

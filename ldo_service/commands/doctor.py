@@ -82,7 +82,7 @@ def doctor(
 
     `ldo doctor calibration DIR` prints what the run in DIR has found about its camera: depth bias,
     vignetting, and the times at which rows of color and depth are recorded. A line marked warn
-    says what a large value costs and how to avoid the cost.
+    says how a large value affects the results and how to avoid this.
 
       ldo doctor
       ldo doctor calibration runs/desk

@@ -25,8 +25,9 @@ def replay(
 ) -> None:
     """Replay a recording with new actors, and compare their outputs with the recorded outputs.
 
-    The replay also repeats restarts, failures and the recorded send credit at each step. It
-    publishes nothing. Without --verify, it prints differences, and the exit code is still 0.
+    The replay also repeats restarts and failures, and the recorded limits on how many messages an
+    actor may send at each step. It publishes nothing. Without --verify, it prints differences, and
+    the exit code is still 0.
 
       ldo replay recordings/desk --verify
     """
