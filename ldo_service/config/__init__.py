@@ -7,9 +7,9 @@ A configuration file lists only the settings that differ from their defaults:
     service:
       process_actors: [optimizer, mapper]
 
-An unknown setting is an error that names the most similar setting. `ldo config` prints all public
-settings, and the advanced settings that differ from their defaults. `ldo config --all` prints all
-settings.
+An unknown setting causes an error, which names the most similar known setting. `ldo config` prints
+all public settings, and the advanced settings that differ from their defaults. `ldo config --all`
+prints all settings.
 """
 
 from .loading import checked, config_of, load_config

@@ -18,7 +18,7 @@ from .values import (
 
 @dataclass(frozen=True, slots=True)
 class PaperSettings:
-    """Constants of the paper, and switches to rules of the paper that the defaults replace.
+    """Constants of the paper, and switches that replace the default rules by those of the paper.
 
     These settings reproduce the results of the paper. A user need not tune them.
     """
