@@ -205,7 +205,7 @@ class _Ros2:
         return bytes(raw)
 
     def _select(self, part: int) -> None:
-        """Let the reader see only one part."""
+        """Restrict the reader to one part: a file, or a chunk of an MCAP file."""
         file, chunk = self._parts[part]
         if hasattr(self._reader.storage, "storages"):
             self._reader.storage.storages = [file]

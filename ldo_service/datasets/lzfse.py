@@ -1,9 +1,10 @@
 """Check of LZFSE streams before they are decompressed, so that a crafted stream cannot fill memory.
 
-A stream is a sequence of blocks. Each block declares how many bytes it becomes, but the decoder
-does not enforce this for compressed blocks: it writes what their literals and matches yield. The
-library `pyliblzfse` then enlarges its buffer without a limit. This module reads the headers of the
-blocks only, which are little-endian (lzfse_internal.h of github.com/lzfse/lzfse):
+A stream is a sequence of blocks. The header of each block declares its decompressed size, but the
+decoder does not enforce this size for compressed blocks. It writes all bytes that the literals and
+matches of the block yield, and the library `pyliblzfse` enlarges its buffer without a limit. This
+module reads only the headers of the blocks, which are little-endian (lzfse_internal.h of
+github.com/lzfse/lzfse):
 
     bvx-    uint32 bytes; the bytes themselves
     bvxn    uint32 bytes, uint32 size of the payload; the payload, bounded by the decoder

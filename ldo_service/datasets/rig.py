@@ -98,7 +98,7 @@ class SequenceOptions:
 
     @property
     def is_default(self) -> bool:
-        """True if no option of the registration is set."""
+        """True if all options for the registration of depth have their defaults."""
         return not self.register_depth and not self._given()
 
     def over(self, rig: Rig) -> Rig:

@@ -4,10 +4,12 @@ A bag needs three topics: color images, depth images, and the camera info of col
 by their types and usual names, or by `SequenceOptions`. The images are sensor_msgs/Image or
 sensor_msgs/CompressedImage. Each color image has the nearest depth image within 20 ms.
 
-Depth is registered to color in the file if both images have the same size and the same frame, or
-if the name of the depth topic says so. Otherwise, depth is registered here, with the camera info of
-depth and the transform between both frames in /tf_static. nav_msgs/Odometry is the recorded
-odometry, if /tf_static connects its base with the camera. Imu and moving transforms are not used.
+Depth counts as registered to color if both images have the same size and the same viewpoint. The
+viewpoint is the same if the name of the depth topic says so, if the frame_ids are equal, or if the
+transform between them is the identity. Otherwise, this module registers depth to color with the
+camera info of depth and this transform, which it reads from /tf_static or from the topics of
+RealSense Viewer. A topic with nav_msgs/Odometry is the recorded odometry, if /tf_static connects
+its base with the camera. Inertial measurements and moving transforms are not used.
 """
 
 import logging
@@ -158,7 +160,7 @@ class RosBagSequence(Sequence):
 
 
 def _ascending(messages: list[StoredMessage], topic: Topic) -> list[StoredMessage]:
-    """Return the messages of a topic by ascending stamp; only the first of those with one stamp."""
+    """Sort the messages of a topic by stamp, and keep only the first message of each stamp."""
     found: dict[int, StoredMessage] = {}
     for message in messages:
         if message.connection.topic == topic.name:
@@ -302,7 +304,7 @@ def _rig(
     """Return the cameras for the registration of depth, or None if depth is registered already.
 
     Raises:
-        DataError: The transform from depth to color, or the camera info of depth is unknown.
+        DataError: The transform from depth to color or the camera info of depth is missing.
     """
     T_color_depth = options.T_color_depth
     if T_color_depth is None:
