@@ -209,8 +209,8 @@ class DualEncoder:
     def _place_listed(self) -> None:
         """Compute the missing text embeddings of the names.
 
-        With a text encoder, this is called at the first label request and not at the start, because
-        eighty names take seconds.
+        If there is a text encoder, this method is called at the first label request and not at the
+        start, because eighty names take seconds.
         """
         for name, word in self._listed.items():
             if name not in self._rows:
