@@ -124,7 +124,7 @@ class PosedMap:
 
         Returns:
             The motion. None if one of the two frames is missing, if they are too far apart in time,
-            if the motion is implausible, or if the timing of the shutter is not known.
+            if the motion is implausible, or if the shutter has no known delays.
         """
         timing = self.corrections.at(frame.stamp_ns).timing
         stamps_s = self.trajectory.stamps_s

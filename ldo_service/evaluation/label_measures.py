@@ -91,9 +91,9 @@ def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) ->
 
 @dataclass(frozen=True, slots=True)
 class DetectionCounts:
-    """Counts of correct names, true names and names in the map, with their recall and precision.
+    """Recall and precision of the names in a map, with the counts that they are computed from.
 
-    One instance counts objects, or it counts pixels.
+    An instance counts either objects or pixels.
     """
 
     right: int = 0  # Named correctly in the map.
