@@ -32,8 +32,8 @@ class ChangeLog:
 
     New Gaussians are published with the next update. Changed parameters of published Gaussians are
     published less often, because the Gaussian optimizer changes most visible Gaussians at every
-    keyframe.
-    Motions of anchor keyframes are not recorded: each map replica applies them to its own copy.
+    keyframe. Motions of anchor keyframes are not recorded: each map replica applies them to its own
+    copy.
     """
 
     def __init__(self) -> None:

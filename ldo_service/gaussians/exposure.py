@@ -69,8 +69,8 @@ def fit_exposure(
 ) -> Exposure:
     """Fit gain and bias by least squares, such that `seen` = gain * `rendered` + bias.
 
-    Use this function for evaluation only: it fits to the image that the rendering is then compared
-    with. A channel without contrast gets a gain of one.
+    Use this function for evaluation only, because it fits to the same image with which the
+    rendering is compared afterwards. A channel without contrast gets a gain of one.
 
     Args:
         rendered: [H, W, 3], 0..1.

@@ -22,7 +22,7 @@ TRIES_PER_DRAW = 4
 
 @dataclass(frozen=True, slots=True)
 class ViewSamplingConfig:
-    """Settings of the choice of keyframes to which the map is fitted after a new keyframe.
+    """Settings that determine to which keyframes the map is fitted after a new keyframe.
 
     Without iterations on random keyframes, the map would get worse in places that the newest
     keyframe does not show. In published ablations, iterations on random keyframes gain 4.2 dB PSNR,

@@ -145,7 +145,7 @@ class LoopRefit:
         """Do the deduplication and refit iterations that are due with one new keyframe.
 
         Args:
-            is_behind: Whether more new keyframes wait to be mapped. If True, refit iterations are
+            is_behind: True if more new keyframes wait to be mapped. Refit iterations are then
                 postponed.
         """
         config = self.config

@@ -309,7 +309,7 @@ class GaussianMap:
 
     @classmethod
     def restore(cls, state: Mapping[str, np.ndarray]) -> "GaussianMap":
-        """Return the map of a snapshot, bitwise equal.
+        """Return the map that a snapshot contains; it is bitwise equal to the saved map.
 
         Raises:
             DataError: The snapshot has no labels, because an earlier version saved it.
