@@ -34,7 +34,7 @@ class MapperConfig:
     # Gaussians move with their anchor keyframe when a correction has moved it by more than this.
     # Smaller motions, below 0.1 px, are not visible.
     motion_min_m: float = 2e-4
-    motion_min_rad: float = 2e-4  # The same for rotations; equal to MapBuilderConfig.refined_rad.
+    motion_min_rad: float = 2e-4  # Same limit for rotations; equal to MapBuilderConfig.refined_rad.
     refit: LoopRefitConfig = field(default_factory=LoopRefitConfig)
 
     def __post_init__(self) -> None:
