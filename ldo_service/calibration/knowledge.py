@@ -12,9 +12,10 @@ class CameraKnowledge:
     The tracker weights depth by the uncertainty, and compensates frames by the timing.
     """
 
-    # Standard deviation of the coefficients of the depth bias, as a multiple of that of an unknown
-    # camera; 0 if there is no bias.
+    # Standard deviation of the depth bias, divided by the one of an unknown camera; 0 if there is
+    # no bias.
     relative_bias_sigma: float = 0.0
-    # Information [3, 3] in 1/s^2 and right side [3] of the times of the shutter, [3, 4]; their
-    # solution is the estimate in the order of `ShutterTiming`. None before the first estimate.
+    # Normal equations [3, 4] of the times of the shutter: information [3, 3] in 1/s^2, then the
+    # right side [3]. Their solution is the estimate, in the order of `ShutterTiming`. None before
+    # the first estimate.
     timing: np.ndarray | None = None

@@ -152,7 +152,7 @@ class SelfCalibration:
 
     @property
     def knowledge(self) -> CameraKnowledge:
-        """Estimates and uncertainty for the tracking of the next frame."""
+        """Uncertainty of the depth bias and timing of the shutter, to track the next frame."""
         relative = 1.0
         if not self.is_undecided:
             covariance = self.depth_bias_covariance * DEPTH_PRIOR

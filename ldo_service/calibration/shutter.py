@@ -30,7 +30,7 @@ class ShutterTiming:
     """Times at which a camera records the parts of a frame."""
 
     readout_s: float = 0.0  # Time from the first to the last row of the color image.
-    depth_readout_s: float = 0.0  # The same for depth; 0 if all rows are measured at once.
+    depth_readout_s: float = 0.0  # Time from the first to the last row of depth; 0: simultaneous.
     depth_delay_s: float = 0.0  # Time from color to depth, middle rows; negative: depth is earlier.
 
     def __bool__(self) -> bool:
