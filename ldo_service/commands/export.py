@@ -57,7 +57,7 @@ def export(
     source = MapFolder(folder) if online else newest_map(folder)
     out = out or folder / EXPORTED[format][0]
     console = Console(stderr=True, highlight=False)
-    # Formats without keyframes finish at once and show no progress.
+    # Formats without keyframes finish immediately and show no progress.
     has_progress = format in ("mesh", "occupancy")
     with progress(format, 1, console) if has_progress else nullcontext(_no_progress) as advance:
         facts = export_map(
