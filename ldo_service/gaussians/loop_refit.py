@@ -35,11 +35,11 @@ class LoopRefitConfig:
     # Maximum number of keyframes that are deduplicated at the end, newest first; takes some
     # seconds.
     deduplicated_at_end: int = 200
-    # Iterations after the deduplication of each keyframe. A new keyframe gets at least as many
-    # (`MapperConfig.min_iterations`).
+    # Iterations after the deduplication of each keyframe. A new keyframe gets at least this number
+    # of iterations (`MapperConfig.min_iterations`).
     deduplication_iterations: int = 3
     # Refit iterations for each displaced keyframe, half of them on other keyframes. A new keyframe
-    # gets as many iterations.
+    # gets the same number of iterations.
     iterations: int = 12
     # Number of pending refit iterations that run with each new keyframe if no further keyframe
     # waits; mapping then takes 50 % longer. The other pending iterations run while no keyframe

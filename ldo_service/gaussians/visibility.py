@@ -20,7 +20,7 @@ BLOCKS = 12, 16  # Blocks of an image, vertically and horizontally; a grid takes
 BEHIND = 0.1
 # Margin for the 0.3 px^2 that the renderer adds to the variance of a splat: 3.33 sqrt(0.3) = 1.8.
 LOW_PASS_PX = 2.0
-_HOLE_PX = 4  # Equals the hole_px of densification; holes beside an object show the background.
+_HOLE_PX = 4  # Equals the hole_px of densification; holes near an object show the background.
 
 # `render` draws a Gaussian out to alpha = 1/255: sqrt(2 ln 255) = 3.33 standard deviations. The
 # affine approximation makes splats near the edge of the image up to 1.3 times as wide as the
