@@ -68,8 +68,8 @@ class BatchJob(msgspec.Struct, frozen=True, kw_only=True):
         folder: Folder of this result, relative to `out`.
         key: Digest of the content of the source and of everything that the results depend on.
         keeps_front_end: True to record the outputs of the tracker and the detector.
-        front_end: Folder of an earlier run, relative to `out`. Its recorded outputs replace the
-            tracker and the detector. Empty to start both.
+        front_end: Folder of an earlier run, relative to `out`. Its recorded outputs replace frame
+            source, tracker and detector. Empty to run these actors.
         staging: Folder for recordings and results of running processes.
         max_staged_bytes: Limit of all staged recordings on one machine.
         repeats: True to replace finished results.
