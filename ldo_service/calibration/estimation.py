@@ -50,8 +50,8 @@ SHARED_PRIOR = np.zeros((TIMES.stop, TIMES.stop))
 SHARED_PRIOR[BIAS, BIAS] = DEPTH_PRIOR * np.eye(BIAS_TERMS)
 SHARED_PRIOR[TIMES, TIMES] = TIME_COMBINATIONS.T @ (TIME_COMBINATIONS / TIME_SIGMAS_S[:, None] ** 2)
 # Standard deviations in seconds that are added to the estimated ones of the times. They stand for
-# errors that more views do not reduce, because blur and occlusion displace edges. They are about the
-# errors on the simulated camera of `room-handheld` and `tour-handheld` with 30 views.
+# errors that more views do not reduce, because blur and occlusion displace edges. They are about
+# the errors on the simulated camera of `room-handheld` and `tour-handheld` with 30 views.
 TIME_FLOOR_S = (0.0015, 0.004, 0.001)
 # Gauss-Newton steps of the first estimate, and of later ones, which start from its result.
 FIRST_ROUNDS, LATER_ROUNDS = 3, 2
