@@ -36,7 +36,7 @@ class LoopRefitConfig:
     # seconds.
     deduplicated_at_end: int = 200
     # Iterations after the deduplication of each keyframe. A new keyframe gets at least this number
-    # of iterations (`MapperConfig.min_iterations`).
+    # (`MapperConfig.min_iterations`).
     deduplication_iterations: int = 3
     # Refit iterations for each displaced keyframe, half of them on other keyframes. A new keyframe
     # gets the same number of iterations.
