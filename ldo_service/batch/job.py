@@ -34,8 +34,8 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
         refine: Iterations of the Gaussian optimizer after the last frame.
         exports: Formats of `ldo export`.
         threads: Threads of one process; 0 for all cores.
-        evaluates_all: True to render all frames of every recording for its evaluation. False to
-            render only a few frames of a recording that has no ground truth.
+        evaluates_all: True to evaluate the renderings of every recording in full. False to render
+            only a few frames of a recording that has no ground truth.
 
     Raises:
         ConfigError: An option is out of its range, or two options exclude each other.

@@ -181,9 +181,9 @@ def _evaluate(
 ) -> Results | None:
     """Evaluate the run, and save its pictures.
 
-    Evaluating all frames takes a quarter of the CPU time of a recording. If the recording has no
-    ground truth and `evaluates_all` is False, only a few frames are rendered. Such a recording gets
-    no eval.json. If the run cannot be evaluated, a note says why.
+    A full evaluation takes a quarter of the CPU time of a recording. If the recording has no ground
+    truth and `evaluates_all` is False, only a few frames are rendered. Such a recording gets no
+    eval.json. If the run cannot be evaluated, a note says why.
     """
     threads = actor_parameters(config).mapper.thread_count()
     try:
