@@ -145,8 +145,8 @@ def _rig(calibration: bytes, color: Video, depth: Video, path: Path) -> Rig:
         T_color_depth, T_depth_depth = map(_transform, (color_fields, depth_fields))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(
-            f"{source} has not the expected values ({type(error).__name__}: {error}). Copy the "
-            "recording again."
+            f"{source} does not have the expected values ({type(error).__name__}: {error}). Copy "
+            "the recording again."
         ) from error
     try:
         cameras_of_images = (
@@ -154,14 +154,14 @@ def _rig(calibration: bytes, color: Video, depth: Video, path: Path) -> Rig:
             _depth_camera(parameters[1], depth.width, depth.height),
         )
     except DataError as error:
-        raise DataError(f"{source}: {error}") from error
+        raise DataError(f"{source} does not fit the images: {error}") from error
     return Rig(*cameras_of_images, T_color_depth @ se3.inverse(T_depth_depth))
 
 
 def _cameras(content: Any) -> list[Any]:
     cameras = content["CalibrationInformation"]["Cameras"]
     if not isinstance(cameras, list):
-        raise TypeError("Cameras is no list")
+        raise TypeError("`Cameras` must be a list")
     return cameras
 
 
@@ -173,8 +173,8 @@ def _parameters(values: Any, source: Path) -> list[float]:
         TypeError: `values` is not a list of 14 items.
     """
     if not isinstance(values, list) or len(values) != 14:
-        raise TypeError("ModelParameters are not 14 numbers")
-    fields = {str(k): value for k, value in enumerate(values)}
+        raise TypeError("`ModelParameters` must be a list of 14 numbers")
+    fields = {f"ModelParameters[{k}]": value for k, value in enumerate(values)}
     return [number(fields, key, source) for key in fields]
 
 
@@ -188,7 +188,7 @@ def _transform(fields: Any) -> np.ndarray:
     T[:3, :3] = np.array(fields["Rt"]["Rotation"], float).reshape(3, 3)
     T[:3, 3] = np.array(fields["Rt"]["Translation"], float).reshape(3)
     if not is_rigid(T):
-        raise ValueError(f"Rt is no rigid transform: {T.tolist()}")
+        raise ValueError(f"`Rt` must be a rigid transform, but is {T.tolist()}")
     return se3.orthonormalize(T)
 
 
@@ -209,7 +209,10 @@ def _depth_camera(parameters: list[float], width: int, height: int) -> Camera:
     """
     if (width, height) not in DEPTH_MODES:
         sizes = ", ".join(f"{w}x{h}" for w, h in DEPTH_MODES)
-        raise DataError(f"depth has {width}x{height} pixels, expected one of {sizes}.")
+        raise DataError(
+            f"depth has {width}x{height} pixels, expected one of {sizes}. Record in a depth mode "
+            "of the Azure Kinect."
+        )
     whole, left, top = DEPTH_MODES[width, height]
     return _camera(parameters, (whole, whole), (left, top), (width, height))
 

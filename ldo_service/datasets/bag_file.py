@@ -105,7 +105,7 @@ class BagFile:
         except Exception as error:  # rosbags raises errors of many kinds for damaged files.
             raise FrameError(
                 f"{self.path}: a message of {message.connection.topic} cannot be read: "
-                f"{_text(error)}."
+                f"{_text(error)}. {_advice(self.path)}"
             ) from error
         return decoded(body, message.connection.msgtype)
 

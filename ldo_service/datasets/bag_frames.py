@@ -24,7 +24,7 @@ def readable_messages(bag: BagFile, is_wanted: Callable[[Topic], bool]) -> Itera
             try:
                 yield bag.read(message)
             except FrameError as error:
-                log.warning("%s; no action needed if depth is registered.", error)
+                log.warning("%s No action needed if depth is registered to color.", error)
 
 
 def matrix_of(transform: Any) -> np.ndarray | None:
@@ -81,8 +81,8 @@ def odometry_topic(bag: BagFile, given: str) -> Topic | None:
         chosen = next((topic for topic in found if topic.name == given), None)
         if chosen is None:
             raise DataError(
-                f"--topic odometry={given} names no topic with nav_msgs/Odometry in {bag.path}. "
-                f"Its topics of this type: {names}."
+                f"--topic odometry={given} does not name a topic with nav_msgs/Odometry in "
+                f"{bag.path}. Choose one of its topics of this type: {names}."
             )
         return chosen
     if len(found) > 1:
@@ -123,9 +123,9 @@ def read_odometry(bag: BagFile, topic: Topic, camera_frame: str) -> Trajectory |
     T_base_camera = static_transform(bag, base_frame, camera_frame)
     if T_base_camera is None:
         raise DataError(
-            f"{bag.path}: the odometry of {topic.name} is that of the frame {base_frame!r}, and "
-            f"/tf_static does not connect it with the camera's frame {camera_frame!r}. Record "
-            "/tf_static too, or remove --recorded-odometry."
+            f"{bag.path}: {topic.name} has poses of the frame {base_frame!r}, and /tf_static does "
+            f"not connect this frame with the camera's frame {camera_frame!r}. Record /tf_static "
+            "too, or remove --recorded-odometry."
         )
     stamps_ns = sorted(poses)
     T_odom_camera = np.array([poses[stamp_ns] @ T_base_camera for stamp_ns in stamps_ns])

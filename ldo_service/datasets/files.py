@@ -72,9 +72,14 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path} cannot be read as JSON: {error}.") from error
+        raise DataError(
+            f"{path} cannot be read as JSON: {error}. Copy or export it again."
+        ) from error
     if not isinstance(content, dict):
-        raise DataError(f"{path} contains a {type(content).__name__}, expected a JSON object.")
+        raise DataError(
+            f"{path} contains a {type(content).__name__}, expected a JSON object. Copy or export "
+            "it again."
+        )
     return content
 
 
@@ -92,7 +97,10 @@ def number(fields: dict[str, Any], key: str, path: Path) -> float:
     value = fields.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
         found = "it is missing" if key not in fields else f"it is {value!r}"
-        raise DataError(f'{path}: expected a finite number under "{key}", but {found}.')
+        raise DataError(
+            f'{path}: expected a finite number under "{key}", but {found}. Correct or replace '
+            "the file."
+        )
     return float(value)
 
 
@@ -110,15 +118,18 @@ def pinhole(fields: dict[str, Any], width: str, height: str, path: Path) -> Came
     """
     distortion = fields.get("distortion", [])
     if not isinstance(distortion, list):
-        raise DataError(f'{path}: "distortion" is {distortion!r}, expected a list [k1, k2, ...].')
-    coefficients = {str(i): value for i, value in enumerate(distortion)}
+        raise DataError(
+            f'{path}: "distortion" is {distortion!r}, expected a list [k1, k2, ...]. Correct the '
+            "file."
+        )
+    coefficients = {f"distortion[{i}]": value for i, value in enumerate(distortion)}
     fx, fy, cx, cy = (number(fields, key, path) for key in ("fx", "fy", "cx", "cy"))
     size = round(number(fields, width, path)), round(number(fields, height, path))
+    k = tuple(number(coefficients, key, path) for key in coefficients)
     try:
-        k = tuple(number(coefficients, key, path) for key in coefficients)
         return Camera(*size, fx, fy, cx, cy, k)
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{path} has invalid intrinsics: {error}") from error
 
 
 def read_matrix(path: Path, size: int) -> np.ndarray:
@@ -132,7 +143,9 @@ def read_matrix(path: Path, size: int) -> np.ndarray:
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read as a matrix: {error}.") from error
+        raise DataError(
+            f"{path} cannot be read as a matrix: {error}. Copy or export it again."
+        ) from error
     rows = [_row(path, k, line, size) for k, line in enumerate(lines, 1) if line.strip()]
     if len(rows) != size:
         raise DataError(
@@ -178,7 +191,7 @@ def read_intrinsics(path: Path, size: int, image: tuple[int, int]) -> Camera:
     try:
         return Camera(*image, fx, fy, cx, cy)
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{path} has invalid intrinsics: {error}") from error
 
 
 def read_trajectory(stamps_ns: np.ndarray, paths: list[Path]) -> Trajectory | None:
@@ -243,7 +256,8 @@ def _row(path: Path, line_number: int, line: str, size: int) -> list[float]:
         row = []
     if len(row) != size:
         raise DataError(
-            f"{path}, line {line_number}: expected a row of {size} numbers, found {line[:80]!r}."
+            f"{path}, line {line_number}: expected a row of {size} numbers, found {line[:80]!r}. "
+            "Copy or export the file again."
         )
     return row
 

@@ -77,7 +77,7 @@ class IclNuimSequence(Sequence):
         if len(paths) > 1:
             raise DataError(
                 f"{self._folder} has {len(paths)} files *.gt.freiburg: "
-                f"{', '.join(path.name for path in paths)}. Keep that of the sequence."
+                f"{', '.join(path.name for path in paths)}. Keep only the file of this sequence."
             )
         if not paths:
             return None
@@ -95,7 +95,7 @@ def _associated(path: Path) -> NumberedFrames:
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read: {error}.") from error
+        raise DataError(f"{path} cannot be read: {error}. Download it again.") from error
     color: dict[int, Path] = {}
     depth: dict[int, Path] = {}
     for line_number, line in enumerate(lines, 1):
@@ -105,8 +105,8 @@ def _associated(path: Path) -> NumberedFrames:
         files = [inside(path.parent, name) for name in words[1::2]]
         if len(words) != 4 or None in files or not words[0].isdecimal() or len(words[0]) > 9:
             raise DataError(
-                f"{path}, line {line_number}: expected `1 depth/1.png 1 rgb/1.png`, found "
-                f"{line[:80]!r}."
+                f"{path}, line {line_number}: expected a line such as `1 depth/1.png 1 rgb/1.png`, "
+                f"found {line[:80]!r}. Download the file again."
             )
         for file in files:
             assert file is not None

@@ -80,7 +80,9 @@ def first_size(paths: list[Path]) -> tuple[int, int]:
             return _size(path)
         except FrameError as error:  # Reading this frame later raises the error again.
             first = first or error
-    raise FrameError(f"none of {len(paths)} images can be read. The first: {first}") from first
+    raise FrameError(
+        f"none of {len(paths)} images can be read. The error of the first: {first}"
+    ) from first
 
 
 def _size(path: Path) -> tuple[int, int]:

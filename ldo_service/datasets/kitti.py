@@ -147,19 +147,24 @@ def _calibration(path: Path, left: int, right: int, images: list[Path]) -> _Ster
             "odometry benchmark."
         )
     P, P_right = matrices[f"P{left}"], matrices[f"P{right}"]
-    K = P[:, :3]
+    K, size = P[:, :3], first_size(images)
     try:
         fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-        camera = Camera(*first_size(images), fx, fy, cx, cy)
+        camera = Camera(*size, fx, fy, cx, cy)
         T_camera_camera0 = np.eye(4)
         T_camera_camera0[:3, 3] = np.linalg.solve(K, P[:, 3])
         baseline_m = float(P[0, 3] - P_right[0, 3]) / camera.fx
-    except (DataError, np.linalg.LinAlgError) as error:
-        raise DataError(f"{path}, P{left}: {error}") from error
+    except DataError as error:
+        raise DataError(f"{path} has invalid intrinsics in line P{left}: {error}") from error
+    except np.linalg.LinAlgError as error:
+        raise DataError(
+            f"{path} has a singular intrinsic matrix in line P{left}. Download the file again."
+        ) from error
     if not (baseline_m > 0 and np.allclose(K, P_right[:, :3], rtol=1e-3, atol=1e-3)):
         raise DataError(
-            f"{path}: P{left} and P{right} are no rectified pair: the baseline is {baseline_m:g} m "
-            "and must be positive, and both must have equal intrinsics. Download the file again."
+            f"{path}: P{left} and P{right} are not the cameras of a rectified pair. Their baseline "
+            f"is {baseline_m:g} m and must be positive, and their intrinsics must be equal. "
+            "Download the file again."
         )
     return _Stereo(camera, baseline_m, se3.inverse(T_camera_camera0))
 
@@ -187,11 +192,13 @@ def _times_ns(path: Path) -> np.ndarray:
             times_ns.append(parse_stamp(line))
         except ValueError:
             raise DataError(
-                f"{path}, line {number}: expected seconds, found {line[:80]!r}."
+                f"{path}, line {number}: expected a time in seconds, found {line[:80]!r}. "
+                "Download the file again."
             ) from None
         if len(times_ns) > 1 and times_ns[-1] <= times_ns[-2]:
             raise DataError(
-                f"{path}, line {number}: {line.strip()} s is not after the line before."
+                f"{path}, line {number}: the time {line.strip()} s is not later than the time in "
+                "the previous line. Download the file again."
             )
     return np.array(times_ns, np.int64)
 
@@ -210,7 +217,7 @@ def _poses(path: Path) -> np.ndarray:
         if values is None or not is_rigid(T):
             raise DataError(
                 f"{path}, line {number}: expected 12 numbers, the first three rows of a rigid "
-                f"transform, found {line[:80]!r}."
+                f"transform, found {line[:80]!r}. Download the file again."
             )
         poses.append(se3.orthonormalize(T))
     return np.array(poses).reshape(-1, 4, 4)
@@ -230,4 +237,4 @@ def _lines(path: Path) -> list[str]:
     try:
         return [line for line in path.read_text().splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read: {error}.") from error
+        raise DataError(f"{path} cannot be read: {error}. Download it again.") from error

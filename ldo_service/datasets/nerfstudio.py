@@ -73,7 +73,10 @@ class NerfstudioSequence(Sequence):
         factor = {"depth_unit_scale_factor": METERS_PER_UNIT, **content}
         meters = number(factor, "depth_unit_scale_factor", path)
         if meters <= 0:
-            raise DataError(f'{path}: "depth_unit_scale_factor" is {meters:g}, must be positive.')
+            raise DataError(
+                f'{path}: "depth_unit_scale_factor" is {meters:g}, must be positive. Set it to the '
+                "meters per depth unit, such as 0.001."
+            )
         self._depth_scale = Calibration(self._grid.camera, 1 / meters).depth_scale
         stamps_ns = np.arange(len(frames), dtype=np.int64) * 10**9 // FRAME_RATE_HZ
         super().__init__(name_of(folder), self._grid.camera, stamps_ns)

@@ -94,6 +94,9 @@ def _camera(path: Path) -> Camera:
     fields = read_json(path)
     K = fields.get("intrinsic_matrix")
     if not isinstance(K, list) or len(K) != 9:
-        raise DataError(f'{path}: expected 9 numbers under "intrinsic_matrix", column by column.')
+        raise DataError(
+            f'{path}: expected a list of 9 numbers under "intrinsic_matrix", the matrix column by '
+            "column. Correct the file."
+        )
     values = {**fields, "fx": K[0], "fy": K[4], "cx": K[6], "cy": K[7], "distortion": []}
     return pinhole(values, "width", "height", path)

@@ -82,14 +82,14 @@ class PhoneGrid:
         full, n = self.color_camera, self.block
         if color.shape != (full.height, full.width, 3):
             raise FrameError(
-                f"frame {index}: color is {color.shape[1]}x{color.shape[0]} pixels, and its camera "
-                f"is for {full.width}x{full.height}. Check the intrinsics and the image."
+                f"frame {index}: color is {color.shape[1]}x{color.shape[0]} pixels, but its "
+                f"intrinsics are for {full.width}x{full.height}. Check intrinsics and image."
             )
         if depth.ndim != 2 or abs(depth.shape[1] * full.height / full.width - depth.shape[0]) > 1:
             raise FrameError(
-                f"frame {index}: depth has the shape {depth.shape}, and color "
-                f"{full.width}x{full.height} pixels. Depth must be one image with the aspect ratio "
-                "of color. Export the recording again."
+                f"frame {index}: depth has the shape {depth.shape}, and color has "
+                f"{full.width}x{full.height} pixels. Depth must have one channel and the aspect "
+                "ratio of color. Export the recording again."
             )
         grid = self.camera
         if n > 1:

@@ -61,7 +61,10 @@ class Record3DSequence(Sequence):
                 f"`metadata` ({type(error).__name__}: {error}). Export or copy it again."
             ) from error
         if not isinstance(metadata, dict):
-            raise DataError(f"{path}: metadata is a {type(metadata).__name__}, must be an object.")
+            raise DataError(
+                f"{path}: its file `metadata` contains a {type(metadata).__name__}, expected a "
+                "JSON object. Export the recording again."
+            )
         names = set(self._archive.namelist())
         found = (re.fullmatch(r"rgbd/(\d{1,9})\.depth", name) for name in names)
         numbers = sorted(int(m[1]) for m in found if m and f"rgbd/{m[1]}.jpg" in names)
@@ -143,8 +146,8 @@ class Record3DSequence(Sequence):
             content = b""
         if len(content) != size:
             raise FrameError(
-                f"{self._path}: {name} is damaged, or no {width}x{height} image of type "
-                f"{np.dtype(dtype)}. Export or copy the recording again."
+                f"{self._path}: {name} is damaged, or it is not an image of {width}x{height} "
+                f"pixels of type {np.dtype(dtype)}. Export or copy the recording again."
             )
         return np.frombuffer(content, dtype).reshape(height, width)
 
@@ -162,13 +165,16 @@ class Record3DSequence(Sequence):
             key = "K"
             values = [K[0], K[4], K[6], K[7]] if isinstance(K, list) and len(K) == 9 else None
         if not isinstance(values, list) or len(values) != 4:
-            raise DataError(f"{path}: {key} of the metadata is missing or has a wrong length.")
-        listed = {str(position): value for position, value in enumerate(values)}
+            raise DataError(
+                f"{path}: {key} of the metadata is missing or has a wrong length. Export the "
+                "recording again."
+            )
+        listed = {f"{key}[{position}]": value for position, value in enumerate(values)}
         try:
             fx, fy, cx, cy = (number(listed, position, path) for position in listed)
             camera = Camera(_size(fields, "w", path), _size(fields, "h", path), fx, fy, cx, cy)
         except DataError as error:
-            raise DataError(f"{path}, {key} of the metadata: {error}") from error
+            raise DataError(f"{path} has invalid intrinsics in its metadata: {error}") from error
         return scaled(camera, *self._color_size, str(path))
 
     def _stamps_ns(self) -> np.ndarray:
@@ -212,5 +218,8 @@ def _pose(numbers: Any) -> np.ndarray | None:
 def _size(metadata: dict[str, Any], key: str, path: Path) -> int:
     size = number(metadata, key, path)
     if not 1 <= size <= MAX_PIXELS**0.5 or size != int(size):
-        raise DataError(f"{path}: {key} of the metadata is {size:g}, must be a number of pixels.")
+        raise DataError(
+            f"{path}: {key} of the metadata is {size:g}, must be a number of pixels. Export the "
+            "recording again."
+        )
     return int(size)

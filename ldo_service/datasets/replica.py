@@ -71,7 +71,8 @@ class ReplicaLabels:
         if number not in classes or number not in instances:
             raise DataError(
                 f"{self._folder} has a labels.json, but no labels of frame {number}: expected "
-                f"semantic_class/{number:06d}.png and instance/{number:06d}.png."
+                f"semantic_class/{number:06d}.png and instance/{number:06d}.png. Copy these files "
+                "again."
             )
         class_ids = read_labels(classes[number], np.uint8)
         return FrameLabels(class_ids, read_labels(instances[number], np.uint16))
@@ -92,7 +93,7 @@ def _class_names(path: Path) -> tuple[str, ...]:
     if not names or not 0 <= min(names) <= max(names) < MAX_CLASSES:
         raise DataError(
             f'{path}: expected "classes", an object that maps numbers from 0 to '
-            f"{MAX_CLASSES - 1} to names."
+            f"{MAX_CLASSES - 1} to names. Correct the file."
         )
     return tuple(names.get(number, "") for number in range(max(names) + 1))
 
@@ -148,7 +149,10 @@ def _calibration(folder: Path) -> Calibration:
         )
     fields = read_json(path).get("camera")
     if not isinstance(fields, dict):
-        raise DataError(f'{path}: expected an object under "camera".')
+        raise DataError(
+            f'{path}: expected a JSON object under "camera". Copy the cam_params.json of the data '
+            "set again."
+        )
     return Calibration(pinhole(fields, "w", "h", path), number(fields, "scale", path))
 
 
@@ -161,7 +165,7 @@ def _poses(path: Path) -> np.ndarray:
     try:
         lines = [line for line in path.read_text().splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read as poses: {error}.") from error
+        raise DataError(f"{path} cannot be read as poses: {error}. Copy it again.") from error
     return np.array([_pose(path, k, line) for k, line in enumerate(lines, 1)]).reshape(-1, 4, 4)
 
 
@@ -173,6 +177,6 @@ def _pose(path: Path, line_number: int, line: str) -> np.ndarray:
     if not is_rigid(T_world_camera):
         raise DataError(
             f"{path}, line {line_number}: expected the 16 numbers of a rigid 4x4 camera-to-world "
-            f"matrix by rows, found {line[:80]!r}."
+            f"matrix by rows, found {line[:80]!r}. Copy the file again."
         )
     return se3.orthonormalize(T_world_camera)

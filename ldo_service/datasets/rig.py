@@ -88,7 +88,7 @@ class SequenceOptions:
     def __post_init__(self) -> None:
         if unknown := sorted(self.topics.keys() - {"color", "depth", "odometry"}):
             raise ConfigError(
-                f"topics names the stream {unknown[0]!r}. Known streams: color, depth, odometry."
+                f"topics names the unknown stream {unknown[0]!r}. Use color, depth or odometry."
             )
         if self.T_color_depth is not None and not is_rigid(self.T_color_depth):
             raise ConfigError(

@@ -156,7 +156,7 @@ class RosBagSequence(Sequence):
                 return self._images(index)
             except FrameError as error:
                 reason = reason or str(error)
-        raise DataError(f"{self._bag.path}: its first frames cannot be read: {reason}")
+        raise DataError(f"none of the first frames of {self._bag.path} can be read: {reason}")
 
 
 def _ascending(messages: list[StoredMessage], topic: Topic) -> list[StoredMessage]:
@@ -336,10 +336,10 @@ def _transform(
     T_color_depth = static_transform(bag, color_frame, depth_frame)
     if T_color_depth is None:
         raise DataError(
-            f"{bag.path}: the depth of {depth.name} is not registered to color. Its frame is "
-            f"{depth_frame!r}, that of color {color_frame!r}, and /tf_static does not connect "
-            "them. Record depth that is registered (realsense2_camera: align_depth.enable:=true), "
-            "or record /tf_static, or set dataset.T_color_depth."
+            f"{bag.path}: the depth of {depth.name} is not registered to color. The frame of depth "
+            f"is {depth_frame!r} and the frame of color is {color_frame!r}, and /tf_static does "
+            "not connect them. Record depth that is registered (realsense2_camera: "
+            "align_depth.enable:=true), or record /tf_static, or set dataset.T_color_depth."
         )
     return T_color_depth
 

@@ -74,7 +74,7 @@ class SensSequence(RigSequence):
                 self._header = _header(file, path)
                 self._index = _index(file, path, self._header.frames)
         except OSError as error:
-            raise DataError(f"{path} cannot be read: {error}.") from error
+            raise DataError(f"{path} cannot be read: {error.strerror}. Copy it again.") from error
         stamps_ns = _stamps_ns(self._index.stamps_us, path)
         super().__init__(path.stem, self._header.rig, stamps_ns, options)
 
@@ -87,7 +87,9 @@ class SensSequence(RigSequence):
                 file.seek(int(self._index.offsets[index]))
                 color, depth = file.read(color_size), file.read(depth_size)
         except OSError as error:
-            raise FrameError(f"{source} cannot be read: {error}.") from error
+            raise FrameError(
+                f"{source} cannot be read: {error.strerror}. Copy the file again."
+            ) from error
         return self._color(color, source), self._depth(depth, source), self._header.depth_scale
 
     def read_depth_poses(self) -> Trajectory | None:
@@ -125,8 +127,8 @@ class SensSequence(RigSequence):
 def _require_bytes(data: bytes, size: int, source: str) -> None:
     if len(data) != size:
         raise FrameError(
-            f"{source} does not have {size} bytes, as its size in pixels needs. Download the file "
-            "again."
+            f"{source} does not have the {size} bytes that its size in pixels needs. Download the "
+            "file again."
         )
 
 
@@ -151,8 +153,8 @@ def _header(file: BinaryIO, path: Path) -> _Header:
     version, name_bytes = struct.unpack("<IQ", _exactly(file, 12, path, "its header"))
     if version != VERSION or name_bytes > MAX_NAME_BYTES:
         raise DataError(
-            f"{path} is no file .sens of version {VERSION}: its version is {version}, and the name "
-            f"of its sensor has {name_bytes} bytes. Convert it by ScanNet's tools."
+            f"{path} is not a .sens file of version {VERSION}: its version is {version}, and the "
+            f"name of its sensor has {name_bytes} bytes. Convert it with ScanNet's tools."
         )
     _exactly(file, name_bytes, path, "its header")
     matrices = MATRICES.unpack(_exactly(file, MATRICES.size, path, "its header"))
@@ -174,14 +176,17 @@ def _header(file: BinaryIO, path: Path) -> _Header:
         cameras = (_camera(K_color, *sizes[:2]), _camera(K_depth, *sizes[2:]))
         scale = Calibration(cameras[1], depth_scale).depth_scale
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{path} has an invalid header: {error}") from error
     T_color_depth = se3.inverse(se3.orthonormalize(T_color)) @ se3.orthonormalize(T_depth)
     return _Header(Rig(*cameras, T_color_depth), scale, color, depth, frames)
 
 
 def _camera(K: np.ndarray, width: int, height: int) -> Camera:
     if width * height > MAX_PIXELS:
-        raise DataError(f"{width}x{height} pixels are more than the maximum of {MAX_PIXELS}.")
+        raise DataError(
+            f"an image of {width}x{height} pixels has more than the maximum of {MAX_PIXELS} "
+            "pixels. Copy or download the file again."
+        )
     fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     return Camera(width, height, fx, fy, cx, cy)
 
@@ -195,8 +200,8 @@ def _index(file: BinaryIO, path: Path, frames: int) -> _Index:
     end = path.stat().st_size
     if not 0 < frames <= end // FRAME.size:
         raise DataError(
-            f"{path} has {end} bytes and {frames} frames by its header, expected at least one "
-            "frame, and room for all of them. Copy or download it again."
+            f"{path} has {end} bytes and its header announces {frames} frames, expected 1 to "
+            f"{end // FRAME.size} frames. Copy or download it again."
         )
     poses, stamps_us, offsets, sizes = [], [], [], []
     for k in range(frames):

@@ -94,14 +94,19 @@ def _camera(path: Path, video: Video) -> Camera:
         rows = [line.split(",") for line in path.read_text().splitlines() if line.strip()]
         K = np.array([[float(word) for word in row] for row in rows])
     except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be read as a matrix: {error}.") from error
+        raise DataError(
+            f"{path} cannot be read as a matrix: {error}. Export the recording again."
+        ) from error
     if K.shape != (3, 3):
-        raise DataError(f"{path} has the shape {K.shape}, expected 3 rows of 3 numbers.")
+        raise DataError(
+            f"{path} has the shape {K.shape}, expected 3 rows of 3 numbers. Export the recording "
+            "again."
+        )
     fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     try:
         return Camera(video.width, video.height, fx, fy, cx, cy)
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{path} has invalid intrinsics: {error}") from error
 
 
 def _lines(path: Path) -> dict[int, _Line]:
@@ -113,7 +118,7 @@ def _lines(path: Path) -> dict[int, _Line]:
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read: {error}.") from error
+        raise DataError(f"{path} cannot be read: {error}. Export the recording again.") from error
     found: dict[int, _Line] = {}
     last = (-1, -(2**63))
     for line_number, line in enumerate(lines[1:], 2):
@@ -125,7 +130,7 @@ def _lines(path: Path) -> dict[int, _Line]:
         except (ValueError, IndexError):
             raise DataError(
                 f"{path}, line {line_number}: expected `timestamp, frame, x, y, z, qx, qy, qz, "
-                f"qw`, found {line[:80]!r}."
+                f"qw`, found {line[:80]!r}. Export the recording again."
             ) from None
         if number <= last[0] or stamp <= last[1]:
             raise DataError(

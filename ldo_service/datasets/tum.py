@@ -112,7 +112,10 @@ def _listing(path: Path) -> _Listing:
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read as a list of images: {error}.") from error
+        raise DataError(
+            f"{path} cannot be read as a list of images: {error}. Copy or download it again; each "
+            "line must have the form `stamp file`."
+        ) from error
     rows = [
         _row(path, line_number, line)
         for line_number, line in enumerate(lines, 1)
@@ -130,7 +133,8 @@ def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
             raise ValueError(line)
     except (ValueError, IndexError):
         raise DataError(
-            f"{path}, line {line_number}: expected `stamp file`, found {line[:80]!r}."
+            f"{path}, line {line_number}: expected `stamp file`, such as `1305031102.175 "
+            f"rgb/1.png`, found {line[:80]!r}. Correct this line."
         ) from None
     if inside(path.parent, name) is None:
         raise DataError(
@@ -165,9 +169,10 @@ def _pinhole_of_eth3d(path: Path, size: tuple[int, int]) -> Camera:
         fx, fy, cx, cy = (float(word) for word in path.read_text().split())
     except (OSError, ValueError) as error:
         raise DataError(
-            f"{path} cannot be read as the four numbers `fx fy cx cy`: {error}."
+            f"{path} cannot be read as the four numbers `fx fy cx cy`: {error}. Copy or download "
+            "it again."
         ) from error
     try:
         return Camera(*size, fx, fy, cx, cy)
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{path} has invalid intrinsics: {error}") from error

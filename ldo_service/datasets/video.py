@@ -68,7 +68,7 @@ class Video:
         if not packets or not 0 < self.width * self.height <= MAX_PIXELS:
             raise DataError(
                 f"{path} has {len(packets)} frames of {self.width}x{self.height} pixels, expected "
-                f"at least one frame and at most {MAX_PIXELS} pixels. Export the recording again."
+                f"at least one frame, with 1 to {MAX_PIXELS} pixels. Export the recording again."
             )
         unit = self._stream.time_base
         stamps_ns = [stamp * unit.numerator * 10**9 // unit.denominator for stamp in self._stamps]

@@ -48,7 +48,10 @@ class Camera:
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if self.width < 1 or self.height < 1:
-            raise DataError(f"camera size {self.width}x{self.height} must be at least 1x1 pixels.")
+            raise DataError(
+                f"the camera has {self.width}x{self.height} pixels, expected at least 1x1. Give "
+                "the width and height of its images."
+            )
         if not all(isfinite(n) for n in numbers):
             raise DataError(
                 f"camera intrinsics {numbers} contain NaN or infinity. Calibrate the camera again."
@@ -73,15 +76,15 @@ class Camera:
         if len(self.distortion) not in (0, 4, 5, 8):
             raise DataError(
                 f"{len(self.distortion)} distortion coefficients are given, expected 0, 4, 5 or 8 "
-                "as in OpenCV's models."
+                "as in OpenCV's models. Undistort the images if the lens has another model."
             )
         across = max(self.cx, self.width - self.cx) / self.fx
         down = max(self.cy, self.height - self.cy) / self.fy
         if self.distortion and not _is_lens(self.distortion, hypot(across, down)):
             raise DataError(
-                f"distortion {self.distortion} is no lens: it changes the distance of a point from "
-                f"the image center by more than a factor of {MAX_LENS_FACTOR:g}. Check the order "
-                "of the coefficients: k1 k2 p1 p2 k3 k4 k5 k6."
+                f"distortion {self.distortion} fits no real lens: it changes the distance of a "
+                f"point from the image center by more than a factor of {MAX_LENS_FACTOR:g}. Check "
+                "the order of the coefficients: k1 k2 p1 p2 k3 k4 k5 k6."
             )
 
     @staticmethod

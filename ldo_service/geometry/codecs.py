@@ -111,7 +111,8 @@ def decode_depth(encoding: str, width: int, height: int, data: memoryview) -> np
         depth = _decompress(data, cv2.IMREAD_UNCHANGED, encoding, width, height)
         if depth.dtype != np.uint16 or depth.ndim != 2:
             raise FrameError(
-                f"depth PNG contains {depth.dtype}{depth.shape}, expected a 16-bit gray image."
+                f"depth PNG contains {depth.dtype}{depth.shape}, expected a 16-bit gray image. "
+                "Encode depth as 16-bit gray PNG."
             )
         return depth
     dtype = np.uint16 if encoding.startswith("z16") else np.float32
@@ -137,7 +138,7 @@ def _pixels(data: memoryview | bytes, dtype: type, shape: tuple[int, ...]) -> np
     if len(data) != np.prod(shape) * np.dtype(dtype).itemsize:
         raise FrameError(
             f"image has {len(data)} bytes, expected {np.prod(shape) * np.dtype(dtype).itemsize} "
-            f"for {np.dtype(dtype)}{shape}."
+            f"for {np.dtype(dtype)}{shape}. Check the declared width, height and encoding."
         )
     return np.frombuffer(data, dtype).reshape(shape)
 
@@ -147,32 +148,45 @@ def _expand(data: memoryview, size: int) -> bytes:
     try:
         return zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
     except zstandard.ZstdError as error:
-        raise FrameError(f"depth cannot be decompressed: {error}.") from error
+        raise FrameError(
+            f"depth image of {len(data)} bytes cannot be decompressed: {error}. Compress it with "
+            "Zstandard, as its encoding declares."
+        ) from error
 
 
 def _decompress(data: memoryview, flags: int, encoding: str, width: int, height: int) -> np.ndarray:
     """Decode a PNG or JPEG after checking the size in its header."""
     announced = read_image_size(data)
     if announced is None:
-        raise FrameError(f"{len(data)} bytes of data are not a readable {encoding} image.")
-    if announced != (width, height):
-        raise FrameError(
-            f"{encoding} image is {announced[0]}x{announced[1]}, declared as {width}x{height}."
-        )
+        raise _undecodable(data, encoding)
+    _require_size(announced, (width, height), encoding)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        raise FrameError(f"{encoding} image cannot be decoded: {error.err}.") from error
+        raise _undecodable(data, encoding, f" ({error.err})") from error
     if image is None:
-        raise FrameError(f"{len(data)} bytes of data are not a readable {encoding} image.")
-    _require_size(image, width, height, encoding)
+        raise _undecodable(data, encoding)
+    _require_size((image.shape[1], image.shape[0]), (width, height), encoding)
     return image
 
 
-def _require_size(image: np.ndarray, width: int, height: int, encoding: str) -> None:
-    if image.shape[:2] != (height, width):
+def _undecodable(data: memoryview, encoding: str, reason: str = "") -> FrameError:
+    return FrameError(
+        f"{len(data)} bytes cannot be decoded as a {encoding} image{reason}. Check the program "
+        "that encodes the images."
+    )
+
+
+def _require_size(found: tuple[int, int], declared: tuple[int, int], encoding: str) -> None:
+    """Check the width and height of an image.
+
+    Raises:
+        FrameError: The image does not have the declared size.
+    """
+    if found != declared:
         raise FrameError(
-            f"{encoding} image is {image.shape[1]}x{image.shape[0]}, declared as {width}x{height}."
+            f"{encoding} image is {found[0]}x{found[1]}, declared as {declared[0]}x{declared[1]}. "
+            "Declare the size of the encoded image."
         )
 
 

@@ -51,7 +51,9 @@ class Trajectory:
         try:
             lines = path.read_text().splitlines()
         except (OSError, UnicodeDecodeError) as error:
-            raise DataError(f"{path} cannot be read as a TUM trajectory: {error}.") from error
+            raise DataError(
+                f"{path} cannot be read as a TUM trajectory: {error}. Give a readable text file."
+            ) from error
         rows = [
             _row(path, number, line)
             for number, line in enumerate(lines, 1)
@@ -71,6 +73,6 @@ def _row(path: Path, number: int, line: str) -> list[float]:
     if len(row) != 8 or not np.all(np.isfinite(row)) or not any(row[4:]):
         raise DataError(
             f"{path}, line {number}: expected `stamp tx ty tz qx qy qz qw` with finite numbers "
-            f"and a nonzero quaternion, found {line[:80]!r}."
+            f"and a nonzero quaternion, found {line[:80]!r}. Correct this line."
         )
     return row

@@ -79,13 +79,19 @@ def changed(camera: int, key: str, value: object) -> Any:
     ("calibration", "message"),
     [
         (None, r"has no attachment calibration\.json; its video streams are: COLOR, DEPTH"),
-        ({}, "has not the expected values .KeyError: 'CalibrationInformation'"),
-        ({"CalibrationInformation": {"Cameras": 3}}, "Cameras is no list"),
+        ({}, "does not have the expected values .KeyError: 'CalibrationInformation'"),
+        ({"CalibrationInformation": {"Cameras": 3}}, "`Cameras` must be a list"),
         (changed(1, "Location", "x"), "KeyError: 'CALIBRATION_CameraLocationPV0'"),
-        (changed(0, "Intrinsics", {"ModelParameters": [1]}), "ModelParameters are not 14"),
+        (
+            changed(0, "Intrinsics", {"ModelParameters": [1]}),
+            "`ModelParameters` must be a list of 14",
+        ),
         (changed(0, "Intrinsics", {"ModelParameters": ["x"] * 14}), "expected a finite number"),
         (changed(0, "Intrinsics", {"ModelParameters": [0.0] * 14}), "focal length"),
-        (changed(1, "Rt", {"Rotation": [2] * 9, "Translation": [0] * 3}), "no rigid transform"),
+        (
+            changed(1, "Rt", {"Rotation": [2] * 9, "Translation": [0] * 3}),
+            "must be a rigid transform",
+        ),
         (changed(1, "Rt", {"Rotation": [2], "Translation": [0] * 3}), "ValueError"),
     ],
 )

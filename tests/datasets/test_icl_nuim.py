@@ -75,7 +75,9 @@ def test_folder_without_truth_has_none_and_two_files_are_named(folder: Path) -> 
 def test_invalid_association_is_named(tmp_path: Path, line: str) -> None:
     folder = write_icl_nuim(tmp_path / "a", FRAMES, POSES)
     (folder / "associations.txt").write_text(f"0 depth/0.png 0 rgb/0.png\n{line}\n")
-    with pytest.raises(DataError, match=r"associations\.txt, line 2: expected `1 depth/1.png"):
+    with pytest.raises(
+        DataError, match=r"associations\.txt, line 2: expected a line such as `1 depth/1.png"
+    ):
         open_sequence(str(folder))
 
 

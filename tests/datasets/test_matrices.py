@@ -59,7 +59,7 @@ def test_missing_and_binary_files_are_named(tmp_path: Path) -> None:
 def test_intrinsics_are_a_camera_of_the_image(tmp_path: Path) -> None:
     path = write(tmp_path / "k.txt", np.array([[585, 0, 320], [0, 586, 240], [0, 0, 1.0]]))
     assert read_intrinsics(path, 3, (640, 480)) == Camera(640, 480, 585, 586, 320, 240)
-    with pytest.raises(DataError, match=r"k\.txt: cx=320 px is far outside"):
+    with pytest.raises(DataError, match=r"k\.txt has invalid intrinsics: cx=320 px is far outside"):
         read_intrinsics(path, 3, (64, 48))
 
 

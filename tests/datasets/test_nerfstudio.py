@@ -149,5 +149,5 @@ def test_missing_images_name_the_first_and_their_number(folder: Path) -> None:
     content = json.loads((folder / "transforms.json").read_text())
     for frame in content["frames"]:
         (folder / frame["file_path"]).unlink()
-    with pytest.raises(DataError, match=r"none of 4 images can be read\. The first: "):
+    with pytest.raises(DataError, match=r"none of 4 images can be read\. The error of the first: "):
         open_sequence(str(folder))

@@ -128,7 +128,7 @@ def test_base_that_is_not_connected_with_the_camera_is_named(
     tmp_path: Path, room: Sequence
 ) -> None:
     sequence = open_sequence(str(write_odometry_bag(tmp_path, "mcap", room, mounts=0)))
-    with pytest.raises(DataError, match=r"/odom is that of the frame 'base_link'.*/tf_static"):
+    with pytest.raises(DataError, match=r"/odom has poses of the frame 'base_link'.*/tf_static"):
         sequence.odometry()
 
 

@@ -88,7 +88,7 @@ def _set(key: str, value: object) -> Callable[[Path], object]:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (_set("intrinsic_matrix", [1, 2]), 'expected 9 numbers under "intrinsic_matrix"'),
+        (_set("intrinsic_matrix", [1, 2]), 'expected a list of 9 numbers under "intrinsic_matrix"'),
         (_set("intrinsic_matrix", ["a"] * 9), "expected a finite number under \"fx\".*it is 'a'"),
         (_set("width", None), 'expected a finite number under "width"'),
         (_set("height", 4800), "focal length fy=51.2 px is implausible"),

@@ -91,7 +91,9 @@ def test_frame_of_another_focal_length_is_resampled_to_the_grid() -> None:
 
 
 def test_color_of_a_wrong_size_is_a_bad_frame() -> None:
-    with pytest.raises(FrameError, match="color is 960x720 pixels, and its camera is for 1920x144"):
+    with pytest.raises(
+        FrameError, match="color is 960x720 pixels, but its intrinsics are for 1920x144"
+    ):
         PhoneGrid(FULL).frame(
             3, 0, np.zeros((720, 960, 3), np.uint8), np.ones((192, 256), np.uint16), 1000.0
         )

@@ -73,9 +73,13 @@ def test_depth_of_low_confidence_is_dropped_and_confidence_is_optional(path: Pat
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("rgbd/1.depth", b"bvx2 and no more", r"rgbd/1\.depth is damaged, or no 32x24 image"),
+        (
+            "rgbd/1.depth",
+            b"bvx2 and no more",
+            r"rgbd/1\.depth is damaged, or it is not an image of 32x24",
+        ),
         ("rgbd/1.depth", b"", r"rgbd/1\.depth is damaged"),
-        ("rgbd/1.depth", liblzfse.compress(bytes(24 * 32)), r"no 32x24 image of type float32"),
+        ("rgbd/1.depth", liblzfse.compress(bytes(24 * 32)), r"32x24 pixels of type float32"),
         ("rgbd/1.depth", b"bvx-\xff\xff\xff\xff" + bytes(99), r"rgbd/1\.depth is damaged"),
         ("rgbd/1.conf", liblzfse.compress(bytes(24)), r"rgbd/1\.conf is damaged"),
         ("rgbd/1.jpg", b"\xff\xd8\xff short", r"desk\.r3d: rgbd/1\.jpg is truncated"),
@@ -107,7 +111,7 @@ def _cut(path: Path) -> None:
         (lambda path: path.write_bytes(b""), "a ZIP archive with a file `metadata`"),
         (lambda path: change_archive(path, {"metadata": None}), "KeyError"),
         (lambda path: change_archive(path, {"metadata": b"{"}), "JSONDecodeError"),
-        (lambda path: change_archive(path, {"metadata": b"[1]"}), "metadata is a list"),
+        (lambda path: change_archive(path, {"metadata": b"[1]"}), "`metadata` contains a list"),
         (
             lambda path: change_archive(path, {f"rgbd/{k}.depth": None for k in range(11)}),
             r"no rgbd/N\.jpg with an rgbd/N\.depth",

@@ -99,7 +99,7 @@ def test_damaged_depth_is_one_bad_frame(tmp_path: Path) -> None:
         sequence.read(1)
     longer = zlib.compress(bytes(DEPTH_BYTES + 2))
     path.write_bytes(data.replace(compressed, longer + bytes(len(compressed) - len(longer))))
-    with pytest.raises(FrameError, match=f"frame 1, depth does not have {DEPTH_BYTES} bytes"):
+    with pytest.raises(FrameError, match=f"frame 1, depth does not have the {DEPTH_BYTES} bytes"):
         open_sequence(str(path)).read(1)
     assert sequence[2].index == 2
 
@@ -119,14 +119,14 @@ def test_damaged_color_is_one_bad_frame(tmp_path: Path) -> None:
         (lambda path: path.write_bytes(b""), "is truncated in its header"),
         (lambda path: path.write_bytes(path.read_bytes()[:200]), "is truncated in its header"),
         (lambda path: path.write_bytes(path.read_bytes()[:-5000]), "truncated in frame 3 of 4"),
-        (lambda path: put(path, 0, "I", 3), r"no file \.sens of version 4: its version is 3"),
+        (lambda path: put(path, 0, "I", 3), r"not a \.sens file of version 4: its version is 3"),
         (lambda path: put(path, 4, "Q", 2**60), "sensor has 1152921504606846976 bytes"),
         (lambda path: put(path, FORMAT, "i", -1), "color of compression -1"),
         (lambda path: put(path, FORMAT + 4, "i", 2), "depth of compression 2"),
-        (lambda path: put(path, FORMAT + 8, "I", 2**31), "pixels are more than the maximum"),
+        (lambda path: put(path, FORMAT + 8, "I", 2**31), "more than the maximum"),
         (lambda path: put(path, FORMAT + 24, "f", 0.0), r"the depth scale is 0\.0"),
-        (lambda path: put(path, FORMAT + 28, "Q", 0), "0 frames by its header"),
-        (lambda path: put(path, FORMAT + 28, "Q", 2**63), "room for all of them"),
+        (lambda path: put(path, FORMAT + 28, "Q", 0), "header announces 0 frames"),
+        (lambda path: put(path, FORMAT + 28, "Q", 2**63), "expected 1 to [0-9]+ frames"),
         (lambda path: put(path, FORMAT + 28, "Q", 5), "truncated in frame 4 of 5"),
         (lambda path: put(path, MATRICES, "f", np.nan), "contain NaN or infinity"),
         (lambda path: put(path, MATRICES + 64, "f", 3.0), "the extrinsics of color"),

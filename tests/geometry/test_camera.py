@@ -80,6 +80,6 @@ def test_camera_at_the_limits_can_be_halved(
 
 def test_distortion_that_no_lens_has_is_named() -> None:
     shrinking = (1e9, 0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 0.0)  # By 1000, and increasing steadily.
-    with pytest.raises(DataError, match="is no lens"):
+    with pytest.raises(DataError, match="fits no real lens"):
         Camera(640, 480, 64000.0, 48000.0, 320.0, 240.0, shrinking)
     Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))

@@ -63,7 +63,7 @@ def test_image_of_another_size_than_announced_is_rejected() -> None:
 
 
 def test_a_truncated_image_is_rejected() -> None:
-    with pytest.raises(FrameError, match="not a readable jpeg"):
+    with pytest.raises(FrameError, match="cannot be decoded as a jpeg"):
         codecs.decode_color("jpeg", 9, 6, memoryview(codecs.encode_jpeg(COLOR)[:20]))
 
 
