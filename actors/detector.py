@@ -55,7 +55,7 @@ class Detector(Actor):
             if self.config.model:
                 self._network = open_detector(self.config.model, self.config.network)
         except ConfigError as error:
-            log.error('detector disabled: %s Check detector.model with "ldo models list".', error)
+            log.error("detector disabled: %s Keyframes get no detections.", error)
 
     def handle(self, message: Keyframe) -> Iterator[DetectionBoxes]:
         """Yield the detections of the keyframe in one message.
@@ -80,8 +80,9 @@ class Detector(Actor):
         except ModelError as error:
             if not self._is_failing:
                 log.error(
-                    "detector: inference failed (%s: %s); keyframes get no detections until it "
-                    "succeeds. Try inference.providers=[cpu].",
+                    "detector: inference with the network %s failed: %s Keyframes get no "
+                    "detections until inference succeeds. If inference.providers names a GPU, try "
+                    "inference.providers=[cpu].",
                     self._network.identity,
                     error,
                 )

@@ -242,7 +242,8 @@ class Tracker(Actor):
         self._prior_checks[check] += 1
         if check is not PriorCheck.FOLLOWS and self._prior_checks[check] == 1:
             log.warning(
-                "tracker: the odometry/prior of stamp %d %s. Further such poses are only counted.",
+                "tracker: the pose on odometry/prior with stamp %d ns %s. Further such poses are "
+                "only counted. If many follow, check the program that publishes odometry/prior.",
                 message.stamp_ns, check,
             )  # fmt: skip
 
@@ -369,9 +370,7 @@ def _known_correction(config: TrackerConfig) -> CameraCorrection:
     except DataError as error:
         if config.localize:
             raise
-        raise DataError(
-            f"tracker.calibration_run={folder}: {error} Choose the folder of a finished `ldo run`."
-        ) from error
+        raise DataError(f"tracker.calibration_run={folder} cannot be used: {error}") from error
 
 
 def _box(detection: Detection) -> Box:

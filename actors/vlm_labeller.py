@@ -127,8 +127,8 @@ class VlmLabeller(Actor):
         except (ModelError, EndpointError, FrameError) as error:
             if not self._is_failing:
                 log.error(
-                    "vlm_labeller: request failed (%s: %s); regions get no open-vocabulary label. "
-                    "Check vlm_labeller.model, or the server at vlm_labeller.url.",
+                    "vlm_labeller: the labeller %s failed: %s Regions get no open-vocabulary label "
+                    "until the labeller succeeds.",
                     self._labeller.identity,
                     error,
                 )

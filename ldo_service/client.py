@@ -231,7 +231,7 @@ class Client:
         if not topic.is_state:
             keeping = ", ".join(other.name for other in TOPICS if other.is_state)
             raise ConfigError(
-                f"{topic.name} has no last value to request. Topics with a last value: {keeping}."
+                f"{topic.name} keeps no last value. Choose a topic with a last value: {keeping}."
             )
         return self._reader.last_values(topic, timeout_s)
 
@@ -326,7 +326,9 @@ class Client:
         try:
             message = AddLabel(stamp_ns=time.time_ns(), name=name)
         except ValueError as error:
-            raise ConfigError(f"{name[:40]!r} cannot be added: {error}.") from None
+            raise ConfigError(
+                f"the label {name[:40]!r} cannot be added: {error}. Choose another name."
+            ) from None
         until_s = time.monotonic() + timeout_s
         with self.poller(LABEL_NAMES.name, LabelNames) as inbox:
             self._send_request(LABEL_ADD, message, min(timeout_s, 3.0))
@@ -366,7 +368,7 @@ def _topic(topic: Topic | str) -> Topic:
 
 def _names_or_why(name: str, answer: LabelNames) -> tuple[str, ...]:
     if answer.error:
-        raise ConfigError(f"{name!r} was not added: {answer.error}")
+        raise ConfigError(f"the label {name!r} was not added: {answer.error}")
     return answer.names
 
 

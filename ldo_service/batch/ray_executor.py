@@ -142,7 +142,8 @@ def _ray(address: str) -> ModuleType:
         import_module("ray.exceptions")
     except ImportError as error:
         raise ConfigError(
-            f"--cluster needs the extra `cluster`: {install_command('cluster')} ({error})."
+            f"--cluster needs the extra `cluster` ({error}). Install it by "
+            f"{install_command('cluster')}."
         ) from error
     return ray
 

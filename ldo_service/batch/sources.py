@@ -88,7 +88,9 @@ def listed(path: Path) -> list[str]:
     try:
         lines = [line.strip() for line in path.expanduser().read_text().splitlines()]
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the list {path} cannot be read: {error}.") from error
+        raise ConfigError(
+            f"the list of sources {path} cannot be read: {error}. Give a text file in UTF-8."
+        ) from error
     words = [line for line in lines if line and not line.startswith("#")]
     return [
         word if _is_remote(word) or word.startswith((SYNTHETIC, "~")) else str(path.parent / word)
@@ -131,7 +133,7 @@ def _expanded(word: str, note: Callable[[str], None]) -> Iterator[str]:
             yield store.url
             return
         found = [] if store.is_file() else store.entries()
-        problem = f"{word} is no recording and contains none."
+        problem = f"{word} is not a recording and contains none."
     elif PATTERN.intersection(word):
         found = store.matches()
         problem = f"no recording matches {word}."
@@ -143,7 +145,7 @@ def _expanded(word: str, note: Callable[[str], None]) -> Iterator[str]:
             f"{problem} Check the path; `ldo run --help` lists the layouts of recordings."
         )
     if others := len(found) - len(recordings):
-        note(f"{word}: {others} of {len(found)} entries are no recordings. They are not used.")
+        note(f"{word}: {others} of {len(found)} entries are not recordings and are not used.")
     yield from recordings
 
 
@@ -188,4 +190,6 @@ def _sha256(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+        raise DataError(
+            f"{path} cannot be read: {error.strerror}. Check its permissions."
+        ) from error

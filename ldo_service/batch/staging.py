@@ -37,14 +37,14 @@ def staging_folder(root: Path, size_bytes: int, max_bytes: int) -> Iterator[Path
     if size_bytes > max_bytes:
         raise DataError(
             f"the recording has {size_bytes / GB:.3g} GB, more than --max-staged-gb "
-            f"{max_bytes / GB:g} allows. Raise the limit if {root} has the space."
+            f"{max_bytes / GB:g} allows. Raise --max-staged-gb if {root} has enough free space."
         )
     try:
         root.mkdir(parents=True, exist_ok=True)
         folder, lock = _admitted(root, size_bytes, max_bytes)
     except OSError as error:
         raise DataError(
-            f"{root} cannot be written: {error.strerror}. Choose another --staging."
+            f"{root} cannot be written: {error.strerror}. Choose another folder with --staging."
         ) from error
     try:
         yield folder

@@ -195,10 +195,12 @@ def open_store(url: str) -> Store:
     except ImportError as error:
         extra = EXTRAS.get(name)
         how = install_command(extra) if extra else known_implementations[name].get("err", error)
-        advice = f"the extra `{extra}`: {how}" if extra else f"another package: {how}"
-        raise ConfigError(f"{url}: {name}:// needs {advice}.") from error
+        advice = f"the extra `{extra}`. Install it by {how}" if extra else f"another package: {how}"
+        raise ConfigError(f"{url}: the protocol {name}:// needs {advice}.") from error
     except Exception as error:
-        raise ConfigError(f"{url} cannot be opened: {reason_of(error)}.") from error
+        raise ConfigError(
+            f"{url} cannot be opened: {reason_of(error)}. Check the address and your credentials."
+        ) from error
     return Store(url.rstrip("/"), system, path.rstrip("/"))
 
 
@@ -210,7 +212,9 @@ def _mark(info: dict[str, Any]) -> str:
 def _as_data_error(url: str, access: str, error: Exception) -> DataError:
     if isinstance(error, DataError):
         return error
-    return DataError(f"{url} cannot be {access}: {reason_of(error)}.")
+    return DataError(
+        f"{url} cannot be {access}: {reason_of(error)}. Check the address and your access rights."
+    )
 
 
 def reason_of(error: Exception) -> str:

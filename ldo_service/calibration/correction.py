@@ -148,10 +148,13 @@ def read_corrections(folder: Path) -> CorrectionHistory:
             ),
         )
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+        raise DataError(
+            f"{path} cannot be read: {error.strerror}. Give the folder of a finished `ldo run`."
+        ) from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataError(
-            f"{path} is not what `ldo run` writes: {error!r}. Give the folder of a finished run."
+            f"{path} does not have the format that `ldo run` writes ({error!r}). Give the folder "
+            "of a finished `ldo run`."
         ) from error
 
 

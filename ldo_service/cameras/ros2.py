@@ -193,7 +193,10 @@ class RosCamera:
 
     def _frame(self, color: RosImage, depth: RosImage) -> CameraRgbd:
         if self._camera is None:
-            raise FrameError(f"no camera info was received on {self._topics.camera_info} yet.")
+            raise FrameError(
+                f"no camera info was received on {self._topics.camera_info} yet. If none arrives, "
+                "check that the camera publishes this topic."
+            )
         frame = joined(color, depth, self._camera, self.frames_made, self._topics.is_registered)
         self.frames_made += 1
         return frame

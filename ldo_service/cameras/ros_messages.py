@@ -78,8 +78,8 @@ def color_image(message: Any) -> RosImage:
     channels = COLOR_CHANNELS.get(message.encoding)
     if channels is None:
         raise FrameError(
-            f"color encoding {message.encoding[:40]!r} is not supported, expected one of "
-            f"{', '.join(COLOR_CHANNELS)}."
+            f"color encoding {message.encoding[:40]!r} is not supported. Set the camera driver to "
+            f"one of {', '.join(COLOR_CHANNELS)}."
         )
     pixels = _pixels(message, np.dtype("u1"), channels)
     if channels == 1:
@@ -111,8 +111,8 @@ def depth_image(message: Any) -> RosImage:
         return _compressed_depth(message)
     if message.encoding not in DEPTH_KINDS:
         raise FrameError(
-            f"depth encoding {message.encoding[:40]!r} is not supported, expected one of "
-            f"{', '.join(DEPTH_KINDS)}."
+            f"depth encoding {message.encoding[:40]!r} is not supported. Set the camera driver to "
+            f"one of {', '.join(DEPTH_KINDS)}."
         )
     encoding, kind, depth_scale = DEPTH_KINDS[message.encoding]
     dtype = np.dtype((">" if message.is_bigendian else "<") + kind)
@@ -152,7 +152,9 @@ def camera_model(info: Any, is_rectified: bool) -> CameraModel:
             distortion=() if is_rectified else _distortion(info),
         )
     except ValueError as error:
-        raise FrameError(f"the camera info is invalid: {error}.") from error
+        raise FrameError(
+            f"the camera info is invalid: {error}. Calibrate the camera, or correct its driver."
+        ) from error
 
 
 def joined(
@@ -193,7 +195,10 @@ def joined(
             depth_scale=depth.depth_scale,
         )
     except ValueError as error:
-        raise FrameError(f"color and depth do not fit together: {error}.") from error
+        raise FrameError(
+            f"color and depth cannot form a frame: {error}. Check the settings of the camera "
+            "driver."
+        ) from error
 
 
 # --- CDR ------------------------------------------------------------------------------------------
@@ -228,7 +233,10 @@ def decoded(body: bytes, kind: str) -> Any:
     try:
         return store.deserialize_cdr(body, kind)
     except Exception as error:  # rosbags does not convert all errors of decoding to its own.
-        raise FrameError(f"{len(body)} bytes are not a valid {kind}: {error}.") from error
+        raise FrameError(
+            f"{len(body)} bytes cannot be decoded as {kind}: {error}. Check that the topic has "
+            "this message type."
+        ) from error
 
 
 def _ros_image(message: Any, image: Image, depth_scale: float = 1.0) -> RosImage:
@@ -243,12 +251,14 @@ def _pixels(message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
     row_bytes = width * channels * dtype.itemsize
     if not 0 < width * height <= MAX_PIXELS:
         raise FrameError(
-            f"an image has {width}x{height} pixels, expected 1 to {MAX_PIXELS} in total."
+            f"an image has {width}x{height} pixels, expected 1 to {MAX_PIXELS} in total. Lower "
+            "the resolution in the camera driver."
         )
     if step < row_bytes or len(message.data) != step * height:
         raise FrameError(
-            f"a {message.encoding} image of {width}x{height} needs {height} rows of at least "
-            f"{row_bytes} bytes, but has {len(message.data)} bytes in rows of {step}."
+            f"a {message.encoding} image of {width}x{height} pixels needs {height} rows of at "
+            f"least {row_bytes} bytes, but has {len(message.data)} bytes in rows of {step}. Check "
+            "the camera driver."
         )
     rows = np.reshape(message.data, (height, step))[:, :row_bytes]
     return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
@@ -266,13 +276,16 @@ def _compressed(message: Any, start: int, depth_scale: float = 1.0) -> RosImage:
     size = read_image_size(data)
     if size is None:
         raise FrameError(
-            f"{len(data)} bytes of format {message.format[:40]!r} are neither PNG nor JPEG."
+            f"a compressed image of format {message.format[:40]!r} is neither PNG nor JPEG. "
+            "Publish PNG or JPEG images."
         )
     encoding: ImageEncoding = "jpeg" if bytes(data[:2]) == b"\xff\xd8" else "png"
     try:
         image = Image(encoding=encoding, width=size[0], height=size[1], data=data)
     except ValueError as error:
-        raise FrameError(f"a compressed image is invalid: {error}.") from error
+        raise FrameError(
+            f"a compressed image is invalid: {error}. Check the settings of the camera driver."
+        ) from error
     return _ros_image(message, image, depth_scale)
 
 
@@ -291,8 +304,8 @@ def _compressed_depth(message: Any) -> RosImage:
         return _compressed(message, 0 if is_plain else COMPRESSED_DEPTH_HEADER, 1000.0)
     if not message.format.startswith("32FC1"):
         raise FrameError(
-            f"compressed depth format {message.format[:40]!r} is not supported, expected 16UC1 or "
-            "32FC1."
+            f"compressed depth format {message.format[:40]!r} is not supported. Publish depth as "
+            "16UC1 or 32FC1."
         )
     stored = _compressed(message, COMPRESSED_DEPTH_HEADER)
     image = stored.image

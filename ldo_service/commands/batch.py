@@ -122,7 +122,9 @@ def batch(
     executor: Executor
     if cluster is None:
         if gpus:
-            raise ConfigError(f"--gpus {gpus:g} applies to --cluster. Remove it.")
+            raise ConfigError(
+                f"--gpus {gpus:g} applies only with --cluster. Remove --gpus, or add --cluster."
+            )
         executor = LocalExecutor(workers or default_workers(threads, memory_gb))
     else:
         executor = RayExecutor(cluster, RayNeeds(threads, memory_gb, gpus), workers)

@@ -38,11 +38,13 @@ def bench(
     Set the environment variable LDO_ISA to avx512, avx2 or baseline to choose the instruction set.
     """
     width, height = _pixels(size)
-    if not min(gaussians, threads, repeats) >= 1 or gaussians_out_of_view < 0:
+    if not min(gaussians, threads, repeats) >= 1:
         raise ConfigError(
-            "--gaussians, --threads and --repeats must be at least 1, --gaussians-out-of-view at "
-            "least 0."
+            f"--gaussians {gaussians}, --threads {threads} and --repeats {repeats} must each be "
+            "at least 1."
         )
+    if gaussians_out_of_view < 0:
+        raise ConfigError(f"--gaussians-out-of-view {gaussians_out_of_view} must be at least 0.")
     camera = bench_camera(width, height)
     iteration = Iteration(gaussians, camera, threads=threads, elsewhere=gaussians_out_of_view)
     times = asdict(iteration_times(iteration, repeats))

@@ -72,12 +72,13 @@ def camera_findings(folder: Path) -> Iterator[Finding]:
     yield from _large(folder, correction, camera)
     yield Finding(
         "note",
-        "scale of depth: unknown, because images do not tell it. Measure a known length in the "
-        "map, and correct depth_scale of the camera",
+        "scale of depth: unknown, because it cannot be estimated from images. Measure a known "
+        "length in the map, and correct depth_scale of the camera",
     )
     yield Finding(
         "note",
-        "pose between depth and color camera: not estimated. Depth must be registered to color",
+        "pose of the depth camera relative to the color camera: not estimated. Depth must be "
+        "registered to color",
     )
 
 
@@ -119,8 +120,8 @@ def _progress(metrics: Mapping[str, float], *, is_on: bool, known: str) -> Findi
     views = f"{metrics['calibration_views']:.0f} of {SelfCalibrationConfig().views[-1]} views"
     return Finding(
         "warn",
-        f"self-calibration: not finished ({views}), {start}. Vignetting and depth bias may be "
-        f"missing or change: {MOVE}",
+        f"self-calibration: not finished ({views}), {start}. The corrections of vignetting and "
+        f"depth bias may be missing or still change. To finish, {MOVE}",
     )
 
 
@@ -133,17 +134,18 @@ def _depth_bias(
         near, far = (depth_errors_mm(correction, camera, depth_m) for depth_m in DEPTHS_M)
         return Finding(
             "ok",
-            f"depth bias: corrected. At {DEPTHS_M[0]:g} and {DEPTHS_M[1]:g} m, measured depth is "
-            f"wrong by 0 and 0 mm in the center, {near[0]:+.0f} and {far[0]:+.0f} mm at the top "
-            f"left and bottom right, {near[1]:+.0f} and {far[1]:+.0f} mm at the top right and "
-            f"bottom left{evidence}",
+            f"depth bias: corrected. A measured depth of {DEPTHS_M[0]:g} m is wrong by "
+            f"{near[0]:+.0f} mm at the top left and bottom right, and by {near[1]:+.0f} mm at the "
+            f"top right and bottom left. A measured depth of {DEPTHS_M[1]:g} m is wrong by "
+            f"{far[0]:+.0f} mm and {far[1]:+.0f} mm there. In the center, the error is 0"
+            f"{evidence}",
         )
     if ratio is not None and limit < ratio <= PROBABLE_RATIO:
         return Finding(
             "warn",
             f"depth bias: probable, but not confirmed and not corrected{evidence}. Tracking may "
-            f"confuse it with rotation: {MOVE}, or set tracker.calibration_run to a run of this "
-            "camera that corrected it",
+            f"confuse it with rotation. To confirm it, {MOVE}, or set tracker.calibration_run to a "
+            "run of this camera that corrected it",
         )
     if ratio is None:
         return Finding("note", f"depth bias: not corrected{evidence}")
@@ -175,7 +177,10 @@ def _ratio(metrics: Mapping[str, float], name: str) -> float | None:
 def _held_out(ratio: float | None, limit: float) -> str:
     if ratio is None:
         return " (no estimate in this run)"
-    return f" (held-out residual {ratio:.2f} of that without correction; {limit:g} confirms)"
+    return (
+        f" (the correction changes the residual of held-out frames by a factor of {ratio:.2f}; "
+        f"{limit:g} or less confirms it)"
+    )
 
 
 def _time(
@@ -190,18 +195,22 @@ def _time(
         if sigma_ms is None or sigma_ms < UNCERTAIN_TIME_MS:
             return Finding("ok", used)
         return Finding(
-            "warn", f"{used}, uncertain. Turn the camera faster, left, right, up and down"
+            "warn",
+            f"{used}. This estimate is uncertain. To improve it, turn the camera faster: left, "
+            "right, up and down",
         )
     if sigma_ms is None:
         return Finding(
             "note",
-            f"{text}: not compensated, no estimate. It needs frames that are at most "
-            f"{config.max_interval_s:g} s apart while the camera turns",
+            f"{text}: not compensated, because there is no estimate. An estimate needs frames that "
+            f"are at most {config.max_interval_s:g} s apart while the camera turns",
         )
     return Finding(
         "ok",
-        f"{text}: not compensated, {metrics[f'{name}_estimate_ms']:.1f} ms (1 sigma {sigma_ms:.1f} "
-        f"ms). One of the times must exceed {1e3 * config.min_s:g} ms and {config.sigmas:g} sigma",
+        f"{text}: not compensated, estimated as {metrics[f'{name}_estimate_ms']:.1f} ms (1 sigma "
+        f"{sigma_ms:.1f} ms). The readouts of color and depth and the delay of depth are "
+        f"compensated once one of them exceeds {1e3 * config.min_s:g} ms and {config.sigmas:g} "
+        "sigma",
     )
 
 
@@ -221,9 +230,9 @@ def _large(folder: Path, correction: CameraCorrection, camera: Camera) -> Iterat
     if large:
         yield Finding(
             "warn",
-            f"large: {', '.join(large)}. Each run has these errors until it has estimated them. "
-            "Start the next run of this camera with the result of this one: --set "
-            f"tracker.calibration_run={folder}",
+            f"large errors of this camera: {', '.join(large)}. Each run has these errors until it "
+            "has estimated them. Start the next run of this camera with the result of this run: "
+            f"--set tracker.calibration_run={folder}",
         )
     if abs(times_ms["depth_delay_ms"]) >= LARGE_TIME_MS:
         yield Finding(
@@ -244,8 +253,11 @@ def _metrics(folder: Path) -> Mapping[str, float]:
         metrics = json.loads(path.read_text()).get("calibration", {})
         return {str(name): float(value) for name, value in metrics.items()}
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+        raise DataError(
+            f"{path} cannot be read: {error.strerror}. Give the folder of a finished `ldo run`."
+        ) from error
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise DataError(
-            f"{path} is not what `ldo run` writes: {error!r}. Give the folder of a finished run."
+            f"{path} does not have the format that `ldo run` writes ({error!r}). Give the folder "
+            "of a finished `ldo run`."
         ) from error

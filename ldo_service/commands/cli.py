@@ -125,7 +125,9 @@ def _refuse_renamed_options(words: Sequence[str]) -> None:
     for word in words:
         option = word.partition("=")[0]
         if option in RENAMED_OPTIONS:
-            raise ConfigError(f"{option} is now {RENAMED_OPTIONS[option]}.")
+            raise ConfigError(
+                f"the option {option} is now {RENAMED_OPTIONS[option]}. Use the new name."
+            )
 
 
 def first_lines() -> Iterator[str]:

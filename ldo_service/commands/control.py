@@ -52,11 +52,13 @@ def control(
       ldo control refine --iterations 500
       ldo control add-label "fire extinguisher"
     """
-    if bool(name) != (verb == "add-label"):
+    if verb == "add-label" and not name:
         raise ConfigError(
-            f"`ldo control {verb}` with name {name!r}: add-label needs a NAME, as in `ldo control "
-            "add-label samovar`; the other verbs take none."
+            "`ldo control add-label` needs the NAME of the label, as in `ldo control add-label "
+            "samovar`."
         )
+    if verb != "add-label" and name:
+        raise ConfigError(f"`ldo control {verb}` takes no NAME, but {name!r} is given. Remove it.")
     with connect(robot, endpoint, keys) as service:
         if verb == "refine":
             ask_to_refine(service, iterations)

@@ -87,10 +87,15 @@ def doctor(
       ldo doctor
       ldo doctor calibration runs/desk
     """
-    if (run is not None) != (check == "calibration"):
+    if check == "calibration" and run is None:
         raise ConfigError(
             "`ldo doctor calibration` needs the folder of a run, as in `ldo doctor calibration "
-            "runs/desk`; `ldo doctor` takes none."
+            "runs/desk`."
+        )
+    if check != "calibration" and run is not None:
+        raise ConfigError(
+            f"the folder {run} applies only to `ldo doctor calibration {run}`. Remove it, or add "
+            "the word calibration."
         )
     if run is not None:
         show(camera_findings(run))
@@ -127,8 +132,8 @@ def extras() -> Iterator[Finding]:
     for extra, packages in EXTRAS.items():
         missing = [p for p in packages if importlib.util.find_spec(p) is None]
         if missing:
-            advice = f"{install_command(extra)} installs it"
-            yield Finding("absent", f"extra {extra} ({', '.join(missing)}): {advice}")
+            advice = f"to use it, run {install_command(extra)}"
+            yield Finding("absent", f"extra {extra} (missing: {', '.join(missing)}): {advice}")
         else:
             yield Finding("ok", f"extra {extra}")
 
@@ -139,8 +144,9 @@ def networks() -> Iterator[Finding]:
     if not models.names:
         yield Finding(
             "absent",
-            "registered networks: the built-in `demo` recognizes only objects of the synthetic "
-            "scenes; `ldo models add NAME FILE` registers a YOLOv5, YOLOX or YOLOv8 in ONNX",
+            "no network is registered. The built-in `demo` recognizes only objects of the "
+            "synthetic scenes. `ldo models add NAME FILE` registers a YOLOv5, YOLOX or YOLOv8 in "
+            "ONNX",
         )
     for name in models.names:
         try:

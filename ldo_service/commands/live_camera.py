@@ -41,11 +41,12 @@ class RealSenseOptions:
             ConfigError: If the size or the rate is invalid.
         """
         width, _, height = self.size.partition("x")
-        if not (width.isdecimal() and height.isdecimal() and self.fps > 0):
+        if not (width.isdecimal() and height.isdecimal()):
             raise ConfigError(
-                f"--size {self.size} --fps {self.fps}: must be WIDTHxHEIGHT in pixels and a "
-                "positive rate in Hz, such as 640x480 and 30."
+                f"--size {self.size} must be WIDTHxHEIGHT in pixels, such as 640x480."
             )
+        if self.fps <= 0:
+            raise ConfigError(f"--fps {self.fps} must be a positive rate in Hz, such as 30.")
         return RealSenseStream(self.serial, int(width), int(height), self.fps)
 
 

@@ -181,7 +181,8 @@ def show(console: Console) -> None:
     console.print(f"{demo_networks.NAME}, a detector and a pair, comes with the package.")
     if damaged:
         raise LdoError(
-            f"{damaged} of the networks above are damaged. Remove them and add them again."
+            f"networks marked damaged above: {damaged}. Remove each with `ldo models remove NAME`, "
+            "and add it again with `ldo models add`."
         )
 
 
@@ -195,4 +196,6 @@ def _license(text: str) -> str:
     try:
         return path.read_text("utf-8") if is_file else text
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--license {text} cannot be read: {error}.") from error
+        raise ConfigError(
+            f"--license {text} cannot be read: {error}. Give a text file in UTF-8."
+        ) from error

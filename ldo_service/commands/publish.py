@@ -110,7 +110,7 @@ def publish(
             relay(service, live, chosen, restamp, console.print)
         return
     if rate is not None and not 0 < rate < float("inf"):
-        raise ConfigError(f"--rate {rate:g}: must be positive.")
+        raise ConfigError(f"--rate {rate:g} must be positive and finite.")
     settings = load_config(config, with_topics(set, topic))
     sequence = open_sequence(source, settings.dataset.options())
     indices = Selection(stride, max_frames).indices(sequence)
@@ -132,8 +132,8 @@ def publish(
     )
     if camera.bad > MAX_BAD * len(indices):
         raise DataError(
-            f"{camera.bad} of {len(indices)} frames could not be read. The reason for the first is "
-            "printed above."
+            f"{camera.bad} of {len(indices)} frames could not be read, more than the maximum of "
+            f"{MAX_BAD:.0%}. The reason for the first is printed above. Restore the damaged files."
         )
 
 

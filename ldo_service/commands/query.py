@@ -116,7 +116,9 @@ def _texts_of(model: str, run: Path | None) -> Encode:
             return open_labeller(model, DualEncoderConfig()).texts.encode(texts)
         had = None if run is None else _labeller_of(run)
         if had is None:
-            raise TextComparisonError("`--model NAME` names an encoder pair for the comparison.")
+            raise TextComparisonError(
+                "there is no encoder pair for the comparison. Choose one with `--model NAME`."
+            )
         try:
             return open_labeller(had.model, had.dual_encoder).texts.encode(texts)
         except ConfigError as error:
@@ -138,7 +140,8 @@ def _labeller_of(run: Path) -> VlmLabellerConfig | None:
         config = actor_parameters(load_config(run / "config.yaml")).vlm_labeller
     except ConfigError as error:
         raise TextComparisonError(
-            f"{run / 'config.yaml'}: {error} `--model NAME` names a pair."
+            f"the labeller of the run in {run} is unknown: {error} Choose an encoder pair with "
+            "`--model NAME`."
         ) from error
     return config if config.model else None
 

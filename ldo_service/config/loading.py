@@ -91,7 +91,7 @@ def _read(path: Path) -> dict[str, Any]:
             f"{path} is not a text file in UTF-8. Give a YAML file in this encoding."
         ) from error
     except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is not valid YAML: {error}") from error
+        raise ConfigError(f"{path} is not valid YAML: {error}. Correct the file.") from error
     if not isinstance(tree or {}, dict):
         raise ConfigError(
             f"{path} must contain sections such as `tracker:`. `ldo config --all` prints all "
@@ -107,7 +107,10 @@ def _apply(tree: dict[str, Any], setting: str) -> None:
     try:
         plain = load_yaml(value)
     except yaml.YAMLError as error:
-        raise ConfigError(f"--set {setting}: the value is not valid YAML: {error}") from error
+        raise ConfigError(
+            f"--set {setting}: the value is not valid YAML: {error}. Put a text with special "
+            "characters into quotes."
+        ) from error
     _put(tree, name.strip(), plain, f"--set {setting}")
 
 
@@ -119,7 +122,10 @@ def _put(tree: dict[str, Any], name: str, value: object, shown: str) -> None:
     for section in sections:
         tree = tree.setdefault(section, {})
         if not isinstance(tree, dict):
-            raise ConfigError(f"{shown}: {section} is a setting, not a section.")
+            raise ConfigError(
+                f"{shown}: {section} is a setting, not a section. `ldo config --all` lists the "
+                "settings."
+            )
     tree[last] = value
 
 

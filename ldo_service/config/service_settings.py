@@ -72,7 +72,10 @@ class DatasetSettings:
             )
         except ConfigError as error:
             values = list(self.T_color_depth)
-            raise ConfigError(f"dataset.T_color_depth={values} must be rigid: {error}") from error
+            raise ConfigError(
+                f"dataset.T_color_depth={values} must be a rigid transform from depth to color "
+                "coordinates in meters: a 4x4 matrix, row by row, whose last row is 0 0 0 1."
+            ) from error
 
 
 @dataclass(frozen=True, slots=True)

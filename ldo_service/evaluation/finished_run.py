@@ -180,8 +180,8 @@ class FinishedRun:
             if not is_there or sequence.stamps_ns[frame.index] != frame.stamp_ns:
                 raise DataError(
                     f"the run has frame {frame.index} with the stamp {frame.stamp_ns} ns, but "
-                    f"{sequence.name} has no such frame. Pass the SOURCE that the run was made "
-                    "from."
+                    f"{sequence.name} has no frame with this number and stamp. Give the SOURCE of "
+                    "the run."
                 )
 
 

@@ -175,7 +175,10 @@ def draw(folder: Path, pictures: dict[str, np.ndarray]) -> list[Path]:
         for name, picture in pictures.items():
             save_picture(folder / name, picture)
     except OSError as error:
-        raise ConfigError(f"{error}: free some disk space or make {folder} writable.") from error
+        raise ConfigError(
+            f"the results cannot be written to {folder}: {error}. Free some disk space, or make "
+            "the folder writable."
+        ) from error
     return [folder / name for name in pictures]
 
 

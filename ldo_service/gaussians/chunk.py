@@ -89,5 +89,7 @@ def unpack(data: bytes | memoryview) -> Chunk:
         rows = np.ascontiguousarray(planes[:, : 4 * ROW]).view("<f4")
         labels = np.ascontiguousarray(planes[:, 4 * ROW :])
     except (zstandard.ZstdError, struct.error, ValueError, MemoryError) as error:
-        raise DataError(f"the {len(data)} bytes are not a chunk of Gaussians: {error}") from error
+        raise DataError(
+            f"the {len(data)} bytes of a file cannot be decoded as Gaussians: {error}"
+        ) from error
     return Chunk(anchor, np.cumsum(steps), rows, labels)

@@ -57,6 +57,7 @@ TYPES = {
     for name in names
 }
 MAX_LINE = 4096  # Maximum length of a header line, bytes.
+PLY_ADVICE = "Give a PLY file of 3D Gaussian splatting, such as the map.ply of a run."
 
 SPLAT = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)]
@@ -105,10 +106,13 @@ def read_ply(path: Path) -> np.ndarray:
             header = _read_header(path, file)
             vertices = _read_vertices(path, header, file.read())
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+        raise DataError(
+            f"{path} cannot be read: {error.strerror}. Give an existing, readable PLY file."
+        ) from error
     if any(name.startswith("f_rest_") for name in header.properties):
         log.warning(
-            "%s: view-dependent color (f_rest_*) is not supported and is ignored; no action needed",
+            "%s: view-dependent color (f_rest_*) is not supported and is ignored; no action "
+            "needed.",
             path,
         )
     return _rows(path, vertices)
@@ -141,33 +145,40 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
             case ["property", "list", _, _, _] if elements and list(elements)[-1] != "vertex":
                 pass
             case _:
-                raise DataError(f"{path}: its header has an unknown line {' '.join(words)!r}.")
+                raise DataError(
+                    f"{path} has an unknown line {' '.join(words)!r} in its header. {PLY_ADVICE}"
+                )
     if byte_order is None:
-        raise DataError(f"{path}: its header names no format, so it is not a PLY file.")
+        raise DataError(
+            f"{path} has no line `format` in its header, so it is not a PLY file. {PLY_ADVICE}"
+        )
     if next(iter(elements), None) != "vertex":
-        raise DataError(f"{path} is not a map of Gaussians: its first element is not `vertex`.")
+        raise DataError(
+            f"{path} is not a map of Gaussians: its first element is not `vertex`. {PLY_ADVICE}"
+        )
     return _Header(byte_order, *elements["vertex"], is_last=len(elements) == 1)
 
 
 def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
     """Yield the words of each line between `ply` and `end_header`, without comments."""
     if file.readline(MAX_LINE).rstrip() != b"ply":
-        raise DataError(f"{path} is not a PLY file: it does not start with `ply`.")
+        raise DataError(f"{path} is not a PLY file: it does not start with `ply`. {PLY_ADVICE}")
     while line := file.readline(MAX_LINE):
         words = line.decode("ascii", "replace").split()
         if words == ["end_header"]:
             return
         if words and words[0] not in ("comment", "obj_info"):
             yield words
-    raise DataError(f"{path} is cut off: its header has no end, the line `end_header`.")
+    raise DataError(
+        f"{path} is cut off: its header has no line `end_header`. Copy or export it again."
+    )
 
 
 def _read_vertices(path: Path, header: _Header, body: bytes) -> dict[str, np.ndarray]:
     missing = [name for name in COLUMNS if name not in header.properties]
     if missing:
         raise DataError(
-            f"{path} has no property {missing[0]}: it is not a map of Gaussians in the format "
-            "of 3D Gaussian splatting."
+            f"{path} has no property {missing[0]}, so it is not a map of Gaussians. {PLY_ADVICE}"
         )
     if header.byte_order:
         return _binary_vertices(path, header, body)
@@ -187,7 +198,9 @@ def _text_vertices(path: Path, header: _Header, body: bytes) -> dict[str, np.nda
     try:
         table = np.array(words[: header.count * width], float).reshape(header.count, width)
     except ValueError as error:
-        raise DataError(f"{path} holds text that is not a number: {error}.") from error
+        raise DataError(
+            f"{path} contains text that is not a number: {error}. Export it again."
+        ) from error
     return {name: table[:, list(header.properties).index(name)] for name in COLUMNS}
 
 
@@ -195,13 +208,13 @@ def _require_size(path: Path, header: _Header, found: int, each: int, unit: str)
     expected = header.count * each
     if found < expected:
         raise DataError(
-            f"{path} is cut off: {header.count} Gaussians need {expected} {unit}, the file holds "
-            f"{found}."
+            f"{path} is cut off: {header.count} Gaussians need {expected} {unit}, but the file "
+            f"has {found}. Copy or export it again."
         )
     if found > expected and header.is_last:
         raise DataError(
-            f"{path} holds {found - expected} {unit} beyond the {header.count} Gaussians of its "
-            "header: header and content do not match. Write the file again."
+            f"{path} has {found - expected} {unit} more than the {header.count} Gaussians in its "
+            "header need. Header and content do not match. Export the file again."
         )
 
 
@@ -214,8 +227,9 @@ def _rows(path: Path, vertices: dict[str, np.ndarray]) -> np.ndarray:
     bad = ~np.isfinite(rows).all(axis=1) | ~rows[:, 6:10].any(axis=1)
     if bad.any():
         raise DataError(
-            f"{path}: {bad.sum()} of {len(rows)} Gaussians hold NaN, infinity or a quaternion of "
-            f"length zero (first index: {np.argmax(bad)}). Write the file again without them."
+            f"{path}: {bad.sum()} of {len(rows)} Gaussians contain NaN, infinity or a quaternion "
+            f"of length zero; the first has index {np.argmax(bad)}. Export the file again without "
+            "them."
         )
     return rows
 

@@ -327,8 +327,8 @@ class OffloadedGaussians:
         entry = self._entries.pop(number)
         count, anchor = entry.count, entry.anchor
         log.error(
-            "offloading: %d Gaussians of anchor keyframe %d are lost (%s); the map has a gap there "
-            "until the camera returns",
+            "offloading: %d Gaussians of anchor keyframe %d are lost (%s). The map has a gap there "
+            "until the camera returns. Check the disk.",
             count,
             anchor,
             reason,

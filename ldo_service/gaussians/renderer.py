@@ -127,7 +127,7 @@ class Rasterizer:
         """
         if camera.distortion:
             raise DataError(
-                "the rasterizer does not support lens distortion: pass camera.rectified()."
+                "the rasterizer does not support lens distortion. Pass camera.rectified()."
             )
         size = (PLANES, camera.height, camera.width)
         if self._planes.shape != size:
@@ -328,7 +328,7 @@ def render(
         ValueError: The shapes of the arrays do not match.
     """
     if camera.distortion:
-        raise DataError("the rasterizer does not support lens distortion: pass camera.rectified().")
+        raise DataError("the rasterizer does not support lens distortion. Pass camera.rectified().")
     T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     size = camera.width, camera.height

@@ -249,7 +249,9 @@ def unpack(body: bytes | memoryview) -> KeyframeImages:
         depth_m = _depth_of(stored.depth, stored.is_depth_differences, size)
         mask = None if stored.mask is None else _expanded(stored.mask, np.uint8, size)
     except (zstandard.ZstdError, ValueError, RecursionError) as error:
-        raise DataError(f"{len(body)} bytes hold no images of a keyframe: {error}.") from error
+        raise DataError(
+            f"its {len(body)} bytes cannot be decoded as the images of a keyframe: {error}"
+        ) from error
     for image in (color, depth_m, mask):
         if image is not None:
             image.flags.writeable = False

@@ -296,8 +296,8 @@ class RecordingFile:
 
     def _give_up(self, error: OSError) -> None:
         """End the recording after an error; the records before it stay readable."""
-        log.error("%s: %s: this recording ends here; the robot continues.",
-                  self.path, error.strerror)  # fmt: skip
+        log.error("%s: writing failed (%s). This recording ends here; the robot continues. Check "
+                  "the disk before the next recording.", self.path, error.strerror)  # fmt: skip
         self.abandon()
 
     def abandon(self) -> None:

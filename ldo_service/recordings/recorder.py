@@ -111,7 +111,7 @@ class Recorder(Journal):
         try:
             parts = None if state is None else {k: encode_state(v) for k, v in state.items()}
         except (NotImplementedError, TypeError) as error:
-            log.error("%s: a state cannot be recorded: %s. A replay stops here.",
+            log.error("%s: the actor's state cannot be recorded: %s. A replay stops here.",
                       self._file.path, error)  # fmt: skip
             self._submit(0, self._file.add_entry, Gap(step=self._steps, reason="state"))
             return
@@ -188,9 +188,9 @@ class Recorder(Journal):
     def _lose(self, delivery: Delivery) -> None:
         if self._lost == 0:
             log.error(
-                "%s: the disk is too slow, %.0f MB are queued: %s #%d and later messages are not "
-                "recorded. A replay stops here; the robot continues. Record to a faster disk or "
-                "lower the frame rate.",
+                "%s: the disk is too slow: %.0f MB wait to be written. The message of %s with "
+                "number %d and later messages are not recorded. A replay stops here; the robot "
+                "continues. Record to a faster disk, or lower the frame rate.",
                 *(self._file.path, self._waiting / 1e6),
                 *(delivery.port.topic.name, delivery.header.seq),
             )
@@ -216,7 +216,8 @@ class Recorder(Journal):
         try:
             job(*args)
         except Exception:
-            log.exception("%s: this recording ends here; the robot continues.", self._file.path)
+            log.exception("%s: writing failed. This recording ends here; the robot continues.",
+                          self._file.path)  # fmt: skip
             self._file.abandon()
         finally:
             with self._lock:

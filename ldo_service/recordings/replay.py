@@ -189,7 +189,10 @@ class ReplaySession:
         why = "a state could not be recorded"
         if gap.reason == "slow":
             why = f"the disk was too slow and {gap.lost} messages were not recorded"
-        self._note(f"has a gap before step {gap.step}: {why}; the replay skips to the next start.")
+        self._note(
+            f"has a gap before step {gap.step}: {why}. The replay continues at the next start of "
+            "the actor."
+        )
 
     def _note(self, text: str) -> None:
         self._replayed.notes.append(f"{self._file.path.name} {text}")
@@ -256,7 +259,7 @@ class ReplaySession:
         except Exception:
             self._replayed.failures_repeated += 1
         else:
-            self._note(f"step {step.step} failed when recorded ({step.error}), but succeeds now.")
+            self._note(f"has step {step.step}, which failed ({step.error}) but succeeds now.")
 
     def _compare(self, step: StepRecord, produced: list[Produced]) -> None:
         self._replayed.made.update(made.topic.name for made in produced)

@@ -83,13 +83,14 @@ def export_map(
         )
     if voxel_m is not None and format not in ("mesh", "occupancy"):
         raise ConfigError(
-            f"a voxel size (--voxel) applies to mesh and occupancy, not to {format}. Remove it."
+            f"a voxel size (--voxel) applies to the formats mesh and occupancy, not to {format}. "
+            "Remove it."
         )
     written = [out.with_suffix(Path(name).suffix) for name in EXPORTED[format][1:]]
     if out in written:
         raise ConfigError(
-            f"{out} would be replaced by the floor plan beside the grid. Choose a file named "
-            f"{out.with_suffix(Path(EXPORTED[format][0]).suffix).name}."
+            f"the floor plan, which is written next to the grid, would replace {out}. Choose a "
+            f"file named {out.with_suffix(Path(EXPORTED[format][0]).suffix).name}."
         )
     require_writable((run, source.folder), [out, *written], overwrite)
     try:

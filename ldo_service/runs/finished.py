@@ -178,11 +178,13 @@ def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
     try:
         yield path, json.loads(path.read_text())
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+        raise DataError(
+            f"{path} cannot be read: {error.strerror}. Give the folder of a finished `ldo run`."
+        ) from error
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(
-            f"{path} is not what `ldo run` writes: {error!r}. Give "
-            "the folder of a finished `ldo run`."
+            f"{path} does not have the format that `ldo run` writes ({error!r}). Give the folder "
+            "of a finished `ldo run`."
         ) from error
 
 
@@ -194,8 +196,9 @@ def _viewpoint(path: Path, keyframe: dict[str, Any]) -> Viewpoint:
         )
     T_map_camera = np.array(keyframe["T_map_camera"], float)
     if T_map_camera.shape != (4, 4) or not np.all(np.isfinite(T_map_camera)):
-        raise ValueError(
-            f"T_map_camera of keyframe {keyframe['keyframe']} is not a finite 4x4 matrix"
+        raise DataError(
+            f"{path}: T_map_camera of keyframe {keyframe['keyframe']} must be a 4x4 matrix of "
+            "finite numbers. Repeat the run."
         )
     return Viewpoint(Camera(*(keyframe["camera"][name] for name in CAMERA)), T_map_camera)
 
@@ -206,7 +209,8 @@ def _frames(path: Path) -> tuple[RunFrame, ...]:
             return tuple(_frame(row) for row in csv.DictReader(file))
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise DataError(
-            f"{path} cannot be read: {error!r}. Give the folder of a finished `ldo run`."
+            f"{path} cannot be read as the list of frames of a run ({error!r}). Give the folder of "
+            "a finished `ldo run`."
         ) from error
 
 

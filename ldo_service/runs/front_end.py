@@ -91,9 +91,9 @@ class FrontEndRecord:
         self._file.add(topic.name, topic.message, body, tick, message.stamp_ns)
         if self._file.is_open and self._file.is_over_limit():
             log.error(
-                "front end: %s exceeds recording.max_gb or leaves less than recording.min_free_gb. "
-                "It is deleted, and the run continues without it. Raise recording.max_gb or free "
-                "disk space.",
+                "front end: %s exceeds recording.max_gb, or less than recording.min_free_gb of the "
+                "disk is free. The file is deleted, and the run continues without it. Raise "
+                "recording.max_gb or free some disk space.",
                 self._file.path,
             )
             self._drop()
@@ -206,7 +206,8 @@ def _require_settings(path: Path, about: Mapping[str, str], config: Config) -> N
         was = dict(json.loads(about.get("settings", "")))
     except (ValueError, TypeError) as error:
         raise DataError(
-            f"{path} lacks the settings of the run that recorded it ({error}). Repeat that run."
+            f"{path} does not contain the settings of the run that recorded it ({error}). Repeat "
+            "that run."
         ) from error
     configured = json.loads(json.dumps(front_end_settings(config)))
     if was.keys() != configured.keys():

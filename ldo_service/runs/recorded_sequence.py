@@ -48,7 +48,8 @@ class RecordedMessage:
             return decode(self.file.body(self.place), kind)
         except msgspec.DecodeError as error:
             raise FrameError(
-                f"{self.file.path}, frame {index} cannot be decoded: {error}."
+                f"frame {index} of {self.file.path} cannot be decoded: {error}. Copy the recording "
+                "again."
             ) from error
 
 

@@ -135,14 +135,17 @@ def read_loops(folder: Path) -> FoundLoops | None:
     try:
         value = json.loads(path.read_text())
         return FoundLoops(
-            tuple(map(_compared, value["candidates"])), tuple(map(_closed, value["closures"]))
+            tuple(map(_compared, value["candidates"])),
+            tuple(_closed(path, row) for row in value["closures"]),
         )
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+        raise DataError(
+            f"{path} cannot be read: {error.strerror}. Give the folder of a finished `ldo run`."
+        ) from error
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(
-            f"{path} is not what `ldo run` writes: {error!r}. Give the folder of a finished "
-            "`ldo run`."
+            f"{path} does not have the format that `ldo run` writes ({error!r}). Give the folder "
+            "of a finished `ldo run`."
         ) from error
 
 
@@ -151,10 +154,13 @@ def _compared(row: dict[str, Any]) -> ComparedPair:
     return ComparedPair(*subgraphs, is_closure=not row["rejected_reason"], ms=row["ms"])
 
 
-def _closed(row: dict[str, Any]) -> LoopClosed:
+def _closed(path: Path, row: dict[str, Any]) -> LoopClosed:
     T = np.array(row["T_reference_keyframe"], float)
     if T.shape != (4, 4) or not np.all(np.isfinite(T)):
-        raise ValueError(f"T_reference_keyframe of {row['keyframe']} is not a finite 4x4 matrix")
+        raise DataError(
+            f"{path}: T_reference_keyframe of keyframe {row['keyframe']} must be a 4x4 matrix of "
+            "finite numbers. Repeat the run."
+        )
     return LoopClosed(int(row["keyframe"]), int(row["reference"]), T)
 
 
@@ -191,15 +197,17 @@ def read_objects(folder: Path) -> MapObjects:
     if not path.is_file():
         refuse_state(folder)
         raise DataError(
-            f"{folder} has no {OBJECTS}: the run kept no objects, because it had no detector. Set "
-            "detector.model, see `ldo models --help`, and run `ldo run` again."
+            f"{folder} has no {OBJECTS}, because the run had no detector. Repeat `ldo run` with "
+            "detector.model; `ldo models --help` shows how to choose one."
         )
     try:
         return msgspec.json.decode(path.read_bytes(), type=MapObjects)
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+        raise DataError(
+            f"{path} cannot be read: {error.strerror}. Give the folder of a finished `ldo run`."
+        ) from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DataError(
-            f"{path} is not what `ldo run` writes: {error}. Give the folder of a finished "
-            "`ldo run`."
+            f"{path} does not have the format that `ldo run` writes ({error}). Give the folder of "
+            "a finished `ldo run`."
         ) from error

@@ -136,7 +136,7 @@ def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedAct
     unknown = [name for name in only if name not in found]
     if unknown:
         raise ConfigError(
-            f"{folder} has no recording of actor {unknown[0]!r}. It has: {', '.join(found)}."
+            f"{folder} has no recording of actor {unknown[0]!r}. Choose from: {', '.join(found)}."
         )
     actors = [
         RecordedActor(name, tuple(JournalFile(path) for path in paths))

@@ -75,6 +75,7 @@ def simulate_graph(
     made = digests.made()
     if not any(entry.messages for entry in made.values()):
         raise DataError(
-            f"{sequence.name}: none of the selected frames could be used. Check the data."
+            f"none of the selected frames of {sequence.name} could be used. The errors of the "
+            "first frames are printed above."
         )
     return made

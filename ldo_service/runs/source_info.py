@@ -114,7 +114,7 @@ def _odometry_poses(sequence: Sequence) -> int:
     try:
         odometry = sequence.odometry()
     except DataError as error:
-        log.warning("%s", error)
+        log.warning("the recorded odometry of %s cannot be used: %s", sequence.name, error)
         return 0
     return 0 if odometry is None else len(odometry)
 

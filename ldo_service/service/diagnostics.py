@@ -53,7 +53,8 @@ def diagnose(seen: ActorStatus, heartbeat_s: float = 0.5) -> Iterator[Problem]:
     if not seen.has_token and seen.health is None:
         yield Problem(
             "is not running",
-            "the service restarts it within its restart budget; see the log of `ldo serve`",
+            "the service restarts it as often as supervision.max_restarts allows; the log of `ldo "
+            "serve` has the cause",
         )
     elif seen.health is None:
         yield _silent(f"for {seen.listened_s:.1f} s")
@@ -94,7 +95,7 @@ def _of_steps(health: Health) -> Iterator[Problem]:
     elif waiting and not health.current_step_s and health.step_age_s > IDLE_S and not health.paused:
         yield Problem(
             f"took none of {waiting} queued messages for {health.step_age_s:.0f} s",
-            "it waits for credit of a consumer; check the actors that consume its outputs",
+            "it waits until a consumer takes its outputs; check the actors that consume them",
         )
 
 
@@ -193,15 +194,16 @@ def notes(seen: ActorStatus) -> Iterator[str]:
         )
     if dropped := health.metrics.get("label_copies_dropped"):
         yield (
-            f"kept labels that depend on the speed of the labeller {dropped:.0f} times, because "
-            "too many keyframes waited for label results; let the robot stand still now and then"
+            "has labels that depend on the speed of the labeller, because too many keyframes "
+            f"waited for label results ({dropped:.0f} times); let the robot stand still now and "
+            "then"
         )
     for output in health.outputs:
         for consumer, behind in output.behind.items():
             if behind > BEHIND:
                 yield (
-                    f"keeps {behind} messages of {output.topic} for {consumer}, which is slower; "
-                    "poses and the map do not wait for it"
+                    f"stores {behind} messages of {output.topic} that the slower {consumer} has "
+                    "not handled yet; poses and the map do not wait for it"
                 )
     is_slow = health.current_step_s > SLOW_STEP_S and not _waits_for_server(health)
     if is_slow and _is_backend(health.actor):

@@ -46,7 +46,11 @@ OF_ACTOR: dict[Row, Callable[[Health], float]] = {
     (CounterMetricFamily, "restarts", "Restarts of the actor within its process."): lambda h: (
         h.restarts
     ),
-    (CounterMetricFamily, "dead_letters", "Messages that failed twice."): lambda h: h.dead_lettered,
+    (
+        CounterMetricFamily,
+        "dead_letters",
+        "Messages that the actor discarded because their handling failed twice.",
+    ): lambda h: h.dead_lettered,
     (GaugeMetricFamily, "step_age_seconds", "Time since the last step ended."): lambda h: (
         h.step_age_s
     ),
@@ -59,11 +63,21 @@ OF_ACTOR: dict[Row, Callable[[Health], float]] = {
     (GaugeMetricFamily, "paused", "1 while the actor is paused."): lambda h: h.paused,
 }
 OF_INPUT: dict[Row, Callable[[InputCount], float]] = {
-    (CounterMetricFamily, "input_messages", "Handled messages of the topic."): lambda i: (
-        i.delivered
-    ),
-    (CounterMetricFamily, "input_dropped", "Messages dropped for newer ones."): lambda i: i.dropped,
-    (CounterMetricFamily, "input_rejected", "Invalid or too big messages."): lambda i: i.rejected,
+    (
+        CounterMetricFamily,
+        "input_messages",
+        "Messages of the topic that the actor has handled.",
+    ): lambda i: i.delivered,
+    (
+        CounterMetricFamily,
+        "input_dropped",
+        "Messages dropped because newer messages replaced them.",
+    ): lambda i: i.dropped,
+    (
+        CounterMetricFamily,
+        "input_rejected",
+        "Messages rejected as invalid or too large.",
+    ): lambda i: i.rejected,
     (CounterMetricFamily, "input_dropped_paused", "Messages dropped while paused."): lambda i: (
         i.dropped_paused
     ),
@@ -73,13 +87,21 @@ OF_INPUT: dict[Row, Callable[[InputCount], float]] = {
 }
 OF_OUTPUT: dict[Row, Callable[[OutputCount], float]] = {
     (CounterMetricFamily, "output_messages", "Sent messages of the topic."): lambda o: o.sent,
-    (CounterMetricFamily, "output_backpressure_waits", "Waits for credit."): lambda o: (
-        o.backpressure_waits
-    ),
-    (CounterMetricFamily, "output_evicted", "Evicted consumers."): lambda o: o.evicted_consumers,
-    (CounterMetricFamily, "output_retransmitted", "Retransmitted messages."): lambda o: (
-        o.retransmitted
-    ),
+    (
+        CounterMetricFamily,
+        "output_backpressure_waits",
+        "Times that the actor waited until a slow consumer took a message.",
+    ): lambda o: o.backpressure_waits,
+    (
+        CounterMetricFamily,
+        "output_evicted",
+        "Consumers evicted because they took no message for too long.",
+    ): lambda o: o.evicted_consumers,
+    (
+        CounterMetricFamily,
+        "output_retransmitted",
+        "Messages sent again because a consumer had not received them.",
+    ): lambda o: o.retransmitted,
     (
         GaugeMetricFamily,
         "output_backlog_messages",
@@ -210,7 +232,9 @@ def _processes(begun_anew: dict[str, int]) -> Metric:
 
 def _step_seconds(actors: list[Health]) -> Metric:
     metric = GaugeMetricFamily(
-        "ldo_step_seconds", "Quantiles of the last 200 step times.", labels=["actor", "quantile"]
+        "ldo_step_seconds",
+        "Quantiles of the handling times of the last 200 messages.",
+        labels=["actor", "quantile"],
     )
     for health in actors:
         metric.add_metric([health.actor, "0.5"], health.step_ms_p50 * 1e-3)
@@ -220,7 +244,9 @@ def _step_seconds(actors: list[Health]) -> Metric:
 
 def _facts(actors: list[Health]) -> Metric:
     metric = GaugeMetricFamily(
-        "ldo_actor_metric", "Metric `metric` that the actor reports.", labels=["actor", "metric"]
+        "ldo_actor_metric",
+        "Value of the actor's own metric that the label `metric` names.",
+        labels=["actor", "metric"],
     )
     for health in actors:
         for name, value in health.metrics.items():

@@ -194,13 +194,13 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     def __post_init__(self) -> None:
         if not self.sequences or not self.variants or not self.figures or not self.seeds:
             raise ConfigError(
-                "sequences, variants, figures and seeds of a suite each need at least one entry."
+                "sequences, variants, figures and seeds must each have at least one entry."
             )
         for name in (*self.sequences, *self.variants):
             if not NAME.fullmatch(name):
                 raise ConfigError(
-                    f"{name!r} must be usable as the name of a folder: use letters, digits, spaces "
-                    "and the characters ._+-"
+                    f"the name {name!r} of a sequence or variant must be usable as the name of a "
+                    "folder. Use letters, digits, spaces and any of . _ + -"
                 )
         if self.front_end not in (None, next(iter(self.variants))):
             raise ConfigError(
@@ -210,7 +210,7 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         unknown = sorted(set(self.figures) - FIGURES.keys())
         if unknown:
             raise ConfigError(
-                f"figures has the unknown metric {', '.join(unknown)}. Use some of: "
+                f"figures has the unknown metric {', '.join(unknown)}. Known metrics: "
                 f"{', '.join(FIGURES)}."
             )
         of_front_end = sorted(OF_FRONT_END.intersection(self.figures))
@@ -270,9 +270,11 @@ def load_suite(name: str) -> Suite:
     path = HERE / f"{name}.yaml" if name in known_suites() else Path(name).expanduser()
     if not path.is_file():
         raise ConfigError(
-            f"there is no suite {name}: neither a file nor one of {', '.join(known_suites())}."
+            f"there is no suite {name}. Give a YAML file or one of {', '.join(known_suites())}."
         )
     try:
         return msgspec.convert(load_yaml(path.read_text()), Suite)
-    except (OSError, ValueError, yaml.YAMLError) as error:
+    except ConfigError as error:
         raise ConfigError(f"{path} is not a suite: {error}") from error
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path} is not a suite: {error}. Correct the file.") from error

@@ -72,8 +72,9 @@ class SyntheticConfig:
     def __post_init__(self) -> None:
         if self.frames < 1 or self.width_px < 8 or self.height_px < 8:
             raise ConfigError(
-                f"synthetic sequence of {self.frames} frames of {self.width_px}x{self.height_px} "
-                "pixels must have at least 1 frame of 8x8 pixels."
+                f"the synthetic sequence has {self.frames} frames of "
+                f"{self.width_px}x{self.height_px} pixels, must have at least 1 frame of 8x8 "
+                "pixels."
             )
         if self.path not in PATHS:
             raise ConfigError(

@@ -387,7 +387,7 @@ def load_keyframe_database(folder: Path) -> KeyframeDatabase:
             tuple(KeyframeRecord.unpack(record) for record in kept["places"])
         )
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+        raise DataError(f"{path} cannot be read: {error.strerror}. Repeat the run.") from error
     except (msgspec.DecodeError, ValueError, KeyError, TypeError) as error:
         raise DataError(
             f"{path} is not a valid keyframe database ({error!r}). Repeat the run (`ldo run`)."

@@ -68,11 +68,11 @@ class PriorConfig:
 class PriorCheck(StrEnum):
     """Outcome of adding a pose to the buffer; each value is the predicate of a log line."""
 
-    FOLLOWS = "follows the last one"
-    LATE = "has a stamp that is not after the last one's, and is dropped"
-    BROKEN = "holds NaN or infinity, and is dropped"
-    RESTARTED = "has a much earlier stamp: its source has restarted"
-    JUMPED = "is too far from the last one for the time between: its source has jumped"
+    FOLLOWS = "follows the previous pose"
+    LATE = "is not later than the previous pose, and is dropped"
+    BROKEN = "contains NaN or infinity, and is dropped"
+    RESTARTED = "is much earlier than the previous pose, so its source has restarted"
+    JUMPED = "is too far from the previous pose for the time between them, so its source has jumped"
 
 
 @dataclass(frozen=True, slots=True)

@@ -264,8 +264,8 @@ class ZenohPublisher:
         try:
             self._publisher.put(body, attachment=header)
         except zenoh.ZError as error:
-            log.warning("%s: put failed: %s; this message is lost.",
-                        self._publisher.key_expr, error)  # fmt: skip
+            log.warning("%s: publishing a message failed (%s), so this message is lost. Check the "
+                        "connection to the router.", self._publisher.key_expr, error)  # fmt: skip
 
     def close(self) -> None:
         """Accept no more messages; send those accepted so far."""

@@ -111,7 +111,7 @@ class RunFolder:
         try:
             value = json.loads(path.read_text())
         except (OSError, ValueError) as error:
-            raise DataError(f"{path} cannot be read: {error}.") from error
+            raise DataError(f"{path} cannot be read: {error}. Repeat the run.") from error
         if not isinstance(value, dict):
             raise DataError(f"{path} must be a JSON object, as `ldo run` writes. Repeat the run.")
         self._summary = value
@@ -121,7 +121,9 @@ class RunFolder:
         try:
             self._frames = max(0, path.read_bytes().count(b"\n") - 1)
         except OSError as error:
-            raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+            raise DataError(
+                f"{path} cannot be read: {error.strerror}. Check its permissions."
+            ) from error
 
     def read_online(self, path: Path) -> None:
         self.scene.online = self._positions(path)

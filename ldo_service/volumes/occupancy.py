@@ -103,7 +103,10 @@ def occupancy(
     config = config or OccupancyConfig()
     occupied = occupied_voxels(rows, config)
     if not len(occupied):
-        raise DataError("no voxel is occupied: the map contains no opaque surface.")
+        raise DataError(
+            "no voxel is occupied, because the map contains no opaque surface. Check the map in "
+            "`ldo view`."
+        )
     stood = [np.floor(v.T_map_camera[:3, 3] / config.voxel_m).astype(int) for v in viewpoints]
     lowest, states = _grid(np.concatenate([occupied, np.reshape(stood, (-1, 3))]), config)
     for done, viewpoint in enumerate(viewpoints, 1):
@@ -182,7 +185,7 @@ def _grid(voxels: np.ndarray, config: OccupancyConfig) -> tuple[np.ndarray, np.n
         extent = " x ".join(f"{side * config.voxel_m:.0f}" for side in size)
         raise ConfigError(
             f"a grid of {extent} m has more than {config.max_voxels:,} voxels of "
-            f"{config.voxel_m} m. Choose larger voxels."
+            f"{config.voxel_m} m. Choose larger voxels (--voxel)."
         )
     return lowest, np.full(size, UNKNOWN, np.uint8)
 
@@ -287,7 +290,7 @@ def floor_plan(
         ConfigError: `up` is not an axis, or the range contains no voxel.
     """
     if up not in UP:
-        raise ConfigError(f"up={up!r} is not one of {', '.join(UP)}.")
+        raise ConfigError(f"up={up!r} must be one of {', '.join(UP)}.")
     x, y, vertical, sign = UP[up]
     states = grid.states.transpose(x, y, vertical)
     centers_m = grid.origin_m[vertical] + grid.voxel_m * (0.5 + np.arange(states.shape[2]))

@@ -447,7 +447,7 @@ def test_unusable_prior_poses_are_counted_and_logged_once_per_kind(
     assert (metrics["prior_rejected"], metrics["prior_restarts"]) == (5, 2)
     warnings = [record.getMessage() for record in caplog.records]
     assert len(warnings) == 2
-    assert f"stamp {prior[0].stamp_ns} has a stamp that is not after the last one's" in warnings[0]
+    assert f"stamp {prior[0].stamp_ns} ns is not later than the previous pose" in warnings[0]
     assert "has jumped" in warnings[1]
 
 

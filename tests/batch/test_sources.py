@@ -23,7 +23,7 @@ def night(room_folder: Path, tmp_path: Path) -> Path:
 def test_folder_and_pattern_stand_for_the_recordings_in_them(night: Path, word: str) -> None:
     notes: list[str] = []
     assert list(find_recordings([f"{night}{word}"], notes.append)) == [f"{night}/a", f"{night}/b"]
-    assert any("1 of 3 entries are no recordings" in note for note in notes) == (word != "/[ab]")
+    assert any("1 of 3 entries are not recordings" in note for note in notes) == (word != "/[ab]")
 
 
 def test_recording_is_not_expanded_and_runs_once(night: Path) -> None:
@@ -55,7 +55,7 @@ def test_wrong_word_is_an_error_of_its_own_unless_all_are_wrong(
     wrong = {
         str(tmp_path / "absent"): "does not exist",
         f"{tmp_path}/absent/*": "no recording matches",
-        str(tmp_path / "empty"): "is no recording and contains none",
+        str(tmp_path / "empty"): "is not a recording and contains none",
         "s3x://bucket": "the protocol s3x:// is unknown",
     }
     found = find_recordings([*wrong, str(night / "a")], pytest.fail)

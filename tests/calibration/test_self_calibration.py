@@ -242,7 +242,7 @@ def test_each_frame_has_the_correction_of_the_last_keyframe_before_it(tmp_path: 
 
 def test_damaged_keyframes_are_an_error_of_the_file(tmp_path: Path) -> None:
     (tmp_path / "keyframes.json").write_text('[{"stamp_ns": 1, "camera_correction": 3}]')
-    with pytest.raises(DataError, match=r"keyframes\.json is not what"):
+    with pytest.raises(DataError, match=r"keyframes\.json does not have the format"):
         read_corrections(tmp_path)
 
 

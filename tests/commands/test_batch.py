@@ -62,10 +62,10 @@ def test_batch_prints_a_table_and_writes_a_report_with_pictures(
         ("synthetic:room --out /proc/x", 3, "/proc/x/batch.json cannot be written"),
         ("synthetic:room --out s3x://x", 2, "the protocol s3x:// is unknown. Did you mean s3?"),
         ("synthetic:room --out o --workers 0", 2, "--workers 0 must be positive"),
-        ("synthetic:room --out o --gpus 1", 2, "--gpus 1 applies to --cluster"),
+        ("synthetic:room --out o --gpus 1", 2, "--gpus 1 applies only with --cluster"),
         ("synthetic:room --out o --stride 5 --hold-out-every 5", 2, "have a common factor"),
         ("synthetic:room --out o --set detector.model=absent", 2, "detector.model=absent"),
-        ("--sources-from absent --out o", 2, "the list absent cannot be read"),
+        ("--sources-from absent --out o", 2, "the list of sources absent cannot be read"),
     ],
 )
 def test_wrong_argument_is_one_paragraph(

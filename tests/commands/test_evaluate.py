@@ -193,7 +193,7 @@ def test_a_truncated_map_is_one_clear_error(capsys, run: Path, room_folder: Path
 def test_source_other_than_that_of_the_run_is_refused(capsys, run: Path) -> None:
     code, _, err = ldo(capsys, "eval", run, "synthetic:tour")
     assert code == 3
-    assert "the run was made from" in last_line(err)
+    assert "Give the SOURCE of the run" in last_line(err)
 
 
 def test_invalid_lpips_network_is_refused_before_rendering(

@@ -130,7 +130,7 @@ def test_existing_floor_plan_blocks_the_export_of_occupancy(run: Path) -> None:
 
 def test_voxel_size_for_a_trajectory_is_refused(run: Path) -> None:
     code, message = ldo_export(run, "--format", "tum", "--voxel", "0.1")
-    assert (code, "(--voxel) applies to mesh and occupancy" in message) == (2, True)
+    assert (code, "(--voxel) applies to the formats mesh and occupancy" in message) == (2, True)
 
 
 @pytest.mark.parametrize("name", ["map.ply", "summary.json", "refined/map.ply"])

@@ -124,10 +124,13 @@ def test_query_without_a_match_names_the_known_labels(
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        (None, "kept no objects"),
-        (b"{", "is not what `ldo run` writes"),
-        (b"\xff\xfe", "is not what `ldo run` writes"),
-        (json.dumps({"type": "MapObjects"}).encode(), "is not what `ldo run` writes"),
+        (None, "had no detector"),
+        (b"{", "does not have the format that `ldo run` writes"),
+        (b"\xff\xfe", "does not have the format that `ldo run` writes"),
+        (
+            json.dumps({"type": "MapObjects"}).encode(),
+            "does not have the format that `ldo run` writes",
+        ),
         (
             msgspec.json.encode(msgspec.structs.replace(OBJECTS_MESSAGE, objects=())),
             "has no objects yet",

@@ -134,7 +134,9 @@ def test_invalid_setting_is_refused_with_the_reason(setting: str, expected: str)
 def test_transform_that_is_not_rigid_is_refused() -> None:
     numbers = [2.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
     config = load_config(settings=[f"dataset.T_color_depth={numbers}"])
-    with pytest.raises(ConfigError, match=r"^dataset\.T_color_depth=\[2\.0, .* must be rigid"):
+    with pytest.raises(
+        ConfigError, match=r"^dataset\.T_color_depth=\[2\.0, .* must be a rigid transform"
+    ):
         config.dataset.options()
 
 

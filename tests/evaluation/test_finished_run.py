@@ -35,7 +35,7 @@ def test_another_source_is_rejected(finished_run: Path, room: Sequence, room_fol
     beyond = replace(run.frames[3], index=16)
     sequence = open_sequence(str(room_folder))
     for frame in (later, beyond):
-        with pytest.raises(DataError, match="the SOURCE that the run was made from"):
+        with pytest.raises(DataError, match="Give the SOURCE of the run"):
             replace(run, frames=(*run.frames[:3], frame)).require_source(sequence)
     assert len(room) > 16
 

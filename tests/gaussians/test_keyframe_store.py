@@ -83,7 +83,7 @@ def test_images_that_mismatch_their_camera_raise() -> None:
 
 @pytest.mark.parametrize("body", [b"", b"\x93\x01\x02\x03", b"\xff" * 100])
 def test_invalid_bytes_raise(body: bytes) -> None:
-    with pytest.raises(DataError, match="no images of a keyframe"):
+    with pytest.raises(DataError, match="cannot be decoded as the images of a keyframe"):
         unpack(body)
 
 

@@ -88,7 +88,7 @@ def test_chunk_of_an_earlier_version_raises_with_the_reason() -> None:
     "body", [b"", b"no zstd", pack(Chunk(0, np.arange(3), rows_of(1), labels_of(1)))]
 )
 def test_invalid_bytes_raise(body: bytes) -> None:
-    with pytest.raises(DataError, match="not a chunk of Gaussians"):
+    with pytest.raises(DataError, match="cannot be decoded as Gaussians"):
         unpack(body)
 
 

@@ -132,10 +132,10 @@ def test_refined_map_is_preferred_once_it_exists(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"T_map_camera": np.eye(3).tolist()}, "not a finite 4x4"),
-        ({"T_map_camera": np.full((4, 4), np.nan).tolist()}, "not a finite 4x4"),
+        ({"T_map_camera": np.eye(3).tolist()}, "must be a 4x4 matrix of finite"),
+        ({"T_map_camera": np.full((4, 4), np.nan).tolist()}, "must be a 4x4 matrix of finite"),
         ({"camera": {"width": 320}}, "height"),
-        ({"camera": [1, 2]}, "not what `ldo run` writes"),
+        ({"camera": [1, 2]}, "not have the format that `ldo run` writes"),
     ],
 )
 def test_invalid_keyframe_is_refused_with_the_reason(

@@ -46,7 +46,7 @@ def test_frames_yield_poses_and_a_map(tmp_path: Path) -> None:
             silent.discard(next(health_messages)[1].actor)
         with pytest.raises(ConfigError, match="Did you mean pose/tracked"):
             service.client.latest("pose/traked")
-        with pytest.raises(ConfigError, match="map/delta has no last value"):
+        with pytest.raises(ConfigError, match="map/delta keeps no last value"):
             service.client.latest("map/delta")
         parts = service.client.latest(MAP_SNAPSHOT, timeout_s=60)
         assert all(isinstance(part, MapSnapshot) for part in parts)

@@ -145,7 +145,7 @@ def test_score_that_was_not_evaluated_is_none(name: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"figures": ["beauty"]}, "unknown metric beauty. Use some of: ate_cm"),
+        ({"figures": ["beauty"]}, "unknown metric beauty. Known metrics: ate_cm"),
         ({"figures": []}, "at least one"),
         ({"variants": {"../up": []}}, "must be usable as the name of a folder"),
         ({"sequences": {"": "x"}}, "must be usable as the name of a folder"),

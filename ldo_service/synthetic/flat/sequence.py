@@ -38,11 +38,11 @@ class FlatConfig:
     def __post_init__(self) -> None:
         if self.width_px < 16 or self.height_px < 16:
             raise ConfigError(
-                f"synthetic flat of {self.width_px}x{self.height_px} pixels must have at least "
-                "16x16 pixels."
+                f"images of synthetic:flat have {self.width_px}x{self.height_px} pixels, must have "
+                "at least 16x16 pixels."
             )
         if self.seed < 0:
-            raise ConfigError(f"synthetic flat: seed={self.seed} must be at least 0.")
+            raise ConfigError(f"synthetic:flat: seed={self.seed} must be at least 0.")
 
 
 NAMED = {"flat": FlatConfig(), "flat-exact": FlatConfig(noise=False)}
@@ -72,7 +72,7 @@ class FlatSequence(Sequence):
             DataError: If the name is unknown.
         """
         if name not in NAMED:
-            raise DataError(f"unknown flat synthetic:{name}; known are {', '.join(NAMED)}.")
+            raise DataError(f"unknown sequence synthetic:{name}; known are {', '.join(NAMED)}.")
         config = replace(NAMED[name], **changes)
         seed = f"@{config.seed}" if config.seed else ""
         return FlatSequence(config, f"synthetic:{name}{seed}")
