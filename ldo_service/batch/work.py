@@ -85,10 +85,14 @@ def process(job: BatchJob) -> Outcome:
         return failed(job, "the memory of the host is exhausted. Use fewer --workers.")
     except OSError as error:
         return failed(
-            job, f"{reason_of(error)}. Free some disk space, or choose another --staging."
+            job,
+            f"a file cannot be read or written: {reason_of(error)}. Free some disk space, or "
+            "choose another folder with --staging.",
         )
     except Exception as error:
-        unexpected = failed(job, f"unexpected {type(error).__name__}: {error}")
+        unexpected = failed(
+            job, f"unexpected {type(error).__name__}: {error}. Please report it with the traceback."
+        )
         return msgspec.structs.replace(unexpected, notes=(traceback.format_exc(),))
 
 

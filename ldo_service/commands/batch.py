@@ -47,7 +47,7 @@ def batch(
         str, argument(metavar="WHERE", help="folder or bucket for the results: DIR, s3://..., ...")
     ],
     sources_from: Annotated[
-        Path | None, argument(metavar="FILE", help="file with one more source on each line")
+        Path | None, argument(metavar="FILE", help="text file with more SOURCES, one per line")
     ] = None,
     config: ConfigFile = None,
     set: Settings = (),
@@ -73,7 +73,11 @@ def batch(
         ),
     ] = None,
     threads: Annotated[
-        int, argument(metavar="T", help="threads, and CPUs of the cluster, for each recording")
+        int,
+        argument(
+            metavar="T",
+            help="threads for each recording, and with --cluster the CPUs reserved for it",
+        ),
     ] = 1,
     memory_gb: Annotated[
         float, argument(metavar="GB", help="memory that is reserved for each recording")
@@ -91,12 +95,15 @@ def batch(
         Path | None,
         argument(
             metavar="DIR",
-            help="folder of each machine for unfinished results and copies of recordings; default: "
-            "WHERE/.staging, or the temporary folder of the system with a bucket or --cluster",
+            help="folder on each machine for unfinished results and copies of recordings; default: "
+            "WHERE/.staging, but with a bucket or --cluster the temporary folder of the system",
         ),
     ] = None,
     max_staged_gb: Annotated[
-        float, argument(metavar="GB", help="limit of the copies of recordings on each machine")
+        float,
+        argument(
+            metavar="GB", help="maximum size of all copies of recordings on each machine together"
+        ),
     ] = STAGED_GB,
 ) -> None:
     """Run, evaluate and export many recordings, on this machine or on a Ray cluster.

@@ -91,7 +91,7 @@ class RosOptions:
         bool, argument(help="images are rectified: use P of the CameraInfo, not K and D")
     ] = False
     registered: Annotated[
-        bool, argument(help="depth is registered, although its frame_id is not that of color")
+        bool, argument(help="depth is registered to color, although the two frame_ids differ")
     ] = False
 
     def topics(self) -> RosTopics:

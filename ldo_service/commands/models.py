@@ -46,8 +46,8 @@ class AddModel:
         str,
         argument(
             metavar="FILE",
-            help="classes of the network, one per line; default: those that the network file "
-            "states, or the 80 of COCO",
+            help="text file with the class names of the network, one per line; default: the names "
+            "in the network file, or the 80 names of COCO",
         ),
     ] = ""
     license: Annotated[
@@ -63,7 +63,8 @@ class AddModel:
         Path | None,
         argument(
             metavar="FILE",
-            help="names, embeddings and optionally logit_scale, in .npz or .safetensors",
+            help="file in .npz or .safetensors with names, their embeddings and optionally "
+            "logit_scale",
         ),
     ] = None
 

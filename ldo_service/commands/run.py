@@ -72,7 +72,8 @@ def run(
         argument(
             metavar="FILE",
             help="poses of the robot's base from another odometry, in the TUM format, as initial "
-            "guess for the tracker; tracker.T_base_camera must be the camera pose on the base",
+            "guess for the tracker; tracker.T_base_camera must be the camera pose relative to the "
+            "base",
         ),
     ] = None,
     keep_front_end: Annotated[

@@ -258,7 +258,10 @@ def _stored(
     stamp_ns = seconds * 10**9 + nanoseconds
     stamp_ns = stamp_ns if stamp_ns > 0 else time_ns
     if not 0 <= stamp_ns <= LAST_STAMP_NS:
-        raise ValueError(f"the time {stamp_ns} ns of a message of {connection.topic} is invalid")
+        raise ValueError(
+            f"a message of {connection.topic} has the time {stamp_ns} ns, must be 0 to "
+            f"{LAST_STAMP_NS} ns"
+        )
     return StoredMessage(stamp_ns, connection, place)
 
 

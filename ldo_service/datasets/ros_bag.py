@@ -290,7 +290,7 @@ def _camera(bag: BagFile, image: Topic) -> Camera:
         model = camera_model(bag.read(found[0]), is_rectified)
         return Camera.of(structs.asdict(model))
     except (FrameError, DataError) as error:
-        raise DataError(f"{bag.path}, {topic.name}: {error}") from error
+        raise DataError(f"{topic.name} in {bag.path} cannot be used: {error}") from error
 
 
 def _rig(

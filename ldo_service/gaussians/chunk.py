@@ -82,8 +82,8 @@ def unpack(data: bytes | memoryview) -> Chunk:
         planes = np.frombuffer(body, np.uint8, offset=_HEADER.size + steps.nbytes)
         if planes.size == 4 * ROW * count > 0:
             raise DataError(
-                f"the file holds {count} Gaussians without labels. An earlier version wrote it, "
-                "and this version cannot read it"
+                f"the file contains {count} Gaussians without labels, because an earlier version "
+                "wrote it; start with another state folder"
             )
         planes = planes.reshape(4 * ROW + LABEL_BYTES, count).T
         rows = np.ascontiguousarray(planes[:, : 4 * ROW]).view("<f4")

@@ -130,7 +130,9 @@ class KeyframeStore:
         try:
             images = unpack(self._files.read(keyframe))
             if images.keyframe != keyframe:
-                raise DataError(f"the file contains keyframe {images.keyframe} instead")
+                raise DataError(
+                    f"their file contains keyframe {images.keyframe}, expected keyframe {keyframe}"
+                )
         except DataError as error:
             log.warning(
                 "keyframe store: the images of keyframe %d cannot be read (%s). They are dropped, "

@@ -342,7 +342,9 @@ class GaussianMap:
         inside = before < self._size
         present = self.ids[before[inside]] == ids[inside]
         if np.any(present):
-            raise ValueError(f"id {ids[inside][present][0]} is in the map already.")
+            raise ValueError(
+                f"ids must be new, but id {ids[inside][present][0]} is in the map already."
+            )
 
     def _reserve(self, size: int) -> None:
         if size <= len(self._rows):
@@ -363,7 +365,7 @@ def _piece(
             f"{len(ids)} ids and {len(anchors)} anchors."
         )
     if not np.all(np.isfinite(rows)):
-        raise ValueError("rows hold NaN or infinity.")
+        raise ValueError("rows must be finite, but contain NaN or infinity.")
     labels = new_labels(len(ids)) if labels is None else labels
     if labels.shape != (len(ids), LABEL_BYTES) or labels.dtype != np.uint8:
         raise ValueError(f"labels are {labels.dtype}{labels.shape}, must be uint8[M, 32].")

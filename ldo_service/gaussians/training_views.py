@@ -314,5 +314,5 @@ def _expanded(data: bytes, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
     with zstandard.ZstdDecompressor().stream_reader(data) as stream:
         filled = stream.readinto(out.reshape(-1).view(np.uint8).data)
         if filled < out.nbytes or stream.read(1):
-            raise ValueError(f"the size of an image is not {shape}")
+            raise ValueError(f"an image must have the shape {shape} after decompression")
     return out

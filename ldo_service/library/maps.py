@@ -157,7 +157,10 @@ class Map:
         if threads is not None and threads < 1:
             raise ConfigError(f"threads={threads} must be at least 1, or None for all cores.")
         if labels and self._labels is None:
-            raise ConfigError("the map has no labels, because the run had no detector.")
+            raise ConfigError(
+                "the map has no labels, because the run had no detector. Repeat the run with the "
+                "setting detector.model."
+            )
         T_camera_map = se3.inverse(_map_pose("T_map_camera", T_map_camera))
         count = threads or os.cpu_count() or 1
         shown = render(self._rows, camera, T_camera_map, threads=count, contributions=labels)
@@ -207,5 +210,8 @@ def _map_pose(name: str, value: object) -> np.ndarray:
         ConfigError: The value is no rigid transform.
     """
     if value is None:
-        raise ConfigError(f"{name} is None. A frame that is LOST has no pose in the map.")
+        raise ConfigError(
+            f"{name} is None, as for a frame that is LOST. Give the pose of a frame that is not "
+            "LOST."
+        )
     return rigid_transform(name, value, ConfigError)

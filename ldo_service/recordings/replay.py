@@ -64,7 +64,7 @@ class ReplayReport:
         if not self.is_complete:
             raise DataError(
                 f"{self.actor}: {self.steps} recorded steps verified, but the recording is "
-                "incomplete: " + " ".join(self.notes)
+                f"incomplete: {' '.join(self.notes)} To verify all steps, make a new recording."
             )
 
 

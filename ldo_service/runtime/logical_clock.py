@@ -209,6 +209,6 @@ def _answer(due: PendingOutput, actor: str) -> StepOutput:
         return due.answer.result()
     except Exception as error:
         raise StageError(
-            f"{actor} failed at tick {due.tick}: {type(error).__name__}: {error}. The traceback "
-            "shows where: `ldo --debug` prints it."
+            f"{actor} failed at tick {due.tick} of the logical clock: {type(error).__name__}: "
+            f"{error}. `ldo --debug` prints the traceback; please report it."
         ) from error

@@ -165,7 +165,9 @@ class CertificateAuthority:
         kept = {entry.common_name: entry.grantee for entry in self.entries if entry.name != name}
         if len(kept) == len(self._access):
             known = ", ".join(entry.name for entry in self.entries) or "none"
-            raise ConfigError(f"{self.folder} has no keys named {name!r}. Its keys are: {known}.")
+            raise ConfigError(
+                f"{self.folder} has no keys named {name!r}. Choose one of its keys: {known}."
+            )
         self._grant(kept)
         shutil.rmtree(self.folder / name, ignore_errors=True)  # The user may have moved the folder.
 
