@@ -101,7 +101,7 @@ def without(header: bytes, name: bytes) -> bytes:
     ("damage", "message"),
     [
         (lambda b: b[:-1], "cut off"),
-        (lambda b: b[: b.index(b"property")], "header has no end"),
+        (lambda b: b[: b.index(b"property")], "no line `end_header`"),
         (lambda b: b + b"\0", "do not match"),
         (lambda b: without(b, b"opacity"), "no property opacity"),
         (lambda b: without(b, b"nx"), "more than the 200 Gaussians"),

@@ -142,7 +142,9 @@ def test_failure_names_the_actor_and_ends_the_threads(latency: int) -> None:
             assert isinstance(message, Number)
             yield Double(stamp_ns=0, value=10 // (2 - message.value))
 
-    with pytest.raises(StageError, match=r"doubler failed at tick \d: ZeroDivisionError") as caught:
+    with pytest.raises(
+        StageError, match=r"doubler failed at tick \d of the logical clock: ZeroDivisionError"
+    ) as caught:
         run([FailingDoubler(), OrderCollector()], {"doubler": latency}, 10)
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
     assert not [thread for thread in threading.enumerate() if "doubler" in thread.name]

@@ -126,7 +126,7 @@ def test_each_problem_has_its_own_finding(actor: ActorStatus, text: str) -> None
         (health(metrics={"iterations_pending": 40.0}), "ldo control refine --iterations 40`"),
         (
             health(outputs=outputs(behind={"mapper": 3, "detector": 40})),
-            "keeps 40 messages of keyframe/new for detector",
+            "stores 40 messages of keyframe/new that the slower detector",
         ),
         (
             health(actor="optimizer", current_step_s=12.0),

@@ -168,7 +168,7 @@ def test_invalid_suite_file_is_refused_with_the_reason(
 
 
 def test_unknown_suite_name_lists_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match=r"there is no suite table-99: .*table-1, table-2"):
+    with pytest.raises(ConfigError, match=r"there is no suite table-99\. .*table-1, table-2"):
         load_suite("table-99")
 
 
