@@ -113,7 +113,7 @@ def test_source_without_readable_frames_is_bad_data(room: Sequence) -> None:
         def read(self, index: int) -> RawFrame:
             raise FrameError(f"frame {index} is truncated.")
 
-    with pytest.raises(DataError, match="none of the selected frames of .* could be used"):
+    with pytest.raises(DataError, match=r"none of the selected frames of .* could be used"):
         simulated(Unreadable(room))
 
 
