@@ -1,8 +1,9 @@
 """Data association between the regions of a keyframe and object landmarks (paper, III.C).
 
-An object landmark has a sample of Gaussians, the members. The predicted box of a landmark encloses
-the members that the measured depth does not occlude. It is the box that a detector would draw
-around the visible part of the object. A landmark and a region may be the same object if
+An object landmark has a sample of Gaussians, called its members. The predicted box of a landmark
+encloses the members that are not occluded according to the measured depth. It estimates the box
+that a detector would draw around the visible part of the object. A landmark and a region may be the
+same object if
 
     the IoU of their boxes is at least 0.4,
     the common mass of their label distributions is at least 0.3,
@@ -24,12 +25,12 @@ from .distributions import common_mass, mean_distributions
 from .object_landmarks import MEMBERS, NO_MEMBER, reliable_members, rows_of, shuffled, trimmed
 from .objects_config import AssociationConfig
 
-PROBES = 128  # Members of a landmark that are projected: the first in shuffled order.
+PROBES = 128  # Maximum number of a landmark's members that are projected: its first ones.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MapView:
-    """Data of a keyframe for the association: map, visible Gaussians, regions and depth.
+    """Data for the association in one keyframe: map, visible Gaussians, regions and depth.
 
     Attributes:
         keyframe: Id of the keyframe.
@@ -40,8 +41,8 @@ class MapView:
         ids: Ids of the Gaussians, [N] int64, ascending.
         anchors: Anchor keyframes of the Gaussians, [N] int32.
         indices: Rows of the Gaussians that contribute to the image, [V] uint32, ascending.
-        regions: Region of each Gaussian in `indices`, [V] int32, see `Assignment`; negative if the
-            Gaussian has none.
+        regions: Region of each Gaussian in `indices`, [V] int32; negative if the Gaussian is in no
+            region. See `Assignment`.
         boxes: Boxes of the regions, [M, 4], x0 y0 x1 y1, pixels.
         classes: Labels by the detector and by the labeller, [M, 2]; -1 if missing.
         depth_m: Depth of the keyframe, [H, W] float32, meters.
@@ -94,8 +95,8 @@ class RegionStatistics:
     Attributes:
         numbers: Numbers of the regions within the keyframe, [R], ascending.
         boxes: Boxes of the regions, [R, 4], pixels.
-        members: Ids of a sample of the Gaussians of each region, [R, 256], in the order of
-            `shuffled`. Unused entries at the end are NO_MEMBER.
+        members: Ids of a sample of the Gaussians of each region, [R, 256], in the order that the
+            function `shuffled` defines. Unused entries at the end are NO_MEMBER.
         p_map: Positions of these Gaussians in the map frame, [R, 256, 3], meters.
         distributions: Means of their label distributions, [R, C], weighted by opacity.
         near_m: Near end of the depth range of these Gaussians, [R], meters.
@@ -116,8 +117,8 @@ def compute_region_statistics(
 ) -> RegionStatistics:
     """Compute the statistics of the regions of a keyframe.
 
-    Only regions with at least min_gaussians Gaussians are used, and at most max_regions of them,
-    those with the most Gaussians.
+    Regions with fewer than min_gaussians Gaussians are left out. If more than max_regions remain,
+    those with the most Gaussians are used.
     """
     hit = np.flatnonzero(view.regions >= 0)
     counts = np.bincount(view.regions[hit], minlength=len(view.boxes))
@@ -141,9 +142,10 @@ def compute_region_statistics(
 
 
 def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationConfig) -> MapView:
-    """Return the view with the Gaussians of each region assigned to the region that contains it.
+    """Return the view after merging each region into the region that contains it, if there is one.
 
-    `find_containing_regions` defines which region contains another one.
+    The Gaussians of a merged region belong to the containing region. `find_containing_regions`
+    defines which region contains another one.
     """
     near_m = np.full(len(view.boxes), np.inf)
     far_m = -near_m
@@ -183,9 +185,9 @@ def find_containing_regions(
     """Find the region that contains each of M regions of a keyframe.
 
     Region a contains region b if three conditions hold: the regions share a class; the gap between
-    their depth ranges is at most max_depth_gap_m; and at least the fraction part_inside of the box
-    of b lies in the larger box of a. If all Gaussians of a region were assigned to the smaller
-    regions of its parts, it gets the depth range of the largest of these regions.
+    their depth ranges is at most max_depth_gap_m; and a has the larger box, which covers at least
+    the fraction part_inside of the box of b. A region may have no Gaussian because all of them were
+    assigned to smaller regions inside it. It then gets the depth range of the largest of these.
 
     Args:
         boxes: Boxes of the regions, [M, 4], x0 y0 x1 y1, pixels.
@@ -245,8 +247,13 @@ def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.nda
     """Return the map rows of each region's first 256 Gaussians in shuffled order, [R, 256].
 
     Unused entries of regions with fewer Gaussians are -1. To save time, only about 512 candidates
-    are sorted in regions with more than 512 Gaussians. `hit` has the positions in `view.indices` of
-    the Gaussians in regions, `counts` [M] their number per region, `numbers` the R regions.
+    are sorted in regions with more than 512 Gaussians.
+
+    Args:
+        view: The map and the regions of the keyframe.
+        hit: Positions in `view.indices` of the Gaussians that are in a region.
+        counts: Number of Gaussians in each region, [M].
+        numbers: Numbers of the regions to sample, [R].
     """
     ordinal = np.full(len(counts), -1)
     ordinal[numbers] = np.arange(len(numbers))
@@ -271,9 +278,12 @@ def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.nda
 class PredictedBoxes:
     """Predicted boxes and visibility of K landmarks in a keyframe.
 
+    Each landmark has members: a sample of its Gaussians. Reliable members are those with enough
+    votes, see `reliable_members`.
+
     Attributes:
         boxes: Boxes of the visible members, [K, 4], x0 y0 x1 y1, pixels. If no member is visible,
-            the box of the members that lie in front of the measured depth. If all members are
+            the box encloses the members in front of the measured depth. If all members are
             occluded or out of view, the box is empty (x0 > x1).
         shown: Fraction of the reliable members that are visible, [K]: the measured depth at their
             pixel is in the landmark's depth range.
@@ -281,7 +291,7 @@ class PredictedBoxes:
             their pixel is behind the landmark's depth range.
         near_m: Near end of the members' depth range, [K], meters.
         far_m: Far end of the members' depth range, [K], meters.
-        rows: Rows of the members in the map, [K, 256]; -1 where a member is not resident.
+        rows: Rows of the members in the map, [K, 256]; -1 where a member is not in memory.
     """
 
     boxes: np.ndarray
@@ -297,8 +307,15 @@ def predict_boxes(
 ) -> PredictedBoxes:
     """Predict boxes and visibility of landmarks in a keyframe.
 
-    `table` has K records of `LANDMARK`. A landmark without reliable resident members is represented
-    by its centroid.
+    A landmark is projected as a sample of its Gaussians, called its members. Members are used if
+    they have enough votes (see `reliable_members`) and are in memory rather than on disk. If a
+    landmark has no such member, its centroid is projected instead.
+
+    Args:
+        table: Landmarks, [K] records of `LANDMARK`.
+        view: The map and the depth of the keyframe.
+        T_camera_map: Transform from the map to the camera, [4, 4].
+        config: Settings of the data association.
     """
     where = rows_of(table["members"], view.ids)
     there = ((where >= 0) & reliable_members(table))[:, :PROBES]
@@ -342,7 +359,7 @@ def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarr
 def depth_gaps_m(
     near_m: np.ndarray, far_m: np.ndarray, others_near_m: np.ndarray, others_far_m: np.ndarray
 ) -> np.ndarray:
-    """Return the gaps between K depth ranges and R other ones, [K, R]; negative at an overlap."""
+    """Return the gaps between K depth ranges and R other ones, [K, R]; negative if they overlap."""
     return np.maximum(near_m[:, None], others_near_m) - np.minimum(far_m[:, None], others_far_m)
 
 
@@ -379,9 +396,9 @@ def association_costs(
 def associate(
     iou: np.ndarray, allowed: np.ndarray, min_iou: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match rows with columns of iou, each at most once, so that the sum of IoU is largest.
+    """Match rows of `iou` with columns so that the sum of the matched values is largest.
 
-    The result is deterministic.
+    Each row and each column is matched at most once. The result is deterministic.
 
     Args:
         iou: IoU of each pair, [K, R].

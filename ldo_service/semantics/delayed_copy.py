@@ -20,7 +20,9 @@ from .semantic_map import SemanticMap
 
 @dataclass(eq=False, slots=True)
 class DelayedCopy:
-    """Copy of the semantics that processes keyframes after the results of all earlier requests.
+    """Copy of the semantics that processes each keyframe after all earlier label results.
+
+    A label result is the answer of the labeller to a label request.
 
     Attributes:
         semantics: The copy.
@@ -37,7 +39,7 @@ class DelayedCopy:
     keyframes: dict[int, RegionDetections | None] = field(default_factory=dict)
 
     def keyframes_of_step(self) -> list[int]:
-        """Return the keyframes whose images the next step needs."""
+        """Return the keyframes whose images the next call of `step` needs."""
         naming = self.semantics.naming
         if not self.results_due or naming is None:
             return list(self.keyframes)[:1]
@@ -45,13 +47,13 @@ class DelayedCopy:
         return [region.keyframe, *naming.shown_in(region.id)]
 
     def step(self, results: Mapping[bytes, RegionLabelResult]) -> list[Region]:
-        """Apply one result or process one keyframe, unless results are missing.
+        """Apply one label result or process one keyframe, unless label results are missing.
 
         Args:
-            results: Known results by key of their requests.
+            results: Label results that have arrived, by `request_key` of their requests.
 
         Returns:
-            Requests whose results are missing.
+            Label requests whose results must arrive before the next call.
         """
         missing = [one for one in self.results_due if request_key(one) not in results]
         if missing:
@@ -79,7 +81,12 @@ class DelayedCopy:
 
     @staticmethod
     def restored(state: Mapping[str, Any], semantics: SemanticMap) -> "DelayedCopy":
-        """Restore a copy from `snapshot`."""
+        """Restore a copy from the result of `snapshot`.
+
+        Args:
+            state: The result of `snapshot`.
+            semantics: Semantics that have already been restored.
+        """
         keyframes = {
             keyframe: RegionDetections(*arrays) if arrays else None
             for keyframe, arrays in state["keyframes"]
@@ -110,9 +117,10 @@ class GaussianLabels:
 
     @contextmanager
     def in_map(self, gaussians: GaussianMap) -> Iterator[None]:
-        """Exchange the labels of a map with these ones for the time of the context.
+        """Replace the labels of a map by these labels until the context ends.
 
-        No Gaussian may be added, removed or loaded meanwhile.
+        At the end, changes of the labels are stored here and the map gets its own labels back. No
+        Gaussian may be added to the map, removed or loaded from disk in the meantime.
         """
         shown, ids = gaussians.labels.copy(), gaussians.ids.copy()
         gaussians.labels[:] = self._of(gaussians)
@@ -139,8 +147,8 @@ class GaussianLabels:
     def _of(self, gaussians: GaussianMap) -> np.ndarray:
         """Return the labels of the resident Gaussians of a map, [N, 32].
 
-        A Gaussian that was created later is unlabelled. One that was offloaded at first has its
-        label in the map.
+        A Gaussian that is newer than this copy gets no label. A Gaussian that was on disk when the
+        copy was made keeps its label in the map.
         """
         labels, ids = gaussians.labels.copy(), gaussians.ids
         if len(self.ids) == 0:
@@ -154,7 +162,7 @@ class GaussianLabels:
 
 
 def request_key(region: Region) -> bytes:
-    """Return a digest of all that a label request contains, except the id of the region."""
+    """Return a digest of the whole content of a label request except the id of the region."""
     digest = hashlib.blake2b(digest_size=16)
     digest.update(repr((region.keyframe, region.box_px, region.label, region.score)).encode())
     for view in region.views:
@@ -163,9 +171,10 @@ def request_key(region: Region) -> bytes:
 
 
 def renumbered(objects: Objects, before: Objects, first_new: int) -> Objects:
-    """Return objects with the ids of the same objects in an earlier table.
+    """Return the objects of the copy with the ids that they have in the live semantics.
 
-    New objects get the id of the object with most common Gaussians, one to one, or an unused id.
+    An object that is new in the copy gets the id of the live object with which it has the most
+    Gaussians in common. Each id is given once; without a match, an object gets an unused id.
 
     Args:
         objects: Objects of the copy.

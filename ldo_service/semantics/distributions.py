@@ -98,9 +98,9 @@ def divergence(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def entropy(p: np.ndarray) -> np.ndarray:
-    """Return the entropies H = -sum_c p_c log p_c of dense distributions [..., C], [...], nats.
+    """Return the entropies H = -sum_c p_c log p_c of dense distributions [..., C].
 
-    Paper, III.C.
+    The result has the shape [...] and the unit nat. Paper, III.C.
     """
     return -np.sum(p * np.log(np.where(p > 0, p, 1)), axis=-1)
 
@@ -123,7 +123,10 @@ def common_mass(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def names(p: np.ndarray) -> np.ndarray:
-    """Return the heaviest label other than background of distributions [..., C], [...] uint8."""
+    """Return the likeliest label except background of each distribution.
+
+    The distributions p have the shape [..., C], the labels [...] uint8.
+    """
     p = p.copy()
     p[..., BACKGROUND] = -1
     return np.argmax(p, axis=-1).astype(np.uint8)

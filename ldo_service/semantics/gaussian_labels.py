@@ -34,7 +34,7 @@ class ConsistencyConfig:
     sigma_m: float = 0.05  # sigma_cons (III.A).
     # Maximum distance of neighbors: three sigma. Farther Gaussians would have weights below 2e-4.
     radius_m: float = 0.15
-    rate: float = 0.1  # Step size, 0..1: 1 - lambda (III.A), as for one observation.
+    rate: float = 0.1  # Step size, 0..1. The default equals 1 - lambda (III.A).
 
     def __post_init__(self) -> None:
         if not (self.sigma_m > 0 and self.radius_m > 0 and 0 <= self.rate <= 1):
@@ -117,15 +117,16 @@ def smooth_labels(
 class LabelConfig:
     """Settings of the label update with each observation.
 
-    The constants of `corrected` were chosen with voxels in place of Gaussians, on one floor of a
-    Replica apartment. usual_extent_m and hold_back were chosen on the same frames with two
-    detectors.
+    The constants of the rule `corrected` were chosen on frames from one floor of a Replica
+    apartment, with voxels in place of Gaussians. usual_extent_m and hold_back were chosen on the
+    same frames with two detectors.
     """
 
     ema: Literal["paper", "corrected"] = "corrected"  # Rule of the update; see `observe`.
     # Factor by which each new observation reduces the weight of earlier ones: lambda (III.A).
     keep: float = 0.9
-    # Misses in a row after which the rule `paper` makes a Gaussian background: N_miss (III.A).
+    # Number of misses in a row that turn a Gaussian into background by the rule `paper`: N_miss
+    # (III.A). A miss is a keyframe that shows the Gaussian, but no region at the Gaussian.
     miss_limit: int = 5
     # A miss with `corrected` is evidence for background if the object would appear large enough for
     # the detector to find it. The next three settings define this.
@@ -171,7 +172,7 @@ class Observations:
 
 
 def fields(labels: np.ndarray) -> np.ndarray:
-    """Return label rows [N, 32] as records [N] of `ROW`: a view, not a copy."""
+    """Return a view of label rows [N, 32] as records [N] of `ROW`; no data is copied."""
     return labels.view(ROW)[:, 0]
 
 
@@ -260,7 +261,7 @@ def clear_background(labels: np.ndarray, indices: np.ndarray) -> None:
 
 
 def reset_labels(labels: np.ndarray, indices: np.ndarray) -> None:
-    """Reset rows `indices` [V] of labels [N, 32] to never observed, in place."""
+    """Reset rows `indices` [V] of labels [N, 32] in place, as if they were never observed."""
     labels[indices] = 0
 
 
@@ -305,7 +306,7 @@ def distribution(labels: np.ndarray, classes: int = MAX_LABELS) -> np.ndarray:
 
 
 def entropy(labels: np.ndarray) -> np.ndarray:
-    """Return the entropy H = -sum p log p (III.A) of label rows [N, 32], [N] float32, nats.
+    """Return the entropies H = -sum p log p (III.A) of N label rows [N, 32], in nats.
 
     >>> labels = new_labels(1)
     >>> fields(labels)["weights"][0, 0] = 0.5

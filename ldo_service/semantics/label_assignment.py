@@ -22,9 +22,9 @@ HIDDEN, UNMATCHED = -2, -1  # Values in place of a region's number; see `Assignm
 class AssignmentConfig:
     """Settings of the assignment of Gaussians to regions."""
 
-    # Measure of the overlap of a splat and a region. The paper's `iou` labels almost no Gaussian,
-    # because a splat is a few pixels wide and a box hundreds. `coverage` is the intersection
-    # divided by the area of the splat.
+    # Measure of the overlap of a splat and a region. `iou` is the measure of the paper. It labels
+    # almost no Gaussian, because a splat is a few pixels wide and a box is hundreds of pixels wide.
+    # `coverage` is the area of the intersection divided by the area of the splat.
     rule: Literal["coverage", "iou"] = "coverage"
     min_overlap: float = 0.3  # Minimum overlap: theta_IoU (III.A).
     # Maximum difference between the depth of a Gaussian and the measured depth: delta_z (III.A).
@@ -90,7 +90,8 @@ class Assignment:
     Attributes:
         regions: Number of the region of each Gaussian, [V] int32. UNMATCHED: in no region. HIDDEN:
             outside of the image, or not at the depth that was measured at its pixel.
-        overlaps: Overlap with that region by the setting `rule`, [V] float32; 0 without a region.
+        overlaps: Overlap of each Gaussian with its region, measured as the setting `rule` says,
+            [V] float32; 0 without a region.
         depths_m: Depths of the Gaussians in the camera frame, [V] float32.
     """
 
@@ -114,8 +115,9 @@ def assign_gaussians(
 
     Each Gaussian is projected as in rendering, S = J R Sigma R' J' + 0.3 px^2 I. Its splat is the
     axis-aligned box of two standard deviations around its center, clipped to the image. A Gaussian
-    is HIDDEN if its center lies outside of the image, or max_depth_gap_m or more from the measured
-    depth at that pixel. Any other Gaussian may be assigned to a region if overlap > min_overlap:
+    is HIDDEN if its center lies outside of the image, or if its depth differs by max_depth_gap_m or
+    more from the measured depth at that pixel. Any other Gaussian may be assigned to a region if
+    overlap > min_overlap:
 
         rule `coverage`:  overlap = area(splat and region) / area(splat)
         rule `iou`:       overlap = area(splat and region) / area(splat or region)

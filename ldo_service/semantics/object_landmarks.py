@@ -119,14 +119,17 @@ def _in_order(ids: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def reliable_members(table: np.ndarray) -> np.ndarray:
     """Return which members are reliable, [K, 256] bool.
 
-    A reliable member has at least a third of the landmark's highest number of votes. Gaussians next
-    to an object get few votes, because the edges of regions vary between keyframes.
+    A member is a Gaussian of a landmark's sample, with a number of votes. It is reliable if it has
+    at least a third of the votes of the landmark's member with the most votes. Gaussians next to
+    an object get few votes, because the edges of regions vary between keyframes.
     """
     return (table["votes"] > 0) & (3 * table["votes"] >= table["votes"].max(axis=1, keepdims=True))
 
 
 def rows_of(members: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """Return the rows of members in the map, [...]; -1 if a member is not resident.
+    """Return the rows of members in the map, [...]; -1 if a member is not in memory.
+
+    A member is a Gaussian of a landmark's sample.
 
     Args:
         members: Ids of the members, [...].
@@ -153,7 +156,9 @@ def derive(
 ) -> None:
     """Derive pose, size, label and anchor of landmarks [K] from the map, in place.
 
-    Landmarks with fewer than `least` reliable resident members stay unchanged.
+    The values come from the members of a landmark, a sample of its Gaussians. Members are used if
+    they have enough votes (see `reliable_members`) and are in memory rather than on disk. Landmarks
+    with fewer than `least` such members stay unchanged.
 
     Args:
         table: Landmarks, [K] records of `LANDMARK`.
@@ -161,7 +166,7 @@ def derive(
         labels: Label rows of the Gaussians, [N, 32].
         ids: Ids of the Gaussians, [N], ascending.
         anchors: Anchor keyframes of the Gaussians, [N].
-        least: Minimum number of reliable resident members.
+        least: Minimum number of members that are used.
     """
     where = np.where(reliable_members(table), rows_of(table["members"], ids), -1)
     known = np.flatnonzero(np.count_nonzero(where >= 0, axis=1) >= max(least, 1))
@@ -191,14 +196,14 @@ def derive_in_batches(table: np.ndarray, *gaussians: np.ndarray, least: int) -> 
     Args:
         table: Landmarks, [K] records of `LANDMARK`.
         *gaussians: Rows, labels, ids and anchors of the map, see `derive`.
-        least: Minimum number of reliable resident members; see `derive`.
+        least: Minimum number of usable members; see `derive`.
     """
     for start in range(0, len(table), _AT_A_TIME):
         derive(table[start : start + _AT_A_TIME], *gaussians, least=least)
 
 
 def _opacities(rows: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Return the opacities of members, [K, M]; 0 where a member is not resident."""
+    """Return the opacities of members, [K, M]; 0 where a member is not in memory."""
     opacity = 1 / (1 + np.exp(-rows[np.maximum(where, 0), 10].astype(float)))
     return np.where(where >= 0, opacity, 0)
 
@@ -255,7 +260,7 @@ def trimmed(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return low, np.where(count > 0, high, -np.inf)
 
 
-SAVING = 0.8  # Volume ratio of oriented to axis-aligned box below which the oriented one is used.
+SAVING = 0.8  # The oriented box is used if its volume is below this fraction of the other's.
 
 
 def boxes(
@@ -293,15 +298,16 @@ def boxes(
 
 
 def _largest(axes: np.ndarray) -> np.ndarray:
-    """Return the component of largest magnitude of each column of matrices [K, 3, 3], [K, 3]."""
+    """Return the largest component by magnitude of each column, [K, 3], of matrices [K, 3, 3]."""
     at = np.argmax(np.abs(axes), axis=1)[:, None]
     return np.take_along_axis(axes, at, axis=1)[:, 0]
 
 
 def _commonest(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return the most frequent valid value of each row of [K, M], [K].
+    """Return the most frequent valid value of each of K rows.
 
-    Of equally frequent values, the smallest is returned.
+    If several values are equally frequent, the smallest is returned. `values` and `valid` have the
+    shape [K, M], the result has the shape [K].
     """
     ordered = np.sort(np.where(valid, values, np.iinfo(np.int32).max).astype(np.int64), axis=1)
     width = ordered.shape[1]

@@ -64,7 +64,7 @@ class Objects:
 
     @property
     def landmarks(self) -> np.ndarray:
-        """Copy of the objects, records [K] of `LANDMARK`, sorted by id."""
+        """Copy of the objects without the candidates: records [K] of `LANDMARK`, sorted by id."""
         table = self._table[self._table["id"] != CANDIDATE]
         return table[np.argsort(table["id"])]
 
@@ -84,12 +84,12 @@ class Objects:
         Args:
             view: The map and the regions of the keyframe.
             undetectable: Labels that the detector does not know, [256] bool. An object with such a
-                label is missed only if the measured depth shows that it is gone. None: the detector
-                knows all labels.
+                label counts as missed only if the measured depth shows that it is gone. None: the
+                detector knows all labels.
             is_late: True if the keyframe was observed before and the view has only regions whose
-                labels arrived later. Objects then gain no observation, and nothing is missed. A
-                candidate gains an observation only if the keyframe is before its first or after its
-                last observation.
+                labels arrived later. Objects then gain no observation, and no landmark counts as
+                missed. A candidate gains an observation only if the keyframe is before its first or
+                after its last observation.
 
         Raises:
             ValueError: If the shapes of the arrays do not fit.
@@ -147,8 +147,8 @@ class Objects:
         A region is a piece if enough of its Gaussians lie in the box of the landmark.
 
         Returns:
-            Landmarks that are matched or have a piece, [K] bool; they are not missed. Numbers of
-            the regions that are neither matched nor a piece.
+            First, which landmarks are matched or have a piece, [K] bool; they do not count as
+            missed. Second, the numbers of the regions that are neither matched nor a piece.
         """
         excused, is_left = np.zeros(len(near), bool), np.ones(len(regions.numbers), bool)
         excused[k], is_left[r] = True, False
@@ -192,13 +192,24 @@ class Objects:
         ]
 
     def _lacks(self, which: np.ndarray, keyframe: int) -> np.ndarray:
-        """Return a mask [K] of the candidates observed only before or only after a keyframe."""
+        """Return which landmarks are candidates observed only before or only after a keyframe.
+
+        Args:
+            which: Rows of the landmarks in the table, [K].
+            keyframe: Id of the keyframe.
+
+        Returns:
+            [K] bool.
+        """
         table = self._table[which]
         is_within = (table["first"] <= keyframe) & (keyframe <= table["last"])
         return (table["id"] == CANDIDATE) & ~is_within
 
     def _derive(self, table: np.ndarray, *gaussians: np.ndarray) -> None:
-        """Derive landmarks in place; landmarks with too few resident Gaussians stay unchanged."""
+        """Derive pose, size and label of landmarks from their Gaussians, in place.
+
+        Landmarks with too few Gaussians in memory stay unchanged.
+        """
         derive_in_batches(table, *gaussians, least=self.config.association.min_gaussians)
 
     def _promote(self, which: np.ndarray) -> tuple[int, ...]:
@@ -221,10 +232,11 @@ class Objects:
         excused: np.ndarray,
         undetectable: np.ndarray | None,
     ) -> np.ndarray:
-        """Return the positions in `near` of the landmarks that are missed in the keyframe.
+        """Return the positions in `near` of the landmarks that count as missed in the keyframe.
 
-        A landmark is missed if it is visible and the detector did not find it. It is also missed if
-        the measured depth behind it shows that it is gone. `excused` landmarks are never missed.
+        A landmark is missed if it should be visible and the detector did not find it. It is also
+        missed if the depth camera measured a surface behind it, so that it must be gone. Landmarks
+        in `excused` are never missed.
         """
         sides = np.clip(predicted.boxes[:, 2:] - predicted.boxes[:, :2], 0, None)
         is_large = np.sqrt(np.prod(sides, axis=1)) >= self.config.min_side_px
@@ -301,7 +313,10 @@ class Objects:
 
     # --- candidates -------------------------------------------------------------------------------
     def _begin(self, view: MapView, regions: RegionStatistics, left: np.ndarray) -> None:
-        """Create candidates for the regions `left`, and keep at most `max_candidates` in total."""
+        """Create a candidate for each region in `left`.
+
+        If there are then more than `max_candidates`, those observed longest ago are dropped.
+        """
         new = new_landmarks(len(left), view.keyframe)
         new["members"], new["seen"] = regions.members[left], 1
         new["votes"] = one_each(new["members"])
@@ -322,8 +337,8 @@ class Objects:
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move the landmarks after a correction of the keyframe poses.
 
-        Each landmark moves with the anchor keyframe of most of its members, as its offloaded
-        Gaussians do. Landmarks with resident Gaussians become exact with the next `refresh`.
+        Each landmark moves with one keyframe: the anchor keyframe of most of its Gaussians.
+        `refresh` then derives exact poses for the landmarks whose Gaussians are in memory.
 
         Args:
             T_new_old: Correction of each moved keyframe in the map frame, [4, 4], by id.

@@ -17,7 +17,7 @@ class AssociationConfig:
     # Maximum gap between the depth ranges of an object and a region, and tolerance of the occlusion
     # test (delta_z, III.A).
     max_depth_gap_m: float = 0.1
-    min_gaussians: int = 8  # Minimum Gaussians of a region; fewer do not fix its position.
+    min_gaussians: int = 8  # Minimum Gaussians of a region; fewer do not determine its position.
     # Maximum regions per keyframe; those with the most Gaussians are used. Images of COCO have 7
     # objects on average.
     max_regions: int = 64
@@ -50,26 +50,29 @@ class ObjectsConfig:
     association: AssociationConfig = field(default_factory=AssociationConfig)
     # Keyframes that must observe a candidate before it becomes an object (III.C).
     min_keyframes: int = 3
-    # Divergence (nats) of the label distributions of a candidate and its observation from which the
-    # candidate's count of observations starts again (III.C).
+    # Maximum divergence (nats) between the label distributions of a candidate and of its
+    # observation. At a larger one, the candidate's count of observations restarts (III.C).
     max_divergence: float = 0.2
     # Misses in a row after which an object is removed (III.C).
     miss_limit: int = 10
-    # Value of miss_limit for objects with an entropy above `uncertain_entropy`.
+    # Misses in a row after which an object is removed if the entropy of its label distribution is
+    # above `uncertain_entropy`.
     uncertain_miss_limit: int = 5
     # Entropy (nats) of the label distribution above which an object is removed earlier (III.C).
     uncertain_entropy: float = 0.5
-    # Value of miss_limit for candidates; a removed candidate can be created again.
+    # Misses in a row after which a candidate is removed; it can be created again.
     candidate_miss_limit: int = 3
-    # A miss counts only if at least this fraction of an object's members is visible, which means in
-    # view and not occluded.
+    # A miss counts only if at least this fraction of an object's sampled Gaussians is in view and
+    # not occluded.
     min_visible: float = 0.5
     # A miss counts only if the square root of the predicted box's area is at least this length,
     # because a detector may overlook smaller objects.
     min_side_px: float = 20.0
-    # Two objects merge if at least this fraction of one object's members lies in the other's box.
+    # Two objects merge if at least this fraction of one object's sampled Gaussians lies in the
+    # other object's box.
     merge_overlap: float = 0.5
-    # Maximum objects; 2000 take 6 MB, and some ms per keyframe if all of them are in view.
+    # Maximum number of objects. 2000 objects take 6 MB of memory. If all of them are in view, they
+    # take a few milliseconds per keyframe.
     max_objects: int = 2000
     max_candidates: int = 256  # Maximum candidates; the most recently observed ones are kept.
 

@@ -63,7 +63,7 @@ class KeyframeSemantics:
 
 
 def one_each(members: np.ndarray) -> np.ndarray:
-    """Return one vote for each of the members [K, 256], [K, 256] int8; 0 where NO_MEMBER."""
+    """Return votes [K, 256] int8 for members [K, 256]: 1 for each member, 0 for NO_MEMBER."""
     return (members != NO_MEMBER).astype(np.int8)
 
 
@@ -72,12 +72,13 @@ def update_votes(
 ) -> np.ndarray:
     """Return the votes of the members of K landmarks after a keyframe, [K, 256] int8.
 
-    A member in the region of its landmark gains a vote, up to 8. A member that is visible outside
-    of this region, or not resident, loses a vote. A member without votes stays at 0.
+    The members of a landmark are a sample of its Gaussians. A member in the region of its landmark
+    gains a vote, up to 8. A member loses a vote if it is visible outside of this region or not in
+    memory. A member without votes stays at 0.
 
     Args:
         votes: Votes before the keyframe, [K, 256].
-        rows: Rows of the members in the map, [K, 256]; -1 if not resident.
+        rows: Rows of the members in the map, [K, 256]; -1 if not in memory.
         view: The map and the regions of the keyframe.
         numbers: Number of the region that each landmark was associated with, [K].
     """
@@ -153,16 +154,16 @@ def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[
 
 
 def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: float) -> bool:
-    """Return whether enough members of a landmark lie in the box of another landmark.
+    """Return whether the Gaussians of one landmark mostly lie in the box of another landmark.
 
-    The members of `one` are compared with the box of `other`, and the members of `other` with the
-    box of `one`. The larger of the two fractions must be at least `least`.
+    Both directions are tested: the Gaussians of `one` with the box of `other`, and the Gaussians of
+    `other` with the box of `one`. The larger of the two fractions must be at least `least`.
 
     Args:
         one: First landmark, as an array with one record of `LANDMARK`.
         other: Second landmark, in the same format.
         view: The map with the Gaussians of both landmarks.
-        least: Minimum fraction of the reliable resident members, 0..1.
+        least: Minimum fraction, 0..1, of the Gaussians from `resident_positions`.
     """
     shares = (
         inside(other[0], resident_positions(one, view)),
@@ -202,9 +203,10 @@ def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
 
 
 def resident_positions(landmark: np.ndarray, view: MapView) -> np.ndarray:
-    """Return the positions of the reliable resident members of a landmark, [M, 3], map frame, m.
+    """Return the positions of a landmark's Gaussians in the map frame, [M, 3], meters.
 
-    `landmark` is an array with one record of `LANDMARK`.
+    Gaussians of the landmark's sample are used if they have enough votes (see `reliable_members`)
+    and are in memory. `landmark` is an array with one record of `LANDMARK`.
     """
     where = rows_of(landmark["members"][reliable_members(landmark)], view.ids)
     return view.rows[where[where >= 0], :3].astype(float)

@@ -5,10 +5,10 @@ names of their regions and for the choice of the next label requests. If keyfram
 before an earlier result has arrived, labels and objects therefore depend on the speed of the
 labeller and of the detector.
 
-The live semantics never wait. If they process a keyframe while a label result is missing, a copy of
-them stays behind. While no message arrives, the copy processes the same keyframes again, each one
-after the results of all earlier requests. Results that are known are not requested again. When the
-copy has processed all keyframes, it replaces the live semantics.
+The live semantics never wait. Before they process a keyframe while a label result is missing, a
+copy of them is made. While no message arrives, the copy processes the same keyframes again. It
+processes each one after the results of all earlier requests. Results that are known are not
+requested again. When the copy has processed all keyframes, it replaces the live semantics.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,13 +26,13 @@ from .observations import KeyframeSemantics
 from .semantic_map import SemanticMap
 from .semantic_map_config import SemanticMapConfig
 
-# Maximum number of keyframes that wait for the copy, some kB each. If more wait, the live semantics
-# are kept as they are.
+# Maximum number of keyframes that the copy has yet to process, a few kB each. If there are more,
+# the copy is dropped and the live semantics stay.
 MAX_KEYFRAMES = 1024
-# Maximum number of stored label results, some 100 B each; more than 1024 keyframes request.
+# Maximum number of stored label results, about 100 B each. 1024 keyframes request fewer.
 MAX_RESULTS = 4096
-# Regions of the copy have ids from this number on in label requests. The live semantics have
-# regions with the same ids.
+# Offset added to region ids in label requests of the copy. It keeps them apart from the region ids
+# in requests of the live semantics.
 FIRST_REGION = 1 << 32
 
 
@@ -56,7 +56,7 @@ class OrderedSemantics:
         self._options = {"has_labeller": has_labeller, "threads": threads}
         self.live = SemanticMap(map_, config, **self._options, before_fusion=self._before_fusion)
         self._copy: DelayedCopy | None = None
-        # Requests that wait until the labeller has room, by region id of the request.
+        # Label requests that have not been sent yet, by the region id of the request.
         self._waiting: dict[int, Region] = {}
         # Sent requests without a result, the oldest first.
         self._sent: list[Region] = []
@@ -71,7 +71,11 @@ class OrderedSemantics:
         return self._noted(self.live.add_detections(keyframe, detections))
 
     def on_keyframe_mapped(self, keyframe: int) -> KeyframeSemantics | None:
-        """Fuse the stored detections of a just mapped keyframe; return None if there are none."""
+        """Fuse the stored detections of a keyframe that was just mapped.
+
+        Returns:
+            The result of the fusion; None if no detections were stored for the keyframe.
+        """
         return self._noted(self.live.on_keyframe_mapped(keyframe))
 
     def apply_label(self, region: int, keyframe: int, answer: RegionLabelResult) -> bool:
@@ -94,12 +98,12 @@ class OrderedSemantics:
         self._sent.append(self._waiting.pop(region))
 
     def withdraw(self, region: int, keyframe: int, *, is_replaced: bool) -> None:
-        """Drop a label request that was not sent; the copy requests it again if it needs it.
+        """Drop a label request that was not sent; the copy makes it again if it needs it.
 
         Args:
             region: Id of the region in the request.
             keyframe: Keyframe of the request.
-            is_replaced: True if a newer request of the region waits.
+            is_replaced: True if a newer request for the region is still to be sent.
         """
         if not is_replaced:
             self._waiting.pop(region, None)
@@ -113,7 +117,7 @@ class OrderedSemantics:
             self._copy.semantics.objects.move(T_new_old)
 
     def _before_fusion(self) -> None:
-        """Copy the live semantics if they fuse a keyframe before an earlier result arrives."""
+        """Copy the live semantics if an earlier label result is missing; called before fusion."""
         pending = [*self._sent, *self._waiting.values()]
         if self._copy is None and pending:
             first_object = next_id_of(self.live.objects)
@@ -147,13 +151,13 @@ class OrderedSemantics:
 
     # --- copy -------------------------------------------------------------------------------------
     def has_work(self) -> bool:
-        """Return whether the copy can do a step: it exists, and no result is missing."""
+        """Return whether `step` can be called: the copy exists, and no label result is missing."""
         return self._copy is not None and not self._waiting and not self._sent
 
     def step(self) -> "OrderedStep":
-        """Apply one label result in the copy, or let it process one keyframe.
+        """Apply one label result in the copy, or process one keyframe in it.
 
-        At the end, the copy replaces the live semantics.
+        After the last keyframe, the copy replaces the live semantics.
         """
         copy, gaussians = self._copy, self._map.gaussians
         assert copy is not None
@@ -181,7 +185,7 @@ class OrderedSemantics:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return the state of both semantics without the labels of the map."""
+        """Return the state of the live semantics and of the copy, without the labels of the map."""
         return {
             **self.live.snapshot(),
             "requests": [
@@ -205,17 +209,17 @@ class OrderedSemantics:
         """Return the counters of the live semantics and of the copies."""
         return {
             **self.live.metrics(),
-            # Keyframes that are processed again in idle time, after their label results.
+            # Keyframes that are still to be processed again, while no message arrives.
             "keyframes_to_relabel": len(self._copy.keyframes) + 1 if self._copy else 0,
             "labels_reordered": self._replaced,
-            # Copies that were dropped because too many keyframes waited.
+            # Copies that were dropped because they had too many keyframes to process.
             "label_copies_dropped": self._abandoned,
         }
 
 
 @dataclass(frozen=True, slots=True)
 class OrderedStep:
-    """Result of a step of the copy."""
+    """Result of `OrderedSemantics.step`."""
 
     requests: tuple[Region, ...]  # Regions to send to the labeller.
     is_done: bool  # True if the copy has replaced the live semantics.

@@ -100,7 +100,7 @@ def fuse_confidences(
     Args:
         detector_labels: Labels of the detector, [V] int.
         detector_confidences: Confidences of the detector, [V], 0..1; 0 without a detection.
-        overlaps: IoU or coverage of region and Gaussian, [V], 0..1.
+        overlaps: Overlap of each Gaussian with its region, IoU or coverage, [V], 0..1.
         open_labels: Labels of the labeller, [V] int.
         open_confidences: Confidences of the labeller, [V], 0..1; 0 if the labeller was not invoked
             or gave no label.
@@ -136,7 +136,8 @@ def reliable_label_mask(labels: np.ndarray, top: np.ndarray, least: float) -> np
 
     Args:
         labels: Label rows of the Gaussians, [N, 32].
-        top: Row of the Gaussian that contributes most to each pixel, [H, W]; negative without one.
+        top: Row of the Gaussian that contributes most to each pixel, [H, W]; negative if no
+            Gaussian contributes.
         least: Minimum probability of the label.
     """
     rows = labels[np.maximum(top, 0).ravel()]
@@ -311,9 +312,10 @@ def assign_detections(
 def regions_of(
     detections: RegionDetections, depth_m: np.ndarray, camera: Camera, config: SemanticFusionConfig
 ) -> Regions:
-    """Return the region of each box: its foreground or, with the setting `region: box`, all of it.
+    """Return the region of each box, which is the foreground in the box.
 
-    A foreground does not have the pixels of smaller regions that are nested in it.
+    With the setting `region: box`, the region is the whole box. A foreground does not include the
+    pixels of smaller regions that are nested in it.
 
     Args:
         detections: Boxes and scores, with foregrounds where they are already known.
@@ -344,10 +346,11 @@ def observations(
     *,
     is_late: bool = False,
 ) -> Observations:
-    """Return the observations of Gaussians: labels with confidences in regions, misses elsewhere.
+    """Return the observations of Gaussians.
 
-    The extent of an object is the side of a square with the area of its box, converted to meters at
-    the depth of the Gaussian.
+    A Gaussian in a region observes a label with a confidence; a visible Gaussian elsewhere counts
+    as missed. The extent of an object is the side of a square with the area of its box, converted
+    to meters at the depth of the Gaussian.
 
     Args:
         where: Region of each Gaussian.

@@ -55,7 +55,8 @@ class SemanticMap:
             has_labeller: True if a labeller receives label requests.
             threads: Number of threads.
             before_fusion: Called before the detections of a keyframe are fused.
-            changes_map: False: nothing but the labels of the map changes, and no change is marked.
+            changes_map: If False, only the labels of the map change, and the changes are not
+                marked.
         """
         self.config = config or SemanticMapConfig()
         self.vocabulary = Vocabulary(self.config.max_names)
@@ -114,7 +115,11 @@ class SemanticMap:
         return None
 
     def on_keyframe_mapped(self, keyframe: int) -> KeyframeSemantics | None:
-        """Fuse the stored detections of a just mapped keyframe; return None if nothing is fused."""
+        """Fuse the stored detections of a keyframe that was just mapped.
+
+        Returns:
+            The result of the fusion; None if nothing was fused.
+        """
         if keyframe not in self._waiting:
             return None
         return self._fuse_keyframe(keyframe, self._waiting.pop(keyframe))
@@ -201,13 +206,13 @@ class SemanticMap:
         return detections, tuple(request.region for request in requests)
 
     def _is_labellers(self, label: int) -> bool:
-        """Return whether only the labeller ever gave this label, and never the detector."""
+        """Return whether the labeller has given this label and the detector never has."""
         return label in self._by_labeller and label not in self._by_detector
 
     def _undetectable_labels(self) -> np.ndarray | None:
-        """Return the labels that the detector cannot miss, [256] bool: only the labeller gave them.
+        """Return the labels that only the labeller has given, [256] bool; None if it gave no label.
 
-        None if the labeller gave no label.
+        The detector does not know these labels, so its silence about such an object is no miss.
         """
         if not self._by_labeller:
             return None
@@ -221,7 +226,7 @@ class SemanticMap:
         *,
         is_late: bool = False,
     ) -> FusionResult:
-        """Fuse labels of regions into the Gaussians `indices` [V], and mark those that changed."""
+        """Fuse labels of regions into the Gaussians `indices` [V], and mark changed Gaussians."""
         is_labelled = detections.open_confidences > 0
         self._by_labeller.update(detections.open_labels[is_labelled].astype(int).tolist())
         gaussians = self._map.gaussians
@@ -319,13 +324,17 @@ class SemanticMap:
     def _assign(
         self, view: TrainingView, indices: np.ndarray, detections: RegionDetections
     ) -> np.ndarray:
-        """Return the region of each of the Gaussians `indices` [V], [V] int32; labels stay."""
+        """Return the region of each Gaussian in `indices` [V], as [V] int32; no label changes."""
         at = view.camera, view.T_map_camera, view.depth_m, detections, self.config.labelling
         rows = self._map.gaussians.rows
         return assign_detections(rows, indices, *at, threads=self._threads).regions
 
     def refresh(self, view: TrainingView | None = None) -> None:
-        """Derive the objects in view of a keyframe, or all if None, from their Gaussians again."""
+        """Derive objects from their Gaussians again.
+
+        Args:
+            view: Keyframe; only objects in its view are derived. None: all objects are derived.
+        """
         gaussians = self._map.gaussians
         known = gaussians.rows, gaussians.labels, gaussians.ids, gaussians.anchors
         seen_from = view and (view.camera, view.T_map_camera)
@@ -333,7 +342,10 @@ class SemanticMap:
 
     # --- state ------------------------------------------------------------------------------------
     def adopt(self, other: "SemanticMap", objects: Objects) -> None:
-        """Take over regions and labels from another instance, and objects; the counters stay."""
+        """Replace regions and labels by those of another instance, and the objects by `objects`.
+
+        The counters of this instance stay.
+        """
         assert self.naming is not None
         assert other.naming is not None
         self.objects = objects

@@ -7,7 +7,7 @@ weights   [N, 5] float32     five highest probabilities, heaviest first; the res
 ids       [N, 5] uint8       labels that the weights belong to; unused where the weight is 0
 evidence  [N] float32        sum of the weights of all observations, decayed with age
 extent_mm [N] uint16         size of the object at the last observation of a label
-misses    [N] uint8          misses since that observation: visible, but in no region
+misses    [N] uint8          keyframes since then that showed the Gaussian in no region
 """
 
 from dataclasses import dataclass

@@ -65,10 +65,10 @@ def search(
 def text_similarity(
     text: str, names: Sequence[str], encode: Encode | None = None
 ) -> dict[str, float]:
-    """Return the nearness of names to `text` by name; `search` defines the nearness.
+    """Return the nearness, 0..1, of names to `text`, by name; see `search` for its definition.
 
-    Names with a nearness of 0 are omitted. The result also has the synonyms of `text`, its hyponyms
-    and its hypernyms, even if they are not in `names`.
+    Names with a nearness of 0 are omitted. The result also contains the synonyms, hyponyms and
+    hypernyms of `text`, even if they are not in `names`.
 
     Raises:
         TextComparisonError: If the text encoder fails or has no vector for `text`.
