@@ -66,7 +66,7 @@ class KeyframePoses:
         return iter(self._known.ids.tolist())
 
     def of(self, keyframes: Collection[int]) -> np.ndarray:
-        """Return T_map_keyframe [n, 4, 4] of the given keyframes that are known."""
+        """Return T_map_keyframe [n, 4, 4] of those given keyframes that are known."""
         return self._known.all["T_map"][self._known.rows(keyframes)]
 
     def are_known(self, keyframes: Collection[int]) -> np.ndarray:
@@ -102,7 +102,7 @@ class KeyframePoses:
         return self[keyframe]
 
     def place(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
-        """Set the pose of a known keyframe until the next correction.
+        """Set the pose of a known keyframe; the next correction may change it again.
 
         The stored pose relative to the reference keyframe changes accordingly.
 
@@ -127,9 +127,10 @@ class KeyframePoses:
         Args:
             version: Version of the pose graph.
             T_map: Corrected T_map_keyframe [4, 4] by id.
-            held: Keyframes whose stored pose relative to the reference keyframe is more accurate
-                than the one that the pose graph used. If the reference keyframe is known, the pose
-                is computed from it; otherwise it is taken from `T_map`.
+            held: Keyframes whose stored pose relative to their reference keyframe is more accurate
+                than the relative pose in the pose graph. If the reference keyframe of such a
+                keyframe is known, its pose is computed from that of the reference keyframe.
+                Otherwise its pose is taken from `T_map`.
         """
         if version <= self.version or not T_map:
             return
@@ -181,7 +182,7 @@ class KeyframePoses:
         return int(known[-1]) if len(known) else None
 
     def keep_only(self, keyframes: Iterable[int]) -> None:
-        """Remove all keyframes except the given ones, for a component that needs only a few."""
+        """Remove all keyframes except the given ones, in a component that needs few keyframes."""
         self._known.keep_only(keyframes)
 
     def T_map_odom(self, keyframe: int) -> np.ndarray:

@@ -189,7 +189,7 @@ def _require_bounded(
 
 
 def _cover_row(nearest: np.ndarray, z: np.ndarray, pixel: np.ndarray, more: np.ndarray) -> None:
-    """Set `nearest` to z where z is smaller, at `pixel` and the `more` pixels to the right of it.
+    """Lower `nearest` to z at `pixel` and at the `more` pixels to the right of it.
 
     Args:
         nearest: Least depth of each color pixel so far, [Hc * Wc]; changed in place.

@@ -57,7 +57,7 @@ def inverse(T: Array) -> Array:
 
 
 def orthonormalize(T: Array) -> Array:
-    """Return T [4, 4] with its upper left 3x3 block replaced by the nearest rotation.
+    """Return a copy of T [4, 4] whose upper left 3x3 block is replaced by the nearest rotation.
 
     This removes the rounding errors that products of transforms accumulate.
     """

@@ -43,7 +43,7 @@ class Sequence(ABC):
         stamps_ns: Stamps, [len] int64, ascending.
         depth_offsets_ns: Stamps of the depth images minus `stamps_ns`, [len] int64; None if depth
             has no stamps of its own.
-        registration: Where depth is registered to color: in the source, by `read`, or nowhere.
+        registration: Step that registers depth to color: the source, `read`, or none.
     """
 
     depth_offsets_ns: np.ndarray | None = None
@@ -136,7 +136,7 @@ class Cached(Sequence):
 
 
 class OdometryAsTruth(Sequence):
-    """Sequence whose recorded odometry takes the place of the ground truth."""
+    """Sequence whose recorded odometry is returned as the ground truth."""
 
     def __init__(self, sequence: Sequence) -> None:
         super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns)

@@ -72,7 +72,7 @@ class StreamBuffer:
     """Buffer of the measurements of one stream that have no partner yet."""
 
     waiting: deque[Stamped] = field(default_factory=deque)  # The oldest first.
-    # The newest received stamps, also of measurements that are paired or dropped.
+    # The newest received stamps, including those of measurements already paired or dropped.
     stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_INTERVALS + 1))
     lost: int = 0  # Number of measurements that were dropped without a partner.
 
@@ -201,7 +201,9 @@ class StreamPairer(Generic[A, B]):
 
     @staticmethod
     def _has_nearer(earlier: StreamBuffer, later: StreamBuffer, skew: int) -> bool:
-        """Return whether the second waiting half of one stream makes a better pair than the first.
+        """Return whether the second waiting half of a stream makes a better pair than its first.
+
+        A half is a measurement that waits for its partner in the other stream.
 
         Args:
             earlier: Stream whose oldest half is earlier.
@@ -213,11 +215,14 @@ class StreamPairer(Generic[A, B]):
 
     @staticmethod
     def _may_get_nearer(earlier: StreamBuffer, skew: int) -> bool:
-        """Return whether a half that one stream has yet to receive may make a better pair.
+        """Return whether the next measurement of a stream may be nearer than its oldest one.
+
+        Nearer means a smaller difference between its stamp and that of the other stream's oldest
+        measurement.
 
         Args:
-            earlier: Stream whose oldest half is earlier.
-            skew: Difference between the stamps of the two oldest halves, nanoseconds.
+            earlier: Stream whose oldest waiting measurement is earlier.
+            skew: Difference between the stamps of the two oldest measurements, nanoseconds.
         """
         period = earlier.period_ns()
         return len(earlier.waiting) == 1 and period is not None and 2 * skew > period
