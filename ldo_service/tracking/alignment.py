@@ -45,8 +45,8 @@ class ResidualConfig:
     noise: DepthNoise = field(default_factory=DepthNoise)
     # Largest depth difference between a point and its measured point q, as a fraction of depth.
     gate: float = 0.1
-    # A point is hidden if it lies farther than this behind the surface that the frame measures;
-    # fraction of depth.
+    # A point counts as hidden if it lies behind the surface that the frame measures by more than
+    # this fraction of its depth.
     occlusion: float = 0.08
 
     def __post_init__(self) -> None:
@@ -156,7 +156,7 @@ class AlignConfig:
     residuals: ResidualConfig = field(default_factory=ResidualConfig)
     start: BrightnessModel = field(default_factory=BrightnessModel)
     iterations: tuple[int, ...] = (8, 8, 10, 10)  # Maximum per level, the finest first.
-    # A level has converged when a step moves the image by less than this; pixels of the level.
+    # A pyramid level has converged when a step moves its image by fewer pixels than this.
     stop_px: float = 0.02
     # Limit of one step: rotation in rad, and translation as a fraction of the median depth.
     max_step: float = 0.15
@@ -170,13 +170,13 @@ class AlignConfig:
     min_depth_noise_scale: float = 0.2
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     # Lower bound of the geometric noise while the depth may have an unknown smooth bias, as a
-    # multiple of `DepthNoise`. A bias shows no noise, so its residuals would weigh as much as exact
-    # ones. With 5, the ATE of tour-handheld falls from 1.6 to 1.1 cm; without a bias, no sequence
-    # changes by more than 0.04 cm.
+    # multiple of `DepthNoise`. A smooth bias does not look like noise, so biased residuals would
+    # weigh as much as exact ones. With a bound of 5, the trajectory error (ATE) on the sequence
+    # tour-handheld falls from 1.6 to 1.1 cm. On sequences without a bias, it changes by at most
+    # 0.04 cm.
     biased_depth_noise_scale: float = 5.0
-    # Factor on the covariance while the depth may have an unknown smooth bias. The squared
-    # errors of the first 20 frames of two simulated cameras are ten times those of the later
-    # frames.
+    # Factor on the covariance while the depth may have an unknown smooth bias. With two simulated
+    # cameras, the squared errors of the first 20 frames were ten times those of the later frames.
     biased_covariance_scale: float = 10.0
 
     def with_bias(self, relative_sigma: float) -> "AlignConfig":
@@ -215,7 +215,7 @@ class Alignment:
     # [6, 6] for T_reference_camera * exp(xi), xi = (rotation rad, translation m).
     information: np.ndarray
     photometric_inliers: float  # Fraction of the visible points within 3 sigma.
-    # Fraction within 3 sigma of the points that are paired with a measured depth.
+    # Fraction within 3 sigma, of the points that are paired with a measured depth.
     geometric_inliers: float
     intensity_sigma: float  # Photometric noise, gray levels.
     depth_noise_scale: float  # Geometric noise as a multiple of `DepthNoise`.

@@ -1,7 +1,8 @@
 """Foreground of a new keyframe, in front of the background that older keyframes measured.
 
-A person who stands still for a while looks static beside the last frames. Older keyframes that show
-the wall behind the person contradict it. Conventions: `ldo_service.geometry`.
+A person who stands still for a while looks static compared with the last frames. Older keyframes
+that show the wall behind the person prove that the person is not. Conventions:
+`ldo_service.geometry`.
 """
 
 from dataclasses import replace
@@ -17,9 +18,11 @@ from .odometry_config import OdometryConfig
 from .pyramid import Pyramid
 from .tracking_result import TrackedFrame
 
-# Older keyframes that are compared: those of the view before the motion began.
+# Maximum number of older keyframes that the frame is compared with. They show the same view before
+# the motion began.
 MAX_RECORDS = 3
-# Image motion from an older keyframe to the frame, within which they share most of their view.
+# Maximum image motion from an older keyframe to the frame. Within it, both images show mostly the
+# same surface.
 MAX_MOTION_RAD = 0.4
 
 
@@ -29,10 +32,10 @@ def with_foreground(
     database: KeyframeDatabase,
     config: OdometryConfig,
 ) -> TrackedFrame:
-    """Add to the dynamic mask of a frame what stands in front of the background.
+    """Add the pixels in front of the known background to the dynamic mask of a frame.
 
-    Without a moving object in the frame, the mask stays: what stands in front of the background is
-    then a new object, and must be mapped.
+    If the frame shows no moving object, the mask stays as it is. Pixels in front of the background
+    then show a new static object, which must be mapped.
 
     Args:
         tracked: The frame, which becomes a keyframe.

@@ -25,7 +25,7 @@ from .pyramid import Level, Pyramid, ReferencePoints
 
 SIFT_SIZE = 128  # Length of a SIFT descriptor.
 
-NEIGHBORS = 10  # Neighbors that the covariance of a point is estimated from; small_gicp's default.
+NEIGHBORS = 10  # Points from which a point's covariance is estimated; default of small_gicp.
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +41,8 @@ class FeatureConfig:
     ratio: float = 0.8
     # Maximum Hamming distance of ORB matches, bits of 256 (ORB-SLAM3: 100 loose, 50 tight).
     max_distance: int = 64
-    # Maximum number of SIFT features of a frame, the strongest ones. A keyframe record has at most
-    # half as many.
+    # Maximum number of SIFT features of a frame; the strongest ones are kept. A keyframe record has
+    # at most half as many.
     count_across_scales: int = 1000
     # SIFT contrast threshold as a fraction of the gray range. OpenCV's default of 0.04 finds few
     # features indoors.
@@ -171,7 +171,7 @@ def _nearest_gradients(
     therefore does not depend on the order of summation.
 
     Returns:
-        As `_nearest_bits`.
+        The same arrays as `_nearest_bits`.
     """
     a, b = reference.astype(np.float32), frame.astype(np.float32)
     squares = np.sum(a * a, axis=1)[:, None] + np.sum(b * b, axis=1) - 2.0 * (a @ b.T)

@@ -20,16 +20,16 @@ from .shutter_timing import BandEquations, band_equations
 from .state import OdometryState
 from .tracking_quality import TrackingStatus
 
-# Timing by which the velocity of a frame is judged.
+# Timing of a fictitious shutter, to express a velocity as the image motion within 10 ms.
 TEN_MS = ShutterTiming(depth_delay_s=0.01)
-# A frame that is aligned again is worse below this ratio of the overlap before, or above this
-# ratio of the noise. A compensation with a right motion increases the overlap and lowers the
-# noise.
+# A second alignment of a frame counts as worse if the ratio of its overlap to that of the first
+# alignment is below WORSE_OVERLAP, or the ratio of the noise is above WORSE_NOISE. Compensation of
+# the true motion increases the overlap and lowers the noise.
 WORSE_OVERLAP, WORSE_NOISE = 0.8, 1.5
 
 
 class FrameCompensator:
-    """Pyramid of the current frame; nothing but a cache is kept from one frame to the next."""
+    """Image pyramid of the current frame; only a cache is kept from one frame to the next."""
 
     def __init__(self, config: OdometryConfig, guesses: InitialGuessAligner) -> None:
         self.config = config
@@ -37,16 +37,16 @@ class FrameCompensator:
         self._view: tuple[RgbdFrame, Pyramid] | None = None  # The last frame and its pyramid.
         # Motion that the pyramid compensates; None if the motion of the frame is unknown.
         self._compensated: FrameMotion | None = None
-        # Motion that the pose of the last frame fits; None if the motion of the frame is unknown.
+        # Motion during the last frame that its pose was computed for; None if unknown.
         self.motion: FrameMotion | None = None
 
     def expect(self, frame: RgbdFrame, state: OdometryState) -> Pyramid:
-        """Compensate a frame that is not tracked yet with the motion of the frames before it."""
+        """Compensate a frame before it is tracked, by the motion that the last frames predict."""
         expected = state.shutter.expected_motion(state.motion, frame.stamp_ns, self.config.shutter)
         return self._compensate(frame, expected)
 
     def view(self, frame: RgbdFrame) -> Pyramid:
-        """Return the pyramid of a frame; that of the last frame is cached."""
+        """Return the image pyramid of a frame; the pyramid of the last frame is cached."""
         if self._view is None or self._view[0] is not frame:
             return self._compensate(frame, None)
         return self._view[1]
@@ -68,11 +68,11 @@ class FrameCompensator:
         status: TrackingStatus,
         state: OdometryState,
     ) -> tuple[PoseHypothesis, ShutterState]:
-        """Measure the motion during a frame, and return the pose that fits this motion.
+        """Measure the motion of the camera during a frame, and return the pose for this motion.
 
-        If the motion is not as expected, the frame is compensated and aligned again. If the
-        difference is small, only the pose is corrected, to first order, unless the frame is not OK
-        or becomes a keyframe.
+        If the motion is not as expected, the frame is compensated with the measured motion and
+        aligned again. After a small difference, only the pose of an OK frame is corrected, to first
+        order, unless the frame becomes a keyframe.
 
         Args:
             frame: The frame of the last call of `expect`.
@@ -127,7 +127,7 @@ class FrameCompensator:
         return self._view[1]
 
     def _interrupt(self, frame: RgbdFrame) -> None:
-        """Compensate nothing in a frame whose motion is unknown."""
+        """Process a frame whose motion is unknown, without compensation."""
         if self.motion is not None:
             self._compensate(frame, None)
 
@@ -176,7 +176,10 @@ class FrameCompensator:
         shutter: ShutterState,
         compensated: FrameMotion,
     ) -> BandEquations:
-        """Return the equations of a frame; an unknown motion of the reference counts as none."""
+        """Return the normal equations of a frame by bands of rows.
+
+        If the motion of the reference is unknown, the reference counts as at rest.
+        """
         unknown = np.zeros(6)
         velocity_there = shutter.reference_velocity
         return band_equations(
@@ -198,7 +201,7 @@ class FrameCompensator:
         candidate: PoseHypothesis,
         equations: BandEquations | None,
     ) -> ShutterState:
-        """Add the equations of a frame for the times of the shutter, while they are estimated."""
+        """Add the equations of a frame to the evidence, while the shutter's times are estimated."""
         velocity_there, motion = shutter.reference_velocity, self._compensated
         if velocity_there is None or keyframe.motion is None or motion is None:
             return shutter
@@ -217,7 +220,7 @@ class FrameCompensator:
 def _corrected(
     candidate: PoseHypothesis, equations: BandEquations, motion: FrameMotion
 ) -> PoseHypothesis:
-    """Return the pose that alignment would find if another motion was compensated."""
+    """Return the pose that alignment would find if `motion` were compensated instead."""
     alignment = candidate.alignment
     change = se3.exp(equations.pose_change(motion.velocity))
     T_reference_camera = se3.orthonormalize(alignment.T_reference_camera @ change)

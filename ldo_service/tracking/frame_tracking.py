@@ -192,9 +192,10 @@ class FrameTracker:
     def _track_against(
         self, keyframe: ReferenceKeyframe, view: Pyramid, stamp_ns: int
     ) -> PoseHypothesis:
-        """Align from the predicted pose; if the result is unsure, also from all other guesses.
+        """Align a frame from the predicted pose, and also from all other guesses if needed.
 
-        The result is unsure if its status is not OK or if the image moved far since the last frame.
+        The other guesses are needed if the tracking status of the first result is not OK, or if the
+        image has moved far since the last frame.
         """
         motion = self.state.motion
         T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
@@ -212,10 +213,10 @@ class FrameTracker:
         )
 
     def _dead_reckoned_pose(self) -> np.ndarray | None:
-        """Return T_odom_camera [4, 4] of this frame by dead reckoning with the odometry prior.
+        """Return T_odom_camera [4, 4] of the last frame by dead reckoning with the odometry prior.
 
-        Dead reckoning adds the motion of the prior since the last OK frame. The result is None if
-        the prior does not cover that time.
+        Dead reckoning adds the motion of the prior since the last OK frame to the pose of that
+        frame. The result is None if the prior does not cover this time span.
         """
         start, now = self.state.dead_reckoning_start, self._prior
         if start is None or now is None:
@@ -257,10 +258,10 @@ class FrameTracker:
     def _search_other_submaps(
         self, tracked: TrackedFrame, keyframe: ReferenceKeyframe, view: Pyramid
     ) -> TrackedFrame:
-        """Search the keyframes of other submaps at intervals.
+        """Search for the frame in the keyframes of other submaps, once every few frames.
 
-        If a match is confirmed, the returned frame needs a keyframe, and that keyframe merges the
-        submaps.
+        If a match is confirmed, the returned frame is marked to become a keyframe. That keyframe
+        then merges the submaps.
         """
         before, config = self.state.submaps, self.config.submaps
         if tracked.status is not TrackingStatus.OK or not before.is_search_due(config):
@@ -321,8 +322,8 @@ class FrameTracker:
         if status is TrackingStatus.OK:
             dynamic_mask = self._segment_motion(keyframe, self.view(frame), alignment)
         if self.state.origin is KeyframeOrigin.KNOWN:
-            # A known keyframe may be old. An object that was placed since then looks dynamic, but
-            # stands still.
+            # A known keyframe may be old. An object that was placed there later looks dynamic,
+            # although it stands still.
             dynamic_mask = None
             self.state = replace(self.state, dynamic_mask=None)
         needed = None
@@ -345,7 +346,8 @@ class FrameTracker:
     ) -> np.ndarray | None:
         """Return the dynamic mask of a frame, [H, W] bool; None if motion segmentation is off.
 
-        If much of the keyframe's surface has moved away, its ignore mask is renewed.
+        If much of the keyframe's surface has moved away, the ignore mask of the keyframe is
+        updated.
         """
         config = self.config.moving
         if not config.is_on:

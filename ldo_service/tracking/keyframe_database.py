@@ -50,8 +50,8 @@ class KeyframeDatabaseConfig:
     # Maximum number of ORB features of a record: half of the number of a frame, to halve the
     # time of matching.
     features: int = 500
-    # A new record replaces an older one within this distance, rad as in
-    # `motion.image_motion_rad`, because the new one shows the current state of the scene. The
+    # A new record replaces an older one within this distance (rad, as in
+    # `motion.image_motion_rad`), because the new one shows the current state of the scene. The
     # value is half the distance between keyframes, so that the database stops growing while a
     # robot repeats its route.
     same: float = 0.1
@@ -87,8 +87,8 @@ class KeyframeRecord:
     camera: Camera  # Intrinsics of `gray` and `depth`.
     gray: bytes  # PNG image of the size of `camera`.
     depth: bytes  # Depth of the size of `camera`, 16 bits compressed by zstd.
-    # Change of the camera correction since images and points were stored; they are converted when
-    # they are used, because it would take long to convert all records at once.
+    # Change of the camera correction since the record was stored. Images and points are converted
+    # only when they are used, because converting all records at the same time would take long.
     change: CorrectionChange | None = None
 
     @cached_property
@@ -110,7 +110,7 @@ class KeyframeRecord:
         return self.__dict__["_across_scales"]
 
     def history(self, otherwise: ResidualHistory) -> ResidualHistory:
-        """Return the residual noise that is usual near this keyframe; if unknown, `otherwise`.
+        """Return the residual noise that is usual near this keyframe; `otherwise` if it is unknown.
 
         Alignments to this keyframe are compared with this noise, because noise differs between
         scenes.
@@ -132,7 +132,10 @@ class KeyframeRecord:
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "KeyframeRecord":
-        """Return the record from its packed form; version 0.1 has `segment` for `submap`."""
+        """Return the record from its packed form.
+
+        Records of version 0.1 have the key `segment` instead of `submap`.
+        """
         values = {**kept, "camera": Camera.of(kept["camera"])}
         if "change" in values:
             values["change"] = CorrectionChange.of(values["change"])
@@ -147,7 +150,10 @@ class KeyframeRecord:
         return sum(array.nbytes for array in arrays) + len(self.gray) + len(self.depth)
 
     def keyframe(self, config: PyramidConfig) -> ReferenceKeyframe:
-        """Rebuild the keyframe to align frames to it; each result is bitwise the same."""
+        """Rebuild the keyframe, so that frames can be aligned to it.
+
+        Every call returns bitwise the same images.
+        """
         view = build_pyramid(self._gray, self.depth_m, self.camera, config)
         return ReferenceKeyframe(
             view, self.T_odom_keyframe, self.id, self.submap, stored_features=self.features
@@ -237,7 +243,7 @@ def _depth_bytes(depth_m: np.ndarray, ignore_mask: np.ndarray) -> bytes:
 
 
 def _are_still(points: np.ndarray, camera: Camera, ignore_mask: np.ndarray) -> np.ndarray:
-    """Return the mask of the points that have a measured depth and project outside `ignore_mask`.
+    """Return which points have a measured depth and project outside `ignore_mask`.
 
     Args:
         points: Points in the camera, [N, 3] meters; z = 0 where unmeasured.
@@ -337,7 +343,9 @@ class KeyframeDatabase:
 
 
 def neighbor_distances(path: Sequence[KeyframeRecord]) -> np.ndarray:
-    """Return the distance between the two neighbors of each record, except the first and the last.
+    """Return the distance between the two neighbors of each record on the path.
+
+    The first and the last record have only one neighbor and are left out.
 
     Args:
         path: N records in the order of the path.

@@ -23,7 +23,7 @@ from .submaps import SubmapConfig, SubmapMatch
 from .tracking_quality import TrackingStatus
 from .tracking_result import KeyframeKind, TrackedFrame, TrackingResult, make_tracking_result
 
-MAP = -1  # Value of `SubmapMatch.there` for the map, which has no submap number.
+MAP = -1  # Value of `SubmapMatch.there` for the finished map, which has no submap number.
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class MapFix:
         return self.T_map_odom is None or self.frames_since_search >= config.search_interval_frames
 
     def after(self, tracked: TrackedFrame) -> "MapFix":
-        """Return the fix after one more frame.
+        """Return the pose of odometry in the map after one more frame.
 
         If odometry has started a new submap, T_map_odom is unknown again.
         """
@@ -53,7 +53,7 @@ class MapFix:
         return replace(self, frames_since_search=self.frames_since_search + 1)
 
     def with_search_result(self, look: SubmapMatch, config: SubmapConfig) -> "MapFix":
-        """Return the fix after a relocalization match.
+        """Return the pose of odometry in the map after a relocalization match.
 
         T_map_odom changes only if the previous match agrees with the new one.
         """

@@ -17,7 +17,8 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 from .tracking_result import TrackedFrame
 
 # Number of newest keyframes whose poses are stored: four credit windows of the topic keyframe/new.
-# Backpressure keeps the pose-graph optimizer from lagging behind by more keyframes.
+# The pose-graph optimizer never lags behind by more keyframes, because backpressure slows the
+# tracker first.
 RECENT_KEYFRAMES = 32
 
 
@@ -26,9 +27,9 @@ class MapCorrection:
     """Keyframe poses of one version of the pose graph, decoded on demand."""
 
     version: int
-    roots: Mapping[int, int]  # Oldest submap that a submap is merged with, by submap.
-    # Function that returns T_map_keyframe [4, 4] by id. Its argument lists the ids to return; the
-    # newest keyframe is always returned too. None returns all keyframes.
+    roots: Mapping[int, int]  # Oldest submap that each submap is merged with, by submap.
+    # Function that returns T_map_keyframe [4, 4] by id. Its argument lists the ids to return, or is
+    # None for all keyframes. The newest keyframe is always returned too.
     read_poses: Callable[[Iterable[int] | None], Mapping[int, np.ndarray]]
 
 

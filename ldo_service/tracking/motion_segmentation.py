@@ -22,10 +22,10 @@ from ldo_service.geometry import Camera, se3
 
 from .pyramid import DepthNoise, Level, Pyramid
 
-# Least fraction of the pixels without motion that agree with a keyframe whose pose is right. The
-# others may show people who stand still.
+# Minimum fraction of the static pixels that must agree with a keyframe. If fewer agree, the pose of
+# the keyframe is wrong. The limit is low because pixels may also show people who stand still.
 MIN_AGREEING_RATIO = 0.3
-# Fraction of the pixels from which a dynamic mask shows a moving object, and not noise.
+# Minimum fraction of the pixels in a dynamic mask that shows a moving object; fewer are noise.
 MIN_DYNAMIC_RATIO = 0.01
 NOTHING_M = 1e4  # Depth of an unmeasured pixel in the computation of minima, meters.
 
@@ -46,8 +46,8 @@ class MotionSegmentationConfig:
     edge_px: int = 2
     # Minimum size of a connected region, fraction of the image; smaller regions are noise.
     min_share: float = 0.0015
-    # A region counts only if the previous frame had a pixel within this distance, in pixels, that
-    # contradicted a static scene too.
+    # A region counts only if a pixel of the previous frame within this distance, in pixels, also
+    # contradicted a static scene.
     streak_px: int = 5
     # The dynamic mask grows to pixels within this distance and this depth difference. Such pixels
     # show parts of the same object that do not contradict a static scene: parts that were there
@@ -100,7 +100,7 @@ class MotionEvidence:
         return is_of_keyframe and self.contradicts.shape == now.depth_m.shape
 
     def of_new_keyframe(self) -> "MotionEvidence":
-        """Return the state after a change of the keyframe: the counts in `gone` start at zero."""
+        """Return the state for a new keyframe: the counts in `gone` restart at zero."""
         return MotionEvidence(self.contradicts, None)
 
 
@@ -146,7 +146,7 @@ class _Pair:
         """Return the pixels [h, w] bool of the frame that have appeared since the keyframe.
 
         Such a pixel lies in front of the keyframe's surface. A pixel that projects onto a moved
-        pixel of the keyframe counts too, unless it lies behind the surface.
+        pixel of the keyframe counts too, unless it lies behind the surface of the keyframe.
         """
         ahead_m = depth_gap_m(self.now, self.then, self.T_then_now, self.config)
         limit_m = self.limit_m(self.now)
@@ -345,7 +345,7 @@ def _rays(camera: Camera) -> np.ndarray:
 def _in_pieces(
     contradicts: np.ndarray, before: np.ndarray | None, config: MotionSegmentationConfig
 ) -> np.ndarray:
-    """Return the connected regions of a mask that are large enough and also in the previous frame.
+    """Return the connected regions of a mask that are large and near those of the last frame.
 
     Args:
         contradicts: Pixels that contradict a static scene, [h, w] bool.

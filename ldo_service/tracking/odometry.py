@@ -119,8 +119,8 @@ class Odometry:
             tracked = self._frames.start_submap(frame)
         # Reuse a known keyframe as the reference instead of making a new keyframe. If the current
         # reference has no measured pose relative to a known keyframe, one more keyframe is made
-        # first. It is measured from the known keyframe, to connect the known keyframe to the last
-        # references in the pose graph.
+        # first. Its pose is measured relative to the known keyframe. This measurement connects the
+        # known keyframe to the last references in the pose graph.
         known, reused = self._find_reusable_keyframe(frame, tracked), None
         if known is not None and self._is_connected_to_map:
             tracked = self._switch_to_keyframe(known, tracked)
@@ -163,7 +163,7 @@ class Odometry:
         return self._map.correct(correction)
 
     def recorrect(self, change: CorrectionChange) -> None:
-        """Convert all keyframes to the camera correction of the next frames; their poses stay."""
+        """Convert all keyframes to a new camera correction; the keyframe poses stay the same."""
         state = self._frames.state
         self._frames.restore(state.recorrected(change, self.config.pyramid))
 
@@ -228,7 +228,8 @@ class Odometry:
     def _has_left_keyframe(self, tracked: TrackedFrame) -> bool:
         """Return whether an OK frame is so far from its reference that it must become a relay.
 
-        The limits are those of `KeyframeConfig.relay_ratio`.
+        A relay is a reference for tracking that is no keyframe. `KeyframeConfig.relay_ratio` sets
+        the limits.
         """
         keyframe = self._frames.state.keyframe
         if keyframe is None:
@@ -305,8 +306,8 @@ class Odometry:
             tracked: The tracking result of the frame.
             kind: The kind of keyframe that the frame needs. If `known` is given, a reference
                 keyframe is made instead of a mapping keyframe.
-            known: A known keyframe from which the new one is measured, to connect both in the pose
-                graph; or None.
+            known: Known keyframe that the pose of the new one is measured relative to, which
+                connects both in the pose graph. None if there is none.
         """
         window: list[RelativePose] = []
         if kind is KeyframeKind.MAPPING and known is None:
@@ -331,8 +332,8 @@ class Odometry:
         Args:
             frame: The frame.
             tracked: The tracking result of the frame, not LOST.
-            is_connected: True if the new keyframe is measured from a known one. The next frames may
-                then reuse known keyframes.
+            is_connected: True if the pose of the new keyframe is measured relative to a known one.
+                The next frames may then reuse known keyframes.
         """
         frames = self._frames
         if tracked.pose_source == "first":
@@ -349,7 +350,7 @@ class Odometry:
         return keyframe.id
 
     def _add_mapping_keyframe(self, frame: RgbdFrame, tracked: TrackedFrame) -> int:
-        """Make the frame a mapping keyframe, and return its id; the reference stays.
+        """Make the frame a mapping keyframe, and return its id; the reference does not change.
 
         The record of the mapping keyframe is kept, because this keyframe is the closest one to the
         camera if tracking is lost next.

@@ -17,7 +17,7 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
-# Number of poses kept: a third of a second at 200 Hz. Tracking a frame takes less time.
+# Number of poses kept: those of a third of a second at 200 Hz. Tracking a frame takes less time.
 KEPT = 64
 
 
@@ -66,7 +66,7 @@ class PriorConfig:
 
 
 class PriorCheck(StrEnum):
-    """Outcome of adding a pose to the buffer; each value is the predicate of a log line."""
+    """Outcome of adding a pose to the buffer; each value is a phrase for a log line."""
 
     FOLLOWS = "follows the previous pose"
     LATE = "is not later than the previous pose, and is dropped"
@@ -159,7 +159,7 @@ class OdometryPriorBuffer:
         return interpolated(before, after, stamp_ns) if is_near else None
 
     def _beyond(self, stamp_ns: int, config: PriorConfig) -> np.ndarray | None:
-        """Extrapolate the pose [4, 4] past the newest one; return None if the stamp is too late.
+        """Extrapolate the pose [4, 4] past the newest pose; return None if the stamp is too late.
 
         The velocity is the motion from the earliest pose within `max_gap_s` to the newest one. Two
         poses closer in time would amplify their noise.
@@ -212,7 +212,7 @@ class DeadReckoningStart:
     reading: PriorPose  # Pose of the same frame in the prior.
 
     def dead_reckon(self, now: PriorPose, config: PriorConfig) -> np.ndarray | None:
-        """Return T_odom_camera [4, 4] at a later time: the last OK pose plus the prior's motion.
+        """Return T_odom_camera [4, 4] at a later time, by the motion of the prior since then.
 
         T_odom_now = T_odom_then * inverse(T_prior_then) * T_prior_now
 

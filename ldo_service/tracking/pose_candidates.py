@@ -18,7 +18,7 @@ from .keyframes import ReferenceKeyframe
 from .motion import image_motion_rad
 from .pyramid import Pyramid
 
-# Weight of visible points relative to points that are also paired with a measured depth.
+# Weight of a point that is only visible, relative to one that is paired with a measured depth.
 PHOTOMETRIC_ONLY_WEIGHT = 0.05
 REALIGNED_LEVELS = 2  # Finest pyramid levels to which a frame is aligned again.
 
@@ -151,7 +151,7 @@ def select_hypothesis(
     if T_keyframe_second is None:
         return chosen
     *unled, led = apart
-    # Two hypotheses that started apart and converged to one pose confirm each other.
+    # Two hypotheses confirm each other if they started apart and converged to the same pose.
     others = unled if winner == len(unled) else [led]
     if min(*others, hypothesis_distance_rad(chosen, T_keyframe_second)) < config.agreement_rad:
         return replace(chosen, is_confirmed=True)
@@ -192,7 +192,7 @@ class InitialGuessAligner:
         T_keyframe_previous: np.ndarray,
         T_keyframe_reckoned: np.ndarray | None,
     ) -> PoseHypothesis:
-        """Align from all initial guesses besides constant velocity; return the best hypothesis.
+        """Align from all initial guesses except constant velocity; return the best hypothesis.
 
         Args:
             predicted: Hypothesis from the constant-velocity guess; it may be the best one.
@@ -226,7 +226,10 @@ class InitialGuessAligner:
     def align_again(
         self, keyframe: ReferenceKeyframe, view: Pyramid, candidate: PoseHypothesis
     ) -> PoseHypothesis:
-        """Align a frame whose images changed a little, from its pose; only the finest levels."""
+        """Align a frame again after a small change of its images.
+
+        Alignment starts from the pose of `candidate` and uses only the finest pyramid levels.
+        """
         finest = replace(keyframe.reference, points=keyframe.reference.points[:REALIGNED_LEVELS])
         guess = se3.inverse(candidate.alignment.T_reference_camera)
         start = replace(self.align, start=candidate.alignment.appearance)

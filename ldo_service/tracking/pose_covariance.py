@@ -3,7 +3,7 @@
 The residuals of neighboring points have correlated errors: a reflection, a blurred edge or a bias
 of the depth shifts many of them alike. The inverse Hessian H^-1 of the normal equations takes the
 residuals as independent, so it is too small by a factor that depends on the sensor. The covariance
-is therefore
+is therefore computed as
 
     scale (H^-1 S H^-1 + max(tr(H^-1 S) / 6, 1) H^-1) + floor,
 
@@ -34,12 +34,13 @@ PRIOR = np.eye(6)
 class CovarianceConfig:
     """Settings of the covariance of a pose.
 
-    They were chosen on seven sequences with exact truth. There the mean normalized estimation error
-    squared, whose expected value is 6, is 2 to 5 without the errors of a real camera, and 11 and 18
-    with them: docs/benchmarks/covariance.md.
+    They were chosen on seven sequences with exact ground truth. The measure is the mean normalized
+    estimation error squared, whose expected value is 6. It is 2 to 5 on sequences without the
+    errors of a real camera, and 11 and 18 on the two sequences with such errors. See
+    docs/benchmarks/covariance.md.
     """
 
-    scale: float = 5.0  # Factor on both terms; see above.
+    scale: float = 5.0  # Factor on both terms; see the docstring of the module.
     # Standard deviations of the floor: errors of the linear interpolation of images.
     floor_rad: float = 3e-5
     floor_m: float = 5e-5

@@ -65,14 +65,14 @@ PosedRecord = tuple[KeyframeRecord, FeaturePose]
 class RelocalizationConfig:
     """Settings of relocalization."""
 
-    # A frame is compared with this number of records, those with the most similar thumbnails. The
+    # Number of records that a frame is compared with: those with the most similar thumbnails. The
     # prototype has the same value.
     appearance_candidates: int = 5
-    # A frame is also compared with this number of further records, which rotate from search to
-    # search. At 30 Hz, the rotation through 1000 records takes 11 s.
+    # Number of further records that a frame is compared with. The next search uses the next ones.
+    # At 30 Hz, all of 1000 records have had their turn after 11 s.
     in_turn: int = 3
-    # A lost frame is compared by SIFT, which matches across scales, with this number of further
-    # records. They rotate from search to search. 0: no SIFT.
+    # Number of further records that a lost frame is compared with by SIFT, which matches across
+    # scales. The next search uses the next ones. 0: no SIFT.
     across_scales: int = 8
     # Maximum number of direct alignments per search, from the feature poses with most inliers.
     attempts: int = 3
@@ -84,12 +84,12 @@ class RelocalizationConfig:
     variety_rad: float = 0.25
     # A match is ambiguous if a distant record has more than this fraction of the match's inliers.
     ambiguous_inlier_ratio: float = 0.3
-    # A record is distant from the match if the camera poses by both differ by more than this: 57
-    # degrees of rotation, or one median depth of translation.
+    # A record is distant from the match if the camera poses that both give differ by more than
+    # this: 57 degrees of rotation, or one median depth of translation.
     ambiguous_rad: float = 1.0
-    # Minimum correlation with the thumbnail of the last OK frame. A WEAK frame below it shows
-    # another place and is LOST. On the sequence kitchen, successive frames correlate above 0.93,
-    # and 97 % of the frames from different places correlate below 0.4.
+    # Minimum correlation of a WEAK frame's thumbnail with that of the last OK frame. Below it, the
+    # frame shows another place and becomes LOST. On the sequence kitchen, successive frames
+    # correlate above 0.93, and 97 % of the frames from different places correlate below 0.4.
     familiar: float = 0.4
 
     def __post_init__(self) -> None:
@@ -171,7 +171,7 @@ class Relocalizer:
         return sure[1]
 
     def resembles_last_trusted(self, view: Pyramid, trusted: np.ndarray) -> bool:
-        """Return whether a frame looks like the last OK frame, whose thumbnail is `trusted`."""
+        """Return whether a frame looks like the last OK frame, which has thumbnail `trusted`."""
         seen, trusted = make_thumbnail(view).astype(float), trusted.astype(float)
         scale = np.linalg.norm(seen) * np.linalg.norm(trusted)
         return bool(seen @ trusted >= self.config.familiar * scale > 0)
@@ -284,10 +284,11 @@ Nearby = tuple[KeyframeRecord, np.ndarray]
 class KeyframeReuseConfig:
     """Settings of keyframe reuse."""
 
-    # Known keyframes are reused once this number of keyframes, mapping keyframes included, have
-    # been made; 0: never. Before that, new keyframes improve the map and cost a few kB each.
+    # Known keyframes are reused once this many keyframes have been made, including mapping
+    # keyframes; 0: never. Before that, new keyframes improve the map and cost a few kB each.
     after: int = 1500
-    # Maximum number of records that a frame is aligned to, the nearest first; 8 ms each at 640x480.
+    # Maximum number of records that a frame is aligned to, the nearest first. Each one takes 8 ms
+    # at 640x480.
     tries: int = 2
     # Maximum rotation plus parallax between the poses by map and by images: 0.03 rad, or 3 % of the
     # median depth. Above it, new keyframes are made until a loop closure corrects the map.

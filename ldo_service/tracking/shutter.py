@@ -1,7 +1,7 @@
 """Motion of the camera while it records a frame, and its compensation during tracking.
 
-The velocity comes from the poses of the last frames. A frame is compensated with the velocity that
-is expected before it is tracked, and again if its pose shows another velocity.
+The velocity comes from the poses of the last frames. Before a frame is tracked, it is compensated
+with the expected velocity. If its pose then shows another velocity, it is compensated again.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -18,7 +18,7 @@ from ldo_service.geometry import Camera
 from .motion import ConstantVelocity
 from .shutter_timing import BandEquations, TimingEvidence
 
-# Weight of evidence from before a large change of the timing, or of the correction of the images.
+# Weight of evidence that is older than a large change of the timing or of the image correction.
 EARLIER_WEIGHT = 0.25
 
 
@@ -32,26 +32,29 @@ class ShutterConfig:
     # Maximum interval between two frames whose mean velocity is used. A hand shakes with periods of
     # 0.2 s.
     max_interval_s: float = 0.15
-    # The times are compensated if one of them exceeds this multiple of its standard deviation, and
-    # min_s. Below min_s, a turn of 60 degrees/s moves the image by less than 1.7 of 640 pixels.
+    # The times are compensated if one of them exceeds both min_s and this multiple of its standard
+    # deviation. Within min_s, a turn of 60 degrees/s moves the image by less than 1.7 of 640
+    # pixels.
     sigmas: float = 4.0
     min_s: float = 0.003
-    max_s: float = 0.05  # Larger estimates are not believed: a frame lasts 33 ms.
-    # Largest standard deviation of a time. All times are compensated together, the uncertain ones
-    # too.
+    max_s: float = 0.05  # Larger estimates are rejected, because a frame lasts 33 ms.
+    # Maximum standard deviation of each time. All times are compensated together, so none may be
+    # more uncertain.
     max_sigma_s: float = 0.015
-    update_frames: int = 3  # Measurements from one estimate to the next.
-    # Change of a time beyond which the evidence before it counts less: its equations are linear
-    # approximations, and give too small times for large displacements.
+    update_frames: int = 3  # Number of measurements between two estimates.
+    # Change of a time after which earlier evidence counts less. The earlier equations are linear
+    # approximations, which give too small times for large displacements.
     relinearized_s: float = 0.004
     max_frames: int = 300  # Measurements after which the estimate is final.
-    # Least velocity of a measurement: image motion in 10 ms, rad. Slower frames tell nothing.
+    # Minimum velocity of a measurement, as image motion within 10 ms, rad. Slower frames contain no
+    # information about the times.
     min_motion_rad: float = 0.003
-    # Change of the expected velocity by the measured pose beyond which the frame is compensated and
-    # aligned again: largest displacement of the image, fraction of the image width.
+    # A frame is compensated and aligned again if its measured velocity differs from the expected
+    # one by more than this. The unit is the displacement of the image as a fraction of its width.
     realign_ratio: float = 0.75 / 640
-    # Larger change up to which only the pose is corrected, to first order, unless the frame becomes
-    # a keyframe. On freiburg1_rpy_part, the ATE is 1.7 cm with 3 pixels and 2.4 cm with 8 pixels.
+    # Larger limit of the same difference. Below it, the frame is not aligned again: only its pose
+    # is corrected, to first order. Frames that become keyframes are always aligned again. The
+    # trajectory error (ATE) on freiburg1_rpy_part is 1.7 cm with 3 pixels and 2.4 cm with 8 pixels.
     max_linear_ratio: float = 3.0 / 640
 
     def __post_init__(self) -> None:
@@ -77,11 +80,11 @@ class ShutterState:
     # and after it. None if unknown, and at the frame after a new reference.
     reference_velocity: np.ndarray | None = None
     has_new_reference: bool = False  # True if the last frame became the reference.
-    # Equations of the last frame, until the next frame tells its velocity.
+    # Equations of the last frame. They are evaluated once the next frame shows its velocity.
     pending: BandEquations | None = None
 
     def informed(self, equations: np.ndarray | None, config: ShutterConfig) -> "ShutterState":
-        """Return the state with the estimate of the self-calibration as the prior of the times.
+        """Return the state with the self-calibration's estimate as the prior of the times.
 
         Args:
             equations: Information and right side of the times, [3, 4]; None if unknown.
@@ -165,7 +168,7 @@ class ShutterState:
         return replace(self, evidence=evidence, timing=timing)
 
     def metrics(self) -> dict[str, float]:
-        """Return the times in use, and the last estimate with its standard deviation, ms.
+        """Return the times in use and the last estimate with its standard deviation, milliseconds.
 
         The estimate is missing until there is enough evidence for one.
         """
@@ -207,7 +210,7 @@ class ShutterState:
 def displacement_ratio(
     expected: FrameMotion | None, measured: FrameMotion, median_depth_m: float, camera: Camera
 ) -> float:
-    """Return by how much an image is displaced at most because its motion was not as expected.
+    """Return the largest displacement in an image whose motion differs from the expected one.
 
     Args:
         expected: Motion that the frame was compensated with; None without compensation.
@@ -227,9 +230,9 @@ def _updated(
 ) -> ShutterTiming:
     """Return the times that are compensated from now on.
 
-    All times are replaced by their estimates if one is significant and none is uncertain. If one of
-    color and depth was compensated alone, they would no longer fit each other. Otherwise, the times
-    stay.
+    If one estimate is significant and none is uncertain, all times are replaced by their estimates.
+    Otherwise, all times stay. If only color or only depth were compensated, the two would no
+    longer fit each other.
     """
     found = evidence.estimate()
     if found is None:

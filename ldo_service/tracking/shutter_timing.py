@@ -3,10 +3,11 @@
 A rolling shutter and a delay between color and depth displace the parts of a frame in proportion to
 the velocity of the camera. The displacement of a row is a twist: the velocity times the time at
 which the row was recorded. The times are thus three more unknowns of the normal equations of
-alignment, and common to all frames. `BandEquations` are the normal equations of one frame by bands
-of rows. Their `timing_equations` are those for the times, after elimination of pose and exposure.
-`TimingEvidence` adds up the equations of many frames. The velocity changes its direction over time,
-so the static errors of a camera, such as a depth bias, average out.
+alignment, and common to all frames. `BandEquations` holds the normal equations of one frame, one
+set for each band of rows. `BandEquations.timing_equations` eliminates pose and exposure, so that
+only the times remain unknown. `TimingEvidence` adds up these equations of many frames. The velocity
+changes its direction over time, so the static errors of a camera, such as a depth bias, average
+out.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -31,13 +32,13 @@ SHARED = slice(8, 11)  # Unknowns of the camera: readout of color, readout and d
 LEVEL = 1
 BANDS = 6  # Bands of rows that are displaced as a whole.
 MIN_BAND_POINTS = 50  # Points; a band with fewer is left out.
-ROW_STRIDE = 4  # The mean rows of a band are those of every fourth point.
-# Noise of the equations as a multiple of that of alignment. The rows far from the middle tell the
-# readout, and are outliers of the alignment as long as the readout is not compensated.
+ROW_STRIDE = 4  # The mean row of a band is computed from every fourth point.
+# Noise of the equations as a multiple of the noise of alignment. The rows far from the middle
+# determine the readout. They are outliers of the alignment until the readout is compensated.
 NOISE_RATIO = 3.0
-# Fraction of the residuals that count as independent, because the errors of neighboring residuals
-# are correlated. Pose errors fit 0.1 on exact renders, and 1e-4 to 3e-5 on a Kinect; the value
-# lies between.
+# Fraction of the residuals that counts as independent, because the errors of neighboring residuals
+# are correlated. The measured pose errors correspond to a fraction of 0.1 on exact renders, and of
+# 1e-4 to 3e-5 on a Kinect. The value lies between them.
 INDEPENDENT_FRACTION = 2e-3
 # Noise that removes one kind of residuals from the normal equations: gray levels, or a multiple of
 # `DepthNoise`.
@@ -49,7 +50,7 @@ MIN_GROUPS, MAX_GROUPS = 12, 24  # Groups of the jackknife; two are merged beyon
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BandEquations:
-    """Normal equations of a frame at its pose, by band of rows, apart for color and depth."""
+    """Normal equations of a frame at its pose, separate by band of rows and for color and depth."""
 
     hessian: np.ndarray  # [B, 2, 8, 8] for color and depth.
     gradient: np.ndarray  # [B, 2, 8]
@@ -78,7 +79,7 @@ class BandEquations:
         return BandEquations(**{**kept, **motions})
 
     def pose_change(self, velocity: np.ndarray) -> np.ndarray:
-        """Return by how much the pose changes if the frame is compensated with another velocity.
+        """Return the change of the pose if the frame is compensated with another velocity.
 
         The change is a first-order approximation.
 
@@ -109,7 +110,7 @@ class BandEquations:
         velocity_there = to_camera @ self.reference_velocity
         used_there = replace(self.at_reference, velocity=to_camera @ self.at_reference.velocity)
         there, here = self.rows.T
-        # Twists [B, 2, 6] that are compensated already, and those per second of each time.
+        # Twists [B, 2, 6] that are compensated already, and twists per second of each time.
         done = _row_twists(self.at_frame, here) - _row_twists(used_there, there)
         J = np.zeros((len(here), 2, 11, 8))
         J[:, :, OWN] = np.eye(8)
@@ -191,7 +192,8 @@ class TimingEvidence:
     size: int = 1  # Measurements per complete group.
     in_last: int = 0  # Measurements in the last group.
     count: int = 0
-    # Information and right side, [3, 4], of an estimate from other evidence, or of `PRIOR`.
+    # Prior of the times as information and right side, [3, 4]: an estimate from other evidence, or
+    # `PRIOR`.
     prior: np.ndarray = field(default_factory=PRIOR.copy)
 
     def extended(self, measurement: np.ndarray) -> "TimingEvidence":
@@ -210,11 +212,11 @@ class TimingEvidence:
     def estimate(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the times [3] of the shutter in seconds, and their standard deviations [3].
 
-        The prior holds times that the frames do not tell. The standard deviations combine two
-        estimates: a jackknife over the groups, because the errors of neighboring frames are alike,
-        and the information of the equations, because a jackknife over few groups may be small by
-        chance. With too few groups, the result is that of the prior; without an estimate from other
-        evidence, it is None.
+        The prior determines those times that the frames do not. The standard deviations combine two
+        estimates. A jackknife over the groups allows for the similar errors of neighboring frames.
+        The information of the equations is the other estimate, because a jackknife over few groups
+        may be small by chance. With too few groups, the result is that of an estimate from other
+        evidence, or None if there is none.
         """
         if len(self.groups) < MIN_GROUPS:
             if np.array_equal(self.prior, PRIOR):
@@ -259,7 +261,10 @@ class TimingEvidence:
 
 
 def _row_twists(motion: FrameMotion, rows: np.ndarray) -> np.ndarray:
-    """Return the twists [B, 2, 6] by which rows [B], -0.5..0.5, of color and depth were moved."""
+    """Return the twists [B, 2, 6] by which the motion moved rows [B] of color and of depth.
+
+    Rows are numbered from -0.5 to 0.5.
+    """
     timing = motion.timing
     color_s = timing.readout_s * rows
     depth_s = timing.depth_readout_s * rows + timing.depth_delay_s

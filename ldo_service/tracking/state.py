@@ -61,7 +61,8 @@ class OdometryState:
     # Dynamic pixels of the last frame, [H, W] bool at working resolution; None if unknown.
     dynamic_mask: np.ndarray | None = None
     motion_evidence: MotionEvidence | None = None
-    # Poses of the last OK frame; None if the odometry prior had no pose at the time of that frame.
+    # Poses of the last OK frame in odometry and in the odometry prior; None if the prior had no
+    # pose at the time of that frame.
     dead_reckoning_start: DeadReckoningStart | None = None
     shutter: ShutterState = field(default_factory=ShutterState)
 
@@ -187,10 +188,11 @@ class OdometryState:
     def informed(
         self, camera: CameraKnowledge, pyramid: PyramidConfig, config: ShutterConfig
     ) -> "OdometryState":
-        """Return the state before a frame, with the estimates of the camera.
+        """Return the state before a frame, with new estimates of the camera.
 
-        Frames are compensated by the current timing of the shutter. A reference with another timing
-        would be distorted beside them, so it is compensated again.
+        Frames are compensated with the current timing of the shutter. If the reference was
+        compensated with another timing, it is compensated again, because otherwise it would be
+        distorted relative to the frames.
 
         Args:
             camera: Estimates of the self-calibration.

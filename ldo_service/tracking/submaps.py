@@ -42,7 +42,7 @@ class SubmapConfig:
     # default is the field of view of a depth camera. Lower values merge sooner and accept
     # perceptual aliases.
     confirm_apart_rad: float = 1.0
-    misses: int = 3  # Number of searches in a row without a match that a pending match survives.
+    misses: int = 3  # Searches in a row without a match after which a pending match still counts.
 
     def __post_init__(self) -> None:
         if self.begin_after_frames < 0 or min(self.search_interval_frames, self.confirm_after) < 1:
@@ -136,11 +136,10 @@ class SubmapMatch:
 class Submaps:
     """Merged submaps, and the state of the search for further merges."""
 
-    # Oldest submap that each submap is merged with, by submap; the submap itself if it is not
-    # merged.
+    # Oldest submap that each submap is merged with, or the submap itself if it is not merged.
     roots: tuple[int, ...] = ()
     lost_frames: int = 0  # LOST frames in a row that were searched in vain.
-    lost_views: int = 0  # Number of these that show another view than the last counted one.
+    lost_views: int = 0  # Number of these frames that differ from the last counted one.
     # Thumbnail of the last counted view, [300] int8; None without LOST frames.
     lost_thumbnail: np.ndarray | None = None
     frames_since_search: int = 0

@@ -52,10 +52,11 @@ class TrackingQualityConfig:
     weak_residual: float = 2.5  # Maximum ratio of an OK frame.
     lost_residual: float = 5.0  # A frame with a larger ratio is LOST.
     lost_overlap: float = 0.08  # A frame with a smaller overlap is LOST.
-    # Residual limits of a pose within confirmed_rad of the pose by features. They replace the
-    # limits above if those are smaller, except while tracking is LOST. They were chosen on the
-    # ScanNet parts and on freiburg1_rpy. Of the frames above weak_residual, those within 0.03
-    # rad of the feature pose erred by at most 0.01 rad, and the others by up to 0.07 rad.
+    # Residual limits of a pose within confirmed_rad of the pose by features. They replace
+    # weak_residual and lost_residual if those are smaller, except while tracking is LOST. They were
+    # chosen on parts of ScanNet and on freiburg1_rpy. There, frames above weak_residual had an
+    # error of at most 0.01 rad if they were within 0.03 rad of the feature pose, and of up to 0.07
+    # rad otherwise.
     confirmed_rad: float = 0.03
     confirmed_weak_residual: float = 6.0
     confirmed_lost_residual: float = 15.0
@@ -63,14 +64,15 @@ class TrackingQualityConfig:
     min_intensity_sigma: float = 2.0
     min_depth_noise_scale: float = 0.5
     # Minimum overlap of the first OK frame after a loss, unless an independent estimate confirms
-    # the pose. Of the confirmed poses with less overlap, 43 of 43 were right (kitchen and flat).
+    # the pose. On the sequences kitchen and `synthetic:flat`, all 43 confirmed poses with less
+    # overlap were right.
     relocalized_overlap: float = 0.35
     # Residual limit of the first OK frame after a loss, at the pose of the keyframe. The limit
     # grows by relocalized_residual_per_rad per radian of image motion from the keyframe
-    # (`motion.image_motion_rad`), up to weak_residual, because the noise of right poses grows
-    # too: its median in the kitchen is 1.4 at 0.15 rad and 2.0 at 0.55 rad. A fixed limit of 1.6
-    # found a third fewer frames of the kitchen, and one more false pose in the ambiguous
-    # corridor of the flat.
+    # (`motion.image_motion_rad`), up to weak_residual. The noise of right poses grows with it too:
+    # on the sequence kitchen, its median is 1.4 at 0.15 rad and 2.0 at 0.55 rad. A fixed limit of
+    # 1.6 relocalized a third fewer frames of kitchen. It accepted one more false pose in the
+    # ambiguous corridor of `synthetic:flat`.
     relocalized_residual: float = 1.3
     relocalized_residual_per_rad: float = 2.0
     # Expected noise while the history is empty. Intensity in gray levels.
@@ -164,7 +166,7 @@ def classify_tracking(
     previous: TrackingStatus,
     config: TrackingQualityConfig,
 ) -> TrackingStatus:
-    """Return the tracking status of a frame, judged by its best alignment.
+    """Return the tracking status of a frame by the quality of its best alignment.
 
     The limits have hysteresis. They are stricter after a WEAK frame, unless an independent estimate
     (features or GICP) confirms the pose. They are strictest after a LOST frame, unless such an

@@ -102,7 +102,10 @@ class TrackedFrame:
         )
 
     def relay(self) -> Relay:
-        """Return the frame's pose in its keyframe as a relay, which later frames are aligned to."""
+        """Return the pose of the frame in its keyframe as a relay.
+
+        A relay is a frame that later frames are aligned to although it is no keyframe.
+        """
         return Relay(self.T_reference_camera, covariance_of(self.information))
 
 
@@ -161,8 +164,7 @@ class TrackingResult:
     reused_keyframe: int | None = None
     # Kind of keyframe that was needed but not allowed by `may_map`; None otherwise.
     denied_keyframe: KeyframeKind | None = None
-    # True if odometry has not started, because `may_map` did not allow a keyframe of its first
-    # frame.
+    # True if odometry has not started yet because `may_map` was False at its first frame.
     awaits_mapping: bool = False
 
 
