@@ -24,11 +24,12 @@ class ConsistencyCheckConfig:
     """Limits of the drift that a loop hypothesis implies, and of its ambiguity."""
 
     drift_m: float = 0.5  # Allowed position drift on any path.
-    drift: float = 0.1  # Additional drift per meter of path; ten times the drift of depth cameras.
+    drift: float = 0.1  # Additional drift per meter of path; ten times that of depth cameras.
     turn_rad: float = 0.35  # Allowed rotation drift on any path.
     turn_rad_per_m: float = 0.02  # Additional rotation drift per meter of path; 1.1 degrees.
-    # Maximum pose difference of two cameras that see the same surfaces: rotation (the width of a
-    # view), and distance in median depths. The allowed drift is added to these limits.
+    # Maximum pose difference of two cameras that see the same surfaces. view_rad is the rotation,
+    # about the width of a view; view_depths is the distance in median depths. The allowed drift is
+    # added to these limits.
     view_rad: float = 1.5
     view_depths: float = 2.0
     # A hypothesis is ambiguous if another one has at least this fraction of its inliers, and if the
@@ -98,10 +99,10 @@ class ConsistencyChecker:
         return may
 
     def check_drift(self, proposal: LoopHypothesis) -> LoopHypothesis:
-        """Return a hypothesis, rejected if it implies more drift than the camera path allows.
+        """Check a loop hypothesis, and return it with a `rejected_reason` if it is rejected.
 
-        A rejected hypothesis has a `rejected_reason`. A hypothesis whose keyframes have no known
-        relative pose is returned unchanged.
+        A hypothesis is rejected if it implies more drift than the length of the camera path allows.
+        A hypothesis whose keyframes have no known relative pose is returned unchanged.
         """
         old, new = proposal.old, proposal.new
         if proposal.rejected_reason or not self._is_known(old, new):
@@ -164,7 +165,7 @@ class ConsistencyChecker:
     def _drift(
         self, old: SubgraphKeyframe, new: SubgraphKeyframe, T_old_new: np.ndarray
     ) -> tuple[float, float]:
-        """Return the difference of a measured relative pose and the one in the map, m and rad."""
+        """Return by how much a measured relative pose differs from that in the map, m and rad."""
         T_map_new = self._poses[old.keyframe] @ T_old_new
         T_gap = se3.inverse(T_map_new) @ self._poses[new.keyframe]
         return float(np.linalg.norm(T_gap[:3, 3])), se3.rotation_angle(T_gap)

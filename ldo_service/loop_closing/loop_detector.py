@@ -1,7 +1,7 @@
 """Loop detector: groups keyframes into subgraphs and finds earlier subgraphs of the same place.
 
-A visual word is an ORB descriptor that stands for all similar descriptors. The words are learned
-during the run, from the first image on.
+A visual word is an ORB descriptor that represents all similar descriptors. The words are learned
+while the detector runs, beginning with the first image.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -33,7 +33,7 @@ from .subgraph import (
 from .verification import LoopHypothesis, VerificationConfig, VerificationResult, Verifier
 
 BYTES = 32  # Length of an ORB descriptor.
-# Minimum feature inliers of a pose between two keyframes. The tracker requires 15; here 12 suffice,
+# Minimum feature inliers of a pose between two keyframes. The tracker requires 15. Here 12 suffice,
 # because surfaces and the pose graph also verify a loop closure.
 LOOP_MIN_INLIERS = 12
 BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.int64)
@@ -43,8 +43,9 @@ BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1
 class VisualWordsConfig:
     """Parameters of the visual words."""
 
-    # Maximum number of words; the counts of 1024 words need 4 kB per subgraph. In the sequences
-    # kitchen and flat, 512 words find 2 % fewer loops than 1024, and 2048 words find no more.
+    # Maximum number of words; the counts of 1024 words need 4 kB per subgraph. On the sequences
+    # kitchen and `synthetic:flat`, 2048 words find as many loops as 1024, and 512 words find 2 %
+    # fewer.
     count: int = 1024
     # A descriptor becomes a word if it differs from every word in more than this many of 256 bits.
     apart_bits: int = 64
@@ -212,9 +213,9 @@ class LoopDetector:
     def flush(self, poses: KeyframePoses, merged: Mapping[int, int]) -> list[LoopCandidateResult]:
         """Complete the unfinished subgraph if it is long enough, and return its loop candidates.
 
-        Call this when no keyframe follows: at the end of a run and after a loss of tracking. Loops
-        are likely then. A run often ends where it began, and after a loss, the newest keyframes are
-        near the place where tracking was lost.
+        Call this when no further keyframe follows: at the end of a run and after a loss of
+        tracking. Loops are likely then. A run often ends where it began. After a loss, the newest
+        keyframes are near the place where tracking was lost.
         """
         if not self.can_flush:
             return []
@@ -297,7 +298,7 @@ class LoopDetector:
         return [LoopCandidateResult(new, like, checks[index]) for index, like in enumerate(likely)]
 
     def _proposal(self, old: Subgraph, new: Subgraph, known: ConsistencyChecker) -> LoopHypothesis:
-        """Return the loop hypothesis of a candidate, marked as rejected if no method finds a pose.
+        """Return the loop hypothesis of a candidate; it is marked as rejected if no pose is found.
 
         The methods are tried in the order features, landmarks, map. Poses from features are
         accurate to centimeters, and poses from landmarks to decimeters. Poses from the map come

@@ -22,9 +22,9 @@ class Histograms:
 
     similarity of rows a, b = cos(a * idf, b * idf),  idf_w = log(1 + N / n_w)
 
-    n_w of the N rows contain word w (Sivic and Zisserman 2003). Without the 1 in idf_w, a word that
-    is in all rows would have no weight, which matters while there are few rows. Sums are computed
-    in a fixed order on one thread, so that equal tables give bitwise equal similarities.
+    Of the N rows, n_w contain the word w (Sivic and Zisserman 2003). Without the 1 in idf_w, a word
+    in all rows would have no weight. This matters while there are few rows. Sums are computed in a
+    fixed order on one thread, so that equal tables give bitwise equal similarities.
 
     >>> known = Histograms(2)
     >>> known.add(np.array([1.0, 0.0]))
@@ -88,14 +88,15 @@ Stages = Literal["two_stage", "semantic", "geometric"]
 class RetrievalConfig:
     """Parameters of the search; III.C is a section of the paper."""
 
-    # Minimum distance of two subgraphs in camera frames, not keyframes; nearer subgraphs are not
-    # loop candidates (III.C).
+    # Minimum number of camera frames between two subgraphs. Subgraphs with fewer frames between
+    # them are not loop candidates (III.C).
     exclude_frames: int = 100
     candidates: int = 5  # K, the maximum number of candidates (III.C).
     min_similarity: float = 0.75  # theta_loop, the minimum cosine of the label histograms (III.C).
-    # A subgraph with at least this cosine of the visual words needs no similar labels. If a
-    # detector misses two of five objects, the cosine of the labels is below theta_loop. With a
-    # value above 1, similar labels are always required, as in the paper.
+    # A subgraph with different labels is also a candidate if the cosine of the visual words is at
+    # least this value. For example, the cosine of the labels is below theta_loop if a detector
+    # misses two of five objects. With a value above 1, similar labels are always required, as in
+    # the paper.
     min_appearance: float = 0.35
     # Maximum number of stored subgraphs; if there are more, `PlaceDatabase` removes some.
     count: int = 1000
@@ -122,7 +123,7 @@ class RetrievalMatch:
     similarity: float  # Cosine of the label histograms.
     layout: float  # Cosine of the layout histograms.
     appearance: float  # Cosine of the visual-word histograms.
-    score: float  # Score by which candidates are ranked.
+    score: float  # Score by which candidates are ranked, see `PlaceDatabase._scores`.
 
 
 class PlaceDatabase:
@@ -196,7 +197,7 @@ class PlaceDatabase:
     def _scores(
         self, new: Subgraph, similarity: np.ndarray, layout: np.ndarray, appearance: np.ndarray
     ) -> np.ndarray:
-        """Return the scores of all stored subgraphs, [S]; 0 for those that are no candidates.
+        """Return the scores of the S stored subgraphs, [S]; 0 for subgraphs that are no candidates.
 
         A stored subgraph is a candidate if its labels or its visual words are similar to those of
         the new subgraph. The score is (appearance + (similarity + layout) / 2) / 2. If either of
@@ -222,11 +223,10 @@ class PlaceDatabase:
         return np.where(both_have_labels, both, np.where(has_similar_images, appearance, 0))
 
     def _are_far(self, new: Subgraph) -> np.ndarray:
-        """Return which subgraphs are more than `exclude_frames` before the new one, [S] bool.
+        """Return which subgraphs are over `exclude_frames` frames before the new one, [S] bool.
 
-        Subgraphs with frame numbers more than `exclude_frames` above those of the new one are
-        included too. They are older, because frame numbers start at 0 again after a restart of the
-        camera.
+        Subgraphs with much larger frame numbers than the new one are included too. They are older,
+        because frame numbers restart at 0 when the camera restarts.
         """
         first = np.array([subgraph.first_frame for subgraph in self.subgraphs])
         last = np.array([subgraph.last_frame for subgraph in self.subgraphs])

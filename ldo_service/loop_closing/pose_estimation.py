@@ -11,7 +11,7 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.se3 import fit_rigid_transform
 
-# Minimum height of a triangle of points over its longest side, meters. Three points that are
+# Minimum height in meters of a triangle of points, above its longest side. Three points that are
 # nearly on a line do not determine the rotation about this line.
 SPREAD = 0.1
 
@@ -51,8 +51,8 @@ def ransac_rigid(
         rng: Source of random triples.
 
     Returns:
-        The result, or None if no triple of pairs forms the same triangle in both sets, or if the
-        best such triple has fewer than three inliers.
+        The result. None if no triple of pairs forms the same triangle in both sets. Also None if
+        the best such triple has fewer than three inliers.
     """
     best: RansacResult | None = None
     if len(pairs) < 3:
@@ -103,7 +103,7 @@ def _supported(
 class DepthConsistencyConfig:
     """Limits for the depth consistency of two keyframes."""
 
-    # Distance along the ray beyond which two depths belong to different surfaces.
+    # Maximum distance along the ray between two depths of the same surface.
     gate_m: float = 0.1
     # Fraction of the depth that is added to gate_m. It allows for the noise of structured light at
     # a depth of 5 m.
@@ -112,9 +112,9 @@ class DepthConsistencyConfig:
     min_overlap: float = 0.2
     # Maximum root mean square distance of the two surfaces along the normals.
     max_rmse_m: float = 0.03
-    # Maximum conflict: of the new points in the old view, the fraction that lies in the free
-    # space of the old camera. Moved objects cause some conflict; a wrong pose puts walls into
-    # free space.
+    # Maximum conflict: the fraction of the new points in the old view that lie in free space, in
+    # front of the surface that the old camera measured. Moved objects cause some conflict; a wrong
+    # pose puts walls into free space.
     max_conflict: float = 0.15
 
     def __post_init__(self) -> None:
@@ -133,7 +133,8 @@ class DepthConsistency:
 
     overlap: float  # Fraction of the new surface's points that the old keyframe also measured.
     rmse_m: float  # Root mean square distance of these points along their normals.
-    # Fraction of the new points in the old view that lie in the free space of the old camera.
+    # Fraction of the new points in the old view that lie in front of the surface that the old
+    # camera measured.
     conflict: float
 
 

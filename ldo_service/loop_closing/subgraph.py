@@ -21,14 +21,14 @@ class SubgraphConfig:
 
     min_keyframes: int = 3  # Minimum keyframes (III.C).
     max_keyframes: int = 5  # Maximum keyframes (III.C).
-    # Rotation plus parallax from the first to the last keyframe above which a subgraph is
-    # complete with `min_keyframes` keyframes. Half of the view of a depth camera is then new.
+    # A subgraph is complete with `min_keyframes` keyframes if the rotation plus parallax from its
+    # first to its last keyframe exceeds this. Half of the view of a depth camera is then new.
     turned_rad: float = 0.5
-    # Rotation plus parallax between two keyframes above which a new subgraph begins. Consecutive
-    # keyframes are 0.35 rad apart, unless frames were dropped.
+    # A new subgraph begins if the rotation plus parallax between two keyframes exceeds this.
+    # Consecutive keyframes are 0.35 rad apart, unless frames were dropped.
     gap_rad: float = 1.5
-    # Stored keyframes per subgraph, 0.13 MB each at 640x480. A larger number did not find more
-    # loops in the sequences flat and kitchen.
+    # Number of stored keyframes per subgraph, 0.13 MB each at 640x480. With a larger number, no
+    # more loops were found on the sequences kitchen and `synthetic:flat`.
     kept_views: int = 2
 
     def __post_init__(self) -> None:

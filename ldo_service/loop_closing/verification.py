@@ -1,8 +1,8 @@
 """Verification of loop candidates: the pose between two keyframes of two subgraphs (fine step).
 
-A pose comes from ORB features, from landmarks or from the map. It must be confirmed by landmarks or
-by a second keyframe of the new subgraph, and the landmarks must not contradict the pose. Direct
-alignment refines the pose on the images, and may change it only a little. At the refined pose, the
+A pose comes from ORB features, from landmarks or from the map. Landmarks or a second keyframe of
+the new subgraph must confirm the pose, and the landmarks must not contradict it. Direct alignment
+then refines the pose on the images. This may change it only a little. At the refined pose, the
 surfaces must overlap without conflict. Conventions: `ldo_service.geometry`.
 """
 
@@ -42,7 +42,8 @@ NOTHING = LandmarkAgreement(0, 0, 0.0, 0.0)
 Evidence = Literal["", "landmarks", "features", "map"]
 # Function of an old and a new keyframe that returns T_old_new [4, 4], or None if it is unknown.
 KnownPose = Callable[[SubgraphKeyframe, SubgraphKeyframe], np.ndarray | None]
-# Maximum decompressed keyframes in the cache, 3 MB each: of a new subgraph and some candidates.
+# Maximum number of decompressed keyframes in the cache, 3 MB each: those of a new subgraph and of
+# some candidates.
 OPENED = 12
 FIT_LEVEL = 1  # Pyramid level of 160 pixels width: 19,200 points suffice for the overlap.
 
@@ -76,8 +77,8 @@ class VerificationConfig:
     # the tracker.
     max_condition: float = 1e5
     max_gain: float = 3.0  # Maximum ratio of the brightness of both images, in either direction.
-    # Maximum number of landmarks that contradict a pose. If more landmarks than this match, the
-    # number of matching landmarks is the maximum.
+    # Maximum number of landmarks that may contradict a pose. If more landmarks than this match, as
+    # many as match may contradict.
     max_contradictions: int = 3
 
     def __post_init__(self) -> None:
@@ -146,10 +147,10 @@ class Verifier:
 
     # --- hypotheses -------------------------------------------------------------------------------
     def hypothesis_from_features(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
-        """Return the pose with the most feature inliers, if a second keyframe of `new` confirms it.
+        """Return the pose with the most feature inliers, marked as rejected if it is not confirmed.
 
         Pairs of keyframes are matched until a second keyframe of `new` gives the same pose as the
-        best one so far. If none does, `_from_single_keyframe` tries to confirm the best pose in
+        best pair so far. If none does, `_from_single_keyframe` tries to confirm the best pose in
         another way, and rejects the hypothesis if this fails.
         """
         found: list[LoopHypothesis] = []
@@ -255,7 +256,7 @@ class Verifier:
         return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=refused)
 
     def _check_overlap(self, proposal: LoopHypothesis) -> VerificationResult | None:
-        """Verify a hypothesis; return None, without aligning, if an overlap is too small."""
+        """Verify a hypothesis; return None, without alignment, if surfaces overlap too little."""
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         T_old_new, least = proposal.T_old_new, self._config.blind_overlap
         if self._fit(old, new, T_old_new).overlap < least:
@@ -321,8 +322,8 @@ class Verifier:
             proposal: The hypothesis with the pose before refinement.
             alignment: Result of the refinement on the images.
             fit: Comparison of the new surface with the old depth at the refined pose.
-            shared: Smaller one of two overlaps, 0..1: of the new surface in the old view, and of
-                the old surface in the new view.
+            shared: The smaller of two overlaps, 0..1: that of the new surface in the old view, and
+                that of the old surface in the new view.
         """
         config, by_landmarks = self._config, proposal.evidence == "landmarks"
         moved = se3.inverse(proposal.T_old_new) @ alignment.T_reference_camera
