@@ -1,4 +1,4 @@
-"""Label requests that wait until the labeller has room for them."""
+"""Label requests that wait until the labeller can receive them."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
@@ -9,8 +9,8 @@ from ldo_service.regions.region import Region
 from ldo_service.schemas import LabelRequest, decode, encode
 from ldo_service.semantics.ordered_semantics import OrderedSemantics
 
-# Maximum number of waiting requests, some 10 kB each. It equals the maximum number of requests that
-# the map keeps pending, three for each of 32 regions.
+# Maximum number of waiting requests, about 10 kB each. The map keeps at most as many requests
+# pending: three for each of 32 regions.
 MAX_WAITING = 96
 # Maximum number of regions for which the largest shown surface is stored, 16 bytes each.
 MAX_REGIONS = 4096
@@ -26,10 +26,11 @@ class WaitingRequest(NamedTuple):
 class LabelRequestQueue:
     """Queue of label requests, at most one for each region.
 
-    A labeller that has room for all waiting requests gets them in order. A slower labeller first
-    gets the requests with the most new surface: the area that the view of the request shows, minus
-    the largest area that an earlier request of the same region showed. The rate of requests
-    therefore follows the speed of the labeller, and large objects get their label first.
+    A labeller that can receive all waiting requests gets them in order. A slower labeller first
+    gets the requests that show the most new surface. The new surface is the area that the view of
+    the request shows, minus the largest area that an earlier request of the same region showed.
+    The rate of requests therefore follows the speed of the labeller, and large objects get their
+    label first.
     """
 
     def __init__(self) -> None:
@@ -103,7 +104,7 @@ class LabelRequests:
     """Label requests of the semantics of a map, on their way to the labeller.
 
     Attributes:
-        queue: Requests that wait until the labeller has room.
+        queue: Requests that wait until the labeller can receive them.
     """
 
     def __init__(self, semantics: OrderedSemantics, map_: MapBuilder) -> None:
@@ -117,7 +118,7 @@ class LabelRequests:
         self._semantics, self._map = semantics, map_
 
     def add(self, regions: Iterable[Region], stamp_ns: int) -> None:
-        """Queue requests for regions, and withdraw the requests that are dropped for them."""
+        """Queue requests for regions, and withdraw older requests that the queue drops for them."""
         for region in regions:
             request = label_request_to_message(region, stamp_ns)
             surface_m2 = region.surface_m2(self._map.views.cameras.get(region.keyframe))

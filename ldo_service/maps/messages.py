@@ -36,7 +36,7 @@ def piece_of(message: Gaussians) -> GaussianBatch:
     """Convert a message to a batch.
 
     The arrays are read-only views of the message. If `labels` of the message is empty, the batch
-    has a new array of labels without an observed class.
+    has a new array of labels, in which no class was observed.
     """
     ids, labels = message.ids.numpy(), message.labels.numpy()
     labels = labels if len(labels) else new_labels(len(ids))

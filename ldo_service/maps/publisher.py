@@ -105,9 +105,9 @@ class MapPublisher:
 
         Args:
             now: Context of the messages.
-            with_changed: True: include changes of published Gaussians, then offload excess
-                Gaussians (`MapBuilder.offload_excess`). False: include only new and removed
-                Gaussians.
+            with_changed: If True, include changes of published Gaussians. Then move Gaussians above
+                the memory limit to disk (`MapBuilder.offload_excess`). If False, include only new
+                and removed Gaussians.
         """
         changes = self._map.changes(with_changed=with_changed)
         for part in split_changes(changes, self.config.max_gaussians_per_message):
@@ -178,7 +178,7 @@ class MapPublisher:
         )
 
     def _new_names(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return all label names if at least one of them is unpublished, else an empty tuple."""
+        """Return all label names if at least one was never published, else an empty tuple."""
         is_news, self._names_published = len(names) > self._names_published, len(names)
         return names if is_news else ()
 
@@ -205,7 +205,8 @@ class MapPublisher:
     def publish_snapshot(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
         """Yield the deltas with all unpublished changes, then a snapshot of the whole map.
 
-        After the deltas, an existing replica equals a new replica that starts from the snapshot.
+        After the deltas, an existing copy of the map equals a new copy that starts from the
+        snapshot.
         """
         yield from self.deltas(now, with_changed=True)
         self._since_snapshot, self._in_snapshot = 0, self._map.size()

@@ -30,7 +30,7 @@ class RelativeMeasurements:
         self._recent: dict[int, dict[int, Matrix6]] = {}
         self._older = RecordTable(LINK)
         self._refinements = 0  # Number of published refinements.
-        # Number of each keyframe's last refinement, unless a pose correction already includes it.
+        # Number of the last refinement of each keyframe that no pose correction includes yet.
         self._unacknowledged: dict[int, int] = {}
 
     def add(self, message: Keyframe) -> None:
@@ -101,7 +101,7 @@ class RelativeMeasurements:
         )
 
     def acknowledged(self, refinements: int) -> KeysView[int]:
-        """Delete the refinements that a pose correction includes; return the keyframes of the rest.
+        """Delete the refinements that a pose correction includes; return the remaining keyframes.
 
         Args:
             refinements: Number of the last refinement message that the correction includes.

@@ -41,8 +41,8 @@ class MapReplica:
         self.label_names: tuple[str, ...] = ()  # Names of the labels, by index.
         self._exposures: dict[int, np.ndarray] = {}
         self._next_id = 0  # Greater than all ids received so far.
-        # Gaussians were removed because of the limit. Their weight may have grown since, so that a
-        # snapshot of the same version must be applied too.
+        # True if Gaussians were removed because of the limit. Their weight may have grown
+        # since then. A snapshot of the same version must therefore be applied too.
         self._was_cut = False
         # Parts of the incomplete snapshot of an exact replica.
         self._parts: dict[int, MapSnapshot] = {}
@@ -114,7 +114,7 @@ class MapReplica:
 
     # --- snapshots --------------------------------------------------------------------------------
     def _collect_part(self, part: MapSnapshot) -> bool:
-        """Store a part of a snapshot; when it was the last missing part, replace the map."""
+        """Store one message of a snapshot; replace the map after the last missing message."""
         self._note_exposures(part)
         if part.version < self.version or (part.version == self.version and not self.is_behind):
             return False
@@ -132,7 +132,7 @@ class MapReplica:
         return True
 
     def _apply_part(self, part: MapSnapshot) -> bool:
-        """Replace all Gaussians in the id range of a snapshot part by those of the part."""
+        """Replace all Gaussians in the id range of one message of a snapshot by its Gaussians."""
         self._note_exposures(part)
         is_news = self.is_behind or self._was_cut or part.version > self.version
         if part.version < self.version or not is_news:
@@ -153,7 +153,7 @@ class MapReplica:
         return True
 
     def _span(self, part: MapSnapshot, ids: np.ndarray) -> tuple[float, float]:
-        """Return the first and the last id of the range that a part of a snapshot replaces."""
+        """Return the first and the last id of the range that one message of a snapshot replaces."""
         if not len(ids):
             return (0, np.inf) if part.parts == 1 else (0, -1)
         follows = part.part == 0 or part.part - 1 in self._last_ids
