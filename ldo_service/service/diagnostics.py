@@ -12,12 +12,12 @@ from ldo_service.actors.topology import GRAPH
 from ldo_service.schemas import Health
 from ldo_service.schemas.map import MAX_ITERATIONS
 
-# Number of unhandled messages above which a note names the slow consumer: five seconds of
-# keyframes at 2 Hz.
+# A note names a slow consumer with more unhandled messages than this: five seconds of keyframes at
+# 2 Hz.
 BEHIND = 10
-SLOW_STEP_S = 5.0  # 8x the slowest step measured (mapper, 1.5 M Gaussians).
-# Maximum time between steps, in seconds, with queued messages or a running camera. An actor takes a
-# queued message after each step, and a camera sends many frames a second.
+SLOW_STEP_S = 5.0  # Eight times the slowest measured step: mapper with 1.5 million Gaussians.
+# Maximum time between two steps of an actor, in seconds, if messages are queued or a camera runs.
+# An actor takes a queued message after each step, and a camera sends many frames a second.
 IDLE_S = 5.0
 
 
@@ -36,7 +36,7 @@ class ActorStatus:
 class Problem:
     """Problem of an actor that needs an action."""
 
-    what: str  # Problem and consequence, as a sentence without its subject, the actor.
+    what: str  # Problem and consequence: a sentence whose subject, the actor, is left out.
     advice: str  # Action of the user.
 
     def __str__(self) -> str:
@@ -87,7 +87,7 @@ def _of_steps(health: Health) -> Iterator[Problem]:
         if _waits_for_server(health):
             return
         if _is_backend(health.actor):
-            return  # `notes` mentions the step, because no other actor waits.
+            return  # No other actor waits for this step, so `notes` mentions it.
         yield Problem(
             f"has been busy with one message for {health.current_step_s:.0f} s",
             "reduce its work per message; after supervision.step_timeout_s the service stops it",

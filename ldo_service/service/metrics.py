@@ -28,10 +28,10 @@ from ldo_service.errors import ConfigError
 from ldo_service.schemas import Health, InputCount, OutputCount, decode
 from ldo_service.transport.endpoint import LOOPBACK
 
-MAX_ACTORS = 64  # Maximum number of actors, because messages may contain any name.
+MAX_ACTORS = 64  # Limit of the stored names, because messages may contain any name.
 COMES_BACK_S = 5.0  # Time for an actor to restart after it was killed at its heartbeat timeout.
 
-MAX_CONNECTIONS = 16  # Connections of the metrics server; two are in use as a rule.
+MAX_CONNECTIONS = 16  # Maximum connections of the metrics server; usually two are in use.
 REQUEST_TIMEOUT_S = 5.0  # Maximum time without data from a client of the metrics server.
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]
@@ -255,10 +255,10 @@ def _facts(actors: list[Health]) -> Metric:
 
 
 class _Server(ThreadingMixIn, WSGIServer):
-    """HTTP server with a thread per connection and a limit of connections.
+    """HTTP server with a thread per connection and a maximum number of connections.
 
-    Beyond the limit it closes the oldest connection. Idle connections therefore cannot keep a new
-    one out, nor take the file descriptors that saving the state needs.
+    Beyond this number it closes the oldest connection. Idle connections therefore cannot block a
+    new one, and cannot use up the file descriptors that saving the state needs.
     """
 
     daemon_threads = True
@@ -284,7 +284,7 @@ class _Server(ThreadingMixIn, WSGIServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore the error of a connection, which its client has caused."""
+        """Ignore an error of a connection, because its client has caused the error."""
 
 
 class _Quiet(WSGIRequestHandler):

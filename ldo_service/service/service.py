@@ -108,7 +108,7 @@ class Service:
     recording: Path | None = None  # Folder of the recording; None: no recording.
 
     def run(self) -> None:
-        """Serve until SIGINT or SIGTERM; a second signal stops at once.
+        """Serve until SIGINT or SIGTERM; a second signal stops immediately.
 
         Raises:
             ConfigError: The configuration or the state is invalid, or a port is in use.
@@ -152,7 +152,7 @@ class Service:
         runners = self._runners(transport)
         control = None if self.only else self._open_control(transport)
         names = ", ".join(runner.name for runner in runners)
-        if self.only:  # The main process has printed the line of the service.
+        if self.only:  # The main process has already printed the start message.
             log.info("%s: ready", names)
         else:
             log.info("service: serving %s on %s", names, self.network.endpoint)
@@ -282,10 +282,10 @@ def _is_fed_from_outside(box: ActorSpec) -> bool:
 
 
 def _leave_if_busy(exit_code: int, why: str) -> None:
-    """Exit the process at once if a step is still running.
+    """Exit the process immediately if a step is still running.
 
-    The thread of the step cannot be stopped. A normal end of the interpreter would kill it inside a
-    library and abort the process.
+    The thread of the step cannot be stopped. A normal end of the interpreter would kill the thread
+    inside a library, and the process would abort.
     """
     if busy := Worker.busy_workers(LEAVE_WITHIN_S):
         log.error("%s (exited during a step of %s)", why, ", ".join(busy))

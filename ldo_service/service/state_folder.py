@@ -95,9 +95,10 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
 
 
 def _inconsistent_states(pasts: Mapping[str, RestoredState]) -> Iterator[tuple[str, str, str]]:
-    """Yield each topic whose consumer has handled messages that its producer has not produced.
+    """Yield each topic of which the consumer has handled messages unknown to the producer.
 
-    Each item has the topic, the producer and the consumer.
+    The saved state of the producer is then older than that of the consumer. Each item has the
+    topic, the producer and the consumer.
     """
     for producer, past in pasts.items():
         for topic, made in past.outputs.items():
