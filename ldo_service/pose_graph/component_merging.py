@@ -37,7 +37,7 @@ class BridgeEdge:
     connected_keyframes: Set[int]
 
     def is_across(self, pair: Pair) -> bool:
-        """Return whether the two keyframes of `pair` lie on different sides of the bridge edge."""
+        """Return whether the two keyframes of `pair` lie on different sides of this bridge edge."""
         return (pair[0] in self.connected_keyframes) != (pair[1] in self.connected_keyframes)
 
 
@@ -107,10 +107,10 @@ def best_bridge_removal(
     variables: Variables,
     initial: Variables,
 ) -> tuple[BridgeEdge, FactorStore, Variables] | None:
-    """Replace one of several bridge edges by a rejected closure if more closures are then accepted.
+    """Replace one of several bridge edges by a rejected closure if more closures then agree.
 
-    Each edge is tried; see `replace_bridge_by_consensus`. The edge is chosen whose replacement
-    leaves the most accepted closures.
+    Each edge is tried; see `replace_bridge_by_consensus`. The chosen edge is the one whose
+    replacement leaves the most accepted closures.
 
     Args:
         known: Store of all measurements, which is not changed.

@@ -38,8 +38,8 @@ class CondensedKeyframes:
         T_head: Measured T_head_keyframe, [F, 4, 4].
         T_tail: Measured T_tail_keyframe, [F, 4, 4].
         fractions: Position of each keyframe between its head (0) and its tail (1), [F]. If the
-            relative pose of head and tail changes, the keyframe moves by this fraction of the
-            change.
+            pose of the tail relative to the head changes, the keyframe moves by this fraction
+            of the change.
     """
 
     keyframes: np.ndarray
@@ -162,7 +162,7 @@ def condense_between(
     T_head: np.ndarray,
     T_head_tail: np.ndarray,
 ) -> CondensedKeyframes:
-    """Return the condensed keyframes between two variables, with evenly spaced fractions.
+    """Return the condensed keyframes between two variables, at evenly spaced fractions of the way.
 
     Args:
         head: Id of the first variable.
@@ -203,9 +203,9 @@ def group_to_condense(
     The tail of a group is the head of the next group. The head or tail of an existing group must
     stay a variable, so it can only be the head of a new group.
 
-    The keyframe that follows the tail should have a measurement from the tail. If all its
-    measurements were from keyframes inside the group, they would be transferred to the head or the
-    tail. A correction would then move the following keyframe only with that variable. To avoid
+    The keyframe that follows the tail should be measured relative to the tail. If it is measured
+    only relative to keyframes inside the group, these measurements are transferred to the head or
+    the tail. A correction would then move the following keyframe with that variable alone. To avoid
     this, the group may grow to twice `size`.
 
     Args:
@@ -287,7 +287,7 @@ def connecting_measurements(
 ) -> list[RelativePose]:
     """Select the measurements that must be kept so that all variables stay connected.
 
-    If several measurements would connect the same parts, the first one is selected.
+    If several measurements would connect the same parts of the graph, the first one is selected.
 
     Args:
         gone: Measurements that are about to be removed, from which the function selects.

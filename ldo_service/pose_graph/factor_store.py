@@ -102,7 +102,7 @@ class FactorStore:
         return ("condensed", *pair)
 
     def _in_head_of_b(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> np.ndarray:
-        """Return T_head_b [4, 4] according to a measurement of keyframe b from keyframe a.
+        """Return T_head_b [4, 4] from a measurement of keyframe b relative to keyframe a.
 
         If a and b have different heads, the current poses in the map relate a to the head of b.
         """
@@ -171,9 +171,9 @@ class FactorStore:
 
         Returns:
             The largest absolute value of the six components of the difference, in standard
-            deviations of a loop closure (`sigma_loop_rad`, `sigma_loop_m`). It is multiplied by the
-            distance to the nearer variable as a fraction of the way from head to tail, 0..0.5. The
-            result is 0 if the keyframe is a variable.
+            deviations of a loop closure (`sigma_loop_rad`, `sigma_loop_m`). This value is
+            multiplied by the distance of the keyframe from the nearer variable, as a fraction,
+            0..0.5, of the way from head to tail. The result is 0 if the keyframe is a variable.
         """
         row = self.rows.get(keyframe)
         if row is None:
@@ -197,7 +197,10 @@ class FactorStore:
 
     # --- condensed keyframes ----------------------------------------------------------------------
     def relative_to_start(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """Return the head of a keyframe and T_head_keyframe [4, 4]; a variable is its own head."""
+        """Return the head of a keyframe, and T_head_keyframe [4, 4]; a variable is its own head.
+
+        The head is the last keyframe before it that is a variable of the pose graph.
+        """
         row = self.rows.get(keyframe)
         if row is None:
             return keyframe, np.eye(4)
@@ -206,7 +209,8 @@ class FactorStore:
     def relative_to_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
         """Return the nearer one of head and tail of a keyframe, and T_variable_keyframe [4, 4].
 
-        A keyframe that is a variable is its own head and tail.
+        Head and tail are the last variable of the pose graph before the keyframe and the first one
+        after it. A keyframe that is a variable is its own head and tail.
         """
         row = self.rows.get(keyframe)
         if row is None or self.interpolated.fractions[row] <= 0.5:
@@ -308,7 +312,7 @@ class FactorStore:
         return [*others, *(self._closure_factor(closure, 0.0) for closure in closures)]
 
     def closure_sigmas(self, variables: Variables, closure: RelativePose) -> float:
-        """Return the largest of the six absolute whitened residuals of a closure, in sigmas."""
+        """Return the largest absolute component of a closure's whitened residual [6], in sigmas."""
         m = self._closure(closure)
         residual = closure_residual(variables[m.a], variables[m.b], m)
         return float(np.abs(np.linalg.cholesky(m.information).T @ residual).max())
@@ -358,7 +362,7 @@ class FactorStore:
         return {k: moved.get(k, value) for k, value in variables.items()}
 
     def keep_rejected(self, closure: RelativePose) -> None:
-        """Store a rejected closure that contradicts a bridge edge; only the newest are kept."""
+        """Store a rejected closure that contradicts a bridge edge; keep only the newest ones."""
         contradicting = {**self.contradicting, pair_of(closure): closure}
         self.contradicting = dict(
             list(contradicting.items())[-self.closures.config.max_contradicting :]

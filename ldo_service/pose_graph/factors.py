@@ -26,12 +26,12 @@ class NoiseConfig:
     # singular.
     sigma_rotation_max_rad: float = 0.2
     sigma_translation_max_m: float = 0.5
-    sigma_odometry_rad: float = 0.05  # Sigma of odometry over a missed keyframe.
+    sigma_odometry_rad: float = 0.05  # Sigma of an odometry pose across missed keyframes.
     sigma_odometry_m: float = 0.1
     # Alignment treats pixels as independent and models no bias, so its sigmas are too small: for
     # a handheld Kinect, the median error of its relative poses is 7 sigma. Therefore the
     # covariance of a random walk is added: about 1 % of the path and 0.5 deg/m after some
-    # meters. Without this covariance, a chain of measurements could not change as far as a true
+    # meters. Without this covariance, a chain of measurements could not bend as far as a true
     # loop closure requires.
     drift_rad_per_sqrt_m: float = 0.02
     drift_m_per_sqrt_m: float = 0.02
@@ -41,17 +41,17 @@ class NoiseConfig:
     # exposure.
     sigma_loop_rad: float = 0.01
     sigma_loop_m: float = 0.01
-    # Two sigmas of the center of a detected box, relative to the projected mean of the Gaussians of
-    # the object. Their squares are added. The detector causes the first one, in pixels. Occlusion
-    # and the visible side of the object cause the second one, a fraction of the longer side of the
-    # box.
+    # Errors of the center of a detected box, relative to the projected mean of the object's
+    # Gaussians. The first sigma, in pixels, is the error of the detector. The second one, a
+    # fraction of the longer side of the box, comes from occlusion and from the visible side of the
+    # object. The squares of both are added.
     sigma_box_px: float = 4.0
     sigma_box_share: float = 0.15
     # Observations of an object from one side have the same error, so N observations contain less
     # information than N independent observations. Each observation counts as this fraction of an
-    # independent one, so 32 observations (`landmarks.max_observations`) count as a tenth of an
-    # independent one. With ten times this value, landmarks moved poses by 3 mm although odometry
-    # was accurate to 2 mm (docs/decisions/0057-tenth-information.md).
+    # independent one. The maximum of 32 observations (`landmarks.max_observations`) thus counts as
+    # a tenth of one independent observation. With ten times this value, landmarks moved poses by
+    # 3 mm although odometry was accurate to 2 mm (docs/decisions/0057-tenth-information.md).
     independent_observations: float = 1 / 320
     # Width of the Cauchy kernel in sigmas: 95 % efficient on Gaussian noise.
     robust_sigmas: float = 2.385
@@ -160,7 +160,8 @@ def box_factor(
 
     Args:
         observation: The observation.
-        variable: Id of the observing keyframe; if it is condensed, the id of its head or tail.
+        variable: Id of the observing keyframe if it is a variable of the pose graph; otherwise the
+            id of the variable before or after it.
         T_variable_keyframe: Pose of the observing keyframe in `variable`, [4, 4].
         noise: Noise of the measurements.
     """

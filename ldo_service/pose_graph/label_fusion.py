@@ -95,7 +95,10 @@ def fuse_labels(
 
 
 def geometric_mean(evidence: Evidence) -> np.ndarray:
-    """Return the distribution [C] argmin_p sum_k w_k KL(p || q_k) ~ prod_k q_k^(w_k / W)."""
+    """Return the weighted geometric mean of the observations, [C].
+
+    It is argmin_p sum_k w_k KL(p || q_k) ~ prod_k q_k^(w_k / W).
+    """
     mean = evidence.log_sum / max(evidence.weight, np.finfo(float).tiny)
     p = np.exp(mean - mean.max())
     return p / p.sum()

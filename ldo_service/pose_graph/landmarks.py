@@ -43,13 +43,13 @@ class ObjectLandmarkConfig:
 
     lambda_sem: float = 0.5  # Weight of the observed labels (III.C).
     w_sem: float = 0.1  # Weight of the similarity (III.C).
-    # Entropy H above which an observation has weight exp(-2 H), and above which a landmark is
+    # Limit of the entropy H. Above it, an observation has the weight exp(-2 H), and a landmark is
     # uncertain, so that it is removed earlier (III.C).
     vague_nats: float = 0.5
     # Minimum number of observations at which a landmark is added to the graph (III.C).
     min_observations: int = 3
-    # Minimum value of the largest angle between two rays to a new landmark, 5 deg. At this angle,
-    # an error of 12 px changes a depth of 2 m by 0.5 m (focal length 525 px).
+    # Minimum value of the largest angle between two rays to a new landmark: 5 degrees. At this
+    # angle, an error of 12 px changes a depth of 2 m by 0.5 m (focal length 525 px).
     min_parallax_rad: float = 0.09
     # Maximum observations of a landmark in the graph. If there are more, the first and the newest
     # observations are kept, half of this number each.
@@ -107,7 +107,7 @@ class LandmarkObservation:
     keyframe: int
     landmark: int
     box_px: np.ndarray  # x0, y0, x1, y1 in pixels, [4].
-    distribution: np.ndarray  # Class distribution [C], sums to one.
+    distribution: np.ndarray  # Class distribution [C]; its sum is one.
     entropy: float  # Entropy of `distribution`, nats.
     is_miss: bool
     camera: np.ndarray  # Width, height, fx, fy, cx, cy in pixels, [6].
@@ -315,7 +315,7 @@ class ObjectLandmarks:
 
     # --- labels -----------------------------------------------------------------------------------
     def _fuse(self, touched: set[int]) -> None:
-        """Fuse the class distributions of the landmarks `touched`, which have new observations.
+        """Fuse the class distributions of the landmarks in `touched`, which have new observations.
 
         The distributions of other landmarks do not change.
         """

@@ -28,9 +28,9 @@ class LoopClosureConfig:
     """Limits for the acceptance of loop closures."""
 
     # Maximum increase of the sum of squared residuals by a closure: the 99.73 % quantile (3
-    # sigma) of chi^2 with six degrees of freedom. The residual of the closure alone is not
-    # sufficient: a false closure can move a chain of 100 measurements by a meter, and its
-    # residual is then only 2 sigma.
+    # sigma) of chi^2 with six degrees of freedom. The residual of the closure alone does not show
+    # a false closure. A false closure can move a chain of 100 measurements by a meter, so that its
+    # own residual is only 2 sigma.
     max_cost: float = 20.06
     # Maximum residual of an accepted closure in any direction, in sigmas (as in RTAB-Map).
     max_sigmas: float = 3.0

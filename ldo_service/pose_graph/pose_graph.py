@@ -175,7 +175,8 @@ class PoseGraph:
         """Turn condensed keyframes of a closure back into variables if the closure moves them far.
 
         The limit is `max_interpolation_sigmas`, in standard deviations of a loop closure. A
-        keyframe stays condensed if there are too many groups (`keyframes_each`).
+        keyframe stays condensed if there are too many groups of condensed keyframes
+        (`keyframes_each`).
 
         Returns:
             The given `variables` of the solution with this closure, and the poses of the keyframes
@@ -192,7 +193,7 @@ class PoseGraph:
         return variables
 
     def _merge_components(self, measured: RelativePose) -> None:
-        """Merge the components of both keyframes in the frame of the older one; solve again."""
+        """Merge the components of both keyframes in the frame of the older one, and solve again."""
         first_a, first_b = self.component_root(measured.a), self.component_root(measured.b)
         moves = T_new_old(measured, self.pose, moves_b=first_a < first_b)
         younger, older = max(first_a, first_b), min(first_a, first_b)
