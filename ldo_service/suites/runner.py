@@ -51,7 +51,8 @@ class SuiteRunner:
         out: Folder for the runs.
         settings: Settings of all runs; the settings of a variant override these.
         overwrite: True to repeat finished runs too.
-        workers: Runs at the same time. Each run uses all cores if this is 1, otherwise one core.
+        workers: Number of runs at the same time. Each run uses one core, or all cores if this
+            number is 1.
     """
 
     suite: Suite
