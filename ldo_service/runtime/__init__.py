@@ -6,8 +6,9 @@
 - `Actor`: inputs, outputs, `handle(message) -> messages`, `snapshot`, `restore`.
 - `Outlet`: sending half of a topic. It numbers messages and waits for lossless consumers.
 - `Mailbox`: bounded queue of all inputs of an actor. It counts each dropped message.
-- `Stage`: takes a message, handles it in the actor's own thread, and sends the outputs in order.
-  After a failure it restores the actor from its last saved state.
+- `Stage`: takes a message, lets the actor handle it in the actor's own thread, and sends the
+outputs
+  in order. After a failure it restores the actor from its last saved state.
 - `ChildProcess`: handle in the parent process for an actor that runs in a process of its own.
 - `supervise`: runs all stages in one task group. The process ends when an actor has used up its
   restart budget.
@@ -16,8 +17,8 @@
   `ldo_service.recordings` writes them to a file.
 - `LogicalClock`: runs the whole graph offline. The result does not depend on the machine's load.
 
-A handler is an ordinary generator: it opens no socket, reads no clock and starts no task. Only the
-stage around it is asynchronous code.
+A handler is an ordinary generator: it opens no socket, reads no clock and starts no task. The stage
+around it is asynchronous code.
 """
 
 from .actor import Actor, Backlog, In, Latest, Lossless, Out

@@ -21,7 +21,7 @@ UNLIMITED = 1 << 30
 class Lossless:
     """Policy of an input that receives every message in order.
 
-    The producer waits while `window` messages are not handled.
+    The producer waits while the consumer has `window` unhandled messages.
     """
 
     window: int = 8  # Maximum number of messages sent but not handled; it bounds memory.
@@ -54,8 +54,8 @@ class Latest:
 
     depth: int = 1  # Maximum number of messages in a queue.
     per_key: bool = False  # Keep one queue for each value of the message field `Topic.key`.
-    # Maximum number of queues. If a new key exceeds it, the queue with the oldest message is
-    # dropped.
+    # Maximum number of queues. If a new key exceeds this number, the queue with the oldest message
+    # is dropped.
     max_keys: int = 32
 
     def __post_init__(self) -> None:
@@ -127,8 +127,8 @@ class Actor:
     lags = False
     # Time without messages after which the stage calls `on_idle`, seconds.
     idle_after_s = 0.2
-    # True if the actor queries an external server, whose answers no journal records. A replay
-    # skips the actor and feeds its consumers from their own recorded inputs.
+    # True if the actor queries an external server, because no journal records the answers of a
+    # server. A replay skips the actor, and feeds its consumers from their own recorded inputs.
     talks_outside = False
     # True if no other actor waits for the outputs. A step may then take minutes.
     is_backend = False

@@ -48,7 +48,8 @@ class Checkpointer:
 
         Args:
             inputs: Position on each lossless input, by topic name.
-            outputs: Position on each output, by topic name; None where no consumer is required.
+            outputs: Position on each output, by topic name; None if the topic has no required
+                consumer.
         """
         return self._ledger.links(
             inputs, {topic: past for topic, past in outputs.items() if past is not None}
@@ -63,8 +64,8 @@ class Checkpointer:
             actor: The actor of the stage.
             links: Offsets and unhandled outputs of the stage, as `links` returns them.
             taken: Input of the last step, for the write-ahead log; None unless `Actor.lags`.
-            whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`. A full
-                write-ahead log has the same effect.
+            whole: Save `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`. The
+                complete state is also saved if the write-ahead log is full.
         """
         is_whole = whole or self._ledger.is_long
         own = actor.checkpoint() if is_whole else actor.snapshot()

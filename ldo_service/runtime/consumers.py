@@ -1,4 +1,4 @@
-"""Lossless consumers of a topic, and what the producer of the topic knows of them."""
+"""State of the lossless consumers of a topic, as its producer knows it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ class Consumer:
     handled: int = 0  # Offset of the first message that the consumer has not handled.
     arrived: int = 0  # Offset of the first message that the consumer has not received.
     limit: int = 0  # Offset of the first message that exceeds the consumer's window.
-    repeated_from: int = -1  # Offset at which the last retransmission began; -1: none.
+    repeated_from: int = -1  # Offset at which the last retransmission began; -1 if there was none.
     repeated_at_s: float = 0.0  # Event-loop time of the last retransmission.
-    # Event-loop time at which the window became full; None while it has room.
+    # Event-loop time at which the consumer's window became full; None while it is not full.
     shut_since_s: float | None = None
     # Offset after the last message that was sent to a consumer with policy Backlog, and the
     # event-loop time at which it was sent. Unused for other consumers.
@@ -86,7 +86,7 @@ class Consumers:
         return max(0, min(limits, default=UNLIMITED))
 
     def window_room(self, seq: int) -> int:
-        """Return the number of messages for which every consumer has room in its window.
+        """Return the number of messages that fit into the window of every consumer.
 
         Consumers with policy `Backlog` count too. The result is 0 if a consumer is disconnected, or
         if there are no consumers.
@@ -104,8 +104,8 @@ class Consumers:
     def all_received(self, seq: int, *, awaited_only: bool = False) -> bool:
         """Return whether every consumer has received every message before `seq`.
 
-        A connected consumer with policy `Backlog` only needs the messages for which its window has
-        room. The other messages stay in the backlog.
+        A connected consumer with policy `Backlog` only needs the messages that fit into its window.
+        The other messages stay in the backlog on disk.
 
         Args:
             seq: Offset of the next message.
@@ -131,7 +131,7 @@ class Consumers:
     def join(self, name: str, seq: int, *, has_backlog: bool = False) -> None:
         """Connect a consumer that sent a hello.
 
-        A new consumer starts at message `seq`. A known consumer receives all messages again that it
+        A new consumer starts at message `seq`. A known consumer receives again all messages that it
         has not handled. `has_backlog` is True for a consumer with policy `Backlog`.
         """
         self._evicted.pop(name, None)
@@ -144,8 +144,8 @@ class Consumers:
         """Note that message `seq` was published to all consumers at event-loop time `now_s`.
 
         For a consumer with policy `Backlog`, the message counts as sent only if the window of the
-        consumer has room and all earlier messages were sent to it. Otherwise the consumer rejects
-        the message, and the producer sends the message from the backlog later.
+        consumer is not full and all earlier messages were sent to it. Otherwise the consumer
+        rejects the message, and the producer sends the message from the backlog on disk later.
         """
         for consumer in self._known.values():
             if not consumer.is_awaited and consumer.pushed == seq < consumer.limit:
@@ -216,7 +216,8 @@ class Consumers:
     def stalled(self, now_s: float, patience_s: float, seq: int) -> list[str]:
         """Return the names of the consumers whose window has been full for over `patience_s`.
 
-        Only connected consumers with policy `Lossless` count.
+        The window is the limit of unhandled messages. Only connected consumers with policy
+        `Lossless` count.
         """
         names: list[str] = []
         for name, consumer in self._known.items():

@@ -28,7 +28,7 @@ from .step import produce
 log = logging.getLogger(__name__)
 
 OFFSETS, OUTBOX, WAL = "stage.offsets", "stage.outbox", "stage.wal"
-# Maximum number of messages that a restored actor with `lags` handles again: some seconds of work.
+# Maximum number of messages that a restored actor with `lags` handles again: a few seconds of work.
 MAX_WAL_ENTRIES = 64
 
 
@@ -66,7 +66,7 @@ class RestoredState:
     inputs: Mapping[str, InletPosition] = field(default_factory=dict)  # Position by topic name.
     outputs: Mapping[str, OutletPosition] = field(default_factory=dict)  # Position by topic name.
     taken: tuple[LoggedInput, ...] = ()  # Write-ahead log: inputs handled after `own`.
-    is_none: bool = False  # The store had no state.
+    is_none: bool = False  # True if no state was saved.
 
     @classmethod
     def of(cls, state: State | None) -> "RestoredState":
@@ -181,7 +181,7 @@ def restore_actor(actor: Actor, past: RestoredState, make: Callable[[], Actor]) 
 
 
 def _handled_again(actor: Actor, taken: Iterable[LoggedInput]) -> int | None:
-    """Handle logged inputs again; return the index of the first failure, None without failure."""
+    """Handle logged inputs again, and return the index of the first that fails, or None."""
     kinds = {port.topic.name: port.topic.message for port in actor.inputs}
     for number, one in enumerate(taken):
         actor.situation = one.situation(actor)

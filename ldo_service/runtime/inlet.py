@@ -49,7 +49,7 @@ class Inlet:
         return True
 
     def offer(self, delivery: Delivery) -> list[Delivery]:
-        """Queue a delivery, and return the older deliveries that are dropped for it."""
+        """Queue a delivery, and return the older deliveries that are dropped in exchange."""
         self.waiting.append(delivery)
         displaced = self._overflow(delivery)
         for old in displaced:
@@ -143,7 +143,7 @@ class LosslessInlet(Inlet):
             return 0
         lost = start - self.arrived if known else 0
         self.numbers.add_lost(lost)
-        if not (known and self.waiting):  # Otherwise `done` advances `handled`.
+        if not (known and self.waiting):  # If messages are queued, `done` advances `handled`.
             self.handled = start
         self.epoch, self.arrived = epoch, start
         self.gap = True  # Request the messages that were sent before the hello.

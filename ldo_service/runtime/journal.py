@@ -130,7 +130,7 @@ class Journal:
         """Record the files that a saved state refers to; called before each start of the actor."""
 
     def record_start(self, state: State | None) -> None:
-        """Record the start of an actor, with its saved state; None: it has no saved state."""
+        """Record the start of an actor with its saved state, or None if it has no saved state."""
 
     def record_input(self, delivery: Delivery, stamp_ns: int) -> None:
         """Record the input of the next step, and the stamp of its message in ns.
@@ -166,7 +166,7 @@ class Journal:
 
 
 async def close_journal(journal: Journal, actor: str) -> None:
-    """Close a journal, and wait for at most `JOURNAL_WITHIN_S` until it is written."""
+    """Close a journal, and wait at most `JOURNAL_WITHIN_S` seconds until it is written."""
     written = asyncio.wrap_future(journal.close())
     done, _ = await asyncio.wait({written}, timeout=JOURNAL_WITHIN_S)
     if not done:

@@ -12,7 +12,7 @@ class LastValue:
         self.parts: tuple[tuple[bytes, bytes], ...] = ()
 
     def add(self, message: Message, header: bytes, body: bytes) -> None:
-        """Add one part of a new value, which replaces the last value when all parts are added."""
+        """Add one message of a new value, which replaces the last value once it is complete."""
         if getattr(message, "part", 0) == 0:
             self._incomplete.clear()
         self._incomplete.append((header, body))

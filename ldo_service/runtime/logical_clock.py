@@ -1,7 +1,7 @@
 """Offline run of the whole actor graph, on a logical clock that ticks once per frame.
 
-A tick delivers one frame and, before it, poses of the odometry prior: all poses that are older than
-the frame and were not delivered yet, and the first pose that is not older.
+A tick delivers one frame. Before the frame, it delivers poses of the odometry prior: all new poses
+that are older than the frame, and the first pose that is not older.
 
 Each actor has a configured latency in ticks. With a latency of n, consumers receive the outputs of
 a step n ticks after its input, however long the step takes. Actors compute in parallel, each in its
@@ -123,7 +123,7 @@ class LogicalClock:
         return self
 
     def __exit__(self, *_exception: object) -> None:
-        for thread in self._threads:  # The request reaches each thread before the first is joined.
+        for thread in self._threads:  # All threads get the request before the first is joined.
             thread.thread.shutdown(wait=False, cancel_futures=True)
         for thread in self._threads:
             thread.thread.shutdown()

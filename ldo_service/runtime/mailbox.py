@@ -33,8 +33,8 @@ from .stage_commands import StageCommand
 
 log = logging.getLogger(__name__)
 
-# Maximum size of all messages of Latest inputs that wait in one mailbox, bytes: two of the largest
-# ones. A burst of four raw frames of 1080p has 33 MB.
+# Maximum size in bytes of all messages of Latest inputs that wait in one mailbox: two of the
+# largest messages. A burst of four raw frames of 1080p has 33 MB.
 MAX_WAITING_BYTES = 128_000_000
 
 
@@ -144,7 +144,7 @@ class Mailbox:
             call_soon(self._loop, self._ready.set)
 
     def _bound_bytes(self) -> None:
-        """Drop the oldest messages of the Latest input that holds most bytes, above the limit.
+        """While the queues exceed the limit, drop the oldest message of the largest queue.
 
         The caller holds the lock.
         """

@@ -13,7 +13,9 @@ MESSAGES_IN_MEMORY = 8
 
 
 class Outbox:
-    """Numbered messages in order, in memory or, for consumers that may be far behind, on disk.
+    """Numbered messages in order, in memory or on disk.
+
+    They are on disk if a consumer may be far behind.
 
     Without a log, all messages are in memory, and the stage saves them with its state. With a log,
     `store` writes them to disk, and only the newest stay in memory.
@@ -30,8 +32,8 @@ class Outbox:
         Args:
             unhandled: Messages that the previous process saved with its state.
             log: Log on disk, which has its own maximum size; None: all messages are in memory.
-            max_bytes: Maximum size of an outbox in memory, bytes; beyond it, the oldest messages
-                are dropped. None: a log or the consumers' windows bound the outbox.
+            max_bytes: Maximum size of an outbox in memory, bytes. The oldest messages beyond it are
+                dropped. None: the log or the consumers' windows limit the size of the outbox.
         """
         self._lock = Lock()
         self._memory = deque(unhandled)
@@ -95,7 +97,10 @@ class Outbox:
                 self._bytes -= len(self._memory.popleft().body)
 
     def read(self, seq: int) -> UnackedMessage | None:
-        """Return message `seq`; None if it is lost. The call may read the disk: use a thread."""
+        """Return message `seq`, or None if it is lost.
+
+        The call may read the disk, so it belongs in a thread.
+        """
         with self._lock:
             if self._memory and self._memory[0].seq <= seq <= self._memory[-1].seq:
                 return self._memory[seq - self._memory[0].seq]

@@ -92,7 +92,8 @@ class Outlet:
         self._outbox = outbox or Outbox(past.unhandled)
         self._unsent = deque(past.unhandled)
         self._changed = asyncio.Event()  # The state of a consumer changed.
-        self._ahead: set[str] = set()  # Consumers that report messages this outlet never sent.
+        # Consumers that have received messages which this outlet never sent.
+        self._ahead: set[str] = set()
         self._repeating: asyncio.Task[None] | None = None
         # Publisher of each consumer's backlog, and the task that is sending on it, by consumer.
         self._backlogs: dict[str, Publisher] = {}
@@ -118,8 +119,8 @@ class Outlet:
     def credits(self) -> int:
         """Return the number of messages that may be sent now; 0 while staged messages wait.
 
-        If the port is nonblocking and all required consumers have policy `Backlog`, the credit is
-        the room in the windows of the consumers, so that no backlog grows.
+        If the port is nonblocking and all required consumers have policy `Backlog`, the result is
+        the number of messages that fit into the consumers' windows, so that no backlog grows.
         """
         if self._unsent:
             return 0
@@ -280,7 +281,7 @@ class Outlet:
 
     # --- retransmission ---------------------------------------------------------------------
     def _push_backlog(self, name: str) -> None:
-        """Send to a consumer the messages of its backlog for which its window has room."""
+        """Send to a consumer those messages of its backlog on disk that fit into its window."""
         if name in self._pushing:
             return
         if self._consumers.skip(self._outbox.first(self._seq)):
@@ -339,7 +340,7 @@ class Outlet:
                 self._repeating = None
 
     def _skip_lost(self, seq: int) -> None:
-        """Let consumers that handled all earlier messages skip message `seq`, which is lost."""
+        """Let consumers skip message `seq`, which is lost, if they handled all earlier messages."""
         if self._consumers.skip(self._outbox.after(seq, self._seq), since=seq):
             self._post_hellos()
 
@@ -359,7 +360,10 @@ class Outlet:
             self._changed.set()
 
     def evict_stalled(self) -> None:
-        """Evict connected consumers whose window has been full for over `evict_after_s`."""
+        """Evict connected consumers that have made no progress for over `evict_after_s`.
+
+        Their window of unhandled messages has been full for this time.
+        """
         overdue = self._consumers.stalled(self._loop.time(), self._evict_after_s, self._next)
         for name in overdue:
             log.error(

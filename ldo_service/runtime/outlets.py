@@ -112,7 +112,10 @@ class Outlets:
         }
 
     def past(self) -> dict[str, OutletPosition | None]:
-        """Return the position to save of each outlet, by topic name; None: no required consumer."""
+        """Return the position to save of each outlet, by topic name.
+
+        The position is None if the topic has no required consumer.
+        """
         return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
 
     def stage_outputs(self, produced: Sequence[Produced]) -> None:
@@ -157,7 +160,7 @@ class Outlets:
             outlet.reset(epoch)
 
     def check_windows(self) -> None:
-        """Evict every consumer whose window has been full for too long."""
+        """Evict every consumer whose window of unhandled messages has been full for too long."""
         for outlet in self._all.values():
             outlet.evict_stalled()
 

@@ -40,9 +40,9 @@ def resident_mb() -> float:
 def trim_memory() -> None:
     """Return freed memory to the operating system.
 
-    Otherwise glibc keeps free memory that lies between blocks in use. It kept 280 MB after a camera
-    walk of three laps through the synthetic flat. On systems other than Linux the function
-    does nothing.
+    Otherwise glibc keeps free memory that lies between blocks in use. It kept 280 MB after three
+    laps through the sequence `synthetic:flat`. On systems other than Linux the function does
+    nothing.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
@@ -226,7 +226,7 @@ class ChildProcess:
         """
         clock, period_s = RunningClock(self._loop.time), self._silent_after_s / 10
         while True:
-            # The child cannot report while this process does not run either.
+            # While this process does not run, it cannot receive heartbeats of the child.
             self._heard_until_s += clock.tick(period_s)
             await asyncio.sleep(period_s)
             now_s = self._loop.time()

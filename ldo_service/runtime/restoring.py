@@ -19,7 +19,7 @@ LOG_PERIOD_S = 60.0  # Minimum time between two log lines about failed messages,
 
 
 class ActorRestorer:
-    """Restorer of an actor's last saved state, within its restart budget."""
+    """Restorer of an actor's last saved state, as often as the actor's restart budget allows."""
 
     def __init__(
         self,
@@ -57,8 +57,8 @@ class ActorRestorer:
         Args:
             worker: Thread of the actor.
             is_charged: Whether the failure counts in the restart budget. A failed message does not
-                count before its second attempt: if that fails too, the fault is in the message, and
-                no message may end the stage.
+                count at its first attempt. If the second attempt fails too, the fault is in the
+                message, and no message may end the stage.
 
         Raises:
             RestartsExhausted: The budget is used up.
@@ -83,9 +83,9 @@ class ActorRestorer:
 
 
 class FailureLog:
-    """Log of failed steps, with at most one line per minute about messages.
+    """Log of failed steps, with at most one line per minute about failed messages.
 
-    Any program may send messages that fail, so their number must not fill the log.
+    Any program may send messages that fail, and they must not fill the log.
     """
 
     def __init__(self) -> None:
@@ -97,7 +97,13 @@ class FailureLog:
             log.exception("%s: %s failed; restoring the actor.", name, what)
 
     def dead_lettered(self, name: str, message: Message, count: int) -> None:
-        """Log a message that failed twice; `count` messages have so far."""
+        """Log a message that failed twice.
+
+        Args:
+            name: Name of the actor.
+            message: The message.
+            count: Number of messages that have failed twice so far.
+        """
         if self._dead_letters.is_due():
             log.error(
                 "%s: message %s (stamp %d ns) failed twice and is discarded as a dead letter (%d "

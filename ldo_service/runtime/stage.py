@@ -219,7 +219,7 @@ class Stage:
         for attempt in range(2):
             if await self._try(message, delivery):
                 if attempt:
-                    self._restorer.charge()  # The fault was not in the message.
+                    self._restorer.charge()  # The message has no fault: its repetition succeeded.
                 return
         self._metrics.dead_lettered += 1
         self._journal.record_step("dead_lettered", FlowStatus())
@@ -243,7 +243,7 @@ class Stage:
         return self._actor.has_idle_work()
 
     async def _work_idly(self) -> None:
-        """Do one part of the actor's idle work; after a failure, wait for the next message."""
+        """Do one step of the actor's idle work; after a failure, wait for the next message."""
         produced = await self._attempt(
             lambda: self._actor.on_idle(), ("idle", "idle_failed"), "idle work"
         )
@@ -365,7 +365,8 @@ class Stage:
                 self._outlets.check_windows()
                 self._publish_health()
             except Exception:
-                # A heartbeat reports on the actor, so its own failure must not end the actor.
+                # A heartbeat only reports on the actor, so a failed heartbeat must not end the
+                # actor.
                 self._metrics.failures += 1
                 log.exception("%s: a heartbeat failed; the actor continues. Please report the "
                               "traceback.", self.name)  # fmt: skip

@@ -16,9 +16,9 @@ Commands:
 
 `Control` replies once for the whole service, when all its actors have replied. `reset` first pauses
 every actor, producers first, so that no message of the old run is in flight when the actors
-restart. Otherwise a graph correction of the old run could arrive in the new run. Its graph version
-would be higher than the first versions of the new run, so the actors would ignore the first
-corrections of the new run.
+restart. Otherwise a graph correction from before the reset could arrive after it. The graph version
+of this correction would be higher than the first versions after the reset, so the actors would
+ignore the first new corrections.
 """
 
 import asyncio
@@ -42,7 +42,8 @@ COMMAND_KEY, REPLY_KEY = "link/command", "link/reply"
 # stage that is still executing the command ignores the repetition.
 REPEAT_AFTER_S = 0.25
 
-# Minimum time that each actor has to reply to a command, seconds: 3x the slowest step measured.
+# Minimum time that each actor has to reply to a command, seconds: three times the slowest step
+# measured.
 MIN_S = 2.0
 
 
@@ -119,8 +120,8 @@ class CommandSender:
         """Send a command to a stage and wait for its reply.
 
         Returns:
-            Empty text on success, else the error of the stage, or that it did not reply within
-            `timeout_s` seconds.
+            An empty text on success. Otherwise, the error of the stage, or a text saying that the
+            stage did not reply within `timeout_s` seconds.
         """
         order = StageCommand(1 + secrets.randbits(62), what, stage)
         report = self._reports[order.number] = self._loop.create_future()
@@ -151,7 +152,7 @@ class CommandSender:
 
 
 class ControlError(Exception):
-    """Error of a command that some actors did not execute; the text names these actors."""
+    """Error of a command that some actors did not execute; its text names these actors."""
 
 
 class Control:

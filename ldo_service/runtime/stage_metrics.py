@@ -20,7 +20,7 @@ from .supervision_policy import RunningClock
 
 @dataclass
 class StageMetrics:
-    """Counters and step times of a stage; fields `..._at_s` are times of the monotonic clock."""
+    """Counters and step times of a stage; fields ending in `_at_s` are monotonic clock times."""
 
     heartbeat: Heartbeat | None = None  # Heartbeat of this process, if a parent process reads it.
     state: Literal["starting", "ready", "draining"] = "starting"

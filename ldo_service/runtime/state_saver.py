@@ -21,7 +21,7 @@ SAVE_AGAIN_S = 0.5
 
 
 class UnsavedStateError(Exception):
-    """End of a stage with an unsaved state; the last step is repeated after a restart."""
+    """Error that ends a stage with an unsaved state; a restart repeats the last step."""
 
 
 class StateSaver:

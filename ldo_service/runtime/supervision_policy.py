@@ -45,7 +45,7 @@ class RestartBudget:
         return delay_s
 
     def delay_s(self, now_s: float) -> float:
-        """Return the delay before a restart that does not count, in seconds."""
+        """Return the delay in seconds before a restart that does not count in the budget."""
         while self._failed_at_s and self._failed_at_s[0] < now_s - self._window_s:
             self._failed_at_s.popleft()
         recent = max(len(self._failed_at_s), 1)
@@ -77,11 +77,12 @@ class RunningClock:
     """Monotonic clock that stands still while this process does not run.
 
     A process does not run while it is suspended (SIGSTOP), while its container is paused, or while
-    its virtual machine is moved. Such a time must not count as a hanging step. The clock notices it
-    because `tick`, which is called periodically, is late.
+    its virtual machine is moved. Such a pause must not count as a hanging step. `tick` is called
+    periodically, so a late call shows that there was a pause.
     """
 
-    # Delay of `tick` above which the process did not run, seconds. A busy machine delays it less.
+    # Delay of a call of `tick`, in seconds, above which the process was paused. A busy machine
+    # causes smaller delays.
     MAX_LATE_S = 2.0
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -118,17 +119,20 @@ class SupervisionConfig:
     restart_delay_s: float = 0.05  # Doubled with each failure in the window.
     restart_delay_max_s: float = 5.0
     heartbeat_s: float = 0.5  # Heartbeat period.
-    # Maximum duration of a step, seconds: 100x the slowest one measured (mapper, 1.5 M Gaussians).
+    # Maximum duration of a step, seconds: a hundred times the slowest one measured (mapper with 1.5
+    # million Gaussians).
     stall_after_s: float = 60.0
-    # The same limit for actors that no other actor waits for: one optimization may take minutes.
+    # Maximum duration of a step of an actor that no other actor waits for, seconds. One
+    # optimization may take minutes.
     backend_stall_after_s: float = 600.0
     # Maximum size on disk of the unhandled messages of one topic, MB: almost 8 minutes of
     # keyframes of 640x480 at 2 Hz.
     backlog_mb: float = 2000.0
-    # Time without progress after which a consumer is evicted, because its producer waits for it.
+    # Time in seconds after which a consumer without progress is evicted, so that its producer no
+    # longer waits for it.
     evict_after_s: float = 30.0
-    # Nice value of threads with work that may be late. On a shared core (Linux) they have a
-    # tenth of the weight of threads that a robot waits for.
+    # Nice value of threads whose work may be late. On a shared core under Linux, such a thread gets
+    # a tenth of the computing time of a thread that a robot waits for.
     nice: int = 10
     # Maximum size of a message that is decoded, MB; raw color and depth of 8 MP have 58 MB.
     max_message_mb: float = 64.0
