@@ -88,7 +88,7 @@ class Recorder(Journal):
 
     # --- called by the stage ----------------------------------------------------------------------
     def record_files(self) -> None:
-        """Record the files of the actor, without which a replay cannot start from a saved state."""
+        """Record the files of the actor, which a replay needs to start from a saved state."""
         if self._files is None or not self._file.is_open:
             return
         try:
@@ -104,7 +104,7 @@ class Recorder(Journal):
             )
 
     def record_start(self, state: State | None) -> None:
-        """Record the start of an actor with its restored state; None for a start without a state.
+        """Record the start of an actor with its restored state, or None if it starts without one.
 
         If the state or a file cannot be recorded, a gap is recorded instead.
         """

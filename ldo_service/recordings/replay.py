@@ -43,12 +43,12 @@ class ReplayReport:
     restored: int = 0  # Number of starts with a saved state.
     steps: int = 0  # Number of replayed steps.
     failures: int = 0  # Steps that failed when they were recorded.
-    failures_repeated: int = 0  # Steps that failed when recorded and failed again in the replay.
+    failures_repeated: int = 0  # Steps that failed when recorded, and again in the replay.
     dead_lettered: int = 0  # Messages that became dead letters.
     taken: Counter[str] = field(default_factory=Counter)  # Number of inputs by topic.
     made: Counter[str] = field(default_factory=Counter)  # Number of outputs by topic.
     notes: list[str] = field(default_factory=list)  # Sentences for the user.
-    # False if the recording has a gap, other than its end at the size limit.
+    # False if the recording has a gap. Its end at the size limit does not count as a gap.
     is_complete: bool = True
     difference: ReplayDiverged | None = None  # First difference; None if there is none.
 
@@ -140,7 +140,7 @@ class ReplaySession:
     def _under_way(self) -> str:
         """Describe the last input if its step was not recorded; else return an empty string.
 
-        In that case, the step may have killed the process.
+        A step that was not recorded may have killed the process.
         """
         taken = self._file.messages
         if not taken or (self._last and self._last.taken == taken[-1].number):
