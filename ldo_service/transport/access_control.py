@@ -95,8 +95,9 @@ def access_control(access: Access, local_robot: str = "") -> dict[str, Any]:
 
     Args:
         access: Role of each certificate.
-        local_robot: Robot whose child processes connect over a Unix socket and perform all
-            operations; empty: none. Only the user of the service can open the socket.
+        local_robot: Robot whose child processes connect over a Unix socket, with permission for
+            all operations; empty if there is none. Only the user of the service can open the
+            socket.
     """
     parts: dict[tuple[Role, str], list[str]] = {}
     for name, grantee in sorted(access.items()):

@@ -7,8 +7,9 @@ The folder DIR of an authority contains:
 - `DIR/access.yaml`: Role of each certificate. The folder of each service has a copy.
 - `DIR/<name>/`: Files for one machine: ca.crt, tls.crt, tls.key.
 
-The common name of a certificate is the name of its keys and a random number. New keys under an old
-name therefore have another common name, and routers with the new access list deny the old keys.
+The common name of a certificate consists of the name of its keys and a random number. New keys with
+the name of old keys therefore have another common name. Routers with the new access list deny the
+old keys.
 """
 
 import os
@@ -41,8 +42,8 @@ from .endpoint import require_robot
 from .keys import ACCESS, CA, CERTIFICATE, KEY
 
 CA_KEY = "ca.key"
-# Valid name, at most 55 characters. With the random number, a common name then has at most 64, the
-# limit of X.509.
+# Valid name, at most 55 characters. With the random number, a common name then has at most 64
+# characters, the limit of X.509.
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,54}")
 HERE = ("localhost", "127.0.0.1", "::1")  # Addresses that the actors of a service connect to.
 HEAD = "# Role of each certificate. `ldo keys` writes this file; routers read it at their start.\n"

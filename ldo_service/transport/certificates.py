@@ -42,7 +42,7 @@ def of_authority(key: PrivateKey, days: int, now: datetime) -> Certificate:
     Raises:
         ConfigError: The number of days is out of range.
     """
-    name = _named(f"ldo-slam {secrets.token_hex(4)}")  # The number tells authorities apart.
+    name = _named(f"ldo-slam {secrets.token_hex(4)}")  # The random number is unique.
     public = key.public_key()
     return (
         _valid(name, name, public, days, now)

@@ -9,15 +9,15 @@ from ldo_service.schemas.topics import ROBOT_PREFIX
 from .access_control import LOCAL
 from .keys import TlsKeys
 
-# Default address of HTTP servers. They have no access control, so on another address every
-# machine on the network could see where the robot is.
+# Default address of HTTP servers. They have no access control: on another address, every machine
+# on the network could see where the robot is.
 LOOPBACK = "127.0.0.1"
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 # Maximum size of a message. A 4K frame with depth in floats has 58 MB. Zenoh's default maximum is
 # 1074 MB.
 MAX_MESSAGE_MB = 128
-CLOSED = {  # Zenoh settings, by path, that keep other programs out.
+CLOSED = {  # Zenoh settings, by path, that prevent connections of other programs.
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "adminspace/enabled": False,
@@ -35,7 +35,7 @@ class Endpoint:
     keys: TlsKeys | None = None
     max_message_mb: int = MAX_MESSAGE_MB  # Receivers drop larger messages.
     # Path of a Unix socket on which a router with TLS keys also listens, for its own child
-    # processes; empty: none. A certificate that has expired does not end this link.
+    # processes; empty if there is none. This link still works when the certificate has expired.
     local_socket: str = ""
 
     def __post_init__(self) -> None:

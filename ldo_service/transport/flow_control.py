@@ -2,9 +2,10 @@
 
 - `ConsumerHello` (consumer to producer): Announces the consumer. It is repeated until the producer
   sends its hello.
-- `ProducerHello` (producer to consumers): Epoch of the producer and, for each consumer that the
-  producer knows, the offset of the first message for this consumer. Each consumer replies at once:
-  with its credit, or with a hello if it is not connected yet.
+- `ProducerHello` (producer to consumers): Epoch of the producer, and the offset of the first
+message
+  for each consumer that the producer knows. Each consumer replies immediately: with its credit, or
+  with a hello if it is not connected yet.
 - `Credit` (consumer to producer): Three offsets, sent after each step and twice a second. Message
   `handled` is the first one that the consumer has not handled. Message `arrived` is the first one
   that the consumer has not received. Message `limit` is the first one that the producer may not
@@ -38,8 +39,8 @@ ALIVE = "link/alive"  # Key of the liveliness tokens of running actors.
 # minute of camera frames.
 MAX_MISSING = 1024
 
-# Largest jump of the sequence numbers that counts as lost messages: 124 days at 100 messages per
-# second. After a larger jump, the numbers are taken for a new numbering, because any program may
+# Largest jump of the sequence numbers that counts as lost messages: those of 124 days at 100
+# messages per second. A larger jump counts as the start of a new numbering, because any program may
 # send any number.
 MAX_JUMP = 1 << 30
 
@@ -167,7 +168,7 @@ def data_key(topic: str) -> str:
 def retransmit_key(topic: str, consumer: str = "") -> str:
     """Return the key of retransmitted messages.
 
-    Only lossless consumers subscribe to it; other consumers receive each message once.
+    Only lossless consumers subscribe to this key. Other consumers get no message twice.
 
     Args:
         topic: Name of the topic.
@@ -192,8 +193,8 @@ class SequenceTracker:
     """Counter of lost messages of a topic.
 
     A message that arrives late does not count as lost. A repeated message changes no count: a
-    restarted producer repeats messages that a consumer may not have received. The numbers come from
-    other programs, so the count stays within an int64 whatever they are.
+    restarted producer repeats messages that a consumer may not have received. The sequence numbers
+    come from other programs, so the count is limited to the range of an int64.
     """
 
     def __init__(self) -> None:

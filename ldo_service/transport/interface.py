@@ -54,7 +54,7 @@ class Transport(Protocol):
         ...
 
     def watch_liveliness(self, on_presence: OnPresence) -> None:
-        """Subscribe to the liveliness of all actors, including those that are alive already."""
+        """Subscribe to the liveliness of all actors, including those that are already alive."""
         ...
 
     def serve_queries(self, key: str, last_values: LastValues) -> None:
@@ -82,7 +82,8 @@ class MemoryTransport:
         """Initialize without subscribers.
 
         Args:
-            lose: Function that returns True for the key of a message to lose; for tests.
+            lose: Function from the key of a message to True if the message is to be lost; for
+                tests.
         """
         self._subscribers: dict[str, list[OnMessage]] = {}
         self._watchers: list[OnPresence] = []

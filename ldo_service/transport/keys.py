@@ -24,7 +24,7 @@ from .access_control import Access, access_control, read_access
 log = logging.getLogger(__name__)
 
 CA, CERTIFICATE, KEY, ACCESS = "ca.crt", "tls.crt", "tls.key", "access.yaml"
-EXPIRY_WARNING_DAYS = 30  # Time before the expiry of a certificate with warnings.
+EXPIRY_WARNING_DAYS = 30  # Warnings are logged during this time before a certificate expires.
 OTHERS = 0o007  # Bits of a file mode that give access to all users of the machine.
 # Time limit for reading the TLS error of a server, seconds. A server rejects a client in the
 # handshake or one round trip later.
@@ -94,9 +94,9 @@ class TlsKeys:
     def days_left(self) -> float | None:
         """Return the days until the certificate of this machine expires; None if unknown.
 
-        The result is negative after the expiry, by the clock of this machine.
+        After the expiry, the result is negative. The clock of this machine is used.
         """
-        # The standard library reads a certificate from a file by this function alone.
+        # The standard library has no other function that reads a certificate from a file.
         read = getattr(getattr(ssl, "_ssl", None), "_test_decode_cert", None)
         if read is None:
             return None
@@ -139,7 +139,7 @@ class TlsKeys:
         return context
 
     def tls_error(self, host: str, port: int) -> str:
-        """Connect to a server by TLS and return the TLS error; an empty string without an error."""
+        """Connect to a server by TLS, and return the TLS error, or "" if there is none."""
         try:
             with (
                 socket.create_connection((host, port), ALERT_WITHIN_S) as plain,

@@ -28,7 +28,7 @@ class MessageReader:
         self._session, self._network = session, network
 
     def messages(self, topic: Topic, keep: int) -> Iterator[tuple[Header, Message]]:
-        """Yield header and message of each sample on a topic, without end.
+        """Yield header and message of each sample on a topic; the iteration never ends.
 
         Messages that a restarted producer repeats are skipped. Samples without a header and
         malformed messages, which other programs may put on a topic, are skipped too. If messages

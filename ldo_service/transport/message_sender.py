@@ -26,7 +26,7 @@ class MessageSender:
         self._publishers: dict[type[Message], Any] = {}  # Publisher by message type.
 
     def send(self, message: Message, source: str, number: int) -> None:
-        """Publish a message on the topic of its type. The call may block for some milliseconds.
+        """Publish a message on the topic of its type. The call may block for a few milliseconds.
 
         Args:
             message: The message.

@@ -44,7 +44,7 @@ class Worker:
         Worker._all.add(self)
 
     def submit(self, job: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> "Future[R]":
-        """Queue a job; after `close`, the job does not run and the returned future is cancelled."""
+        """Queue a job, and return its future. After `close`, the future is cancelled instead."""
         future: Future[R] = Future()
         with self._lock:
             if self._closed:
@@ -90,7 +90,7 @@ class Worker:
             future, job = entry
             if future.set_running_or_notify_cancel():
                 _settle(future, job)
-            del entry, future, job  # An idle thread keeps no references.
+            del entry, future, job  # An idle thread must keep no references.
 
 
 def _lower_priority(name: str, nice: int) -> None:
@@ -112,7 +112,7 @@ def _settle(future: Future[Any], job: Callable[[], Any]) -> None:
     try:
         result = job()
     except (StopIteration, GeneratorExit, KeyboardInterrupt, SystemExit) as error:
-        # asyncio cannot pass these on, so the future gets a RuntimeError.
+        # asyncio cannot pass on errors of this type, so the future gets a RuntimeError.
         failure = RuntimeError(f"{type(error).__name__} was raised")
         failure.__cause__ = error
         future.set_exception(failure)

@@ -32,7 +32,8 @@ from .worker import Worker
 
 log = logging.getLogger(__name__)
 
-# Maximum number of pending queries for values, and of pending commands; further ones get an error.
+# Maximum number of pending queries for values, and of pending commands. Further queries or commands
+# get an error.
 MAX_QUERIES = 16
 CONNECT_WITHIN_MS = 3000
 LEAVE_WITHIN_S = 2.0  # Time to send pending messages when a transport closes.
@@ -109,8 +110,8 @@ class ZenohTransport:
         self._loop = asyncio.get_running_loop()
         self._declared: list[Any] = []
         self._publishers: list[ZenohPublisher] = []
-        # Readers of values and senders of commands have their own slots and threads, so that slow
-        # readers delay no command.
+        # Queries for values and commands have separate limits and threads, so that slow readers of
+        # values do not delay commands.
         self._answering, self._commanding = Worker("answers"), Worker("commands")
         self._responding: set[asyncio.Task[None]] = set()
         self._query_slots = BoundedSemaphore(MAX_QUERIES)
