@@ -1,4 +1,4 @@
-"""Arrays that callers give, and arrays that they get."""
+"""Checks of the arrays that callers pass, and read-only arrays for results."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ FrameArray = Any  # An array that supports DLPack or the buffer protocol.
 
 
 def array_of(name: str, value: FrameArray) -> np.ndarray:
-    """Return an array of a caller as a NumPy array, without a copy where possible.
+    """Return an array that a caller passed as a NumPy array, without a copy if possible.
 
     Raises:
         FrameError: The value is no array, or lies in the memory of a GPU.
@@ -38,20 +38,20 @@ def array_of(name: str, value: FrameArray) -> np.ndarray:
 
 
 def read_only(trajectory: Trajectory) -> Trajectory:
-    """Return a trajectory after its arrays were made read-only."""
+    """Make the arrays of a trajectory read-only, and return the trajectory."""
     read_only_array(trajectory.stamps_s)
     read_only_array(trajectory.T_world_camera)
     return trajectory
 
 
 def read_only_array(array: np.ndarray) -> np.ndarray:
-    """Return an array after it was made read-only."""
+    """Make an array read-only, and return it."""
     array.flags.writeable = False
     return array
 
 
 def rigid_transform(name: str, value: object, error: type[LdoError]) -> np.ndarray:
-    """Return a transform that a caller gave, as a rigid transform [4, 4] float64.
+    """Return a transform that a caller passed as a rigid transform [4, 4] float64.
 
     Args:
         name: Name of the argument, for the error.

@@ -1,4 +1,4 @@
-"""Interrupts by Ctrl-C that do not leave a step half done."""
+"""Handling of Ctrl-C that lets a running step finish."""
 
 import signal
 import threading
@@ -11,8 +11,8 @@ from types import FrameType
 def interrupts_delayed() -> Iterator[None]:
     """Handle Ctrl-C after the block instead of within it, so that each step is complete.
 
-    A second Ctrl-C is handled at once, because a step may hang. Only the main thread receives the
-    signal, so the block does nothing in other threads.
+    A second Ctrl-C is handled immediately, because a step may hang. Only the main thread receives
+    the signal, so the block does nothing in other threads.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -204,7 +204,7 @@ def find(
 
 
 def _map_pose(name: str, value: object) -> np.ndarray:
-    """Return a pose in the map that a caller gave, as a rigid transform [4, 4] float64.
+    """Return a pose in the map that a caller passed as a rigid transform [4, 4] float64.
 
     Raises:
         ConfigError: The value is no rigid transform.

@@ -1,4 +1,4 @@
-"""SLAM in this process: frames in, poses and a map out.
+"""SLAM in this process: its inputs are frames, its results are poses and a map.
 
     from ldo_service import Camera, Slam
 
@@ -47,10 +47,10 @@ class Slam:
     """Tracking and mapping of the frames of one camera in this process.
 
     Use it as a context manager, or call `close`. After `close`, the map, the trajectory and the
-    objects stay available. Several objects may exist side by side, but one object must not be used
-    by two threads at a time. Ctrl-C takes effect after the current frame, so the object can be used
-    further unless a `with` block has closed it. A second Ctrl-C takes effect at once; the object
-    can then track no more frames.
+    detected objects stay available. Several instances may exist at the same time, but two threads
+    must not use one instance at the same time. Ctrl-C takes effect after the current frame, so the
+    instance can be used further unless a `with` block has closed it. A second Ctrl-C takes effect
+    immediately; the instance can then track no more frames.
 
     Attributes:
         camera: Camera of the frames.
@@ -100,7 +100,7 @@ class Slam:
         self._last_stamp_ns = -1
         self._last_pose: TrackedPose | None = None
         self._map_camera: Camera | None = None
-        # Work that `finish` has begun: each item of an iterator is a step that is done.
+        # Unfinished work of `finish`. Each `next` of an iterator does one step.
         self._steps: deque[Iterator[None]] = deque()
         self._is_ending = self._is_closed = False
         self._failure: str | None = None  # Failure after which no step is possible.
@@ -171,8 +171,8 @@ class Slam:
     def finish(self, refine_iterations: int = 0) -> None:
         """Wait for the mapping of all frames, close the last loops, and refit the moved keyframes.
 
-        After an interrupt, another call continues. Further calls with iterations refine the map
-        further.
+        If Ctrl-C interrupts the call, another call continues the work. Each further call with
+        iterations refines the map further.
 
         Args:
             refine_iterations: Iterations that optimize the whole map further.
@@ -207,7 +207,7 @@ class Slam:
     # --- results ----------------------------------------------------------------------------------
     @property
     def map(self) -> Map:
-        """The map so far, a copy; it lacks the Gaussians of submaps that are not merged."""
+        """Copy of the map so far, without the Gaussians of submaps that are not merged yet."""
         record = self._run.record
         in_map, replica = record.in_map(), record.replica
         labels = replica.map.labels[in_map] if replica.label_names else None
