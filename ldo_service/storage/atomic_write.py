@@ -21,7 +21,7 @@ def write_atomically(path: Path, *parts: bytes, syncs: bool = False, unique: boo
     Args:
         path: The file; its folder must exist.
         parts: The content, concatenated in order.
-        syncs: Wait until the content and the name are on the disk, so a power cut loses nothing.
+        syncs: Wait until content and file name are on the disk, so that a power cut loses nothing.
         unique: Use a temporary name that no other process uses. This is needed if several processes
             may write the file at the same time.
 

@@ -26,7 +26,7 @@ _OF_PROCESS = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # Limits of the proces
 
 
 class ChecksummedFolder:
-    """Files `<number>.<suffix>` in a folder; other files there stay unchanged.
+    """Files `<number>.<suffix>` in a folder; other files in the folder stay unchanged.
 
     Attributes:
         is_temporary: Whether the folder is deleted with this object.

@@ -52,8 +52,8 @@ class _Segment:
 class MessageLog:
     """Log of messages in a folder; any thread may call its methods.
 
-    The numbers of the messages are consecutive, except where the disk lost messages, as in a power
-    cut.
+    The numbers of the messages are consecutive, except where messages were lost, for example in a
+    power cut.
 
     The oldest messages are deleted when the log exceeds its maximum size. The numbers of the
     messages belong to one epoch of their producer. Files of other epochs are deleted.
@@ -105,10 +105,10 @@ class MessageLog:
             return sum(segment.size for segment in self._segments)
 
     def append(self, messages: Iterable[LoggedMessage]) -> None:
-        """Append messages with ascending numbers; numbers before `next` are skipped.
+        """Append messages with ascending numbers; messages with numbers before `next` are skipped.
 
-        Only one thread may append at a time. Calls of other methods do not wait for the disk
-        meanwhile.
+        Only one thread may append at a time. Other methods do not wait for the disk while a thread
+        appends.
 
         Raises:
             OSError: The disk is full or cannot be written. The log then ends with a whole message.
@@ -127,7 +127,10 @@ class MessageLog:
                 self._open = None
 
     def _segment_for(self, seq: int) -> _Segment:
-        """Return the segment for message `seq`: a new one after lost messages or a full segment."""
+        """Return the segment for message `seq`.
+
+        It is a new segment if the last one is full or if messages before `seq` were lost.
+        """
         last = self._segments[-1] if self._segments else None
         if last is not None and seq == last.next and last.size < SEGMENT_BYTES:
             return last

@@ -138,7 +138,7 @@ class FolderStore:
                 self._write(folder / new[part], encode_state(value))
         new = {part: new[part] for part in state}
         if new != old:
-            self._saved.pop(actor, None)  # The list may refer to the new files from here on.
+            self._saved.pop(actor, None)  # From now on, the list may refer to the new files.
             body = msgspec.msgpack.encode(_Contents(new))
             write_atomically(folder / CONTENTS, body, syncs=self.syncs)
         for file in set(old.values()) - set(new.values()):
@@ -207,7 +207,7 @@ def _set_aside(folder: Path) -> None:
 
 
 def _remove_unreferenced(folder: Path, files: Mapping[str, str]) -> None:
-    """Remove the files that are not in `files`; killed processes may have left some."""
+    """Remove the files that are not in `files`, such as those that killed processes have left."""
     for file in folder.glob("*"):
         if file.name not in (CONTENTS, *files.values()):
             _remove(file)
