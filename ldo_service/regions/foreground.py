@@ -115,15 +115,16 @@ def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> S
     One call per keyframe is enough for all boxes; it takes 0.8 ms for 640x480 pixels. A pixel
     belongs to a surface if two conditions hold:
 
-    - All depths within its 3x3 pixels are known, and no two of them differ by more than max_step,
-      relatively.
-    - The cosine between the normals two pixels to the left and to the right is above min_cosine,
-      and so is the cosine between the normals two pixels above and below. The normals are computed
-      from blurred depth.
+    - All depths within its 3x3 pixels are known, and no two of them differ by more than the
+    fraction
+      max_step.
+    - The cosine between the normals two pixels to the left and two pixels to the right is above
+      min_cosine. The same holds for the normals two pixels above and two pixels below. The normals
+      are computed from blurred depth.
 
-    Such pixels that share a side belong to the same surface. Surfaces are numbered from 1 in the
-    order of their first pixels, row by row. If a cosine is at its threshold, the result may differ
-    between instruction sets.
+    Two such pixels that share a side belong to the same surface. Surfaces are numbered from 1 in
+    the order of their first pixels, row by row. If a cosine is exactly at its threshold, the result
+    may differ between instruction sets.
 
     Args:
         depth_m: Depth, [H, W], meters; NaN or not above 0 where unknown.
@@ -274,7 +275,7 @@ Window = tuple[slice, slice]
 def _shared(a: Foreground, b: Foreground) -> tuple[Window, Window] | None:
     """Return the common window of two masks, as rows and columns of mask a and of mask b.
 
-    None if the windows of the masks do not intersect.
+    The result is None if the windows of the masks do not intersect.
     """
     top, left = max(a.row, b.row), max(a.column, b.column)
     bottom = min(a.row + a.mask.shape[0], b.row + b.mask.shape[0])
@@ -316,7 +317,7 @@ class RegionDetections:
     def of_detector(
         cls, boxes: np.ndarray, labels: np.ndarray, confidences: np.ndarray
     ) -> "RegionDetections":
-        """Return detections with labels by the detector only; the arrays are as in the class."""
+        """Return detections with labels by the detector alone; the class describes the arrays."""
         return cls(boxes, labels, confidences, labels, np.zeros(len(boxes), np.float32))
 
     @classmethod

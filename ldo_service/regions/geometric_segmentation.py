@@ -137,7 +137,7 @@ def _joined(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndar
 
 
 def _on_planes(found: Planes, apart: np.ndarray) -> np.ndarray:
-    """Return the pixels of `apart` that lie on planes, and the pixels next to them, [h, w] bool.
+    """Return the pixels of `apart` on planes together with the pixels next to them, [h, w] bool.
 
     Args:
         found: All planes of the keyframe.
@@ -195,7 +195,7 @@ def _across(values: np.ndarray, r: int, axis: int) -> np.ndarray:
 def _colored(
     color: np.ndarray, of_room: np.ndarray, config: GeometricSegmentationConfig, camera: Camera
 ) -> Iterator[np.ndarray]:
-    """Yield, for each structural plane, its pixels with another color than its main color.
+    """Yield the pixels of each structural plane whose color differs from its main color.
 
     Args:
         color: Color image, [H, W, 3] uint8 RGB.

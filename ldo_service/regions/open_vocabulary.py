@@ -40,8 +40,8 @@ class OpenVocabularyConfig:
     # Minimum probability of a reliable label in the map. Pixels with such a label need no label
     # request (III.B).
     reliable: float = 0.6
-    # Minimum confidence of a label result. With 0.5, the recall on the synthetic flat is 7
-    # percentage points lower. Results below 0.3 are rare if the labeller recognizes that a region
+    # Minimum confidence of a label result. With 0.5, the recall on the sequence `synthetic:flat` is
+    # 7 percentage points lower. Results below 0.3 are rare if the labeller recognizes that a region
     # shows no object.
     min_sure: float = 0.3
     # Labels that are no objects; a region with such a label result stays background.
@@ -238,10 +238,10 @@ class OpenVocabularyLabeling:
     def _filter_answer(
         self, answer: RegionLabelResult, pending: PendingRequest
     ) -> RegionLabelResult:
-        """Return a label result without labels of structure, see `config.structure`.
+        """Return a label result without labels that are no objects, see `config.structure`.
 
-        The result has no label if its label is one of structure. It also has no label if its
-        confidence is below min_sure, unless the region has a box of the detector.
+        The result has no label if its label is such a name, for example "wall". It also has no
+        label if its confidence is below min_sure, unless the region has a box of the detector.
         """
         others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))
         if not self._is_object(answer.label):
@@ -258,7 +258,7 @@ class OpenVocabularyLabeling:
 
     # --- state ------------------------------------------------------------------------------------
     def adopt(self, other: "OpenVocabularyLabeling") -> None:
-        """Take over regions and pending requests from another instance; the counters stay."""
+        """Replace regions and pending requests by those of another instance; the counters stay."""
         self._regions, self._open = other._regions, other._open
 
     def pack(self) -> dict[str, Any]:
@@ -289,7 +289,7 @@ class OpenVocabularyLabeling:
             "regions_tracked": len(self._regions),
             "questions": self._requests,
             "label_requests_pending": len(self._open),
-            "label_requests_expired": self._overdue,  # Dropped for newer requests, or not sent.
+            "label_requests_expired": self._overdue,  # Replaced by newer requests, or not sent.
             "answers_named": self._named,
             # Results without a label: no object, or no labeller available.
             "answers_unnamed": self._unnamed,

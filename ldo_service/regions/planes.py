@@ -35,11 +35,11 @@ class PlaneConfig:
     blur_px: float = 2.0  # Blur of the inverse depth for normals.
     min_cosine: float = 0.94  # Minimum cosine of normals 4 px apart on one surface.
     max_step: float = 0.04  # Maximum relative depth step within 3x3 pixels of one surface.
-    # Inverse depth, 1 / m, by which a step may exceed max_step. At large distances, the noise alone
-    # exceeds max_step.
+    # Allowance, 1 / m of inverse depth, by which a step may exceed max_step. At large distances,
+    # the noise alone exceeds max_step.
     step_floor: float = 0.004
     min_share: float = 0.01  # Minimum plane size as a fraction of the image.
-    most: int = 24  # Planes are fitted to at most this number of surfaces, the largest ones.
+    most: int = 24  # Maximum number of surfaces to which planes are fitted; the largest are used.
     # Maximum difference, 1 / m, between the inverse depth of a plane and of its pixels.
     tolerance: float = 0.006
     # Maximum fraction of a structural plane's outline past which a farther surface is visible. No
@@ -201,7 +201,7 @@ def _shrunk_inverse(depth_m: np.ndarray, k: int) -> np.ndarray:
 
 
 def _blurred(inverse: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Blur inverse depth [h, w], with the values of measured pixels only; others stay 0."""
+    """Blur inverse depth [h, w] over the measured pixels; unmeasured pixels stay 0."""
     measured = (inverse > 0).astype(np.float32)
     total, count = (cv2.GaussianBlur(a, (0, 0), sigma_px) for a in (inverse, measured))
     return measured * total / np.maximum(count, np.float32(1e-3))

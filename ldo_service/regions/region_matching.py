@@ -42,7 +42,8 @@ class ProjectedPoints:
         """Return the points of some regions only.
 
         Args:
-            regions: Indices of the regions, each once; their order gives the new indices.
+            regions: Indices of the regions, without repetition. Region `regions[i]` gets the new
+                index i.
         """
         places = np.full(len(self.counts), -1)
         places[regions] = np.arange(len(regions))
@@ -214,7 +215,7 @@ def _points(
 
 
 def _spacing_m(seen: RegionObservation, camera: Camera) -> float:
-    """Return the spacing of an observation's points in meters, as if they were on a square grid."""
+    """Return the spacing of an observation's points in meters, assuming a square grid."""
     m_per_px = float(np.median(seen.p_camera[:, 2])) / camera.fx
     return float(np.sqrt(seen.size_px / len(seen.p_camera))) * m_per_px
 

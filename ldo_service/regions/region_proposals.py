@@ -23,7 +23,7 @@ from ldo_service.geometry.boxes import ious, non_maximum_suppression
 from .foreground import Foreground, ForegroundConfig, foreground, pixels_of, surfaces
 from .geometric_segmentation import GeometricSegmentationConfig, Segment
 
-_ORDER = ("flat", "apart", "standing", "convex")  # Kinds by preference, if regions are similar.
+_ORDER = ("flat", "apart", "standing", "convex")  # The first kind of similar regions is kept.
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,7 +232,7 @@ def labeled_regions(
 def regions_of_image(
     found: Sequence[Segment], shape: tuple[int, ...], config: RegionProposalConfig
 ) -> list[RegionProposal]:
-    """Return the segments of an image that a labeller could recognize, without similar ones.
+    """Return the segments of an image that a labeller could recognize, without near duplicates.
 
     The pixels of segments `standing` are removed from the masks of segments `apart`.
 

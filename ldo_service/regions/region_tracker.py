@@ -251,7 +251,7 @@ class RegionTracker:
         )
 
     def _keep(self, region: Region) -> None:
-        """Store a region as the most recently observed one."""
+        """Store a region, and mark it as the most recently observed one."""
         self._regions.pop(region.id, None)
         self._regions[region.id] = region
 

@@ -19,9 +19,9 @@ class RegionTrackerConfig:
     # Keyframes without a better view after which a label is requested.
     patience: int = 3
     max_requests: int = 3  # Maximum label requests for a region.
-    # Maximum label requests per keyframe, on average; regions with the best views come first.
-    # Half of the regions show no object. The paper makes requests on 10-25 % of the frames
-    # (IV.B.8). On the synthetic flat, 1.0 requests per keyframe are made.
+    # Maximum number of label requests per keyframe, on average; regions with the best views come
+    # first. Half of the regions show no object. The paper makes requests on 10-25 % of the frames
+    # (IV.B.8). On the sequence `synthetic:flat`, 1.0 requests per keyframe are made.
     per_keyframe: float = 2.5
     # Maximum label requests at one keyframe, if earlier keyframes made fewer than per_keyframe.
     at_once: int = 4
@@ -36,7 +36,7 @@ class RegionTrackerConfig:
     # many votes as one label result with confidence 1.
     answer_weight: float = 4.0
     # True: boxes vote for the label of a region. False: labels of boxes are fused per Gaussian
-    # (III.B), and the label of a region comes from the labeller only. A change does not affect the
+    # (III.B), and only the labeller labels a region. A change of this setting does not affect the
     # votes of regions that are restored from a checkpoint.
     boxes_vote: bool = True
     # Minimum votes for a label: one box with a score of 0.6, or four with 0.3.
