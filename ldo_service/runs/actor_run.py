@@ -77,12 +77,12 @@ class ActorRun:
         self._clock.finish()
 
     def end_stream(self) -> None:
-        """Finish after the last frame, and keep the step times until now."""
+        """Finish after the last frame, and fix the step times for the summary."""
         self.finish()
         self.keep_step_times()
 
     def keep_step_times(self) -> None:
-        """Use the step times until now in the summary, without those of a later refinement."""
+        """Fix the step times for the summary, so that a later refinement does not count."""
         self._stage_ms = self._step_percentiles()
 
     @property
@@ -97,8 +97,8 @@ class ActorRun:
 
         Args:
             frames: Number of frames.
-            rejected: Number of frames that could not be used, without those that `frame_source`
-                has rejected.
+            rejected: Number of frames that could not be used. Frames that the actor frame_source
+                rejected are not included.
             used: Time that the frames took.
             is_finished: False if the run was interrupted.
         """

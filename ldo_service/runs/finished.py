@@ -59,7 +59,7 @@ def vlm_calls(folder: Path) -> int | None:
 
 
 def newest_map(folder: Path) -> "MapFolder":
-    """Return the refined map of a run, or without one the map at the end of the stream."""
+    """Return the refined map of a run if there is one, else the map at the end of the stream."""
     return MapFolder(folder / REFINED if has_refined(folder) else folder)
 
 
@@ -158,7 +158,7 @@ def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:
 
 
 def _submap(keyframe: dict[str, Any]) -> int:
-    """Return the submap of a keyframe in keyframes.json; 0 if an old version wrote none.
+    """Return the submap of a keyframe in keyframes.json; 0 if an old version did not write it.
 
     Version 0.1 wrote `segment` instead of `submap`.
     """

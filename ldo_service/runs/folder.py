@@ -328,7 +328,7 @@ class RunWriter:
         return _trajectory(frames, self._final_poses.of(frames, T_map))
 
     def _root(self, submap: int) -> int:
-        """Return the submap that `submap` was merged into; `submap` itself if it was not merged."""
+        """Return the submap that `submap` was merged into, or itself if it was not merged."""
         return self._merged_submaps.get(submap, submap)
 
     def _placed_keyframes(self) -> list[dict[str, Any]]:

@@ -6,9 +6,8 @@ logical clock. With the same settings, the other actors then reproduce the recor
 With different settings of the other actors, the odometry is still the same, so differences between
 the runs come from these settings alone.
 
-The recorded tracker received the pose-graph corrections of its own run. Therefore the published
-poses and the reused keyframes remain those of the recorded run, even if the new run corrects
-keyframes differently.
+The recorded tracker received the pose-graph corrections of the recorded run. Its published poses
+and reused keyframes therefore stay the same, even if the new run corrects keyframes differently.
 """
 
 import json

@@ -21,8 +21,8 @@ class Advance(Protocol):
 
     Args:
         done: Number of finished frames and refinement requests.
-        total: Number of all frames and refinement requests; None if it has not changed. The number
-            grows if corrections of the pose graph require a refit.
+        total: Number of all frames and refinement requests; None if it has not changed since the
+            last call. The number grows if corrections of the pose graph require a refit.
     """
 
     def __call__(self, done: int, total: int | None = None, /) -> None: ...

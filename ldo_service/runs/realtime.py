@@ -98,7 +98,7 @@ class _RealTimeRun:
         )
 
     async def _feed(self, transport: MemoryTransport) -> None:
-        """Send each frame at the time of its stamp, after the odometry-prior poses before it."""
+        """Send each frame at the time of its stamp, after the older poses of the odometry prior."""
         camera = transport.publisher(data_key(CAMERA_RGBD.name))
         odometry = transport.publisher(data_key(ODOMETRY_PRIOR.name))
         first_ns = int(self._sequence.stamps_ns[self._indices[0]])

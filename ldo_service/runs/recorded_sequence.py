@@ -138,8 +138,8 @@ def _frames(messages: Iterator[RecordedMessage]) -> Iterator[RecordedFrame]:
                 case CAMERA_DEPTH.name:
                     yield from (RecordedFrame(*pair) for pair in pairing.add_b(stored))
         except FrameError:
-            # The stamp is not later than that of the previous image: the image was received
-            # again after a crash.
+            # An image was received again after a crash if its stamp is not later than the
+            # stamp of the previous image.
             continue
 
 

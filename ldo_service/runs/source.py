@@ -87,8 +87,8 @@ def recorded_prior(
 ) -> Trajectory | None:
     """Return the odometry that was recorded with a sequence as poses T_odom_base, or None.
 
-    The poses are None if the sequence has none at the time of the selected frames, of which the
-    user is warned.
+    The result is None if the sequence has no odometry at the time of the selected frames. The user
+    is then warned.
 
     Args:
         sequence: The sequence.
@@ -139,7 +139,7 @@ class PriorSource:
     """Messages of an odometry prior in the order of their stamps."""
 
     def __init__(self, prior: Trajectory | None) -> None:
-        """Begin with the first of the poses T_odom_base; None has no poses."""
+        """Begin with the first of the poses T_odom_base; `prior` is None if there are no poses."""
         stamps_s, poses = ((), ()) if prior is None else (prior.stamps_s, prior.T_world_camera)
         self._poses = iter(map(prior_message, stamps_s, poses))
         self._last_ns = -1
@@ -186,7 +186,7 @@ def _times_s(sequence: Sequence, indices: range) -> tuple[float, float]:
 
 
 def layout_of(source: str) -> str:
-    """Return the name of the layout of a source, for users; a source that does not exist has none.
+    """Return the name of a source's layout, for users; "none" if no layout fits the source.
 
     Raises:
         ConfigError: A layout of another package cannot be loaded.

@@ -89,7 +89,7 @@ def describe(sequence: Sequence) -> SourceInfo:
 
 
 def estimated_run_s(sequence: Sequence, config: Config, frames: int) -> float:
-    """Estimate the time of an offline run over all frames, by a run over the first ones.
+    """Estimate the time of an offline run over all frames, by a run over the first frames.
 
     Args:
         sequence: The sequence.
@@ -120,7 +120,7 @@ def _odometry_poses(sequence: Sequence) -> int:
 
 
 def _depth_m(sequence: Sequence, index: int) -> np.ndarray | str:
-    """Return the depth of a frame as the camera delivered it, or why it cannot be read."""
+    """Return the depth of a frame as the camera delivered it, or a text why it is unreadable."""
     try:
         return sequence.read(index).depth_m()
     except FrameError as error:

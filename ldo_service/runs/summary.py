@@ -15,7 +15,7 @@ from .folder import RunWriter
 
 Percentiles = dict[str, float]  # Values of p50 and p95.
 TIMES = "readout", "depth_readout", "depth_delay"  # Times of the shutter.
-CALIBRATION = (  # Metrics of the tracker that tell how certain the calibration of the camera is.
+CALIBRATION = (  # Metrics of the tracker about the certainty of the camera's calibration.
     *("calibration_finished", "calibration_views"),
     *("depth_bias_residual_ratio", "vignetting_residual_ratio"),
     *(f"{time}{kind}_ms" for time in TIMES for kind in ("", "_estimate", "_sigma")),
