@@ -86,7 +86,10 @@ def estimate_up(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
 
 
 def interpolate_views(start: CameraView, end: CameraView, steps: int) -> Iterator[CameraView]:
-    """Yield `steps` views of a motion from start to end, slow at both ends; the last is `end`."""
+    """Yield `steps` views of a motion from `start` to `end`; the motion is slow at both ends.
+
+    The last view is `end`.
+    """
     for step in range(1, steps + 1):
         t = step / steps
         share = t * t * (3 - 2 * t)

@@ -17,7 +17,8 @@ from .scene import ObjectBox
 
 Color = tuple[int, int, int]  # RGB, 0..255.
 
-# A step between two poses is a jump if it reaches both limits; tracking was lost in between.
+# A step between two poses is a jump if it reaches both limits below. Tracking was then lost between
+# the two poses.
 JUMP_M = 1.0  # Minimum length of a jump.
 JUMPS = 10.0  # Minimum length of a jump as a multiple of the median step.
 FRUSTUM_M = 0.12  # Distance from a keyframe's camera center to the drawn outline of its image.

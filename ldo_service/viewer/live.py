@@ -42,8 +42,8 @@ from .view_config import ViewerConfig
 
 # Maximum number of actors in the panel. Without a limit, messages could add names without end.
 MAX_ACTORS = 64
-# Maximum number of received loop closures that are kept; the oldest are dropped. The accepted ones
-# are also in each correction.
+# Maximum number of received loop closures that are kept; the oldest are dropped. Accepted loop
+# closures are in each correction too.
 MAX_LOOPS = 4096
 TEXT_INTERVAL_S = 1.0  # Interval between changes of the panel's text, so that it can be read.
 
@@ -63,7 +63,7 @@ STATES = (MAP_SNAPSHOT, GRAPH_CORRECTION, MAP_OBJECTS, POSE_TRACKED)
 RESTARTED_TOGETHER = (
     "tracker",
     "mapper",
-)  # If both restart within TOGETHER_S, the whole service was restarted or reset.
+)  # If both restart within TOGETHER_S seconds, the whole service was restarted or reset.
 # If more time passes between their restarts, each actor was restarted alone.
 TOGETHER_S = 30.0
 
@@ -133,8 +133,8 @@ class LiveScene:
         if self._correction and correction.graph_version <= self._correction.graph_version:
             return
         self._correction = correction
-        # The correction lists only the newest rejected closures. Those rejected before have been
-        # removed by earlier corrections.
+        # The correction lists only the newest rejected closures. Earlier corrections have already
+        # removed the older ones.
         for loop in correction.rejected_closures:
             self._loops.pop(loop, None)
         self._keyframes.correct(correction)

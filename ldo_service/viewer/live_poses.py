@@ -43,9 +43,9 @@ class LiveKeyframes:
 class LivePath:
     """Positions of the camera, as published and after pose-graph corrections.
 
-    A corrected position moves with the reference keyframe of its frame. Each time there are more
-    than `most` positions, every second one is dropped, and from then on only half as many of the
-    new positions are stored as before.
+    A corrected position moves with the reference keyframe of its frame. When there are more than
+    `most` positions, every second one is dropped. From then on, only half as many of the new
+    positions are stored as before.
     """
 
     def __init__(self, most: int) -> None:

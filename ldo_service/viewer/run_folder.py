@@ -88,7 +88,7 @@ class RunFolder:
         return True
 
     def _path(self, name: str) -> Path:
-        """Return the path of a file in the folder of the refined map, else in the run folder."""
+        """Return the path of a file: in the refined map's folder if it exists, else the run's."""
         refined = self._folder / REFINED / name
         return refined if has_refined(self._folder) and refined.is_file() else self._folder / name
 

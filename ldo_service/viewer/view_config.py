@@ -20,8 +20,8 @@ class ViewerConfig:
     max_poses: int = 20_000
     # Maximum number of drawn keyframes. If there are more, every second, third, ... is drawn.
     max_keyframes: int = 2_000
-    # Maximum number of drawn objects, which are those with the most observations. More names would
-    # hide each other.
+    # Maximum number of drawn objects. The objects with the most observations are drawn; more names
+    # would hide each other.
     max_objects: int = 200
     update_s: float = 0.2  # Interval between updates; the camera thus moves at 5 Hz.
     lines_s: float = 1.0  # Interval between drawings of paths, keyframes and boxes, at most 4 MB.

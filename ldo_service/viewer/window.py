@@ -80,7 +80,8 @@ class Window:
     def _begin(self) -> None:
         """Clear the window, because the scene was replaced."""
         self._shown = self._scene
-        # Number of keyframes that the up direction was estimated from; 0 before the first estimate.
+        # Number of keyframes from which the up direction was estimated; 0 before the first
+        # estimate.
         self._leveled_by = 0
         self._found: int | None = None  # Id of the object that the last search found.
 
@@ -321,7 +322,7 @@ def _line(one: ObjectMatch) -> str:
 def _require_own(address: str) -> None:
     """Check that an address belongs to this machine.
 
-    With the address of another machine, viser would try one port after the other without end.
+    With the address of another machine, viser would try one port after the other and never stop.
 
     Raises:
         ConfigError: If the machine does not have the address.
