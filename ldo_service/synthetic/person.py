@@ -10,8 +10,8 @@ SPEED_M_S = 1.0
 STEP_M = 0.7  # Length of a step.
 SWING_M = 0.28  # Amplitude of a foot along the path, relative to the hips.
 ARM_SWING_M = 0.2  # Amplitude of a forearm along the path, relative to the hips.
-# Path of the feet on the floor, x and y in meters: through the left wall, past the sofa,
-# out through the right wall.
+# Path of the feet on the floor, x and y in meters. The person enters through the left wall, walks
+# past the sofa and leaves through the right wall.
 WAY_M = np.array([[-3.1, 0.9], [0.6, 0.9], [1.3, 0.25], [3.2, 0.0]])
 
 

@@ -11,8 +11,8 @@ from .optics import max_displacement_px, undistorted
 from .solids import Solid, Vector, interval, vector
 
 NEAR_M = 0.05
-# If each row has its own pose, a solid is projected at ROW_POSES of these poses. ROW_MARGIN_PX
-# widens its window, because the motion of a solid in view at only one of them is unknown.
+# If each row has its own pose, a solid is projected at ROW_POSES of these poses. The motion of a
+# solid that is in view at only one of them is unknown. Its window is widened by ROW_MARGIN_PX.
 ROW_POSES, ROW_MARGIN_PX = 5, 4.0
 
 

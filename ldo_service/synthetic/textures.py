@@ -44,7 +44,7 @@ class Texture:
             level: Mipmap level [P] of each point, an integer.
         """
         size = TILE_TEXELS >> level
-        start = (TILE_TEXELS**2 - size**2) // 3 * 4  # Texels of all levels before.
+        start = (TILE_TEXELS**2 - size**2) // 3 * 4  # Number of texels of all finer levels.
         x, y = u * size - 0.5, v * size - 0.5
         x0, y0 = np.floor(x), np.floor(y)
         fx, fy = (x - x0)[:, None], (y - y0)[:, None]
@@ -80,7 +80,7 @@ def noise(
 ) -> np.ndarray:
     """Return a tile of noise in -1..1, [TILE_TEXELS, TILE_TEXELS].
 
-    Each octave has half the amplitude of the octave before. The spectra of photographs fall in a
+    Each octave has half the amplitude of the previous octave. The spectra of photographs fall in a
     similar way.
 
     Args:

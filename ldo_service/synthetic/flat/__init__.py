@@ -4,8 +4,8 @@ World frame: x along the corridor, y across the corridor, z up; the origin is th
 corridor's floor.
 
 A half turn about the z axis maps the architecture onto itself. It also maps the two ends of the
-corridor onto each other, including their furniture. This perceptual aliasing is deliberate. The two
-rooms are furnished differently.
+corridor onto each other, including their furniture. The two ends therefore look alike, which is
+deliberate. The two rooms are furnished differently.
 
 Frames are computed with + - * / and square roots of float64 alone, in a fixed order. They are
 therefore bitwise equal on every machine.

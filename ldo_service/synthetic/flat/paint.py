@@ -14,7 +14,7 @@ KINDS |= {"books": 2, "picture": 5, "screen": 3}
 
 @dataclass
 class Materials:
-    """Random choice of materials; called with the kind "wood", it returns a name like "wood 3"."""
+    """Random choice of materials. A call with the kind "wood" returns a name like "wood 3"."""
 
     rng: np.random.Generator
 

@@ -153,7 +153,7 @@ class FlatRenderer:
         )
 
     def _antialiased(self, view: RayCaster, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the mean light [P, 3] of four rays per pixel, all in one cast."""
+        """Return the mean light [P, 3] of four rays per pixel; all rays are cast in one call."""
         du, dv = np.array(QUARTERS_PX).T
         u, v = (u[:, None] + du).ravel(), (v[:, None] + dv).ravel()
         order = np.argsort(v, kind="stable")

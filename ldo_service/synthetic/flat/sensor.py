@@ -23,8 +23,8 @@ BASELINE_PX_M = 0.075  # Baseline of projector and camera in meters, for a focal
 DARK = 0.12  # Brightness below which the camera begins to lose the projected pattern.
 PATCH_PX = 8  # Size of the holes on dark surfaces.
 WINDOW_PX = 6  # Size of the matching windows, in which neighbors have similar errors.
-# Standard deviations of the disparity noise that a matching window shares and of the noise of a
-# single pixel, as fractions of the total; their squares sum to 1.
+# Standard deviations of the disparity noise that is common to a matching window, and of the
+# noise of a single pixel. Both are fractions of the total; their squares sum to 1.
 SHARED_NOISE, OWN_NOISE = 0.8, 0.6
 
 

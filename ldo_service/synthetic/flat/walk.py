@@ -51,8 +51,8 @@ SECOND_HALF = np.array(
 HALF_TURN = np.array([-1, -1, 1, -1, -1, 1])
 KNOTS = np.concatenate([FIRST_HALF, FIRST_HALF * HALF_TURN, SECOND_HALF, SECOND_HALF * HALF_TURN])
 
-# Relative speeds of walking and turning. A step lasts the root sum of squares of the times for its
-# length and for its turn.
+# Relative speeds of walking and turning. A step takes a time for its length and a time for its
+# turn; its duration is the root of the sum of their squares.
 WALK_M_S, TURN_RAD_S = 0.63, 1.02
 STEPS_PER_KNOT = 64  # Resolution of the table that maps time to a position on the path.
 

@@ -22,7 +22,7 @@ from .effects import DepthSensor
 # Time of flight, as in an Azure Kinect: on a white surface, the noise is 3 mm + 1.2 mm/m^2 * z^2.
 TOF_FLOOR_M, TOF_GROWTH_PER_M = 0.003, 0.0012
 TOF_NEAREST_M, TOF_FARTHEST_M = 0.3, 5.5
-EDGE = 1.05  # Neighboring pixels are on two surfaces if their depths have at least this ratio.
+EDGE = 1.05  # Minimum depth ratio of two neighboring pixels that lie on different surfaces.
 # Stereo, as in a RealSense D435: baseline, matching error and subpixel steps of the disparity.
 STEREO_BASELINE_M, STEREO_SIGMA_PX, STEREO_STEP_PX = 0.05, 0.08, 1 / 32
 STEREO_WINDOW_PX = 5  # Matching window; near surfaces appear wider by half a window on each side.
@@ -34,8 +34,8 @@ class DepthBias:
     """Smooth error of inverse depth, 1 / z' = 1 / z + c20 x^2 + c11 x y + c02 y^2.
 
     x and y are the offset of a pixel from the image center, in half image widths. The sizes of the
-    coefficients are taken from the ASUS Xtion of the sequence `crowd` of Bonn RGB-D Dynamic. At
-    3 m, that camera errs by 70 to 210 mm at the sides of the image.
+    coefficients are those of the ASUS Xtion that recorded `crowd` of Bonn RGB-D Dynamic. At a depth
+    of 3 m, the error of that camera at the sides of the image is 70 to 210 mm.
     """
 
     c20_per_m: float
