@@ -33,7 +33,7 @@ def points(texels: Image, normals: Image, intrinsics: Intrinsics) -> Image: ...
 # hidden if it lies more than `occlusion` behind that surface. Both are fractions of the depth.
 # `cells` has a cell number of 0..63 for each point, [N]. The last result, [64, 2, 8], is then the
 # gradient of the photometric and of the geometric residuals by cell; without `cells`, it is empty.
-# Strips of 16 consecutive points are added to one cell, that of their middle point.
+# All of 16 consecutive points are added to the cell of their middle point.
 def normal_equations(
     points: Image,
     texels: Image,

@@ -43,7 +43,7 @@ def assign(
         rects: Column, row, width and height of the rectangle that each region's mask covers,
             [M, 4]. A region whose rectangle has width 0 has no mask and covers its whole box.
         sums: Summed-area tables [height + 1, width + 1] of the masks, one after the other.
-        by_iou: Whether the overlap is the IoU of region and splat. If False, it is the fraction of
+        by_iou: True if the overlap is the IoU of region and splat. If False, it is the fraction of
             the splat that the region covers.
         min_overlap: Overlap that a region must exceed.
         max_depth_gap_m: Maximum distance between a Gaussian and the measured surface, meters.
@@ -82,15 +82,15 @@ def update(
         indices: Rows to update, [V], ascending.
         observed: Observed labels, [V]; -1 for a miss, -2 for no observation.
         confidence: Confidences of the labels, [V], 0..1.
-        extent_m: Extent of the label's object, [V], meters; for a miss, the minimum extent of an
-            object that counts as missed.
+        extent_m: Size of the object with the label, [V], meters. For a miss, the minimum size that
+            an object must have to count as missed.
         is_corrected: Whether the corrected moving average is used. If False, the moving average of
             the paper is used.
         keep: Factor on earlier observations, in [0, 1).
         miss_weight: Weight of a miss as an observation of background, 0..1.
         miss_limit: Misses in a row that reset a row to background, for the paper's average.
-        usual_extent_m: Extent of objects where it is unknown, meters.
-        hold_back: Damping of uncertain observations of settled Gaussians, 0..1.
+        usual_extent_m: Assumed size of an object whose size is unknown, meters.
+        hold_back: Damping, 0..1, of low-confidence observations of Gaussians with low entropy.
         threads: Number of threads.
 
     Raises:

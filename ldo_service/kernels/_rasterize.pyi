@@ -188,7 +188,7 @@ def descend(
     max_sigma_px: float = ...,
     threads: int = 1,
 ) -> NDArray[np.float64]:
-    """Run `backpropagate` and `adam_step` in one pass that never stores the row gradients.
+    """Run `backpropagate` and `adam_step` in one pass, which does not store the row gradients.
 
     `rows`, `mean`, `square` and `steps` change in place, bitwise as if both functions were called.
     Then the standard deviations of changed rows are limited to `max_sigma_px`. The rendering in

@@ -13,7 +13,7 @@ def image_motion(
     The function releases the GIL, as `warp` does.
 
     Args:
-        depth: Depth, [H, W] meters; 0 where unknown. The median stands in for unknown depth.
+        depth: Depth, [H, W] meters; 0 where unknown. The median depth replaces unknown depth.
         intrinsics: Intrinsics (fx, fy, cx, cy), pixels.
         velocity: Velocity of the camera, [6]: rotation in rad/s, then translation in m/s, in the
             camera frame.
@@ -33,7 +33,7 @@ def warp(
     velocity: NDArray[np.float64],
     times_s: tuple[float, float, float],
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Move an image and its depth to where the camera would have recorded them at once.
+    """Move pixels and depths to where the camera would have recorded them at one instant.
 
     The result has the same bits on all instruction sets.
 
@@ -45,8 +45,9 @@ def warp(
         times_s: Readout of color, readout of depth, and delay of depth, seconds.
 
     Returns:
-        The image by bilinear interpolation, black where it mixes with a missing pixel or is read
-        from outside; and the depth of the nearest pixel, [H, W] meters, 0 where unknown.
+        The image by bilinear interpolation; it is black where a missing pixel or a pixel outside of
+            the image would contribute. Then the depth of the nearest pixel, [H, W] meters, 0 where
+            unknown.
 
     Raises:
         ValueError: An array has the wrong shape, type or strides, or an intrinsic is invalid.

@@ -42,9 +42,9 @@ def compare(
 ) -> int:
     """Compare each `stride`-th surface block of one view with the surface of another view.
 
-    The residual is the distance of the moved point from the tangent plane here, in meters. Its
-    derivatives are those at the mean depth of point and plane, so that their noise does not
-    correlate with that of the residual.
+    The first view is called "there", the second "here". The residual is the distance, in meters, of
+    the moved point from the tangent plane here. Its derivatives are computed at the mean depth of
+    point and plane, so that their noise does not correlate with the noise of the residual.
 
     Args:
         there: Result of `surfaces` for the first view, [h w, 6].

@@ -10,7 +10,7 @@
 
 namespace ldo::LDO_ISA {
 
-// Minimum fraction of the near-mode pixels that a part of the object holds.
+// Minimum fraction of the pixels near the depth mode that a connected part of the object contains.
 constexpr double kLeastShare = 0.1;
 
 // Image of floats for a window, with a border of zeros.

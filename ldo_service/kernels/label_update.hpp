@@ -115,7 +115,8 @@ class LabelUpdate {
     row.misses = 0;
   }
 
-  // Count a miss. Fade the labels if the object is large enough here for the detector to see it.
+  // Count a miss. If the object would appear large enough for the detector, reduce the weights of
+  // the labels.
   void doubt(LabelRow& row, float extent_m) const {
     row.misses += row.misses < 255;
     const float known_m =
@@ -137,7 +138,8 @@ class LabelUpdate {
     return weight / row.evidence;
   }
 
-  // Return the factor on the step, below 1 for uncertain observations of settled Gaussians.
+  // Return the factor on the step. It is below 1 for an observation with low confidence of a
+  // Gaussian whose labels have a low entropy.
   float held_back(const LabelRow& row, float confidence) const {
     if (rule_.hold_back == 0.0f || row.weights[0] == 0.0f) return 1.0f;
     return 1.0f - rule_.hold_back * std::exp(-2.0f * entropy(row)) * (1.0f - confidence);

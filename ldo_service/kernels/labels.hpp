@@ -60,7 +60,7 @@ struct UpdateRule {
   float miss_weight;     // Weight of a miss as an observation of background, 0..1.
   int miss_limit;        // Misses in a row that reset a Gaussian, for the paper's average.
   float usual_extent_m;  // Extent of objects where it is unknown.
-  float hold_back;       // Damping of uncertain observations of settled Gaussians, 0..1.
+  float hold_back;       // Damping of uncertain observations of Gaussians with low entropy, 0..1.
 };
 
 // Length scale of the weights, maximum distance of a neighbor, and size of the step, 0..1.

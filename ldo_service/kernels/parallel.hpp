@@ -18,8 +18,8 @@
 
 namespace ldo::LDO_ISA {
 
-// Jobs of one call. Each thread takes the next job until none is left. A seat is a place for one
-// helper thread in the round.
+// Jobs of one call, called a round. Each thread takes the next job until none is left. A seat is a
+// place for one helper thread in the round.
 class Round {
  public:
   template <class F>

@@ -9,7 +9,7 @@ struct Keyed {
   uint32_t key, value;
 };
 
-// The histogram and the cache lines that all bins are written to fit in the cache.
+// Limit at which the histogram and the cache lines that all bins write to fit in the cache.
 constexpr int kMaxDigitBits = 12;
 
 // Pieces in which an array of n items is sorted: one piece for a single thread, else four pieces

@@ -48,8 +48,8 @@ std::vector<float> inverse_depths(const float* depth, const MovingCamera& camera
   return values;
 }
 
-// Return when a surface point was recorded. A point that moves downwards is recorded in a later row
-// than the one in which it is in the middle of the frame, and the row is recorded later in turn.
+// Return when a surface point was recorded. `v` is its row at the middle of the frame. If it moves
+// downwards, it is recorded in a lower row. Lower rows are recorded later, so it moves further.
 float time_of(float v, float flow_v, float readout_s, float delay_s, int height) {
   const float row_s = readout_s / std::max(height - 1, 1);
   const float shift = std::clamp(flow_v * row_s, -kMaxRowShift, kMaxRowShift);

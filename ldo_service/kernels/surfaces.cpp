@@ -50,8 +50,8 @@ bool compare_block(const SurfaceView& view, const Comparison& input, int64_t a, 
   const double* there = input.there + kSurfaceDoubles * a;
   if (!has_normal(there)) return false;
   const double* T = input.T_here_there;
-  // Move the point to the time of the color image there, transform it to that of the color image
-  // here, and move it to the time at which depth here is measured.
+  // Move the point to the time of the first color image ("there"), transform it to the time of the
+  // second one ("here"), and move it to the time at which the second depth is measured.
   double row_there, row_here, speed_there[3], speed_here[3], at_color[3], point[3];
   const double v_there = view.block * (static_cast<double>(a / view.width) + 0.5) - 0.5;
   const double time_there = depth_time(view, input.motion_there, v_there, &row_there);
