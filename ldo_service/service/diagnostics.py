@@ -87,7 +87,7 @@ def _of_steps(health: Health) -> Iterator[Problem]:
         if _waits_for_server(health):
             return
         if _is_backend(health.actor):
-            return  # No other actor waits for this step, so `notes` mentions it.
+            return  # `notes` mentions such a step, because no other actor waits for it.
         yield Problem(
             f"has been busy with one message for {health.current_step_s:.0f} s",
             "reduce its work per message; after supervision.step_timeout_s the service stops it",
