@@ -138,7 +138,7 @@ class FolderStore:
                 self._write(folder / new[part], encode_state(value))
         new = {part: new[part] for part in state}
         if new != old:
-            self._saved.pop(actor, None)  # From now on, the list may refer to the new files.
+            self._saved.pop(actor, None)  # The list may now refer to the new files.
             body = msgspec.msgpack.encode(_Contents(new))
             write_atomically(folder / CONTENTS, body, syncs=self.syncs)
         for file in set(old.values()) - set(new.values()):
