@@ -123,7 +123,7 @@ class LogicalClock:
         return self
 
     def __exit__(self, *_exception: object) -> None:
-        for thread in self._threads:  # All threads get the request before the first is joined.
+        for thread in self._threads:  # Ask each thread to end before waiting for the first one.
             thread.thread.shutdown(wait=False, cancel_futures=True)
         for thread in self._threads:
             thread.thread.shutdown()

@@ -144,7 +144,7 @@ class Mailbox:
             call_soon(self._loop, self._ready.set)
 
     def _bound_bytes(self) -> None:
-        """While the queues exceed the limit, drop the oldest message of the largest queue.
+        """Drop the oldest message of the largest queue until the queues fit into the limit.
 
         The caller holds the lock.
         """

@@ -226,7 +226,7 @@ class ChildProcess:
         """
         clock, period_s = RunningClock(self._loop.time), self._silent_after_s / 10
         while True:
-            # While this process does not run, it cannot receive heartbeats of the child.
+            # This process cannot receive heartbeats of the child while it does not run itself.
             self._heard_until_s += clock.tick(period_s)
             await asyncio.sleep(period_s)
             now_s = self._loop.time()
