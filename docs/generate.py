@@ -157,7 +157,7 @@ def _fields_of(name: str, node: ast.ClassDef, path: Path, topics: list[str]) -> 
 
 
 def _comments(path: Path) -> dict[int, tuple[str, bool]]:
-    """Return each comment of a file, by line, with True if it stands on a line of its own."""
+    """Return each comment of a file by its line, with True if the line has no code."""
     with path.open("rb") as file:
         return {
             token.start[0]: (token.string.lstrip("# "), token.line.strip().startswith("#"))
@@ -311,7 +311,10 @@ def _box(name: str, text: str, fill: str) -> str:
 
 
 def _arrow(maker: str, taker: str, solid: bool) -> str:
-    """Return an arrow between two boxes, shifted to its right to separate both directions."""
+    """Return an arrow between two boxes.
+
+    It is shifted to its right, so that arrows in opposite directions do not overlap.
+    """
     (x0, y0), (x1, y1) = _center(maker), _center(taker)
     length = ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
     right_x, right_y = -(y1 - y0) / length * 7, (x1 - x0) / length * 7

@@ -1,4 +1,4 @@
-"""A layout of recordings for `ldo run`, in a package of its own.
+"""Layout of recordings that a separate package adds to `ldo run`.
 
 The recording is a file .npz with the arrays color [N, H, W, 3] uint8 and depth_mm [N, H, W] uint16,
 stamps_ns [N] int64, and camera [6]: width, height, fx, fy, cx, cy. The package registers LAYOUT in
@@ -35,7 +35,7 @@ class NumpySequence(Sequence):
         super().__init__(path.stem, camera, stamps_ns)
 
     def read(self, index: int) -> RawFrame:
-        """Return a frame; `Sequence.read` says what it raises."""
+        """Return a frame; see `Sequence.read` for the errors."""
         images = self._color[index], self._depth_mm[index]
         return RawFrame(index, int(self.stamps_ns[index]), *images, 1000.0, self.raw_camera)
 

@@ -103,7 +103,7 @@ class Client:
     def publish_color(
         self, color: np.ndarray, camera: CameraModel, stamp_ns: int | None = None
     ) -> None:
-        """Send a color image of a camera that sends depth separately, by `publish_depth`.
+        """Send a color image; the camera sends its depth images separately with `publish_depth`.
 
         The arguments are those of `publish`.
         """
@@ -156,7 +156,7 @@ class Client:
     def send(self, frame: CameraRgbd | CameraColor | CameraDepth) -> None:
         """Send an RGB-D frame, color image or depth image, which may be compressed.
 
-        The call may block for some milliseconds. A congested network drops the message.
+        The call may block for a few milliseconds. A congested network drops the message.
         """
         kind = type(frame)
         self._sender.send(frame, "camera", self._numbers[kind])
@@ -179,7 +179,7 @@ class Client:
         return self._sender.wait_for_subscriber(CameraRgbd, timeout_s)
 
     def poses(self, keep: int = 1) -> Iterator[TrackedPose]:
-        """Yield tracked poses as they arrive, without end.
+        """Yield tracked poses as they arrive; the iteration never ends.
 
         Args:
             keep: Number of buffered poses; older ones are dropped.
@@ -189,7 +189,7 @@ class Client:
             yield message
 
     def messages(self, topic: Topic | str, keep: int = 1) -> Iterator[tuple[Header, Message]]:
-        """Yield header and message of each sample on a topic, without end.
+        """Yield header and message of each sample on a topic; the iteration never ends.
 
         Messages that a restarted producer repeats are skipped.
 
@@ -311,7 +311,7 @@ class Client:
     def add_label(self, name: str, timeout_s: float = 60.0) -> tuple[str, ...]:
         """Add a name to the vocabulary of the labeller.
 
-        The call waits for the labeller, which may be busy with a region for some seconds.
+        The call waits for the labeller, which may be busy with a region for a few seconds.
 
         Args:
             name: The new name.

@@ -66,7 +66,7 @@ class FrameError(DataError):
 
 
 class StageError(LdoError):
-    """Failure of an actor that the service does not restart again; the service stops."""
+    """Failure of an actor after which the service stops instead of restarting the actor."""
 
     exit_code = 4
 

@@ -18,8 +18,8 @@ class InputCount(msgspec.Struct, frozen=True, kw_only=True):
     queued: int  # Messages in the mailbox now.
     peak_queued: int  # Maximum of `queued` so far.
     dropped_paused: int = 0  # Messages dropped while the service was paused.
-    # Messages that never arrived, counted by gaps in the sequence. For lossless inputs, only
-    # messages that the producer had to drop.
+    # Messages that never arrived, counted by gaps in the sequence. For lossless inputs, it counts
+    # the messages that the producer had to drop.
     lost: int = 0
 
 

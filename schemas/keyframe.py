@@ -44,7 +44,8 @@ class CameraCorrection(msgspec.Struct, frozen=True, kw_only=True):
     the smallest V of the channel in the image, so the correction clips no color.
 
     The three times are those of the camera's shutter, 0 until they are estimated. Color and depth
-    are as if recorded at once, unless the motion of the camera was unknown.
+    are compensated as if all rows had been recorded at one instant, unless the motion of the camera
+    was unknown.
     """
 
     depth_bias: Terms = NO_TERMS  # b1, b2, b3 in 1/m.

@@ -36,8 +36,9 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
     byte  26      number of keyframes since then that show the Gaussian in no object (u1)
     bytes 27..31  labels of the five weights, indices into `label_names` (u1)
 
-    The weights sum to at most 1. The difference to 1 is the weight of background, label 0. The
-    likeliest label is byte 27 if the first weight is larger than the weight of background, else 0.
+    The sum of the weights is at most 1. The difference from 1 is the weight of background, which is
+    label 0. If the first weight is larger than that of background, the likeliest label is byte 27;
+    otherwise it is 0.
     """
 
     ids: Array  # Ids, i8 [N], unique, ascending.

@@ -31,8 +31,8 @@ class Topic:
     message: type[Message]
     description: str
     is_state: bool = False  # True if the topic also answers queries with its last value.
-    # Message field. Inputs with the policy `Latest(per_key=True)` keep the latest message per
-    # value of this field.
+    # Name of a field of the message, or None. Inputs with the policy `Latest(per_key=True)` keep
+    # the latest message per value of this field.
     key: str | None = None
     answer: type[Message] | None = None  # Type of the reply if `message` is the payload of a query.
     is_per_actor: bool = False  # True if each actor publishes on its own key, `<name>/<actor>`.
