@@ -138,7 +138,7 @@ class Submaps:
 
     # Oldest submap that each submap is merged with, or the submap itself if it is not merged.
     roots: tuple[int, ...] = ()
-    lost_frames: int = 0  # LOST frames in a row that were searched in vain.
+    lost_frames: int = 0  # LOST frames in a row for which relocalization found no keyframe.
     lost_views: int = 0  # Number of these frames that differ from the last counted one.
     # Thumbnail of the last counted view, [300] int8; None without LOST frames.
     lost_thumbnail: np.ndarray | None = None
@@ -178,7 +178,7 @@ class Submaps:
         )
 
     def should_start(self, config: SubmapConfig) -> bool:
-        """Return whether enough LOST frames were searched in vain to start a submap."""
+        """Return whether to start a submap, because relocalization of many LOST frames failed."""
         count = max(self.lost_frames, FRAMES_PER_VIEW * self.lost_views)
         return 0 < config.begin_after_frames <= count
 
