@@ -2,7 +2,7 @@ class Heartbeat:
     """Thread that writes the age of the current step to a file descriptor, without the GIL.
 
     Each heartbeat is a native double in seconds; 0 between steps. If a heartbeat cannot be written
-    at once, it is skipped.
+    without waiting, it is skipped.
     """
 
     def __init__(self, fd: int, period_s: float) -> None: ...

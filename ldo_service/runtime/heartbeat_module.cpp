@@ -53,8 +53,8 @@ class Heartbeat {
     while (!stopped_) {
       const double began_s = began_s_;
       const double age_s = began_s > 0.0 ? now_s() - began_s : 0.0;
-      // The descriptor does not block. A heartbeat that cannot be written at once, or that has no
-      // reader, is skipped.
+      // The descriptor does not block. A heartbeat is skipped if it cannot be written without
+      // waiting or has no reader.
       [[maybe_unused]] const ssize_t written = ::write(fd_, &age_s, sizeof(age_s));
       changed_.wait_for(lock, std::chrono::duration<double>(period_s_));
     }

@@ -113,7 +113,7 @@ class Outlet:
         transport.watch_liveliness(self._presence)
         if self.topic.is_state:
             transport.serve_queries(data_key(topic), lambda: self._last_value.parts)
-        self._post_hellos()  # Running consumers connect at once.
+        self._post_hellos()  # Running consumers then connect immediately.
 
     # --- sending ----------------------------------------------------------------------------
     def credits(self) -> int:
@@ -185,7 +185,7 @@ class Outlet:
 
         It waits at most `FLUSH_BACKLOG_S` for consumers with policy `Backlog`; they may be stopped.
         """
-        self._post_hellos()  # Each consumer replies with its credit at once.
+        self._post_hellos()  # Each consumer immediately replies with its credit.
         while not self._consumers.all_received(self._seq, awaited_only=True):
             await self._change()
         with suppress(TimeoutError):

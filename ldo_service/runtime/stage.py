@@ -188,7 +188,7 @@ class Stage:
         """Take the next delivery or command; None if the mailbox is closed and empty.
 
         While none arrives, save an unsaved state, or do idle work of the actor. Idle work starts
-        after `Actor.idle_after_s` without a message. Its further steps follow at once.
+        after `Actor.idle_after_s` without a message. Its further steps follow without a pause.
         """
         is_idle = False
         while True:

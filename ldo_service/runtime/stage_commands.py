@@ -244,9 +244,9 @@ class Control:
         """Send a command to the actors, one after the other, and wait for each reply.
 
         The order matters for `pause`: a producer that waits for credit can finish its step only
-        while its consumer is not paused. All actors together have `timeout_s` seconds. Each actor
-        has at least `MIN_S`, or `timeout_s` if that is shorter, even if an earlier actor does not
-        reply.
+        while its consumer is not paused. All actors together have `timeout_s` seconds to reply. If
+        earlier actors have used up this time, each further actor still has `MIN_S` seconds, but not
+        more than `timeout_s`.
 
         Raises:
             ControlError: Some actors did not execute the command. The error names them, and is

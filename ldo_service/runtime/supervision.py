@@ -154,7 +154,7 @@ class Watchdog:
             notify.sendto(word.encode(), self._address)
 
     async def ping(self) -> None:
-        """Notify the watchdog periodically; return at once if systemd has set no watchdog."""
+        """Notify the watchdog periodically; return immediately if systemd has set no watchdog."""
         while self.period_s > 0:
             self.notify("WATCHDOG=1")
             await asyncio.sleep(self.period_s / PINGS_PER_PERIOD)

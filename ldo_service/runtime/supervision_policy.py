@@ -94,7 +94,7 @@ class RunningClock:
         """Note that the process runs; call it every `period_s` seconds.
 
         Returns:
-            The time since the last call in which the process did not run, seconds; 0 as a rule.
+            How long the process was paused since the last call, seconds; usually 0.
         """
         now_s = self._clock()
         late_s = 0.0 if self._last_s is None else now_s - self._last_s - period_s
