@@ -48,7 +48,8 @@ class LabelRequestQueue:
         """Add a request, and return the requests that are dropped from the queue.
 
         The new request replaces an earlier one of the same region. If the queue is then too long,
-        the request with the least new surface is dropped.
+        one request is dropped: the one that shows the least surface beyond what earlier requests of
+        its region showed.
 
         Args:
             request: Label request of a region.
