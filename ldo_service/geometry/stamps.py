@@ -173,7 +173,7 @@ class StreamPairer(Generic[A, B]):
         return self._b.lost
 
     def skews_ms(self) -> list[float]:
-        """Return the stamp differences of the last 200 pairs, in milliseconds, at least 0."""
+        """Return the absolute stamp differences of the last 200 pairs, in milliseconds."""
         return [skew * 1e-6 for skew in self._skews_ns]
 
     def _decided(self) -> Iterator[tuple[A, B]]:
