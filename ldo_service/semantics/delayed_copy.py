@@ -112,7 +112,7 @@ class GaussianLabels:
 
     @staticmethod
     def of(gaussians: GaussianMap) -> "GaussianLabels":
-        """Copy the labels of the resident Gaussians of a map."""
+        """Copy the labels of those Gaussians of a map that are in memory."""
         return GaussianLabels(gaussians.ids.copy(), gaussians.labels.copy(), gaussians.next_id)
 
     @contextmanager
@@ -145,7 +145,7 @@ class GaussianLabels:
         return changed
 
     def _of(self, gaussians: GaussianMap) -> np.ndarray:
-        """Return the labels of the resident Gaussians of a map, [N, 32].
+        """Return the labels of the N Gaussians of a map that are in memory, [N, 32].
 
         A Gaussian that is newer than this copy gets no label. A Gaussian that was on disk when the
         copy was made keeps its label in the map.

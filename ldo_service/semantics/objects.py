@@ -258,7 +258,7 @@ class Objects:
         ]
 
     def _remove(self, gone: np.ndarray) -> tuple[int, ...]:
-        """Remove landmarks with too many misses, and the landmarks in `gone` [K] bool.
+        """Remove landmarks with too many misses, and those for which `gone` [K] is True.
 
         Returns:
             Ids of the objects that were removed after misses.
