@@ -1,7 +1,8 @@
 """Condensation: ten keyframes become one variable and a relative measurement to the next variable.
 
-After Grisetti, Kuemmerle and Ni, Robust Optimization of Factor Graphs by using Condensed
-Measurements (2012). The poses of condensed keyframes are interpolated between two variables.
+The method follows Grisetti, Kuemmerle and Ni, Robust Optimization of Factor Graphs by using
+Condensed Measurements (2012). The poses of condensed keyframes are interpolated between two
+variables.
 """
 
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence

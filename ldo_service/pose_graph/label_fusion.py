@@ -97,7 +97,7 @@ def fuse_labels(
 def geometric_mean(evidence: Evidence) -> np.ndarray:
     """Return the weighted geometric mean of the observations, [C].
 
-    It is argmin_p sum_k w_k KL(p || q_k) ~ prod_k q_k^(w_k / W).
+    It minimizes sum_k w_k KL(p || q_k) over p, and is proportional to prod_k q_k^(w_k / W).
     """
     mean = evidence.log_sum / max(evidence.weight, np.finfo(float).tiny)
     p = np.exp(mean - mean.max())
