@@ -76,8 +76,8 @@ def requests(iterations: int) -> int:
 def require_held_out(stride: int, hold_out: int) -> None:
     """Check that the run reads the frames that are held out.
 
-    Every `hold_out`-th frame of the whole sequence is held out, counted before the stride selects
-    frames. If both numbers have a common factor, the stride skips all held-out frames.
+    Every `hold_out`-th frame of the whole sequence is held out, including frames that the stride
+    skips. If both numbers have a common factor, the stride skips all held-out frames.
 
     Raises:
         ConfigError: If both numbers have a common factor.

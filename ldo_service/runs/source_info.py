@@ -100,7 +100,7 @@ def estimated_run_s(sequence: Sequence, config: Config, frames: int) -> float:
         The time in seconds.
 
     Raises:
-        LdoError: The short run fails as a whole run would.
+        LdoError: The short run fails. A run over all frames would fail in the same way.
     """
     selection = Selection(max_frames=frames)
     with TemporaryDirectory() as name:
