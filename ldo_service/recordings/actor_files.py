@@ -1,4 +1,4 @@
-"""Files of an actor in a recording: keyframe images and offloaded Gaussians of the mapper.
+"""Files of an actor in a recording, such as keyframe images and Gaussians of the mapper.
 
 A saved state of the mapper refers to files in the mapper's folder, so a restored mapper needs the
 state and the files. The folder `<actor>.files` of a recording holds these files. `Started.files`
