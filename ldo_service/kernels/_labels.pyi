@@ -84,8 +84,7 @@ def update(
         confidence: Confidences of the labels, [V], 0..1.
         extent_m: Size of the object with the label, [V], meters. For a miss, the minimum size that
             an object must have to count as missed.
-        is_corrected: Whether the corrected moving average is used. If False, the moving average of
-            the paper is used.
+        is_corrected: True to use the corrected moving average, False to use that of the paper.
         keep: Factor on earlier observations, in [0, 1).
         miss_weight: Weight of a miss as an observation of background, 0..1.
         miss_limit: Misses in a row that reset a row to background, for the paper's average.

@@ -133,7 +133,7 @@ class Voxels {
   }
 
   // Add a voxel to the table. The table has an entry per voxel, not per Gaussian, so that it fits
-  // in the cache. At least three of four slots are empty, so that most lookups succeed at once: a
+  // in the cache. At least three of four slots are empty, so that most lookups need one attempt. A
   // mispredicted branch takes more time than the additional memory.
   int32_t added(uint64_t key, size_t slot) {
     const int32_t cell = static_cast<int32_t>(keys_.size());
