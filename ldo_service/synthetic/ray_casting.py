@@ -142,9 +142,9 @@ EMPTY = _Window(1, 0, 1, 0)
 def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
     """Return the window of a solid at one pose [4, 4], or at the poses of all rows [H, 4, 4].
 
-    With one pose for each row, the window is the union over a few of the row poses, grown by the
-    largest motion from one of these poses to the next. With lens distortion, the window also grows
-    by the largest displacement of a pixel.
+    With one pose for each row, the windows at a few of the row poses are united. The union is grown
+    by the largest motion between two successive poses of these. With lens distortion, the window
+    also grows by the largest displacement of a pixel.
     """
     if T.ndim == 2 and not any(camera.distortion):
         return _window_at(solid, camera, T)

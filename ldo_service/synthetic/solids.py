@@ -45,7 +45,7 @@ class Solid:
         )
 
     def direction_to_local(self, d: Vector) -> Vector:
-        """Transform a world direction to the local frame, scale included."""
+        """Transform a world direction to the local frame, including the scale of the frame."""
         (c, s), (sx, sy, sz) = self.heading, self.size_m
         return (
             (c * d[0] + s * d[1]) * (2 / sx),

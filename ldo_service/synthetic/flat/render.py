@@ -91,7 +91,7 @@ def _normal(panel: Panel) -> Vector:
 
 
 def _grid_on_face(panel: Panel) -> tuple[Vector, tuple[int, int]]:
-    """Return the points of the light grid in the world, [rows * columns], and (rows, columns)."""
+    """Return the world points of the light grid, [rows * columns], and its size (rows, columns)."""
     solid, axis = panel.solid, panel.face // 2
     a, b = plane_axes(axis)
     columns, rows = (int(solid.size_m[i] / LIGHT_CELL_M) + 2 for i in (a, b))

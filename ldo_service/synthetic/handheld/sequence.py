@@ -202,8 +202,8 @@ class HandheldSequence(Sequence):
     def depth_row_poses(self, index: int) -> np.ndarray:
         """Return T_world_camera [H, 4, 4] when the rows of a depth image are measured.
 
-        Time of flight and stereo measure all rows at once. Exact depth and a Kinect's depth have
-        the same shutter as the color camera.
+        Time-of-flight and stereo cameras measure all rows at the same time. Exact depth and a
+        Kinect's depth have the same shutter as the color camera.
         """
         if self.config.effects.depth in ("tof", "stereo"):
             time_s = np.full(HEIGHT_PX, self._time_s(index) + self.depth_delay_s)
