@@ -86,7 +86,7 @@ Stages = Literal["two_stage", "semantic", "geometric"]
 
 @dataclass(frozen=True, slots=True)
 class RetrievalConfig:
-    """Parameters of the search; III.C is a section of the paper."""
+    """Parameters of the search for similar subgraphs; III.C is a section of the paper."""
 
     # Minimum number of camera frames between two subgraphs. Subgraphs with fewer frames between
     # them are not loop candidates (III.C).
