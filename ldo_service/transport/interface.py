@@ -144,11 +144,11 @@ class MemoryPublisher:
         self._closed = False
 
     async def send(self, header: bytes, body: bytes) -> None:
-        """Deliver a message at once."""
+        """Deliver a message immediately."""
         self.post(header, body)
 
     def post(self, header: bytes, body: bytes) -> None:
-        """Deliver a message at once."""
+        """Deliver a message immediately."""
         if not self._closed:
             self._transport.deliver(self._key, header, body)
 
