@@ -7,8 +7,7 @@
 - `Outlet`: sending half of a topic. It numbers messages and waits for lossless consumers.
 - `Mailbox`: bounded queue of all inputs of an actor. It counts each dropped message.
 - `Stage`: takes a message, lets the actor handle it in the actor's own thread, and sends the
-outputs
-  in order. After a failure it restores the actor from its last saved state.
+  outputs in order. After a failure it restores the actor from its last saved state.
 - `ChildProcess`: handle in the parent process for an actor that runs in a process of its own.
 - `supervise`: runs all stages in one task group. The process ends when an actor has used up its
   restart budget.

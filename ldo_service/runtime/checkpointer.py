@@ -84,7 +84,7 @@ class Checkpointer:
             log.info("%s: its state is saved again; no action needed.", actor.name)
 
     def record_failure(self, name: str, error: OSError) -> bool:
-        """Count a failed save, and log the first one after a success.
+        """Count a failed save, and log the first of several failures in a row.
 
         Returns:
             True if this is the first failure since the last successful save.

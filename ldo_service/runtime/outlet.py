@@ -183,7 +183,8 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until every lossless consumer has received all messages.
 
-        It waits at most `FLUSH_BACKLOG_S` for consumers with policy `Backlog`; they may be stopped.
+        It waits at most `FLUSH_BACKLOG_S` seconds for consumers with policy `Backlog`, because they
+        may be stopped.
         """
         self._post_hellos()  # Each consumer immediately replies with its credit.
         while not self._consumers.all_received(self._seq, awaited_only=True):
@@ -312,7 +313,8 @@ class Outlet:
     def _retransmit(self, consumer: Consumer, gap: bool) -> None:
         """Retransmit the messages that a consumer has not received.
 
-        Without a gap, the outlet waits `REPEAT_AFTER_S` for messages that are still on their way.
+        If the consumer has not reported a gap, the outlet first waits `REPEAT_AFTER_S` seconds,
+        because the messages may still be on their way.
         """
         now = self._loop.time()
         recently = now - consumer.repeated_at_s < self.REPEAT_AFTER_S
