@@ -3,9 +3,8 @@
 - `ConsumerHello` (consumer to producer): Announces the consumer. It is repeated until the producer
   sends its hello.
 - `ProducerHello` (producer to consumers): Epoch of the producer, and the offset of the first
-message
-  for each consumer that the producer knows. Each consumer replies immediately: with its credit, or
-  with a hello if it is not connected yet.
+  message for each consumer that the producer knows. Each consumer replies immediately: with its
+  credit, or with a hello if it is not connected yet.
 - `Credit` (consumer to producer): Three offsets, sent after each step and twice a second. Message
   `handled` is the first one that the consumer has not handled. Message `arrived` is the first one
   that the consumer has not received. Message `limit` is the first one that the producer may not
