@@ -142,8 +142,8 @@ def prepare(folder: Path, overwrite: bool) -> None:
 class RunWriter:
     """Record of the outputs of a run's actors, and writer of its folder.
 
-    With a folder, config.yaml is written at the start and frames.csv during the run. `save` writes
-    all files.
+    If the record starts with a folder, config.yaml is written at the start and frames.csv during
+    the run. `save` writes all files.
     """
 
     def __init__(self, folder: Path | None, config_text: str, tracker: TrackerConfig) -> None:
@@ -258,7 +258,7 @@ class RunWriter:
         self.save(self.folder, summary)
 
     def save(self, folder: Path, summary: dict[str, Any]) -> None:
-        """Write all files to a folder, which exists; the record may continue afterwards.
+        """Write all files to an existing folder; more messages may be recorded afterwards.
 
         A record that was started with a folder can only be saved in this folder.
         """
