@@ -348,9 +348,9 @@ def observations(
 ) -> Observations:
     """Return the observations of Gaussians.
 
-    A Gaussian in a region observes a label with a confidence; a visible Gaussian elsewhere counts
-    as missed. The extent of an object is the side of a square with the area of its box, converted
-    to meters at the depth of the Gaussian.
+    A Gaussian in a region gets the label of the region with a confidence. A visible Gaussian that
+    is in no region gets a miss. The extent of an object is the side of a square with the area of
+    its box, converted to meters at the depth of the Gaussian.
 
     Args:
         where: Region of each Gaussian.
