@@ -1,8 +1,8 @@
 """Rigid transforms as 4x4 float64 arrays. Conventions: `ldo_service.geometry`.
 
 The module contains the exponential and the logarithm of SE(3) and conversions of rotations. It also
-interpolates many transforms at once and fits a transform to corresponding points (Umeyama, PAMI
-1991).
+interpolates between pairs of transforms, and fits a transform to corresponding points (Umeyama,
+PAMI 1991).
 """
 
 import numpy as np
