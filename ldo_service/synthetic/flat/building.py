@@ -62,7 +62,8 @@ def _room(placed: Placement, room: int, paint: str, floor: str) -> list[Panel]:
 def _corridor() -> list[Panel]:
     """Return the panels of the corridor.
 
-    A half turn about z copies one side wall with a doorway and one end wall to the opposite sides.
+    One side wall with a doorway and one end wall are built. The opposite walls are copies of them,
+    turned by half a turn about z.
     """
     length, width = CORRIDOR_SIZE_M
     door_m = ROOM_A.origin_m[0] + DOOR_X_M
