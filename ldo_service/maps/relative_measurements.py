@@ -75,7 +75,8 @@ class RelativeMeasurements:
         """Yield the measurements in which at least one keyframe moved, the oldest first.
 
         Yields:
-            The measured keyframe, the keyframe that it was measured from, and the information.
+            The measured keyframe, the keyframe that it was measured relative to, and the
+            information matrix.
         """
         older, keyframes = self._older.all, list(moved)
         at_an_end = np.isin(older["id"], keyframes) | np.isin(older["reference"], keyframes)
