@@ -1,1 +1,1 @@
-"""Execution of runs over a sequence of frames, which write a folder of results."""
+"""Runs over a sequence of frames, whose results are written to a folder."""

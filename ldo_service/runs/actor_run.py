@@ -1,4 +1,4 @@
-"""Actors of a run in this process, on a logical clock, and the record of their outputs."""
+"""Execution of a run's actors on a logical clock in this process, with a record of outputs."""
 
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -73,7 +73,7 @@ class ActorRun:
         self._clock.finish()
 
     def finish(self) -> None:
-        """Wait for all steps, and deliver the final messages of the actors; `tick` may follow."""
+        """Wait for all steps, and deliver the final messages; `tick` may be called afterwards."""
         self._clock.finish()
 
     def end_stream(self) -> None:

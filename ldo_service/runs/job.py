@@ -64,7 +64,7 @@ class RunOptions:
 
     @property
     def work(self) -> int:
-        """Number of selected frames and of refinement requests, the total of the progress."""
+        """Total of the progress: number of selected frames plus number of refinement requests."""
         return len(self.selection.indices(self.sequence)) + requests(self.refine)
 
 

@@ -144,7 +144,10 @@ def _frames(messages: Iterator[RecordedMessage]) -> Iterator[RecordedFrame]:
 
 
 def _is_recording(path: Path) -> bool:
-    """Return whether a folder has the file of an actor; other files .mcap are bags."""
+    """Return whether a folder is a recording, which has .mcap files of actors.
+
+    Other .mcap files are bags of ROS.
+    """
     return any(box.name in recorded_actors(path) for box in GRAPH)
 
 
