@@ -70,7 +70,7 @@ class RestoredState:
 
     @classmethod
     def of(cls, state: State | None) -> "RestoredState":
-        """Split a state that the store has loaded; it is None or empty if nothing was saved."""
+        """Split a state that the store has loaded; None or empty if no state was saved."""
         if not state:
             return cls(is_none=True)
         links = state.get(OFFSETS, {"in": {}, "out": {}})  # Absent without lossless links.

@@ -124,7 +124,7 @@ def digest_of(outputs: Iterable[Output]) -> str:
 
 
 class Journal:
-    """Receiver of journal entries; this class discards them, and `Recorder` writes a file."""
+    """Receiver of journal entries. This class discards them; `Recorder` writes them to a file."""
 
     def record_files(self) -> None:
         """Record the files that a saved state refers to; called before each start of the actor."""
