@@ -111,7 +111,10 @@ def objective(
     lambda_sem: float = 0.5,
     w_sem: float = 0.1,
 ) -> float:
-    """Return G(p) up to a constant; all `pairs` count as similar, even with different argmax."""
+    """Return G(p) up to a constant.
+
+    Every pair of landmarks in `pairs` counts as similar, even if the likeliest labels differ.
+    """
     observed = sum(
         evidence[k].weight * np.sum(p_k * np.log(p_k)) - p_k @ evidence[k].log_sum
         for k, p_k in p.items()
