@@ -115,8 +115,8 @@ def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> S
     One call per keyframe is enough for all boxes; it takes 0.8 ms for 640x480 pixels. A pixel
     belongs to a surface if two conditions hold:
 
-    - All depths within its 3x3 pixels are known, and no two of them differ by more than the fraction
-      max_step.
+    - All depths within its 3x3 pixels are known, and no two of them differ by more than the
+      fraction max_step.
     - The cosine between the normals two pixels to the left and two pixels to the right is above
       min_cosine. The same holds for the normals two pixels above and two pixels below. The normals
       are computed from blurred depth.

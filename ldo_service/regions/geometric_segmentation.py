@@ -219,7 +219,7 @@ def _colored(
 
 
 def _steps(lab: np.ndarray) -> np.ndarray:
-    """Return the magnitude of the color gradient of an image [h, w, 3] in Lab, [h, w]."""
+    """Return the magnitudes [h, w] of the color gradient of a Lab image [h, w, 3]."""
     smooth = cv2.GaussianBlur(lab, (0, 0), 1.0)
     across = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     down = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)

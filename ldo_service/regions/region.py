@@ -78,7 +78,7 @@ def winning_label(votes: Votes, least: float) -> tuple[str, float]:
 
 
 def _added(votes: Votes, more: Votes) -> Votes:
-    """Return the sums of two sets of votes by label, with the higher confidence of each label."""
+    """Add two sets of votes label by label; the higher confidence of each label is kept."""
     sums = {name: (total, most) for name, total, most in votes}
     for name, total, most in more:
         before, surest = sums.get(name, (0.0, 0.0))

@@ -327,7 +327,7 @@ class RegionMatcher:
         return iou
 
     def propagated(self, region: int) -> Foreground | None:
-        """Propagate the mask of the region of this id into the keyframe; see `propagate_mask`."""
+        """Propagate the mask of a known region into the keyframe; see `propagate_mask`."""
         i = next(i for i, one in enumerate(self._regions) if one.id == region)
         shape, is_its = self._regions[i].shape, self._seen.of == i
         T_map_now, T_map_seen = (self._T_map_keyframe[k] for k in (self._keyframe, shape.keyframe))
