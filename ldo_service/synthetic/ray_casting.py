@@ -24,7 +24,7 @@ class Hits:
     surface: np.ndarray  # Index [P] of the surface: 0-5 are the shell's faces, 6 + k is solid k.
 
     def by_surface(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield the index of each surface that was hit, and the indices of the rays that hit it."""
+        """Yield each surface that was hit: its index, and the indices of the rays that hit it."""
         order = np.argsort(self.surface, kind="stable")
         met, starts = np.unique(self.surface[order], return_index=True)
         bounds = np.append(starts, len(order))

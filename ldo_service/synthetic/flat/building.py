@@ -32,7 +32,7 @@ class Panel:
 
 
 def lamp_centers_m() -> tuple[tuple[float, float, float], ...]:
-    """Return the centers of the lamps in room A, room B and the corridor, in the world."""
+    """Return the world positions of the lamp centers in room A, room B and the corridor."""
     height_m = HEIGHT_M - 0.15
     middle = Solid("box", (0.0, ROOM_SIZE_M[1] / 2, height_m), (1, 1, 1), "")
     return ROOM_A(middle).center_m, ROOM_B(middle).center_m, (0.0, 0.0, height_m)

@@ -11,7 +11,7 @@ from ldo_service.synthetic.optics import undistorted
 # Vignetting of the green channel of an ASUS Xtion (Bonn RGB-D Dynamic, `crowd`). The radius r is
 # 1 in the corners. The factor on the light is 0.65 there and 0.73 in the middle of the left side.
 VIGNETTING = (-0.62, 0.42, -0.15)  # Coefficients of r^2, r^4, r^6 in (factor - 1).
-CHANNEL_LOSS = (1.06, 1.0, 0.88)  # Red, green, blue: multiples of (factor - 1) of green.
+CHANNEL_LOSS = (1.06, 1.0, 0.88)  # (factor - 1) of red, green and blue, relative to green.
 TARGET = 0.42  # Target of automatic exposure for the mean gray value, 0..1.
 MIN_GAIN, MAX_GAIN = 0.4, 3.0
 # Fraction of the difference from the target that exposure and white balance correct per frame.

@@ -58,7 +58,7 @@ class DepthBias:
         return self.c20_per_m * x * x + self.c11_per_m * x * y + self.c02_per_m * y * y
 
     def biased(self, depth_m: np.ndarray, camera: Camera) -> np.ndarray:
-        """Add the bias to measured depth [H, W], meters; unknown depth, 0, stays 0."""
+        """Add the bias to measured depth [H, W], meters; 0, which means unknown, stays 0."""
         inverse = 1 / np.where(depth_m > 0, depth_m, 1.0) + self.inverse_per_m(camera)
         return np.where((depth_m > 0) & (inverse > 0), 1 / np.maximum(inverse, 1e-6), 0.0)
 
