@@ -249,7 +249,7 @@ class ZenohPublisher:
         return self._thread.run(self._put, header, body)
 
     def post(self, header: bytes, body: bytes) -> None:
-        """Send a message without waiting; it replaces an earlier posted one not sent yet."""
+        """Send a message without waiting; it replaces the last posted message if still unsent."""
         with self._lock:
             is_under_way, self._posted = self._posted is not None, (header, body)
         if not is_under_way:
