@@ -119,7 +119,7 @@ OF_OUTPUT: dict[Row, Callable[[OutputCount], float]] = {
 
 
 class HealthCollector(Collector):
-    """Prometheus collector of the last heartbeat of each actor of a robot."""
+    """Prometheus collector that reads the last heartbeat of each actor of a robot."""
 
     def __init__(
         self, robot: str, actors: Iterable[str] = (), silent_after_s: float = 10.0
