@@ -195,7 +195,7 @@ def label_image(
 
 @dataclass(frozen=True, slots=True)
 class SemanticFusionConfig:
-    """Settings of the fusion of regions into the labels of the map."""
+    """Settings for fusing the labels of image regions into the map."""
 
     region: Literal["foreground", "box"] = "foreground"
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
