@@ -80,7 +80,10 @@ def register_depth(
 def _points(
     depth_m: np.ndarray, depth_camera: Camera, T_color_depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return x, y, z [Hd, Wd] float32 of the depth pixels in the color camera, in meters."""
+    """Return the points of the depth pixels in the frame of the color camera.
+
+    The result is x, y and z in meters, [Hd, Wd] float32 each.
+    """
     ray_x, ray_y = rays(depth_camera)
     R, t = T_color_depth[:3, :3].astype(np.float32), T_color_depth[:3, 3].astype(np.float32)
     x, y, z = (

@@ -107,7 +107,7 @@ class Sequence(ABC):
 
 
 class Cached(Sequence):
-    """Sequence that keeps each frame in memory after its first read; for short sequences."""
+    """Sequence that keeps each frame in memory after its first read. It suits short sequences."""
 
     def __init__(self, sequence: Sequence) -> None:
         super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns)
