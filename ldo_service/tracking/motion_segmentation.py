@@ -212,7 +212,7 @@ def segment_motion(
 
 
 def shows_motion(dynamic_mask: np.ndarray | None) -> bool:
-    """Return whether a dynamic mask [H, W] bool shows a moving object; None shows nothing."""
+    """Return whether a dynamic mask [H, W] bool shows a moving object; False without a mask."""
     return dynamic_mask is not None and bool(np.mean(dynamic_mask) > MIN_DYNAMIC_RATIO)
 
 

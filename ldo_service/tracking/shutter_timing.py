@@ -50,7 +50,7 @@ MIN_GROUPS, MAX_GROUPS = 12, 24  # Groups of the jackknife; two are merged beyon
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BandEquations:
-    """Normal equations of a frame at its pose, separate by band of rows and for color and depth."""
+    """Normal equations of a frame at its pose, for color and for depth of each band of rows."""
 
     hessian: np.ndarray  # [B, 2, 8, 8] for color and depth.
     gradient: np.ndarray  # [B, 2, 8]
@@ -186,7 +186,7 @@ def band_equations(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TimingEvidence:
-    """Sum of the equations of many frames for readout and delay, in groups of equal size."""
+    """Sums of the timing equations of many frames, in groups with equal numbers of frames."""
 
     groups: tuple[np.ndarray, ...] = ()  # [3, 4] each: information | right side, in order of time.
     size: int = 1  # Measurements per complete group.
