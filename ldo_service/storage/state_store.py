@@ -31,7 +31,7 @@ STATE_VERSION = 3
 
 
 class _Contents(msgspec.Struct, frozen=True):
-    """Content of `contents.msgpack`: file name of each part, and version of the state's format."""
+    """Content of `contents.msgpack`: file name of each part of a state, and format version."""
 
     files: dict[str, str]
     version: int = STATE_VERSION
