@@ -54,7 +54,7 @@ KEPT: dict[Topic, int] = {  # Maximum messages held between two updates; the old
     DETECTION_BOXES: 64,
     LOOP_CLOSURE: 64,
     MAP_DELTA: 64,  # Messages of at most 1.8 MB.
-    MAP_SNAPSHOT: 64,  # Messages of at most 1.8 MB: a million Gaussians.
+    MAP_SNAPSHOT: 64,  # A million Gaussians, in messages of at most 1.8 MB.
     HEALTH: 64,
 }
 # Topics whose last value is requested at the start.
