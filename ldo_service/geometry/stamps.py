@@ -108,10 +108,10 @@ class StreamPairer(Generic[A, B]):
     `max_skew_ns`. Pairs keep the order of both streams, and each half is used at most once.
 
     The pairer compares the oldest waiting halves of the two streams: an earlier and a later half.
-    The stream of the earlier half may still deliver a half that is nearer to the later half. If the
-    two stamps differ by at most half the period of that stream, no nearer half can come, and the
-    pair is returned at once. Otherwise the pairer waits for the next half of that stream. While the
-    period is unknown, the pairer accepts any difference up to `max_skew_ns`.
+    The stream of the earlier half may still deliver a half that is nearer to the later half. This
+    is impossible if the two stamps differ by at most half the period of that stream. The pair is
+    then returned immediately. Otherwise the pairer waits for the next half of that stream. While
+    the period is unknown, the pairer accepts any difference up to `max_skew_ns`.
 
     At most `buffer` halves of a stream wait. If there are more, the oldest half is paired with the
     best available half or dropped. Equal input gives equal pairs, because no clock is read.
