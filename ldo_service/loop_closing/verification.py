@@ -236,9 +236,10 @@ class Verifier:
         """Return a pose from the map, refined on images, if two new keyframes give the same pose.
 
         Up to `map_pairs` pairs of keyframes are aligned, the nearest ones first. The alignment
-        starts at their pose in the map, `T_old_new`. A refined pose is returned as soon as it
-        differs by less than `map_confirmation_rad` from the refined pose of an earlier pair with
-        another new keyframe. Otherwise, a rejected hypothesis is returned.
+        starts at their pose in the map, `T_old_new`, and gives a refined pose. Two refined poses
+        confirm each other if they are of different new keyframes and differ by less than
+        `map_confirmation_rad`. The first confirmed pose is returned, or a rejected hypothesis if
+        there is none.
 
         Images of a place from different viewpoints have few features in common, and this method
         needs none. It finds loop closures between nearby keyframes before they drift apart, but
