@@ -171,9 +171,9 @@ class FactorStore:
 
         Returns:
             The largest absolute value of the six components of the difference, in standard
-            deviations of a loop closure (`sigma_loop_rad`, `sigma_loop_m`). This value is
-            multiplied by the distance of the keyframe from the nearer variable, as a fraction,
-            0..0.5, of the way from head to tail. The result is 0 if the keyframe is a variable.
+            deviations of a loop closure (`sigma_loop_rad`, `sigma_loop_m`). This value is multiplied
+            by a fraction, 0..0.5: the way from the nearer variable to the keyframe, divided by the
+            way from head to tail. The result is 0 if the keyframe is a variable.
         """
         row = self.rows.get(keyframe)
         if row is None:
@@ -245,9 +245,10 @@ class FactorStore:
         """Return the covariance [6, 6] that the transfer of a measurement to variables adds.
 
         The pose of a condensed keyframe relative to its variable is uncertain. Each condensed
-        keyframe therefore adds the covariance of the measurement from its head to its tail, times
-        its distance from the variable as a fraction of the way from head to tail. The covariance is
-        for perturbations at keyframe b. It is zero if a and b are variables.
+        keyframe therefore adds a fraction of the covariance of the measurement from its head to its
+        tail. The fraction is the way from the variable to the keyframe, divided by the way from
+        head to tail. The covariance is for perturbations at keyframe b. It is zero if a and b are
+        variables.
         """
         total = np.zeros((6, 6))
         T_b_end = se3.inverse(m.T_a_b), np.eye(4)

@@ -289,9 +289,9 @@ class ObjectLandmarks:
     ) -> np.ndarray | None:
         """Triangulate the point [3] in the map where the rays through the box centers meet.
 
-        Return None if there are too few observations or too little parallax. Also return None if
-        the point is less than 0.1 m in front of a camera, or is projected more than 3 sigma from
-        the center of a box.
+        Return None in four cases: there are too few observations; the parallax is too small; the
+        point is less than 0.1 m in front of a camera; its projection is more than 3 sigma from the
+        center of a box.
         """
         observations = list(observations)
         if len(observations) < self._config.min_observations:
