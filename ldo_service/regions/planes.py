@@ -261,10 +261,9 @@ def _share_behind(
 ) -> float:
     """Return the fraction of a plane's outline past which a farther surface is visible, 0..1.
 
-    Pixels just outside of the outline are compared with the extended plane. The result is the
-    number of pixels that are farther than the plane, divided by the number of pixels that are
-    farther, nearer or cut off by the border of the image. Pixels on the extended plane do not
-    count.
+    Pixels just outside of the outline are compared with the extended plane. They may be farther
+    than the plane, nearer than it, on it, or cut off by the border of the image. The result is the
+    fraction of farther pixels. Pixels on the extended plane do not count.
 
     Args:
         seen: Features of the small image.
