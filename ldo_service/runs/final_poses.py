@@ -42,10 +42,10 @@ class MeasuredKeyframe:
 class FinalPoses:
     """Final poses T_map_camera of frames, computed from the final poses of keyframes.
 
-    Each frame was aligned to a reference keyframe r. Among r and the keyframes that were aligned
-    to r, keyframe a is the last one that is not later than the frame, and keyframe b is the first
-    one that is later. With T_r_a and T_r_b as measured during the run, and the final poses T_map_a
-    and T_map_b, both keyframes give a pose of the camera:
+    Each frame was aligned to a reference keyframe r. Consider r and the keyframes that were aligned
+    to r. Keyframe a is the last of these that is not later than the frame, and keyframe b is the
+    first one that is later. T_r_a and T_r_b were measured during the run; T_map_a and T_map_b are
+    final poses. Both keyframes give a pose of the camera:
 
         T_a = T_map_a T_r_a^-1 T_r_camera,    T_b = T_map_b T_r_b^-1 T_r_camera.
 
