@@ -74,8 +74,8 @@ def measured_depth_m(
 ) -> np.ndarray:
     """Return depth with the errors of a Kinect-like camera.
 
-    The depth has steps of 2.85e-3 z^2 for z in meters (Khoshelham and Elberink, Sensors 2012),
-    ragged edges, and noise of half a step, most of which neighboring pixels share. There is no
+    The depth has steps of 2.85e-3 z^2 for z in meters (Khoshelham and Elberink, Sensors 2012). It
+    has ragged edges and noise of half a step; neighboring pixels have similar noise. There is no
     measurement in the projector's shadow, on dark patches and outside 0.4-5 m.
 
     Args:
