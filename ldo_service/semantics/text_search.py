@@ -38,9 +38,9 @@ def search(
     The score of an object is the maximum of p(name) nearness(name) over its names, where p(name) is
     the probability that the object has this name. Objects with a score below 0.1 are omitted.
 
-    nearness(name) is 1 for `text` and its synonyms, and 0.9 for its hyponyms and hypernyms. For any
-    other name, it is the cosine of the vectors of `text` and the name if `encode` is given and the
-    cosine is at least 0.85, else 0.
+    nearness(name) is 1 for `text` and its synonyms, and 0.9 for its hyponyms and hypernyms. If
+    `encode` is given, the nearness of any other name is the cosine between its vector and that of
+    `text`. A cosine below 0.85 counts as 0. Without `encode`, other names have the nearness 0.
 
     Args:
         text: Name to search for.
