@@ -62,9 +62,10 @@ def compare(
         stride: Distance of compared blocks along each axis, in blocks.
         max_step_ratio: Depth difference, as a fraction of depth, beyond which point and plane are
             different surfaces.
-        rows: Output, [N, 13]: derivatives of the residual by bias, by the times of the shutter
-            (readout of color, readout of depth, delay of depth), and by rotation and translation of
-            T_here_there (exp(x) T); and the residual. N is the number of compared blocks.
+        rows: Output, [N, 13]. The first 12 columns are derivatives of the residual: by the bias
+            (3), by the times of the shutter (3: readout of color, readout of depth, delay of
+            depth), and by rotation and translation of T_here_there (6, for exp(x) T). The last
+            column is the residual. N is the number of compared blocks.
         depths: Output, [N]: mean depth of the moved point and the plane on its ray, meters.
         indices: Output, [N, 2]: blocks there and here.
 
