@@ -171,9 +171,9 @@ class FactorStore:
 
         Returns:
             The largest absolute value of the six components of the difference, in standard
-            deviations of a loop closure (`sigma_loop_rad`, `sigma_loop_m`). This value is multiplied
-            by a fraction, 0..0.5: the way from the nearer variable to the keyframe, divided by the
-            way from head to tail. The result is 0 if the keyframe is a variable.
+            deviations of a loop closure (`sigma_loop_rad`, `sigma_loop_m`). This value is
+            multiplied by a fraction, 0..0.5: the way from the nearer variable to the keyframe,
+            divided by the way from head to tail. The result is 0 if the keyframe is a variable.
         """
         row = self.rows.get(keyframe)
         if row is None:
