@@ -35,9 +35,9 @@ class CovarianceConfig:
     """Settings of the covariance of a pose.
 
     They were chosen on seven sequences with exact ground truth. The measure is the mean normalized
-    estimation error squared, whose expected value is 6. It is 2 to 5 on sequences without the
-    errors of a real camera, and 11 and 18 on the two sequences with such errors. See
-    docs/benchmarks/covariance.md.
+    estimation error squared, whose expected value is 6. It is 1.7 to 5.0 on five sequences with few
+    or no errors of a camera. On the two sequences with all simulated errors of a camera, it is 7.4
+    and 11.1. See docs/benchmarks/covariance.md.
     """
 
     scale: float = 5.0  # Factor on both terms; see the docstring of the module.
