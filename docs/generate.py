@@ -110,7 +110,10 @@ def messages() -> str:
 
 
 def types() -> str:
-    """Return Markdown: a table of the type names in messages that are not names of records."""
+    """Return Markdown: a table of the type aliases in `schemas`, such as `Box`.
+
+    Fields of messages use these types. Record types (structs) are not in the table.
+    """
     rows = dict[str, str]()
     for path in sorted((ROOT / "schemas").glob("*.py")):
         comments = _comments(path)
