@@ -65,13 +65,13 @@ class DualEncoderConfig:
         are_three = len(self.mean) in (0, 3) and len(self.std) in (0, 3)
         if not are_three or min(self.std, default=1) <= 0:
             raise ConfigError(
-                f"dual_encoder: mean={self.mean} and std={self.std} must each be empty or three "
-                "numbers, std positive."
+                f"dual_encoder: mean={self.mean} and std={self.std} must each be empty or have "
+                "three numbers, and every number of std must be positive."
             )
         if not 0 <= self.logit_scale < float("inf") or self.threads < 1:
             raise ConfigError(
-                f"dual_encoder: logit_scale={self.logit_scale:g} must be 0 or positive and finite, "
-                f"threads={self.threads} at least 1."
+                f"dual_encoder: logit_scale={self.logit_scale:g} must be finite and at least 0, "
+                f"and threads={self.threads} must be at least 1."
             )
 
 
@@ -226,8 +226,10 @@ class DualEncoder:
         if row is not None:
             return row
         raise ConfigError(
-            f"{name!r} has no stored embedding in {self.identity}, and there is no text encoder "
-            "to compute it: register the pair with --text and --vocabulary."
+            f"{name!r} has no stored embedding in {self.identity}, and there is no text encoder to "
+            "compute one. Remove this encoder pair with `ldo models remove`. Then run "
+            "`ldo models add` with --text (text encoder) and --vocabulary (byte pairs of the text "
+            "encoder)."
         )
 
     def _own_names(self) -> tuple[str, ...]:

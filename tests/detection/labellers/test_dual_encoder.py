@@ -120,7 +120,7 @@ def test_new_name_without_text_encoder_raises_with_advice(
     cached_files: EncoderFiles,
 ) -> None:
     labeller = DualEncoder(cached_files)
-    with pytest.raises(ConfigError, match=r"'teapot' has no stored .* --text and --vocabulary"):
+    with pytest.raises(ConfigError, match=r"'teapot' has no stored .* with --text .* --vocabulary"):
         labeller.add("teapot")
     assert labeller.names == tuple(COLORS)
     with pytest.raises(ConfigError, match="'teapot'"):
