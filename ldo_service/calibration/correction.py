@@ -35,8 +35,9 @@ class CameraCorrection:
         1 / z_true = 1 / z_measured + b1 x^2 + b2 x y + b3 y^2
         color_measured = V(r) color_true,  log V = a1 r^2 + a2 r^4 + a3 r^6 per channel
 
-    The bias has no constant and no linear term. They scale and tilt the depth, and a change of the
-    poses has the same effect.
+    The bias has no constant term and no linear terms. Such terms would scale and tilt the depth.
+    Changed poses would have nearly the same effect on the measurements, so the two could hardly be
+    told apart.
     """
 
     depth_bias: tuple[float, ...] = (0.0,) * BIAS_TERMS  # b1, b2, b3 in 1/m.
@@ -48,7 +49,10 @@ class CameraCorrection:
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> "CameraCorrection":
-        """Restore a correction from its fields by name; they may be lists."""
+        """Restore a correction from a mapping of field names to values; tuples may be lists.
+
+        `pack` returns such a mapping.
+        """
         return CameraCorrection(
             tuple(values["depth_bias"]),
             tuple(tuple(a) for a in values["vignetting"]),

@@ -19,12 +19,13 @@ CHECK_WORK = 0.2  # Work of the check of one block, in the unit of `estimation.e
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Linearized measurements of one pair of views: residual + shared dc + own dx.
+    """Linearized measurements of one pair of views: residual + J_shared dc + J_own dx.
 
-    dc is the step of the K shared coefficients, dx that of the M unknowns of this block.
+    dc is the step of the K shared coefficients, dx that of the M unknowns of this block. J_shared
+    [..., N, K] and J_own [..., N, M] are the Jacobians of the residuals for these two.
     """
 
-    rows: np.ndarray  # [..., N, K + M + 1] columns: shared, own and the residual.
+    rows: np.ndarray  # [..., N, K + M + 1]: J_shared, J_own and the residual.
     weight: np.ndarray  # [..., N]
     cells: np.ndarray  # [N] int: cell of the image of each residual.
 
@@ -92,7 +93,7 @@ def student_weight(residual: np.ndarray, sigma: np.ndarray | float) -> np.ndarra
 
 
 def solve(blocks: Sequence[Reduced], prior: np.ndarray | float, now: np.ndarray) -> np.ndarray:
-    """Minimize the sum of weight (residual + shared dc + own dx)^2, plus prior (now + dc)^2.
+    """Minimize sum weight (residual + J_shared dc + J_own dx)^2 + prior (now + dc)^2.
 
     Args:
         blocks: Reduced normal equations.

@@ -142,12 +142,12 @@ def prepare(folder: Path, overwrite: bool) -> None:
 class RunWriter:
     """Record of the outputs of a run's actors, and writer of its folder.
 
-    If the record starts with a folder, config.yaml is written at the start and frames.csv during
-    the run. `save` writes all files.
+    If the constructor gets a folder, it writes config.yaml there, and `observe` writes frames.csv
+    during the run. `save` writes all files, with or without such a folder.
     """
 
     def __init__(self, folder: Path | None, config_text: str, tracker: TrackerConfig) -> None:
-        """Start a record; without a folder, nothing is written before `save`."""
+        """Start a record. If `folder` is None, nothing is written before `save`."""
         self._config_text, self._hold_out = config_text, tracker.hold_out
         self._makes_map = not tracker.localize
         self._database = DatabaseWriter(tracker.odometry)

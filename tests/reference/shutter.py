@@ -13,7 +13,11 @@ MAX_ROW_SHIFT = 0.5
 def warped(
     image: np.ndarray, depth_m: np.ndarray, camera: Camera, motion: FrameMotion
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image [H, W] or [H, W, 3] and its depth [H, W] in meters as recorded at once."""
+    """Return color and depth as if the camera recorded all pixels at the same time.
+
+    This is the time of the middle row of the color image. Color is [H, W] or [H, W, 3].
+    Depth is [H, W], meters.
+    """
     flow, z_per_s = image_motion(depth_m, camera, motion.velocity)
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     timing = motion.timing

@@ -194,7 +194,7 @@ def clock(paint: Materials, shape: int) -> Solids:
 
 
 def picture_frame(paint: Materials, shape: int) -> Solids:
-    """Build an upright, wide or square picture frame for the wall."""
+    """Build a picture frame for the wall: shape 0 is portrait, 1 landscape, 2 square."""
     width, height = ((0.5, 0.64), (0.9, 0.6), (0.34, 0.34))[shape]
     rim = box((0, -0.015, -height / 2), (width, 0.03, height), paint("wood"))
     inner = (width - 0.08, 0.004, height - 0.08)
