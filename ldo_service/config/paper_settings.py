@@ -31,12 +31,12 @@ class PaperSettings:
     # (III.A).
     label_region: Literal["foreground", "box"] = advanced("foreground")
     # Maximum distance of a labelled Gaussian from the measured depth, meters. This is delta_z
-    # (III.A).
+    # (paper, III.A).
     max_depth_gap_m: PositiveFloat = advanced(0.1)
     # Rule of the moving average of labels: that of this implementation (corrected), or that of the
     # paper (III.A).
     ema_rule: Literal["corrected", "paper"] = advanced("corrected")
-    # Fraction of its past that the moving average keeps. This is lambda (III.A).
+    # Fraction of its past that the moving average keeps. This is lambda (paper, III.A).
     ema_keep_ratio: Annotated[float, Meta(ge=0, lt=1)] = advanced(0.9)
     # Fraction by which the corrected rule weakens uncertain observations of settled Gaussians.
     ema_hold_back_ratio: Ratio = advanced(1.0)
@@ -46,36 +46,36 @@ class PaperSettings:
     # Rule that fuses detector and labeller: by entropy (adaptive), by a fixed weight, or not at all
     # (detector).
     fusion_rule: Literal["adaptive", "fixed", "detector"] = advanced("adaptive")
-    # Constant beta of the adaptive fusion (III.B).
+    # Constant beta of the adaptive fusion (paper, III.B).
     fusion_beta: PositiveFloat = advanced(2.0)
-    # Constant epsilon of the adaptive fusion (III.B).
+    # Constant epsilon of the adaptive fusion (paper, III.B).
     fusion_epsilon: PositiveFloat = advanced(1e-6)
-    # Weight of the detector in the fixed fusion, an ablation (IV.C).
+    # Weight of the detector in the fixed fusion, an ablation (paper, IV.C).
     fusion_fixed_weight: Ratio = advanced(0.5)
     # Distance scale of the weights with which neighbors average their labels, meters. This is
-    # sigma_cons (III.A).
+    # sigma_cons (paper, III.A).
     consistency_sigma_m: PositiveFloat = advanced(0.05)
     # Maximum distance of neighbors, meters. The default is three times the distance scale, where a
     # weight is below 2e-4.
     consistency_radius_m: PositiveFloat = advanced(0.15)
     # Fraction by which one step moves a label toward the average of its neighbors. This is 1 -
-    # lambda (III.A).
+    # lambda (paper, III.A).
     consistency_rate: Ratio = advanced(0.1)
     # Maximum KL divergence of the classes of a detection and an object to associate the two
-    # (III.C).
+    # (paper, III.C).
     object_max_divergence_nats: NonNegativeFloat = advanced(0.2)
-    # Maximum KL divergence of the classes of matching landmarks of two subgraphs (III.C).
+    # Maximum KL divergence of the classes of matching landmarks of two subgraphs (paper, III.C).
     loop_max_divergence_nats: PositiveFloat = advanced(0.3)
-    # Minimum number of keyframes in a subgraph (III.C).
+    # Minimum number of keyframes in a subgraph (paper, III.C).
     subgraph_min_keyframes: PositiveInt = advanced(3)
-    # Maximum number of keyframes in a subgraph (III.C).
+    # Maximum number of keyframes in a subgraph (paper, III.C).
     subgraph_max_keyframes: Annotated[int, Meta(ge=2)] = advanced(5)
-    # Weight of the observed classes of a landmark (III.C).
+    # Weight of the observed classes of a landmark (paper, III.C).
     lambda_sem: PositiveFloat = advanced(0.5)
-    # Weight of the agreement between landmarks of one class (III.C).
+    # Weight of the agreement between landmarks of one class (paper, III.C).
     w_sem: NonNegativeFloat = advanced(0.1)
     # One keyframe per interval of this length stays a variable of the pose graph. The others are
-    # marginalized (III.C).
+    # marginalized (paper, III.C).
     marginalization_interval_keyframes: PositiveInt = advanced(10)
 
     def __post_init__(self) -> None:

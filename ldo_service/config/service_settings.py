@@ -80,7 +80,10 @@ class DatasetSettings:
 
 @dataclass(frozen=True, slots=True)
 class LatencySettings:
-    """Latency of actors on the logical clock of `ldo run`; other actors have no latency."""
+    """Latency of actors on the logical clock of `ldo run`, in frames.
+
+    Actors without a field here, such as the tracker, have a latency of 0 frames.
+    """
 
     # Frames between a keyframe and its detections.
     detector: NonNegativeInt = advanced(3)

@@ -23,13 +23,13 @@ HIDDEN_NAMES = OTHER + 1
 
 @dataclass(frozen=True, slots=True)
 class LandmarkConfig:
-    """Parameters of the landmarks of a subgraph; III.C is a section of the paper."""
+    """Parameters of the landmarks of a subgraph."""
 
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     # Detections with the same label belong to one object if their distance is below this limit.
     # It is half the width of a chair.
     same_m: float = 0.4
-    # Maximum KL divergence of matching landmarks in both directions, nats (III.C).
+    # Maximum KL divergence of matching landmarks in both directions, nats (paper, III.C).
     max_divergence: float = 0.3
     # Maximum distance of matched landmarks. It is large because the boxes may show different
     # sides of an object.
@@ -238,7 +238,8 @@ def possible_pairs(
 ) -> np.ndarray:
     """Return the index pairs [M, 2] of landmarks with similar label distributions.
 
-    The KL divergence must be below `config.max_divergence` in both directions (III.C: 0.3 nats).
+    The KL divergence must be below `config.max_divergence` in both directions (paper,
+    III.C: 0.3 nats).
     """
     return np.argwhere(_divergences(old, new) < config.max_divergence)
 

@@ -86,13 +86,14 @@ Stages = Literal["two_stage", "semantic", "geometric"]
 
 @dataclass(frozen=True, slots=True)
 class RetrievalConfig:
-    """Parameters of the search for similar subgraphs; III.C is a section of the paper."""
+    """Parameters of the search for similar subgraphs."""
 
     # Minimum number of camera frames between two subgraphs. Subgraphs with fewer frames between
-    # them are not loop candidates (III.C).
+    # them are not loop candidates (paper, III.C).
     exclude_frames: int = 100
-    candidates: int = 5  # K, the maximum number of candidates (III.C).
-    min_similarity: float = 0.75  # theta_loop, the minimum cosine of the label histograms (III.C).
+    candidates: int = 5  # K, the maximum number of candidates (paper, III.C).
+    # theta_loop, the minimum cosine of the label histograms (paper, III.C).
+    min_similarity: float = 0.75
     # A subgraph with different labels is also a candidate if the cosine of the visual words is at
     # least this value. For example, the cosine of the labels is below theta_loop if a detector
     # misses two of five objects. With a value above 1, similar labels are always required, as in

@@ -17,10 +17,10 @@ from .object_points import DetectionPoints, SubgraphLandmarks
 
 @dataclass(frozen=True, slots=True)
 class SubgraphConfig:
-    """Limits of subgraphs. III.C names the section of the LDO-SLAM paper that gives the value."""
+    """Settings of subgraphs."""
 
-    min_keyframes: int = 3  # Minimum keyframes (III.C).
-    max_keyframes: int = 5  # Maximum keyframes (III.C).
+    min_keyframes: int = 3  # Minimum keyframes (paper, III.C).
+    max_keyframes: int = 5  # Maximum keyframes (paper, III.C).
     # A subgraph is complete with `min_keyframes` keyframes if the rotation plus parallax from its
     # first to its last keyframe exceeds this. Half of the view of a depth camera is then new.
     turned_rad: float = 0.5

@@ -39,14 +39,14 @@ def triangulate(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, floa
 
 @dataclass(frozen=True, slots=True)
 class ObjectLandmarkConfig:
-    """Settings of object landmarks; III.C is a section of the paper."""
+    """Settings of object landmarks."""
 
-    lambda_sem: float = 0.5  # Weight of the observed labels (III.C).
-    w_sem: float = 0.1  # Weight of the similarity (III.C).
+    lambda_sem: float = 0.5  # Weight of the observed labels (paper, III.C).
+    w_sem: float = 0.1  # Weight of the similarity (paper, III.C).
     # Limit of the entropy H. Above it, an observation has the weight exp(-2 H), and a landmark is
-    # uncertain, so that it is removed earlier (III.C).
+    # uncertain, so that it is removed earlier (paper, III.C).
     vague_nats: float = 0.5
-    # Minimum number of observations at which a landmark is added to the graph (III.C).
+    # Minimum number of observations at which a landmark is added to the graph (paper, III.C).
     min_observations: int = 3
     # Minimum value of the largest angle between two rays to a new landmark: 5 degrees. At this
     # angle, an error of 12 px changes a depth of 2 m by 0.5 m (focal length 525 px).
@@ -54,7 +54,7 @@ class ObjectLandmarkConfig:
     # Maximum observations of a landmark in the graph. If there are more, the first and the newest
     # observations are kept, half of this number each.
     max_observations: int = 32
-    misses: int = 10  # Consecutive misses after which a landmark is removed (III.C).
+    misses: int = 10  # Consecutive misses after which a landmark is removed (paper, III.C).
     vague_misses: int = 5  # Consecutive misses after which an uncertain landmark is removed.
     # Number of keyframes without an observation after which an uncertain landmark is removed.
     vague_keyframes: int = 20

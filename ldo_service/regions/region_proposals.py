@@ -30,7 +30,7 @@ _ORDER = ("flat", "apart", "standing", "convex")  # The first kind of similar re
 class RegionProposalConfig:
     """Settings of the region proposals."""
 
-    sure: float = 0.6  # Minimum score of a detection that needs no label request (III.B).
+    sure: float = 0.6  # Minimum score of a detection that needs no label request (paper, III.B).
     # Minimum IoU of two boxes that show the same object; the box with the lower score is dropped.
     same_iou: float = 0.5
     # Minimum IoU of a detector's box and the box of a region that show the same object.

@@ -10,8 +10,8 @@ from ldo_service.gaussians.model import new_labels as new_labels
 from ldo_service.kernels import _labels
 
 BACKGROUND, OTHER = 0, 1  # The first two labels of every vocabulary.
-MAX_LABELS = 256  # C_max (III.B)
-SLOTS = 5  # L (III.B)
+MAX_LABELS = 256  # C_max (paper, III.B)
+SLOTS = 5  # L (paper, III.B)
 NOT_SEEN, MISS = -2, -1  # Values in place of an observed label; see `Observations`.
 # Label row of one Gaussian, 32 bytes; all zero if the Gaussian was never observed.
 ROW = np.dtype(
@@ -31,10 +31,10 @@ ROW = np.dtype(
 class ConsistencyConfig:
     """Settings of the label smoothing among neighbors."""
 
-    sigma_m: float = 0.05  # sigma_cons (III.A).
+    sigma_m: float = 0.05  # sigma_cons (paper, III.A).
     # Maximum distance of neighbors: three sigma. Farther Gaussians would have weights below 2e-4.
     radius_m: float = 0.15
-    rate: float = 0.1  # Step size, 0..1. The default equals 1 - lambda (III.A).
+    rate: float = 0.1  # Step size, 0..1. The default equals 1 - lambda (paper, III.A).
 
     def __post_init__(self) -> None:
         if not (self.sigma_m > 0 and self.radius_m > 0 and 0 <= self.rate <= 1):
@@ -123,10 +123,11 @@ class LabelConfig:
     """
 
     ema: Literal["paper", "corrected"] = "corrected"  # Rule of the update; see `observe`.
-    # Factor by which each new observation reduces the weight of earlier ones: lambda (III.A).
+    # Factor by which each new observation reduces the weight of earlier ones: lambda
+    # (paper, III.A).
     keep: float = 0.9
     # Number of misses in a row that turn a Gaussian into background by the rule `paper`: N_miss
-    # (III.A). A miss is a keyframe that shows the Gaussian, but no region at the Gaussian.
+    # (paper, III.A). A miss is a keyframe that shows the Gaussian, but no region at the Gaussian.
     miss_limit: int = 5
     # A miss with `corrected` is evidence for background if the object would appear large enough for
     # the detector to find it. The next three settings define this.
@@ -306,7 +307,7 @@ def distribution(labels: np.ndarray, classes: int = MAX_LABELS) -> np.ndarray:
 
 
 def entropy(labels: np.ndarray) -> np.ndarray:
-    """Return the entropies H = -sum p log p (III.A) of N label rows [N, 32], in nats.
+    """Return the entropies H = -sum p log p of N label rows [N, 32], in nats.
 
     >>> labels = new_labels(1)
     >>> fields(labels)["weights"][0, 0] = 0.5

@@ -26,8 +26,9 @@ class AssignmentConfig:
     # almost no Gaussian, because a splat is a few pixels wide and a box is hundreds of pixels wide.
     # `coverage` is the area of the intersection divided by the area of the splat.
     rule: Literal["coverage", "iou"] = "coverage"
-    min_overlap: float = 0.3  # Minimum overlap: theta_IoU (III.A).
-    # Maximum difference between the depth of a Gaussian and the measured depth: delta_z (III.A).
+    min_overlap: float = 0.3  # Minimum overlap: theta_IoU (paper, III.A).
+    # Maximum difference between the depth of a Gaussian and the measured depth: delta_z
+    # (paper, III.A).
     max_depth_gap_m: float = 0.1
 
     def __post_init__(self) -> None:

@@ -46,9 +46,9 @@ class FusionConfig:
     """Settings of the fusion of detector and labeller."""
 
     rule: Literal["adaptive", "fixed", "detector"] = "adaptive"
-    beta: float = 2.0  # Exponent of the reliabilities (III.B).
-    epsilon: float = 1e-6  # Term against division by zero (III.B).
-    fixed_alpha: float = 0.5  # Weight of the detector with `fixed`, an ablation (IV.C).
+    beta: float = 2.0  # Exponent of the reliabilities (paper, III.B).
+    epsilon: float = 1e-6  # Term against division by zero (paper, III.B).
+    fixed_alpha: float = 0.5  # Weight of the detector with `fixed`, an ablation (paper, IV.C).
 
     def __post_init__(self) -> None:
         if self.rule not in ("adaptive", "fixed", "detector"):
