@@ -141,7 +141,7 @@ def test_one_of_several_odometries_is_chosen_by_its_topic(
     for topic in ("/odom", "/wheels"):
         sequence = open_sequence(path, SequenceOptions(topics={"odometry": topic}))
         assert sequence.odometry() is not None
-    with pytest.raises(DataError, match=r"odometry=/tf names no .*: /odom, /wheels"):
+    with pytest.raises(DataError, match=r"odometry=/tf does not name .*: /odom, /wheels"):
         open_sequence(path, SequenceOptions(topics={"odometry": "/tf"}))
 
 

@@ -220,7 +220,7 @@ def test_full_disk_ends_the_recording_and_not_the_actor(
         path = recorded(tmp_path, range(20, 60))
     assert path.stat().st_size <= 6000
     assert 0 < len(steps(tmp_path)) < 40
-    assert caplog.text.count("this recording ends here") == 1
+    assert caplog.text.count("This recording ends here") == 1
     assert not files(tmp_path)[0].is_whole
 
 
@@ -233,7 +233,7 @@ def test_recorder_failure_ends_the_recording_and_not_the_actor(
 
     recorded(tmp_path, [1, 2, 3, 4, 5], before_each=break_recorder)
     assert len(steps(tmp_path)) == 2
-    assert caplog.text.count("this recording ends here") == 1
+    assert caplog.text.count("This recording ends here") == 1
     assert "ZeroDivisionError" in caplog.text
 
 

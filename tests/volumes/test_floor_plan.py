@@ -71,5 +71,5 @@ def test_band_outside_the_map_raises_with_its_range(grid: OccupancyGrid) -> None
 
 
 def test_invalid_up_axis_raises(grid: OccupancyGrid) -> None:
-    with pytest.raises(ConfigError, match="not one of x, y, z"):
+    with pytest.raises(ConfigError, match="must be one of x, y, z"):
         floor_plan(grid, "w")
