@@ -124,12 +124,16 @@ def pinhole(fields: dict[str, Any], width: str, height: str, path: Path) -> Came
         )
     coefficients = {f"distortion[{i}]": value for i, value in enumerate(distortion)}
     fx, fy, cx, cy = (number(fields, key, path) for key in ("fx", "fy", "cx", "cy"))
-    size = round(number(fields, width, path)), round(number(fields, height, path))
-    k = tuple(number(coefficients, key, path) for key in coefficients)
+    size = tuple(_pixels(number(fields, key, path)) for key in (width, height))
     try:
         return Camera(*size, fx, fy, cx, cy, k)
     except DataError as error:
         raise DataError(f"{path} has invalid intrinsics: {error}") from error
+
+
+def _pixels(size: float) -> int | float:
+    """Return an integer if JSON has one as 640.0; `Camera` refuses other numbers."""
+    return int(size) if size.is_integer() else size
 
 
 def read_matrix(path: Path, size: int) -> np.ndarray:

@@ -5,6 +5,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from math import hypot, isfinite
+from numbers import Integral
 from typing import Any
 
 import cv2
@@ -47,6 +48,9 @@ class Camera:
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        for name, side in (("width", self.width), ("height", self.height)):
+            if isinstance(side, bool) or not isinstance(side, Integral):
+                raise DataError(f"camera {name}={side!r} must be an integer number of pixels.")
         if self.width < 1 or self.height < 1:
             raise DataError(
                 f"the camera has {self.width}x{self.height} pixels, expected at least 1x1. Give "

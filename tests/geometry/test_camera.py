@@ -51,6 +51,8 @@ def test_halving_keeps_the_lens_and_rectifying_removes_it() -> None:
     ("values", "word"),
     [
         ((0, 48, 50, 50, 32, 24), "0x48"),
+        ((64.5, 48, 50, 50, 32, 24), "width=64.5 must be an integer"),
+        ((64, True, 50, 50, 32, 24), "height=True must be an integer"),
         ((64, 48, -50, 50, 32, 24), "focal"),
         ((64, 48, float("nan"), 50, 32, 24), "NaN"),
         ((64, 48, 50, 50, 640, 24), "cx=640"),
