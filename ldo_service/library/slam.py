@@ -282,10 +282,14 @@ class Slam:
                 f"stamp_ns={stamp_ns!r} must be an integer number of nanoseconds, such as "
                 "round(1e9 * seconds)."
             ) from error
-        if not self._last_stamp_ns < stamp <= LAST_INTEGER:
+        if not 0 <= stamp <= LAST_INTEGER:
+            raise FrameError(
+                f"stamp_ns={stamp} must be a number of nanoseconds from 0 to {LAST_INTEGER}."
+            )
+        if stamp <= self._last_stamp_ns:
             raise FrameError(
                 f"stamp_ns={stamp} must be later than the stamp of the last frame, "
-                f"{self._last_stamp_ns}, not negative, and at most {LAST_INTEGER}."
+                f"{self._last_stamp_ns}."
             )
         return RawFrame(number, stamp, *images, self.depth_scale, self.camera)
 
