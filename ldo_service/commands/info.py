@@ -12,12 +12,14 @@ from rich.table import Table
 from ldo_service.config import load_config
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
+from ldo_service.geometry.sequence import Stream
 from ldo_service.runs.source import layout_of
 from ldo_service.runs.source_info import SourceInfo, describe, estimated_run_s
 
 from .options import ConfigFile, Json, Settings, Source, Topics, argument, with_topics
 
-FIRST_UNIX_S = 946_684_800  # The year 2000. A smaller stamp is not a Unix time.
+MAX_UNUSED = 12  # Number of unused streams that the table names; --json lists all.
+FIRST_UNIX_S = 946_684_800  # The year 2000. A smaller stamp is no time of day.
 REGISTRATION = {
     "source": "registered to color in the source",
     "reader": "registered to color when a frame is read",
@@ -35,7 +37,7 @@ def info(
     ] = None,
     json_: Annotated[Json, argument(name="json")] = False,
 ) -> None:
-    """Print what is in a source: frames, rate, gaps, calibration, depth and ground truth.
+    """Print what is in a source: streams, rate, gaps, calibration, depth and ground truth.
 
     The command reads all stamps and five of the frames. A gap is an interval of more than 1.5
     median intervals. --probe runs the first N frames to estimate the time of `ldo run` on this
@@ -58,8 +60,10 @@ def info(
     table = Table(title=escape(source), show_header=False)
     for name, value in _rows(layout, found).items():
         table.add_row(name, escape(value))
-    if run_s is not None:
-        table.add_row("time of `ldo run`", f"about {run_s:.0f} s on this machine")
+    estimate = (
+        "--probe 30 estimates it" if run_s is None else f"about {run_s:.0f} s on this machine"
+    )
+    table.add_row("time of `ldo run`", estimate)
     Console().print(table)
 
 
@@ -74,6 +78,8 @@ def _rows(layout: str, found: SourceInfo) -> dict[str, str]:
     return {
         "layout": layout,
         "frames": f"{timing.frames} in {timing.duration_s:.1f} s, at {rate}",
+        "streams": _used(found.streams),
+        **({"not used": unused} if (unused := _unused(found.streams)) else {}),
         "first stamp": _stamp(timing.first_stamp_s),
         "gaps": _gaps(found),
         "camera": f"{camera['width']}x{camera['height']}, fx {camera['fx']:g}, fy "
@@ -89,6 +95,22 @@ def _rows(layout: str, found: SourceInfo) -> dict[str, str]:
         "ground truth": f"{found.true_poses} poses" if found.true_poses else "none",
         **({"true labels": "yes"} if found.has_true_labels else {}),
     }
+
+
+def _used(streams: tuple[Stream, ...]) -> str:
+    lines = [f"{stream.use}: {_text(stream)}" for stream in streams if stream.use]
+    return "\n".join(lines) or "color and depth"
+
+
+def _unused(streams: tuple[Stream, ...]) -> str:
+    texts = [_text(stream) for stream in streams if not stream.use and stream.messages != 0]
+    more = len(texts) - MAX_UNUSED
+    return "\n".join(texts[:MAX_UNUSED] + ([f"and {more} more"] if more > 0 else []))
+
+
+def _text(stream: Stream) -> str:
+    count = "" if stream.messages is None else f", {stream.messages} messages"
+    return f"{stream.name} ({stream.kind}{count})"
 
 
 def _stamp(stamp_s: float) -> str:

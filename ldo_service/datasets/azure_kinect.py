@@ -23,7 +23,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, DataError, install_command
 from ldo_service.geometry import Camera, RawFrame, Trajectory, associate, se3
-from ldo_service.geometry.sequence import Sequence
+from ldo_service.geometry.sequence import Sequence, Stream
 
 from .files import is_rigid, number
 from .phone_images import PhoneGrid
@@ -58,7 +58,7 @@ class AzureKinectSequence(Sequence):
             DataError: The file cannot be read, or a stream or the calibration is missing.
         """
         self._path = path
-        streams, calibration = _contents(path)
+        streams, calibration, others = _contents(path)
         missing = [title for title in ("COLOR", "DEPTH") if title not in streams]
         if missing or calibration is None:
             found = ", ".join(streams) or "none"
@@ -78,6 +78,11 @@ class AzureKinectSequence(Sequence):
         self._grid = PhoneGrid(rig.color_camera)
         self._rig = Rig(self._grid.camera, rig.depth_camera, rig.T_color_depth)
         super().__init__(path.stem, self._grid.camera, self._color.stamps_ns[pairs[:, 0]])
+        self.streams = (
+            Stream("COLOR", "video", len(self._color), "color"),
+            Stream("DEPTH", "video", len(self._depth), "depth"),
+            *others,
+        )
         self.depth_offsets_ns = self._depth.stamps_ns[pairs[:, 1]] - self.stamps_ns
 
     def read(self, index: int) -> RawFrame:
@@ -93,8 +98,8 @@ class AzureKinectSequence(Sequence):
         return None
 
 
-def _contents(path: Path) -> tuple[dict[str, int], bytes | None]:
-    """Return the numbers of the video streams by title, and the calibration.
+def _contents(path: Path) -> tuple[dict[str, int], bytes | None, tuple[Stream, ...]]:
+    """Return the numbers of the video streams by title, the calibration, and unused streams.
 
     Raises:
         ConfigError: PyAV is not installed.
@@ -110,10 +115,12 @@ def _contents(path: Path) -> tuple[dict[str, int], bytes | None]:
         ) from error
     try:
         with av.open(str(path)) as container:
-            streams = {
-                str(stream.metadata.get("title", f"without title {k}")).upper(): k
-                for k, stream in enumerate(container.streams.video)
-            }
+            streams = {_title(s, k): k for k, s in enumerate(container.streams.video)}
+            others = tuple(
+                Stream(_title(s, k), s.type, None, "")
+                for k, s in enumerate(container.streams)
+                if s.type != "attachment" and _title(s, k) not in ("COLOR", "DEPTH")
+            )
             attached = [
                 stream.data
                 for stream in container.streams.attachments
@@ -124,7 +131,11 @@ def _contents(path: Path) -> tuple[dict[str, int], bytes | None]:
             f"{path} cannot be read as a video ({type(error).__name__}: {error}). It may be "
             "truncated. Copy the recording again."
         ) from error
-    return streams, bytes(attached[0] or b"") if attached else None
+    return streams, bytes(attached[0] or b"") if attached else None, others
+
+
+def _title(stream: Any, number: int) -> str:
+    return str(stream.metadata.get("title", f"without title {number}")).upper()
 
 
 def _rig(calibration: bytes, color: Video, depth: Video, path: Path) -> Rig:

@@ -70,6 +70,7 @@ class BagFile:
         """
         _require_rosbags()
         self.path = path
+        self.read_topics: set[str] = set()  # Names of the topics of `messages`.
         self._lock = Lock()
         with self._readable():
             is_ros1 = path.suffix.lower() == ".bag" and path.is_file()
@@ -89,6 +90,7 @@ class BagFile:
             DataError: A part of the file cannot be read.
         """
         connections = [connection for topic in topics for connection in topic.connections]
+        self.read_topics.update(topic.name for topic in topics)
         with self._lock, self._readable():
             return list(islice(self._format.messages(connections), limit))
 

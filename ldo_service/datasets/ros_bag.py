@@ -4,12 +4,11 @@ A bag needs three topics: color images, depth images, and the camera info of col
 by their types and usual names, or by `SequenceOptions`. The images are sensor_msgs/Image or
 sensor_msgs/CompressedImage. Each color image has the nearest depth image within 20 ms.
 
-Depth counts as registered to color if both images have the same size and the same viewpoint. The
-viewpoint is the same if the name of the depth topic says so, if the frame_ids are equal, or if the
-transform between them is the identity. Otherwise, this module registers depth to color with the
-camera info of depth and this transform, which it reads from /tf_static or from the topics of
-RealSense Viewer. A topic with nav_msgs/Odometry is the recorded odometry, if /tf_static connects
-its base with the camera. Inertial measurements and moving transforms are not used.
+Depth is registered to color in the file if both images have the same size and the same frame, or
+if the name of the depth topic says so. Otherwise, depth is registered here, with the camera info of
+depth and the transform between both frames in /tf_static. nav_msgs/Odometry is the recorded
+odometry, if /tf_static connects its base with the camera. Imu and moving transforms are not used;
+`streams` lists them.
 """
 
 import logging
@@ -32,7 +31,7 @@ from ldo_service.cameras.ros_messages import (
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry import Camera, RawFrame, Trajectory, associate, codecs, se3
 from ldo_service.geometry.frames import in_meters
-from ldo_service.geometry.sequence import Sequence
+from ldo_service.geometry.sequence import Sequence, Stream
 
 from .bag_file import BagFile, StoredMessage, Topic, is_bag
 from .bag_frames import (
@@ -111,6 +110,7 @@ class RosBagSequence(Sequence):
         super().__init__(name_of(path), camera, stamps_ns[pairs[:, 0]])
         self.depth_offsets_ns = depth_stamps_ns[pairs[:, 1]] - self.stamps_ns
         self.registration = "source" if self._rig is None else "reader"
+        self.streams = self._streams(color, depth)
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""
@@ -139,6 +139,17 @@ class RosBagSequence(Sequence):
         if self._odometry is None:
             return None
         return read_odometry(self._bag, self._odometry, self._frame_id)
+
+    def _streams(self, color: Topic, depth: Topic) -> tuple[Stream, ...]:
+        """Return all topics of the bag, with the use of each."""
+        uses = dict.fromkeys(self._bag.read_topics, "calibration")
+        if self._odometry:
+            uses |= {"/tf_static": "calibration", self._odometry.name: "odometry"}
+        uses |= {color.name: "color", depth.name: "depth"}
+        return tuple(
+            Stream(topic.name, topic.kind.replace("/msg/", "/"), topic.count, uses.get(name, ""))
+            for name, topic in self._bag.topics.items()
+        )
 
     def _images(self, index: int) -> tuple[RosImage, RosImage]:
         color, depth = self._frames[index]

@@ -19,7 +19,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, RawFrame, Trajectory, se3
-from ldo_service.geometry.sequence import Sequence
+from ldo_service.geometry.sequence import Sequence, Stream
 
 from .files import name_of, numbered, parse_stamp, valid_trajectory
 from .images import read_depth, read_labels
@@ -64,6 +64,16 @@ class StrayScannerSequence(Sequence):
         self._poses = [lines[k].T_world_camera for k in numbers]
         stamps = np.array([lines[k].stamp_ns for k in numbers], np.int64)
         super().__init__(name_of(folder), self._grid.camera, stamps)
+        self.streams = (
+            Stream("rgb.mp4", "video", len(self._video), "color"),
+            Stream("depth", "images", len(depth), "depth"),
+            Stream("confidence", "images", len(self._confidence), "validity of depth"),
+            Stream("odometry.csv", "poses", len(lines), "odometry"),
+            *(
+                Stream(path.name, "inertial measurements", None, "")
+                for path in folder.glob("imu.csv")
+            ),
+        )
 
     def read(self, index: int) -> RawFrame:
         """Return a frame; see `Sequence.read`."""

@@ -30,6 +30,23 @@ class TrueLabels:
     frame: Callable[[int], FrameLabels]
 
 
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """Stream in a recording, such as a topic of a bag.
+
+    Attributes:
+        name: Name of the topic, the track or the file.
+        kind: Type of its content.
+        messages: Number of its messages or images; None if it is not known.
+        use: What the reader takes from it, such as "color"; empty if it is not used.
+    """
+
+    name: str
+    kind: str
+    messages: int | None
+    use: str
+
+
 class Sequence(ABC):
     """RGB-D frames of one camera in the order of their stamps.
 
@@ -43,11 +60,13 @@ class Sequence(ABC):
         stamps_ns: Stamps, [len] int64, ascending.
         depth_offsets_ns: Stamps of the depth images minus `stamps_ns`, [len] int64; None if depth
             has no stamps of its own.
-        registration: Step that registers depth to color: the source, `read`, or none.
+        registration: Where depth is registered to color: in the source, by `read`, or nowhere.
+        streams: Streams of the recording, used or not; empty if it has only color and depth.
     """
 
     depth_offsets_ns: np.ndarray | None = None
     registration: Literal["source", "reader", "none"] = "source"
+    streams: tuple[Stream, ...] = ()
 
     def __init__(self, name: str, raw_camera: Camera, stamps_ns: np.ndarray) -> None:
         self.name = name
@@ -113,6 +132,7 @@ class Cached(Sequence):
         super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns)
         self.depth_offsets_ns = sequence.depth_offsets_ns
         self.registration = sequence.registration
+        self.streams = sequence.streams
         self._sequence = sequence
         self._frames: dict[int, RawFrame] = {}
 
@@ -142,6 +162,7 @@ class OdometryAsTruth(Sequence):
         super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns)
         self.depth_offsets_ns = sequence.depth_offsets_ns
         self.registration = sequence.registration
+        self.streams = sequence.streams
         self._sequence = sequence
 
     def read(self, index: int) -> RawFrame:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ldo_service.config import Config
 from ldo_service.errors import DataError, FrameError
-from ldo_service.geometry.sequence import Sequence
+from ldo_service.geometry.sequence import Sequence, Stream
 
 from .job import RunOptions
 from .offline import run_offline
@@ -52,6 +52,7 @@ class SourceInfo:
     """Description of a source."""
 
     name: str
+    streams: tuple[Stream, ...]  # See `Sequence.streams`.
     timing: Timing
     camera: dict[str, Any]  # Fields of `Camera`.
     depth: DepthInfo
@@ -76,6 +77,7 @@ def describe(sequence: Sequence) -> SourceInfo:
     truth = sequence.truth()
     return SourceInfo(
         name=sequence.name,
+        streams=sequence.streams,
         timing=_timing(sequence.stamps_ns),
         camera=asdict(sequence.raw_camera),
         depth=_depth(sequence, depths_m),

@@ -4,9 +4,13 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
+
 from ldo_service.datasets import Sequence
+from tests.cameras.ros import STORE, header
 from tests.commands.test_cli import assert_one_paragraph, ldo
-from tests.datasets.bags import entries_of, write_bag
+from tests.datasets.bags import COLOR, COLOR_INFO, DEPTH, entries_of, write_bag
+from tests.datasets.recordings import small_frames, write_stray
 
 
 def test_command_prints_a_table_and_json(capsys, room_folder: Path) -> None:
@@ -18,6 +22,34 @@ def test_command_prints_a_table_and_json(capsys, room_folder: Path) -> None:
     found = json.loads(out)
     assert (code, found["layout"], found["timing"]["frames"]) == (0, "TUM RGB-D", 16)
     assert found["estimated_run_s"] is None
+
+
+def test_topics_of_a_bag_are_listed_with_their_use(capsys, tmp_path: Path, room: Sequence) -> None:
+    imu, T = STORE.types["sensor_msgs/msg/Imu"], STORE.types["geometry_msgs/msg/Vector3"]
+    quaternion = STORE.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    zeros, covariance = T(0.0, 0.0, 0.0), np.zeros(9)
+    samples = [
+        (k, "/imu", imu(header(k), quaternion, covariance, zeros, covariance, zeros, covariance))
+        for k in range(1, 6)
+    ]
+    path = write_bag(tmp_path, "mcap", [*samples, *entries_of(room, range(3))])
+    code, out, _ = ldo(capsys, "info", path, "--json")
+    assert code == 0
+    streams = {stream["name"]: stream for stream in json.loads(out)["streams"]}
+    used = {name: stream["use"] for name, stream in streams.items()}
+    assert used == {COLOR: "color", DEPTH: "depth", COLOR_INFO: "calibration", "/imu": ""}
+    assert (streams["/imu"]["kind"], streams["/imu"]["messages"]) == ("sensor_msgs/Imu", 5)
+    _, out, _ = ldo(capsys, "info", path)
+    lines = [line.strip("│ \n") for line in out.splitlines()]
+    assert any(line.startswith("not used") and "/imu (sensor_msgs/Imu, 5" in line for line in lines)
+
+
+def test_inertial_measurements_of_a_phone_are_listed_as_not_used(capsys, tmp_path: Path) -> None:
+    folder = write_stray(tmp_path / "desk", small_frames(3))
+    assert "imu.csv" not in ldo(capsys, "info", folder)[1]
+    (folder / "imu.csv").write_text("timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n")
+    code, out, _ = ldo(capsys, "info", folder)
+    assert (code, "imu.csv (inertial measurements)" in out) == (0, True)
 
 
 def test_probe_adds_the_time_of_a_run(capsys) -> None:
