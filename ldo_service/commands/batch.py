@@ -23,7 +23,7 @@ from ldo_service.errors import ConfigError, LdoError
 from ldo_service.runs.export import ExportFormat
 from ldo_service.runs.networks import require_usable_networks
 
-from .options import ConfigFile, MaxFrames, Settings, Stride, argument
+from .options import ConfigFile, HoldOutEvery, MaxFrames, Settings, Stride, argument
 from .run import with_options
 
 # Memory for each recording. The peak was 0.4 to 1.4 GB over the recordings of docs/batch.md.
@@ -53,10 +53,7 @@ def batch(
     set: Settings = (),
     max_frames: MaxFrames = None,
     stride: Stride = 1,
-    hold_out_every: Annotated[
-        int | None,
-        argument(metavar="N", help="track every N-th frame but do not map it; 0: map all frames"),
-    ] = None,
+    hold_out_every: HoldOutEvery = None,
     refine_iterations: Annotated[
         int, argument(metavar="N", help="optimize each map for N more iterations at the end")
     ] = 0,
@@ -126,15 +123,7 @@ def batch(
         workers=workers, threads=threads, memory_gb=memory_gb, max_staged_gb=max_staged_gb
     )
     where = open_store(out)
-    executor: Executor
-    if cluster is None:
-        if gpus:
-            raise ConfigError(
-                f"--gpus {gpus:g} applies only with --cluster. Remove --gpus, or add --cluster."
-            )
-        executor = LocalExecutor(workers or default_workers(threads, memory_gb))
-    else:
-        executor = RayExecutor(cluster, RayNeeds(threads, memory_gb, gpus), workers)
+    executor = _executor(cluster, RayNeeds(threads, memory_gb, gpus), workers)
     words = [*sources, *(listed(sources_from) if sources_from else ())]
     if not words:
         raise ConfigError("no SOURCES are given. Name recordings, or use --sources-from FILE.")
@@ -170,6 +159,15 @@ def _plan(
         exports=tuple(dict.fromkeys(exports)),
         threads=threads,
     )
+
+
+def _executor(cluster: str | None, needs: RayNeeds, workers: int | None) -> Executor:
+    """Return the executor on a cluster, or on this machine if `cluster` is None."""
+    if cluster is not None:
+        return RayExecutor(cluster, needs, workers)
+    if needs.gpus:
+        raise ConfigError(f"--gpus {needs.gpus:g} applies to --cluster. Remove it.")
+    return LocalExecutor(workers or default_workers(needs.cpus, needs.memory_gb))
 
 
 def _require_positive(**options: float | None) -> None:

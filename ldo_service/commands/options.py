@@ -70,6 +70,10 @@ RecordedOdometry = Annotated[
 ]
 MaxFrames = Annotated[int | None, argument(metavar="N", help="stop after N frames")]
 Stride = Annotated[int, argument(metavar="N", help="take every N-th frame")]
+HoldOutEvery = Annotated[
+    int | None,
+    argument(metavar="N", help="track every N-th frame but do not map it; 0: map all frames"),
+]
 Recording = Annotated[
     Path,
     tyro.conf.Positional,

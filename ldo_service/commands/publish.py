@@ -89,6 +89,7 @@ def publish(
       ldo publish ros2 --color /camera/color/image_raw --depth /camera/aligned_depth/image_raw
     """
     console = Console(stderr=True, highlight=False, soft_wrap=True)
+    selection = Selection(stride, max_frames)
     if source in (REALSENSE, ROS2):
         require_no_sequence(
             source,
@@ -100,30 +101,46 @@ def publish(
                 "recorded-odometry": recorded_odometry,
             },
         )
-        network, chosen = Endpoint(robot, endpoint, TlsKeys.of(keys)), Selection(stride, max_frames)
         live = (
             realsense.frames(usb.stream())
             if source == REALSENSE
-            else frames_of_ros(ros, network, console.print)
+            else frames_of_ros(ros, Endpoint(robot, endpoint, TlsKeys.of(keys)), console.print)
         )
         with connect(robot, endpoint, keys) as service, closing(live):
-            relay(service, live, chosen, restamp, console.print)
+            relay(service, live, selection, restamp, console.print)
         return
     if rate is not None and not 0 < rate < float("inf"):
         raise ConfigError(f"--rate {rate:g} must be positive and finite.")
     settings = load_config(config, with_topics(set, topic))
     sequence = open_sequence(source, settings.dataset.options())
-    indices = Selection(stride, max_frames).indices(sequence)
-    prior = PriorSource(
+    indices = selection.indices(sequence)
+    recorded = (
         recorded_prior(sequence, indices, settings, console.print) if recorded_odometry else None
     )
-    with (
-        connect(robot, endpoint, keys) as service,
-        progress("publish", len(indices), console) as advance,
-    ):
+    with connect(robot, endpoint, keys) as service:
         service.wait_for_subscriber()
-        camera = SequencePublisher(service, sequence, prior, restamp, console.print)
-        for done, index in enumerate(paced(sequence, indices, rate), 1):
+        camera = SequencePublisher(
+            *(service, sequence, PriorSource(recorded), restamp, console.print)
+        )
+        publish_all(camera, indices, rate, console)
+
+
+def publish_all(
+    camera: "SequencePublisher", indices: range, rate: float | None, console: Console
+) -> None:
+    """Publish frames of a sequence with a progress bar.
+
+    Args:
+        camera: The publisher.
+        indices: Indices of the frames.
+        rate: Frames per second; None keeps the intervals of the recorded stamps.
+        console: Console of the progress bar and of the note at the end.
+
+    Raises:
+        DataError: More than MAX_BAD of the frames cannot be read.
+    """
+    with progress("publish", len(indices), console) as advance:
+        for done, index in enumerate(paced(camera.sequence, indices, rate), 1):
             camera.send(index)
             advance(done)
     console.print(
@@ -152,7 +169,7 @@ class SequencePublisher:
         restamp: bool,
         notify: Callable[[str], None],
     ) -> None:
-        self._service, self._sequence, self._prior = service, sequence, prior
+        self.sequence, self._service, self._prior = sequence, service, prior
         self._restamp, self._notify = restamp, notify
         self._had_subscriber = True
         self.sent = self.bad = self.unreceived = 0
@@ -164,7 +181,7 @@ class SequencePublisher:
         """
         self._notice_listeners()
         try:
-            message = raw_frame_to_message(self._sequence.read(index))
+            message = raw_frame_to_message(self.sequence.read(index))
         except FrameError as error:
             if self.bad == 0:
                 self._notify(f"{error} The frame is skipped; further bad frames are only counted.")

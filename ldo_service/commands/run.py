@@ -23,6 +23,7 @@ from ldo_service.runs.source import Selection, recorded_prior
 
 from .options import (
     ConfigFile,
+    HoldOutEvery,
     Localize,
     MaxFrames,
     Overwrite,
@@ -37,6 +38,16 @@ from .options import (
     with_topics,
 )
 
+# Options of `ldo run` that exclude each other.
+EXCLUSIVE = {
+    "--realtime": ("--refine-iterations", "--reuse-front-end", "--keep-front-end"),
+    "--reuse-front-end": (
+        *("--odometry-prior", "--recorded-odometry", "--localize", "--keep-front-end"),
+    ),
+    "--recorded-odometry": ("--odometry-prior",),
+    "--localize": ("--keep-front-end",),
+}
+
 
 def run(
     source: Source,
@@ -47,10 +58,7 @@ def run(
     recorded_odometry: RecordedOdometry = False,
     max_frames: MaxFrames = None,
     stride: Stride = 1,
-    hold_out_every: Annotated[
-        int | None,
-        argument(metavar="N", help="track every N-th frame but do not map it; 0: map all frames"),
-    ] = None,
+    hold_out_every: HoldOutEvery = None,
     threads: Annotated[
         int | None,
         argument(
@@ -106,47 +114,51 @@ def run(
       ldo run ~/data/desk_again --out runs/again --localize runs/desk
       ldo run synthetic:flat --out runs/half --reuse-front-end runs/flat --set mapper.iterations=7
     """
-    over_file = {
-        "--refine-iterations": refine_iterations,
-        "--reuse-front-end": reuse_front_end,
-        "--keep-front-end": keep_front_end,
-    }
-    looking = {
-        "--odometry-prior": odometry_prior,
-        "--recorded-odometry": recorded_odometry,
-        "--localize": localize,
-        "--keep-front-end": keep_front_end,
-    }
-    require_none_of("--realtime", realtime, over_file)
-    require_none_of("--reuse-front-end", reuse_front_end, looking)
-    require_none_of("--recorded-odometry", recorded_odometry, {"--odometry-prior": odometry_prior})
-    require_none_of("--localize", localize, {"--keep-front-end": keep_front_end})
+    require_compatible(
+        {
+            "--realtime": realtime,
+            "--refine-iterations": refine_iterations,
+            "--reuse-front-end": reuse_front_end,
+            "--keep-front-end": keep_front_end,
+            "--odometry-prior": odometry_prior,
+            "--recorded-odometry": recorded_odometry,
+            "--localize": localize,
+        }
+    )
     require_separate(localize, out, refine_iterations)
     console = Console(stderr=True)
-    settings = with_options(load_config(config, with_topics(set, topic)), hold_out_every, threads)
-    settings = localizing(settings, localize)
+    settings = localizing(
+        with_options(load_config(config, with_topics(set, topic)), hold_out_every, threads),
+        localize,
+    )
     require_usable_networks(settings)
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_sequence(source, settings.dataset.options())
-    recorded = None
+    prior = Trajectory.load(odometry_prior) if odometry_prior else None
     if recorded_odometry:
         indices = selection.indices(sequence)
-        recorded = recorded_prior(sequence, indices, settings, console.print)
+        prior = recorded_prior(sequence, indices, settings, console.print)
     job = RunOptions(
         *(sequence, out, settings, selection, console.print),
         refine=refine_iterations,
-        prior=Trajectory.load(odometry_prior) if odometry_prior else recorded,
+        prior=prior,
         front_end=kept_front_end(reuse_front_end, out, settings, sequence, selection),
         keep_front_end=keep_front_end,
     )
     prepare(out, overwrite)
     record = execute(job, run_realtime if realtime else run_offline, console)
-    Console().print(summary_table(record.summary, out))
+    print_results(record, out, localize)
+
+
+def print_results(record: RunWriter, out: Path, localize: Path | None) -> None:
+    """Print the summary of a finished run, and notes on what the user may not expect."""
+    console = Console()
+    console.print(summary_table(record.summary, out))
     if record.summary["gaussians_unmerged"]:
-        Console().print(format_unmerged(record.summary["gaussians_unmerged"]), style="dim")
+        console.print(format_unmerged(record.summary["gaussians_unmerged"]), style="dim")
     if localize:
-        Console().print(format_localization(record.statuses, localize), style="dim")
+        console.print(format_localization(record.statuses, localize), style="dim")
 
 
 def execute(
@@ -220,20 +232,19 @@ def with_options(config: Config, hold_out: int | None, threads: int | None) -> C
     return checked(replace(config, tracker=tracker, mapper=mapper))
 
 
-def require_none_of(option: str, is_given: object, others: Mapping[str, object]) -> None:
-    """Check that an option is not given together with an option that it excludes.
+def require_compatible(options: Mapping[str, object]) -> None:
+    """Check that no options are given that exclude each other (EXCLUSIVE).
 
     Args:
-        option: Name of the option.
-        is_given: Value of the option; a true value means that the option is given.
-        others: Values of the options that `option` excludes, by name.
+        options: Values of the options by name; a true value means that the option is given.
 
     Raises:
-        ConfigError: If the option and one of `others` are given.
+        ConfigError: If two such options are given.
     """
-    wrong = [name for name, value in others.items() if value]
-    if is_given and wrong:
-        raise ConfigError(f"{option} and {wrong[0]} exclude each other. Remove one of them.")
+    for option, others in EXCLUSIVE.items():
+        wrong = [other for other in others if options[other]]
+        if options[option] and wrong:
+            raise ConfigError(f"{option} and {wrong[0]} exclude each other. Remove one of them.")
 
 
 def require_separate(localize: Path | None, out: Path, refine: int) -> None:
