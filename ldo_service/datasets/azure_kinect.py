@@ -22,16 +22,15 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError, DataError, install_command
-from ldo_service.geometry import Camera, RawFrame, Trajectory, associate, se3
+from ldo_service.geometry import Camera, RawFrame, Trajectory, se3
 from ldo_service.geometry.sequence import Sequence, Stream
 
-from .files import is_rigid, number
+from .files import is_rigid, number, pair_by_stamp
 from .phone_images import PhoneGrid
 from .rig import Rig
 from .video import Video
 
 SUFFIX = ".mkv"
-MAX_SKEW_NS = 20_000_000  # Maximum stamp difference of paired images, as for TUM sequences.
 DEPTH_SCALE = 1000.0  # Units per meter.
 MAX_CALIBRATION_BYTES = 1 << 20  # Maximum size of calibration.json; it has about 10 kB.
 # Modes of the depth camera: size of the image, size of the calibrated image at the same resolution,
@@ -67,12 +66,12 @@ class AzureKinectSequence(Sequence):
                 f"video streams are: {found}. Record color and depth with k4arecorder."
             )
         self._color, self._depth = (Video(path, streams[title]) for title in ("COLOR", "DEPTH"))
-        pairs = associate(self._color.stamps_ns, self._depth.stamps_ns, MAX_SKEW_NS)
-        if len(pairs) == 0:
-            raise DataError(
-                f"{path}: none of its {len(self._color)} color images is within 20 ms of any of "
-                f"its {len(self._depth)} depth images. Record again with synchronized images."
-            )
+        pairs = pair_by_stamp(
+            path,
+            ("color images", self._color.stamps_ns),
+            ("depth images", self._depth.stamps_ns),
+            "Record again with synchronized images.",
+        )
         self._pairs = pairs
         rig = _rig(calibration, self._color, self._depth, path)
         self._grid = PhoneGrid(rig.color_camera)

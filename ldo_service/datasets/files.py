@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import DataError
-from ldo_service.geometry import Camera, Trajectory, se3
+from ldo_service.geometry import Camera, Trajectory, associate, se3
 
 log = logging.getLogger(__name__)
 
+# Maximum stamp difference of paired color and depth images; the value of TUM's associate.py.
+MAX_SKEW_NS = 20_000_000
 LAST_STAMP_NS = 2**63 - 1  # Maximum of int64, in the year 2262.
 FRAME_RATE_HZ = 30  # Assumed rate of data sets without stamps: frame k is at k / 30 s.
 
@@ -134,6 +136,20 @@ def pinhole(fields: dict[str, Any], width: str, height: str, path: Path) -> Came
 def _pixels(size: float) -> int | float:
     """Return an integer if JSON has one as 640.0; `Camera` refuses other numbers."""
     return int(size) if size.is_integer() else size
+
+
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """Return the lines of a text file with their numbers, without empty lines and comments (#).
+
+    Raises:
+        DataError: The file cannot be read.
+    """
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read as text: {error}.") from error
+    numbered_lines = ((number, line.strip()) for number, line in enumerate(lines, 1))
+    return [(number, line) for number, line in numbered_lines if line and line[0] != "#"]
 
 
 def read_matrix(path: Path, size: int) -> np.ndarray:
@@ -322,3 +338,35 @@ def pair_by_number(color: dict[int, Path], depth: dict[int, Path], folder: Path)
     return NumberedFrames(
         np.array(numbers, np.int64), [color[k] for k in numbers], [depth[k] for k in numbers]
     )
+
+
+def pair_by_stamp(
+    source: Path, color: tuple[str, np.ndarray], depth: tuple[str, np.ndarray], advice: str
+) -> np.ndarray:
+    """Pair each color image with the nearest depth image within MAX_SKEW_NS.
+
+    Args:
+        source: Path of the recording, for messages.
+        color: Name of the color images, and their stamps in ns, [N] int64.
+        depth: Name of the depth images, and their stamps in ns, [M] int64.
+        advice: What a user can do if no images can be paired.
+
+    Returns:
+        Indices of color and depth image, [K, 2].
+
+    Raises:
+        DataError: No color image has a depth image.
+    """
+    (color_name, color_ns), (depth_name, depth_ns) = color, depth
+    pairs = associate(color_ns, depth_ns, MAX_SKEW_NS)
+    if len(pairs) == 0:
+        raise DataError(
+            f"{source}: none of the {len(color_ns)} {color_name} is within 20 ms of any of the "
+            f"{len(depth_ns)} {depth_name}. {advice}"
+        )
+    if len(pairs) < len(color_ns):
+        log.info(
+            "%s: skipping %d of %d %s, which have no depth image within 20 ms.",
+            *(source, len(color_ns) - len(pairs), len(color_ns), color_name),
+        )
+    return pairs

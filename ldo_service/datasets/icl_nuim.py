@@ -23,7 +23,15 @@ from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.camera import rays
 from ldo_service.geometry.sequence import Sequence
 
-from .files import FRAME_RATE_HZ, NumberedFrames, inside, name_of, numbered, pair_by_number
+from .files import (
+    FRAME_RATE_HZ,
+    NumberedFrames,
+    inside,
+    name_of,
+    numbered,
+    pair_by_number,
+    read_lines,
+)
 from .images import read_color, read_depth
 
 CAMERA = Camera(640, 480, 481.2, 480.0, 319.5, 239.5)
@@ -92,16 +100,10 @@ def _associated(path: Path) -> NumberedFrames:
     Raises:
         DataError: The file cannot be read, or a line is invalid.
     """
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read: {error}. Download it again.") from error
     color: dict[int, Path] = {}
     depth: dict[int, Path] = {}
-    for line_number, line in enumerate(lines, 1):
+    for line_number, line in read_lines(path):
         words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
         files = [inside(path.parent, name) for name in words[1::2]]
         if len(words) != 4 or None in files or not words[0].isdecimal() or len(words[0]) > 9:
             raise DataError(

@@ -29,7 +29,7 @@ from ldo_service.cameras.ros_messages import (
     depth_image,
 )
 from ldo_service.errors import ConfigError, DataError, FrameError
-from ldo_service.geometry import Camera, RawFrame, Trajectory, associate, codecs, se3
+from ldo_service.geometry import Camera, RawFrame, Trajectory, codecs, se3
 from ldo_service.geometry.frames import in_meters
 from ldo_service.geometry.sequence import Sequence, Stream
 
@@ -41,15 +41,13 @@ from .bag_frames import (
     readable_messages,
     static_transform,
 )
-from .files import name_of
+from .files import name_of, pair_by_stamp
 from .rig import Rig, SequenceOptions
 
 __all__ = ["RosBagSequence", "is_bag"]
 
 log = logging.getLogger(__name__)
 
-# Maximum stamp difference of paired color and depth images, as for TUM sequences.
-MAX_SKEW_NS = 20_000_000
 TRIES = 10  # Number of first images of a topic of which one must be readable.
 
 # Names of topics, without the suffix of compressed images. An earlier pattern is preferred.
@@ -88,18 +86,12 @@ class RosBagSequence(Sequence):
             np.array([message.stamp_ns for message in stream], np.int64)
             for stream in (colors, depths)
         )
-        pairs = associate(stamps_ns, depth_stamps_ns, MAX_SKEW_NS)
-        if len(pairs) == 0:
-            raise DataError(
-                f"{path}: none of the {len(colors)} images of {color.name} is within 20 ms of any "
-                f"of the {len(depths)} images of {depth.name}. Check that one clock made the "
-                "stamps of both."
-            )
-        if len(pairs) < len(colors):
-            log.info(
-                "%s: skipping %d of %d color images, which have no depth image within 20 ms.",
-                *(path, len(colors) - len(pairs), len(colors)),
-            )
+        pairs = pair_by_stamp(
+            path,
+            (f"images of {color.name}", stamps_ns),
+            (f"images of {depth.name}", depth_stamps_ns),
+            "Check that one clock made the stamps of both.",
+        )
         self._frames = [(colors[i], depths[j]) for i, j in pairs]
         camera = options.color_camera or _camera(bag, color)
         images = self._first_images()

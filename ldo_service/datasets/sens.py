@@ -27,7 +27,7 @@ import numpy as np
 from ldo_service.errors import DataError, FrameError
 from ldo_service.geometry import Camera, Trajectory, se3
 
-from .files import FRAME_RATE_HZ, LAST_STAMP_NS, Calibration, is_rigid
+from .files import FRAME_RATE_HZ, LAST_STAMP_NS, Calibration, is_rigid, valid_trajectory
 from .images import MAX_PIXELS, decode_color
 from .rig import Rig, RigSequence, SequenceOptions
 
@@ -94,12 +94,7 @@ class SensSequence(RigSequence):
 
     def read_depth_poses(self) -> Trajectory | None:
         """Return the poses of the depth camera; see `RigSequence.read_depth_poses`."""
-        poses = self._index.T_world_camera
-        known = np.flatnonzero([is_rigid(T) for T in poses])
-        if not len(known):
-            return None
-        T_world_camera = np.array([se3.orthonormalize(T) for T in poses[known]])
-        return Trajectory(self.stamps_ns[known] / 1e9, T_world_camera)
+        return valid_trajectory(self.stamps_ns, list(self._index.T_world_camera))
 
     def _color(self, data: bytes, source: str) -> np.ndarray:
         """Return the color image [Hc, Wc, 3] uint8 RGB."""

@@ -9,7 +9,6 @@ camera.json              optional for the original recordings; see CAMERA_JSON
 calibration.txt          of ETH3D SLAM: `fx fy cx cy`; used if there is no camera.json
 """
 
-import logging
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,20 +16,26 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.errors import DataError
-from ldo_service.geometry import Camera, RawFrame, Trajectory, associate
+from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.sequence import Sequence
 
-from .files import Calibration, inside, name_of, number, parse_stamp, pinhole, read_json
+from .files import (
+    Calibration,
+    inside,
+    name_of,
+    number,
+    pair_by_stamp,
+    parse_stamp,
+    pinhole,
+    read_json,
+    read_lines,
+)
 from .images import first_size, read_color, read_depth
-
-log = logging.getLogger(__name__)
 
 CAMERA_JSON = (
     '{"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, '
     '"distortion": [k1, k2, p1, p2, k3], "depth_scale": 5000}, the last two optional'
 )
-# Maximum stamp difference of paired color and depth images; the value of TUM's associate.py.
-ASSOCIATION_TOLERANCE_NS = 20_000_000
 DEPTH_SCALE = 5000.0  # Units per meter in all recordings of the benchmark.
 
 # Published calibrations of the color cameras of the benchmarks, by a part of the folder's name;
@@ -68,17 +73,12 @@ class TumSequence(Sequence):
         """Open the sequence of a folder."""
         self._folder = folder
         color, depth = _listing(folder / "rgb.txt"), _listing(folder / "depth.txt")
-        pairs = associate(color.stamps_ns, depth.stamps_ns, ASSOCIATION_TOLERANCE_NS)
-        if len(pairs) == 0:
-            raise DataError(
-                f"{folder}: none of the {len(color.files)} color images is within 20 ms of any of "
-                f"the {len(depth.files)} depth images. Check the stamps in rgb.txt and depth.txt."
-            )
-        if len(pairs) < len(color.files):
-            log.info(
-                "%s: skipping %d of %d color images, which have no depth image within 20 ms.",
-                *(folder, len(color.files) - len(pairs), len(color.files)),
-            )
+        pairs = pair_by_stamp(
+            folder,
+            ("color images", color.stamps_ns),
+            ("depth images", depth.stamps_ns),
+            "Check the stamps in rgb.txt and depth.txt.",
+        )
         self._files = [(color.files[i], depth.files[j]) for i, j in pairs]
         calibration = _calibration(folder, [folder / file for file, _ in self._files])
         self.depth_scale = calibration.depth_scale
@@ -109,19 +109,7 @@ def _listing(path: Path) -> _Listing:
     Raises:
         DataError: The file cannot be read, or a line is invalid.
     """
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(
-            f"{path} cannot be read as a list of images: {error}. Copy or download it again; each "
-            "line must have the form `stamp file`."
-        ) from error
-    rows = [
-        _row(path, line_number, line)
-        for line_number, line in enumerate(lines, 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    rows.sort()
+    rows = sorted(_row(path, line_number, line) for line_number, line in read_lines(path))
     return _Listing(np.array([stamp for stamp, _ in rows], np.int64), [file for _, file in rows])
 
 
