@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import Cached, Sequence
-from ldo_service.synthetic import SCENES, open_synthetic
+from ldo_service.synthetic import open_synthetic
 
 from .azure_kinect import SUFFIX, AzureKinectSequence
 from .icl_nuim import IclNuimSequence
@@ -34,19 +34,19 @@ LAYOUTS = (
         lambda path, _options: TumSequence(path),
     ),
     Layout(
-        "Replica as NICE-SLAM lays it out",
+        "Replica (NICE-SLAM)",
         "results/frame*.jpg and results/depth*.png",
         lambda path: (path / "results").is_dir(),
         lambda path, _options: ReplicaSequence(path),
     ),
     Layout(
-        "Open3D and Redwood",
+        "Open3D, Redwood",
         "color/ (or image/, rgb/), depth/ and camera_intrinsic.json",
         Open3dSequence.matches,
         lambda path, _options: Open3dSequence(path),
     ),
     Layout(
-        "ScanNet as SensReader exports it",
+        "ScanNet (SensReader)",
         "color/*.jpg, depth/*.png and intrinsic/",
         lambda path: (path / "color").is_dir() and (path / "depth").is_dir(),
         ScanNetSequence,
@@ -96,14 +96,14 @@ LAYOUTS = (
         lambda path, _options: NerfstudioSequence(path),
     ),
     Layout(
-        "ScanNet as it is published",
+        "ScanNet (.sens)",
         "a file .sens",
         lambda path: path.is_file() and path.suffix.lower() == ".sens",
         SensSequence,
         has_options=True,
     ),
     Layout(
-        "a bag of ROS 1 or ROS 2",
+        "a bag of ROS",
         "a file .bag, .mcap or .db3, or a folder with metadata.yaml",
         is_bag,
         RosBagSequence,
@@ -111,6 +111,8 @@ LAYOUTS = (
         has_topics=True,
     ),
 )
+
+MAX_SEARCHED = 200  # Maximum number of entries of a folder that may be recordings themselves.
 
 
 def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequence:
@@ -138,8 +140,8 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     path = Path(source).expanduser()
     if not path.exists():
         raise DataError(
-            f"{source} does not exist. Check the path, or give a built-in scene synthetic:NAME, "
-            f"where NAME is {', '.join(SCENES)}."
+            f"{source} does not exist. Check the path, or give a built-in scene, such as "
+            "synthetic:room. `ldo run --help` lists them."
         )
     if layout := find_layout(path):
         return layout.open_sequence(path, options)
@@ -166,18 +168,28 @@ def _unknown(path: Path) -> str:
             f"{path / parts[0]}."
         )
     layouts = (*LAYOUTS, *registered_layouts())
-    names = [part.name for part in sorted(path.iterdir())] if path.is_dir() else [path.name]
+    known = (
+        f"Known are {', '.join(layout.name for layout in layouts)}: docs/first-steps.md lists "
+        "their files."
+    )
+    if not path.is_dir():
+        return f"the file {path} has no known layout. {known}"
+    entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
+    if inner := next((entry for entry in entries[:MAX_SEARCHED] if find_layout(entry)), None):
+        return (
+            f"the folder {path} is no recording, but contains recordings. Give one of them, such "
+            f"as {inner}, or give the folder to `ldo batch`."
+        )
+    names = [entry.name for entry in entries]
     similar = [layout for layout in layouts if any(_is_listed(n, layout.files) for n in names)]
-    kind = "folder" if path.is_dir() else "file"
-    advice = (
-        " or ".join(f"{layout.files} ({layout.name})" for layout in similar[:2])
-        if similar
-        else f"the files of one of these: {', '.join(layout.name for layout in layouts)}"
-    )
-    return (
-        f"the {kind} {path} has no known layout. Expected {advice}. docs/first-steps.md lists the "
-        "files of each layout."
-    )
+    if similar:
+        files = " or ".join(f"{layout.files} ({layout.name})" for layout in similar[:2])
+        return (
+            f"the folder {path} has no known layout. Expected {files}. docs/first-steps.md lists "
+            "the files of each layout."
+        )
+    content = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return f"the folder {path} has no known layout; it contains {content or 'nothing'}. {known}"
 
 
 def _is_listed(name: str, files: str) -> bool:

@@ -29,13 +29,27 @@ def test_unknown_synthetic_name_lists_the_known_ones() -> None:
         open_sequence("synthetic:castle")
 
 
-def test_messages_and_help_list_every_built_in_scene(tmp_path: Path) -> None:
+def test_error_and_page_list_every_built_in_scene() -> None:
     page = (Path(__file__).parents[2] / "docs/first-steps.md").read_text()
-    for source in ("synthetic:castle", str(tmp_path / "nowhere")):
-        with pytest.raises(DataError) as caught:
-            open_sequence(source)
-        assert all(name in str(caught.value) for name in SCENES)
+    with pytest.raises(DataError) as caught:
+        open_sequence("synthetic:castle")
+    assert all(name in str(caught.value) for name in SCENES)
     assert all(f"`synthetic:{name}`" in page for name in SCENES)
+
+
+def test_folder_of_recordings_names_one_of_them(tum_folder: Callable[..., Path]) -> None:
+    recording = tum_folder(["1"], ["1"])
+    with pytest.raises(DataError, match=f"such as {recording}, or give the folder to `ldo batch`"):
+        open_sequence(str(recording.parent))
+
+
+def test_unknown_folder_is_a_short_error_with_its_content(tmp_path: Path) -> None:
+    for name in ("c.txt", "a.txt", ".hidden", "b.txt", "d.txt"):
+        (tmp_path / name).touch()
+    with pytest.raises(DataError) as caught:
+        open_sequence(str(tmp_path))
+    assert "it contains a.txt, b.txt, c.txt and 1 more." in str(caught.value)
+    assert len(str(caught.value).replace(str(tmp_path), "")) < 360
 
 
 def test_folder_with_several_sequences_of_7_scenes_names_one_of_them(
@@ -75,7 +89,7 @@ def test_error_for_a_folder_with_a_file_of_a_layout_names_its_other_files(tmp_pa
 
 
 def test_missing_folder_and_file_have_different_messages(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"nowhere does not exist.*synthetic:NAME"):
+    with pytest.raises(DataError, match=r"nowhere does not exist.*synthetic:room"):
         open_sequence(str(tmp_path / "nowhere"))
     (tmp_path / "a.txt").touch()
     with pytest.raises(DataError, match=r"the file .*no known layout"):

@@ -66,7 +66,7 @@ def test_layout_is_named(
     bag = write_bag(tmp_path, "mcap", entries_of(room, range(1, 4)), "frame_source")
     expected = {
         str(room_folder): "TUM RGB-D",
-        str(bag): "a bag of ROS 1 or ROS 2",
+        str(bag): "a bag of ROS",
         str(recording): "a recording of `ldo record`",
         "synthetic:room": "a built-in scene",
         str(tmp_path): "none",
