@@ -10,6 +10,7 @@ from ldo_service.datasets import Layout, SequenceOptions, open_sequence
 from ldo_service.errors import DataError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_layout.py"
+PAGE = Path(__file__).parents[2] / "docs" / "own-layout.md"
 
 
 @pytest.fixture
@@ -40,3 +41,10 @@ def test_example_names_a_damaged_file(layout: Layout, tmp_path: Path) -> None:
     path.write_bytes(b"no archive")
     with pytest.raises(DataError, match=r"desk\.npz cannot be read.*color"):
         layout.open_sequence(path, SequenceOptions())
+
+
+def test_page_includes_the_example_and_it_has_at_most_40_lines() -> None:
+    """The fence must not be named `python`: ruff would format the inclusion as a program."""
+    assert '```{ .python }\n--8<-- "examples/own_layout.py"\n```' in PAGE.read_text()
+    lines = [line for line in EXAMPLE.read_text().splitlines() if line.strip()]
+    assert len(lines) <= 40
