@@ -1,5 +1,6 @@
 """Report of a batch: batch.json, and a page with a row and pictures for each recording."""
 
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -27,8 +28,9 @@ td:first-child, th:first-child, td:nth-child(2), th:nth-child(2) { text-align: l
 tbody { border-bottom: 1px solid #8884; }
 td.pictures, td.text { text-align: left; white-space: normal; padding-bottom: .8rem; }
 td.text { max-width: 60rem; }
-img { height: 180px; max-width: 100%; margin-right: .6rem; border: 1px solid #8886; }
-img { object-fit: cover; object-position: top left; }
+img { height: 320px; max-width: 100%; margin: 0 .6rem .6rem 0; border: 1px solid #8886; }
+img { object-fit: contain; background: white; }
+code { font-size: .9em; background: #8882; padding: 0 .25em; }
 .failed { color: #d1242f; } .kept { opacity: .75; }
 """
 
@@ -112,15 +114,20 @@ def _number(value: Any, form: str) -> str:
     return "" if value is None else f"{value:{form}}"
 
 
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:,.1f} min"
+
+
 def page(report: Report) -> str:
     """Return the report as an HTML page, whose pictures are in the folders of the results."""
     counts = ", ".join(f"{count} {status}" for status, count in report.counts.items())
     totals = report.totals
     text = (
         f"{counts or 'no recordings'}. CPU time {totals['cpu_s']:,.0f} s for "
-        f"{totals['recording_s'] / 60:,.1f} min of recordings; sources "
+        f"{_duration(totals['recording_s'])} of recordings; sources "
         f"{totals['source_bytes'] / 1e6:,.0f} MB, results {totals['result_bytes'] / 1e6:,.0f} MB. "
-        f"Finished {report.finished} after {report.wall_s:,.0f} s"
+        f"Finished {report.finished.replace('T', ' ').replace('+00:00', ' UTC')} after "
+        f"{_duration(report.wall_s)}"
         f"{', interrupted' if report.is_interrupted else ''}. LDO-SLAM {report.ldo}."
     )
     head = "".join(f"<th>{escape(column)}</th>" for column in COLUMNS)
@@ -141,7 +148,8 @@ def _rows(outcome: Outcome) -> str:
     lines = [f'<tr class="{escape(outcome.status)}">{row}</tr>']
     texts = [outcome.error] if outcome.error else list(outcome.notes)
     if texts:
-        text = "<br>".join(map(escape, texts))
+        # Messages have commands in backticks.
+        text = re.sub("`([^`]+)`", r"<code>\1</code>", "<br>".join(map(escape, texts)))
         lines.append(f'<tr><td class="text" colspan="{len(COLUMNS)}">{text}</td></tr>')
     if outcome.pictures:
         pictures = "".join(_picture(outcome, name) for name in outcome.pictures)
