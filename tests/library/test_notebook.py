@@ -30,10 +30,10 @@ def outputs(notebook: nbformat.NotebookNode, kind: str) -> list[str]:
 
 def test_notebook_tracks_all_frames_and_finds_objects(executed: nbformat.NotebookNode) -> None:
     printed = "".join(outputs(executed, "text"))
-    assert "{'OK': 40, 'WEAK': 0, 'LOST': 0}" in printed
+    assert "{'OK': 60, 'WEAK': 0, 'LOST': 0}" in printed
     assert "Gaussians" in printed
     assert "center [" in printed
-    assert "40 poses" in printed
+    assert "60 poses" in printed
 
 
 def test_notebook_shows_a_trajectory_and_renderings(executed: nbformat.NotebookNode) -> None:
