@@ -40,18 +40,24 @@ class RayExecutor:
         address: Address of the cluster, such as `auto` or HOST:6379.
         needs: Resources for each recording.
         workers: Maximum number of recordings at the same time; None for as many as fit.
+
+    Raises:
+        ConfigError: Ray is not installed, which is found before recordings are looked up.
     """
 
     address: str
     needs: RayNeeds
     workers: int | None = None
 
+    def __post_init__(self) -> None:
+        _ray(self.address)
+
     def outcomes(self, jobs: Iterable[BatchJob]) -> Generator[Outcome, None, None]:
         """Yield the outcome of each job; see `Executor.outcomes`.
 
         Raises:
-            ConfigError: Ray is not installed, the cluster cannot be reached, or no host has the
-                resources that a recording needs.
+            ConfigError: The cluster cannot be reached, or no host has the resources that a
+                recording needs.
         """
         ray = _ray(self.address)
         _connect(ray, self.address)

@@ -197,7 +197,7 @@ def _execute(
         save_report(work.out, report)
 
     save(is_interrupted=True)  # A folder that cannot be written is found before hours of runs.
-    console.print(f"batch: looking for results of {len(found)} recordings")
+    console.print(f"batch: looking for results of {_counted(len(found))}")
     is_interrupted = True
     try:
         for outcome in outcomes.values():
@@ -237,7 +237,7 @@ class _Progress:
         is_known = all(sizes.values())
         self._weights = {source: size if is_known else 1.0 for source, size in sizes.items()}
         self._all, self._started_s = sum(self._weights.values()), time.perf_counter()
-        self._console.print(f"batch: {len(jobs)} of {self._total} recordings to run")
+        self._console.print(f"batch: {len(jobs)} of {_counted(self._total)} to run")
 
     def add(self, outcome: Outcome) -> None:
         """Print the outcome of a recording."""
@@ -256,6 +256,10 @@ class _Progress:
         left_s = elapsed_s * (self._all - self._finished) / self._finished
         text = f"{left_s / 60:.0f} min" if left_s >= 90 else f"{left_s:.0f} s"
         return f"; about {text} left"
+
+
+def _counted(recordings: int) -> str:
+    return f"{recordings} recording{'s' if recordings != 1 else ''}"
 
 
 def _print_table(outcomes: Sequence[Outcome], out: Store) -> None:
