@@ -23,7 +23,9 @@ from weakref import finalize
 from ldo_service.cameras.ros_messages import IMAGE, decoded, typestore
 from ldo_service.errors import ConfigError, DataError, FrameError, LdoError, install_command
 
-SUFFIXES = (".bag", ".mcap", ".db3")
+# First bytes of a file, by its suffix.
+MAGIC = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
+SUFFIXES = tuple(MAGIC)
 METADATA = "metadata.yaml"  # File in the folder of a bag of ROS 2.
 LAST_STAMP_NS = 2**63 - 1  # Maximum of int64, in the year 2262.
 # RealSense Viewer appends the depth unit to each image of ROS 1, as a 4-byte float.
@@ -69,6 +71,7 @@ class BagFile:
             DataError: The bag is damaged or has no index.
         """
         _require_rosbags()
+        _require_magic(path)
         self.path = path
         self.read_topics: set[str] = set()  # Names of the topics of `messages`.
         self._lock = Lock()
@@ -281,6 +284,29 @@ def _ros2_reader(path: Path) -> Any:
     reader = Reader(path)
     reader.open()
     return reader
+
+
+def _require_magic(path: Path) -> None:
+    """Check the first bytes of a file, before rosbags reads it as something that it is not.
+
+    Raises:
+        DataError: The file cannot be read, is empty, or is no bag.
+    """
+    if path.is_dir():
+        return
+    magic = MAGIC[path.suffix.lower()]
+    try:
+        with path.open("rb") as file:
+            found = file.read(len(magic))
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+    if not found:
+        raise DataError(f"{path} is empty. Copy it again, or check that the recorder had started.")
+    if found != magic:
+        raise DataError(
+            f"{path} is no bag of ROS: it begins with {found!r}, expected {magic!r}. Check that it "
+            "is the right file."
+        )
 
 
 def _require_rosbags() -> None:

@@ -223,6 +223,8 @@ def _topic(
             distance = -_common_parts(topic.name, beside.name) if beside else 0
             rank = distance, ranks[0], int(topic.kind == COMPRESSED_IMAGE)
             ranked.setdefault(rank, []).append(topic)
+    if not any(topic.count for topic in bag.topics.values()):
+        raise DataError(f"{bag.path} has no messages. Check that the topics were published.")
     if not ranked:
         raise DataError(
             f"{bag.path} has no topic that is known to have {stream} images. "

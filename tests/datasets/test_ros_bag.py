@@ -404,7 +404,8 @@ def test_truncated_and_empty_bags_of_ros2_are_rejected(
     body, path = (folder / file).read_bytes(), folder if is_folder else folder / file
     for length in (len(body) // 2, 0):
         (folder / file).write_bytes(body[:length])
-        reject(path, "cannot be read as a bag of ROS.*Copy it again")
+        is_named = length == 0 and not is_folder
+        reject(path, "is empty" if is_named else "cannot be read as a bag of ROS.*Copy it again")
 
 
 def test_truncated_empty_and_unindexed_bags_of_ros1_are_rejected(tmp_path: Path) -> None:
@@ -413,11 +414,23 @@ def test_truncated_empty_and_unindexed_bags_of_ros1_are_rejected(tmp_path: Path)
     position = body.index(b"index_pos=") + len(b"index_pos=")
     path.write_bytes(body[:position] + bytes(8) + body[position + 8 :])
     reject(path, "not indexed.*rosbag reindex bag.bag")
-    for length in (len(body) // 2, 100, 0):
+    for length in (len(body) // 2, 100):
         path.write_bytes(body[:length])
         reject(path, "cannot be read as a bag of ROS.*rosbag reindex")
-    path.write_bytes(b"not a bag\n")
-    reject(path, "File magic is invalid")
+    path.write_bytes(b"")
+    reject(path, "is empty. Copy it again")
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
+def test_file_of_another_type_is_rejected_with_its_first_bytes(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"photo{suffix}"
+    path.write_bytes(b"\xff\xd8\xff\xe0JFIF" * 100)
+    reject(path, r"is no bag of ROS: it begins with b'\\xff\\xd8.*Check that it is the right file")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bag_without_messages_is_rejected(tmp_path: Path, kind: str) -> None:
+    reject(write_bag(tmp_path, kind, []), "has no messages")
 
 
 def test_mcap_without_chunks_is_rejected(tmp_path: Path) -> None:
