@@ -126,16 +126,19 @@ def pinhole(fields: dict[str, Any], width: str, height: str, path: Path) -> Came
         )
     coefficients = {f"distortion[{i}]": value for i, value in enumerate(distortion)}
     fx, fy, cx, cy = (number(fields, key, path) for key in ("fx", "fy", "cx", "cy"))
-    size = tuple(_pixels(number(fields, key, path)) for key in (width, height))
+    size = _pixels(fields, width, path), _pixels(fields, height, path)
     try:
         return Camera(*size, fx, fy, cx, cy, k)
     except DataError as error:
         raise DataError(f"{path} has invalid intrinsics: {error}") from error
 
 
-def _pixels(size: float) -> int | float:
-    """Return an integer if JSON has one as 640.0; `Camera` refuses other numbers."""
-    return int(size) if size.is_integer() else size
+def _pixels(fields: dict[str, Any], key: str, path: Path) -> int:
+    """Return the number of pixels under a key of a JSON object; see `number`."""
+    size = number(fields, key, path)
+    if not size.is_integer():
+        raise DataError(f'{path}: expected an integer under "{key}", but it is {size:g}.')
+    return int(size)
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:

@@ -99,7 +99,9 @@ def test_missing_extra_is_named_in_one_line(
     assert code == 2
     assert message in err
     assert "Traceback" not in err
-    assert [line[:5] for line in err.splitlines()] == ["ldo: "]  # Before recordings are looked up.
+    assert [line[:5] for line in err.splitlines()] == [
+        "ldo: "
+    ]  # This is all: the command looked up no recording.
 
 
 def test_interrupted_batch_keeps_finished_results_and_leaves_no_process(

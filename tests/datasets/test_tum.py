@@ -74,6 +74,7 @@ def test_unknown_camera_asks_for_camera_json(tum_folder: Writer) -> None:
         ({"fy": -1.0}, "focal"),
         ({"distortion": "none"}, "distortion"),
         ({"depth_scale": 0}, "depth scale"),
+        ({"width": 64.5}, 'expected an integer under "width"'),
         ({"width": "wide"}, '"width"'),
     ],
 )
