@@ -166,7 +166,9 @@ def _executor(cluster: str | None, needs: RayNeeds, workers: int | None) -> Exec
     if cluster is not None:
         return RayExecutor(cluster, needs, workers)
     if needs.gpus:
-        raise ConfigError(f"--gpus {needs.gpus:g} applies to --cluster. Remove it.")
+        raise ConfigError(
+            f"--gpus {needs.gpus:g} applies only with --cluster. Remove --gpus, or add --cluster."
+        )
     return LocalExecutor(workers or default_workers(needs.cpus, needs.memory_gb))
 
 

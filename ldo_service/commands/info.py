@@ -18,8 +18,8 @@ from ldo_service.runs.source_info import SourceInfo, describe, estimated_run_s
 
 from .options import ConfigFile, Json, Settings, Source, Topics, argument, with_topics
 
-MAX_UNUSED = 12  # Number of unused streams that the table names; --json lists all.
-FIRST_UNIX_S = 946_684_800  # The year 2000. A smaller stamp is no time of day.
+MAX_UNUSED = 12  # Maximum number of unused streams in the table; --json lists all.
+FIRST_UNIX_S = 946_684_800  # The year 2000. A smaller stamp is not a Unix time.
 REGISTRATION = {
     "source": "registered to color in the source",
     "reader": "registered to color when a frame is read",

@@ -127,6 +127,7 @@ def pinhole(fields: dict[str, Any], width: str, height: str, path: Path) -> Came
     coefficients = {f"distortion[{i}]": value for i, value in enumerate(distortion)}
     fx, fy, cx, cy = (number(fields, key, path) for key in ("fx", "fy", "cx", "cy"))
     size = _pixels(fields, width, path), _pixels(fields, height, path)
+    k = tuple(number(coefficients, key, path) for key in coefficients)
     try:
         return Camera(*size, fx, fy, cx, cy, k)
     except DataError as error:
@@ -150,7 +151,7 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read as text: {error}.") from error
+        raise DataError(f"{path} cannot be read as text: {error}. Copy it again.") from error
     numbered_lines = ((number, line.strip()) for number, line in enumerate(lines, 1))
     return [(number, line) for number, line in numbered_lines if line and line[0] != "#"]
 

@@ -4,11 +4,13 @@ A bag needs three topics: color images, depth images, and the camera info of col
 by their types and usual names, or by `SequenceOptions`. The images are sensor_msgs/Image or
 sensor_msgs/CompressedImage. Each color image has the nearest depth image within 20 ms.
 
-Depth is registered to color in the file if both images have the same size and the same frame, or
-if the name of the depth topic says so. Otherwise, depth is registered here, with the camera info of
-depth and the transform between both frames in /tf_static. nav_msgs/Odometry is the recorded
-odometry, if /tf_static connects its base with the camera. Imu and moving transforms are not used;
-`streams` lists them.
+Depth counts as registered to color if both images have the same size and the same viewpoint. The
+viewpoint is the same if the name of the depth topic says so, if the frame_ids are equal, or if the
+transform between them is the identity. Otherwise, this module registers depth to color with the
+camera info of depth and this transform, which it reads from /tf_static or from the topics of
+RealSense Viewer. A topic with nav_msgs/Odometry is the recorded odometry, if /tf_static connects
+its base with the camera. Inertial measurements and moving transforms are not used; `streams` lists
+them.
 """
 
 import logging

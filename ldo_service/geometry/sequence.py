@@ -60,7 +60,7 @@ class Sequence(ABC):
         stamps_ns: Stamps, [len] int64, ascending.
         depth_offsets_ns: Stamps of the depth images minus `stamps_ns`, [len] int64; None if depth
             has no stamps of its own.
-        registration: Where depth is registered to color: in the source, by `read`, or nowhere.
+        registration: Step that registers depth to color: the source, `read`, or none.
         streams: Streams of the recording, used or not; empty if it has only color and depth.
     """
 
