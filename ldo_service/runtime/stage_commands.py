@@ -19,19 +19,26 @@ every actor, producers first, so that no message of the old run is in flight whe
 restart. Otherwise a graph correction from before the reset could arrive after it. The graph version
 of this correction would be higher than the first versions after the reset, so the actors would
 ignore the first new corrections.
+
+If a reset does not reach all actors, some states are from before the reset and some from after it.
+`Control` therefore writes a marker to the disk before the first actor is reset, and removes it
+after the last one. While the marker exists, no frames are taken, and the next start of the service
+completes the reset.
 """
 
 import asyncio
 import logging
 import secrets
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import msgspec
 
 from ldo_service.schemas import ControlAnswer, ControlRequest, decode, encode
+from ldo_service.storage.atomic_write import write_atomically
 from ldo_service.transport.flow_control import encode_link
 from ldo_service.transport.interface import Transport, call_soon
 
@@ -45,6 +52,8 @@ REPEAT_AFTER_S = 0.25
 # Minimum time that each actor has to reply to a command, seconds: three times the slowest step
 # measured.
 MIN_S = 2.0
+# Time between two attempts to complete a reset that the previous process began, seconds.
+COMPLETE_AGAIN_S = 2.0
 
 
 What = Literal["pause", "resume", "reset", "save"]
@@ -165,6 +174,7 @@ class Control:
         sources: Sequence[str],
         saved_where: str,
         timeout_s: float,
+        reset_marker: Path | None = None,
     ) -> None:
         """Connect to the stages.
 
@@ -174,19 +184,25 @@ class Control:
             sources: Names of the actors with inputs from outside the service.
             saved_where: Description of the state folder, for replies.
             timeout_s: Time limit of a command for all actors together, seconds.
+            reset_marker: File that exists while a reset is not complete; None: no file. If the
+                previous process left it, this object completes the reset.
         """
+        self._reset_marker = reset_marker
         self._commander = CommandSender(transport)
         self._actors, self._sources = tuple(actors), tuple(sources)
         self._saved_where, self._timeout_s = saved_where, timeout_s
         self._is_paused = False
         self._one_at_a_time = asyncio.Lock()
-        self._tasks: set[asyncio.Task[str]] = set()
+        self._tasks: set[asyncio.Task[object]] = set()
         self._verbs: dict[str, Callable[[], Awaitable[str]]] = {
             "pause": self._pause,
             "resume": self._resume,
             "save": self._save,
             "reset": self._reset,
         }
+        self._is_reset_pending = reset_marker is not None and reset_marker.exists()
+        if self._is_reset_pending:
+            self._start(self._complete_reset())
         transport.watch_liveliness(self._presence)
 
     async def answer(self, body: bytes) -> bytes:
@@ -213,6 +229,8 @@ class Control:
 
     def close(self) -> None:
         """Close the publisher of commands."""
+        for task in self._tasks:
+            task.cancel()
         self._commander.close()
 
     # --- verbs ------------------------------------------------------------------------------------
@@ -222,6 +240,11 @@ class Control:
         return "frames are dropped and counted until `resume`."
 
     async def _resume(self) -> str:
+        if self._is_reset_pending:
+            raise ControlError(
+                "the last reset is not complete, so the actors have states of two runs. Repeat "
+                "`ldo control reset`."
+            )
         self._is_paused = False
         await self._each("resume", self._sources)
         return "frames are processed again."
@@ -233,12 +256,55 @@ class Control:
     async def _reset(self) -> str:
         try:
             await self._each("pause", self._actors)
+            self._mark_reset()
             await self._each("reset", self._actors)
-        finally:
-            held = self._sources if self._is_paused else ()
-            await self._each("resume", [actor for actor in self._actors if actor not in held])
+        except ControlError as error:
+            with suppress(ControlError):
+                await self._resume_actors()
+            if not self._is_reset_pending:
+                raise
+            raise ControlError(
+                f"{error} Frames are dropped until the reset is complete. A restart of the service "
+                "completes it too."
+            ) from error
+        self._is_reset_pending = False
+        if self._reset_marker is not None:
+            self._reset_marker.unlink(missing_ok=True)
+        await self._resume_actors()
         still = " Frames stay paused." if self._is_paused else ""
         return f"{', '.join(self._actors)} restarted with an empty state.{still}"
+
+    async def _resume_actors(self) -> None:
+        """Resume all actors, except the sources while frames must not be taken."""
+        held = self._sources if self._is_paused or self._is_reset_pending else ()
+        await self._each("resume", [actor for actor in self._actors if actor not in held])
+
+    def _mark_reset(self) -> None:
+        """Write the marker of an incomplete reset to the disk.
+
+        Raises:
+            ControlError: The disk is full or cannot be written. No actor was reset.
+        """
+        if self._reset_marker is not None:
+            try:
+                write_atomically(self._reset_marker, b"", syncs=True)
+            except OSError as error:
+                raise ControlError(
+                    f"no actor was reset, because {self._reset_marker} cannot be written: "
+                    f"{error.strerror}. Free some disk space, then repeat the command."
+                ) from error
+        self._is_reset_pending = True
+
+    async def _complete_reset(self) -> None:
+        """Complete the reset that the previous process began, when all actors are running."""
+        log.warning("completing the reset that the previous process of the service began; frames "
+                    "are dropped until all actors have started.")  # fmt: skip
+        while self._is_reset_pending:
+            async with self._one_at_a_time:
+                with suppress(ControlError):
+                    if self._is_reset_pending:
+                        log.info("reset: %s", await self._reset())
+            await asyncio.sleep(COMPLETE_AGAIN_S)
 
     async def _each(self, what: What, actors: Sequence[str]) -> None:
         """Send a command to the actors, one after the other, and wait for each reply.
@@ -264,10 +330,13 @@ class Control:
     # --- actors that were restarted ---------------------------------------------------------------
     def _presence(self, name: str, alive: bool) -> None:
         """Pause a restarted source actor again; its saved state does not include the pause."""
-        if alive and self._is_paused and name in self._sources:
-            task = asyncio.ensure_future(self._commander.order("pause", name, self._timeout_s))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+        if alive and (self._is_paused or self._is_reset_pending) and name in self._sources:
+            self._start(self._commander.order("pause", name, self._timeout_s))
+
+    def _start(self, work: Coroutine[Any, Any, object]) -> None:
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
 
 def _answer(stamp_ns: int, ok: bool, text: str) -> ControlAnswer:

@@ -1,6 +1,7 @@
 """State folder of a service: its lock, and checks of the actors' saved states."""
 
 import fcntl
+import logging
 import os
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
@@ -9,8 +10,12 @@ from pathlib import Path
 
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.delivery_state import RestoredState
-from ldo_service.storage.state_store import FolderStore
+from ldo_service.storage.state_store import CONTENTS, FolderStore
 
+log = logging.getLogger(__name__)
+
+# File that exists while a reset of the actors is not complete; see `Control`.
+RESET_MARKER = "reset"
 # Actors whose states refer to each other. Each one saves a state before the first keyframe arrives.
 INTERDEPENDENT_ACTORS = ("tracker", "mapper", "optimizer")
 
@@ -76,6 +81,7 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
             f"another service uses the state folder {folder}. Choose another folder with --state."
         ) from error
     store = FolderStore(folder / "state")
+    _complete_reset(folder, store, remote_actors)
     local = [name for name in INTERDEPENDENT_ACTORS if name not in remote_actors]
     pasts = {name: RestoredState.of(store.load(name)) for name in local}
     missing = [name for name, past in pasts.items() if past.is_none]
@@ -85,24 +91,51 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
             "actors. Choose another folder with --state, or delete this folder to start with an "
             "empty map."
         )
-    for topic, producer, consumer in _inconsistent_states(pasts):
+    for topic, producer, consumer, why in _inconsistent_states(pasts):
         raise ConfigError(
-            f"in {folder} the state of {consumer} is newer than the state of {producer}: the newer "
-            f"state counts messages of {topic} that {producer} has not produced. Restore the whole "
-            "folder from one copy, choose another folder with --state, or delete this folder to "
-            "start with an empty map."
+            f"in {folder} the states of {producer} and {consumer} do not belong together: {why} "
+            f"on {topic}. Restore the whole folder from one copy, choose another folder with "
+            "--state, or delete this folder to start with an empty map."
         )
 
 
-def _inconsistent_states(pasts: Mapping[str, RestoredState]) -> Iterator[tuple[str, str, str]]:
-    """Yield each topic of which the consumer has handled messages unknown to the producer.
+def _complete_reset(folder: Path, store: FolderStore, remote_actors: Collection[str]) -> None:
+    """Delete the states of the local actors if the previous process was killed during a reset.
 
-    The saved state of the producer is then older than that of the consumer. Each item has the
-    topic, the producer and the consumer.
+    If there are remote actors, the marker stays: `Control` then resets them too, and removes the
+    marker.
+    """
+    marker = folder / RESET_MARKER
+    if not marker.exists():
+        return
+    log.warning(
+        "%s: the previous process ended during a reset, which is completed now: the service starts "
+        "with an empty map.",
+        folder,
+    )
+    for state in sorted((folder / "state").glob(f"*/{CONTENTS}")):
+        store.delete(state.parent.name)
+    if not remote_actors:
+        marker.unlink()
+
+
+def _inconsistent_states(
+    pasts: Mapping[str, RestoredState],
+) -> Iterator[tuple[str, str, str, str]]:
+    """Yield each topic of which the saved states of producer and consumer do not fit.
+
+    The consumer has then handled messages of another run, or messages unknown to the producer,
+    whose saved state is older. Each item has the topic, the producer, the consumer, and a
+    description of the difference.
     """
     for producer, past in pasts.items():
         for topic, made in past.outputs.items():
             for consumer, other in pasts.items():
                 had = other.inputs.get(topic)
-                if had and had.epoch == made.epoch and had.handled > made.seq:
-                    yield topic, producer, consumer
+                if had is None or not had.handled:
+                    continue
+                if had.epoch != made.epoch:
+                    yield topic, producer, consumer, f"{consumer} has messages of another run"
+                elif had.handled > made.seq:
+                    newer = f"{consumer} is newer than {producer}, and has messages that {producer}"
+                    yield topic, producer, consumer, f"{newer} has not produced"

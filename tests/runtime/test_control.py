@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.runtime.stage import Stage
@@ -36,10 +37,27 @@ class FullStore(MemoryStore):
         raise OSError("disk full")
 
 
+class LockedStore(MemoryStore):
+    """A store that cannot delete states while `is_locked`."""
+
+    is_locked = True
+
+    def delete(self, actor: str) -> None:
+        if self.is_locked:
+            raise OSError("read-only file system")
+        super().delete(actor)
+
+
 class Scene:
     """A source, a collector and the control of their service."""
 
-    def __init__(self, store: StateStore | None = None, timeout_s: float = 5.0) -> None:
+    def __init__(
+        self,
+        store: StateStore | None = None,
+        timeout_s: float = 5.0,
+        reset_marker: Path | None = None,
+    ) -> None:
+        self._reset_marker = reset_marker
         self.transport, self.seen = MemoryTransport(), []
         self.source = Stage(Source, self.transport, config=QUICK, store=store)
         self.collector = Stage(lambda: Collector(self.seen), self.transport, config=QUICK)
@@ -49,7 +67,10 @@ class Scene:
     async def started(self) -> AsyncIterator[None]:
         async with running(self.source, self.collector):
             actors = ("source", "collector")
-            self.control = Control(self.transport, actors, ("source",), "here", self._timeout_s)
+            self.control = Control(
+                *(self.transport, actors, ("source",), "here", self._timeout_s),
+                self._reset_marker,
+            )
             yield
 
     async def request(self, verb: str) -> ControlAnswer:
@@ -141,3 +162,45 @@ async def test_restarted_source_is_paused_again() -> None:
     restarted = Stage(Source, scene.transport, config=QUICK)
     async with running(restarted):
         await eventually(lambda: restarted.health().paused)
+
+
+async def test_incomplete_reset_holds_the_sources_until_it_is_repeated(tmp_path: Path) -> None:
+    store, marker = LockedStore(), tmp_path / "reset"
+    scene = Scene(store, reset_marker=marker)
+    async with scene.started():
+        scene.send(1)
+        await eventually(lambda: scene.seen == [1])
+        answer = await scene.request("reset")
+        assert not answer.ok
+        assert "source OSError: read-only" in answer.message
+        assert marker.exists(), "the next start has to complete the reset"
+        source, collector = scene.health()
+        assert (source.paused, collector.paused) == (True, False)
+        refused = await scene.request("resume")
+        assert "the last reset is not complete" in refused.message
+        store.is_locked = False
+        assert (await scene.request("reset")).ok
+        assert not marker.exists()
+        scene.send(2)
+        await eventually(lambda: scene.seen == [1, 2])
+
+
+async def test_reset_of_the_previous_process_is_completed(tmp_path: Path) -> None:
+    marker = tmp_path / "reset"
+    marker.touch()
+    scene = Scene(reset_marker=marker)
+    before = [health.epoch for health in scene.health()]
+    async with scene.started():
+        await eventually(lambda: not marker.exists())
+        assert all(health.epoch != old for health, old in zip(scene.health(), before, strict=True))
+        await eventually(lambda: not scene.health()[0].paused)
+
+
+async def test_reset_without_a_marker_on_the_disk_is_refused(tmp_path: Path) -> None:
+    scene = Scene(reset_marker=tmp_path / "absent" / "reset")
+    async with scene.started():
+        before = [health.epoch for health in scene.health()]
+        answer = await scene.request("reset")
+        assert "no actor was reset" in answer.message
+        assert [health.epoch for health in scene.health()] == before
+        assert not any(health.paused for health in scene.health())

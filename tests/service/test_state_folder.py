@@ -9,7 +9,7 @@ from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.service.state_folder import claim_state
+from ldo_service.service.state_folder import RESET_MARKER, claim_state
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 ACTORS = {"tracker": Tracker, "mapper": Mapper, "optimizer": Optimizer}
@@ -64,5 +64,36 @@ def test_state_with_tracker_older_than_mapper_is_rejected(tmp_path: Path) -> Non
     offsets = {"in": {"keyframe/new": (1, 6)}, "out": {}}
     state = {**Mapper().snapshot(), "stage.offsets": offsets}
     FolderStore(tmp_path / "state").save("mapper", state)
-    with pytest.raises(ConfigError, match="mapper is newer than the state of tracker"):
+    with pytest.raises(ConfigError, match="mapper is newer than tracker"):
         claim(tmp_path)
+
+
+def test_states_of_two_runs_are_rejected(tmp_path: Path) -> None:
+    """The mapper of the first run would drop the keyframes of the second run as repeated."""
+    save_states(tmp_path, 0, *ACTORS)
+    offsets = {"in": {"keyframe/new": (7, 6)}, "out": {}}
+    state = {**Mapper().snapshot(), "stage.offsets": offsets}
+    FolderStore(tmp_path / "state").save("mapper", state)
+    with pytest.raises(ConfigError, match="mapper has messages of another run on keyframe/new"):
+        claim(tmp_path)
+
+
+def test_interrupted_reset_is_completed_at_the_next_start(tmp_path: Path) -> None:
+    save_states(tmp_path, 0, *ACTORS)
+    offsets = {"in": {"keyframe/new": (7, 6)}, "out": {}}
+    state = {**Mapper().snapshot(), "stage.offsets": offsets}
+    FolderStore(tmp_path / "state").save("mapper", state)
+    FolderStore(tmp_path / "state").save("loop_closer", {"places": [1]})
+    (tmp_path / RESET_MARKER).touch()
+    claim(tmp_path)
+    store = FolderStore(tmp_path / "state")
+    assert [store.load(actor) for actor in (*ACTORS, "loop_closer")] == [None] * 4
+    assert not (tmp_path / RESET_MARKER).exists()
+
+
+def test_interrupted_reset_of_remote_actors_stays_marked(tmp_path: Path) -> None:
+    save_states(tmp_path, 5, *ACTORS)
+    (tmp_path / RESET_MARKER).touch()
+    with ExitStack() as stack:
+        claim_state(tmp_path, stack, ("optimizer",))
+    assert (tmp_path / RESET_MARKER).exists(), "`Control` still has to reset the optimizer"
