@@ -62,9 +62,21 @@ class Health(Message, frozen=True, kw_only=True):
     outputs: tuple[OutputCount, ...]
     metrics: dict[str, float] = {}  # Metrics of the actor by name.
     paused: bool = False  # True while the stage takes no messages, after the command `pause`.
+    failing: bool = False  # True if each of the last three messages failed twice.
+    # Messages that ended the actor's process repeatedly and are saved instead of handled, since the
+    # first start of the service with this state folder.
+    quarantined: int = 0
 
     def check(self) -> None:
-        for name in ("pid", "epoch", "steps", "failures", "restarts", "dead_lettered"):
+        for name in (
+            "pid",
+            "epoch",
+            "steps",
+            "failures",
+            "restarts",
+            "dead_lettered",
+            "quarantined",
+        ):
             require_count(name, getattr(self, name))
         times = (self.step_age_s, self.current_step_s, self.step_ms_p50, self.step_ms_p95)
         require_finite("health", (*times, self.rss_mb, *self.metrics.values()))

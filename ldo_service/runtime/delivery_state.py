@@ -23,6 +23,7 @@ from ldo_service.storage.state_store import State
 from ldo_service.transport.flow_control import InletPosition, OutletPosition, UnackedMessage
 
 from .actor import Actor, FlowStatus
+from .inlet import Delivery
 from .step import produce
 
 log = logging.getLogger(__name__)
@@ -56,6 +57,19 @@ class LoggedInput(NamedTuple):
             credits=counts_by_topic(self.credits, (out.topic for out in actor.outputs)),
             backlog=counts_by_topic(self.backlog, (port.topic for port in actor.inputs)),
         )
+
+
+def logged_input(actor: Actor, delivery: Delivery | None) -> LoggedInput | None:
+    """Return the write-ahead log entry of an actor's step; None unless `Actor.lags`.
+
+    Args:
+        actor: The actor, with the flow status of the step.
+        delivery: Input of the step; None for idle work.
+    """
+    if not actor.lags:
+        return None
+    topic, body = (delivery.port.topic.name, delivery.body) if delivery else ("", b"")
+    return LoggedInput.of(topic, body, actor.situation)
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,12 @@ from ldo_service.transport.worker import Worker
 from ._heartbeat import Heartbeat
 from .actor import Actor, FlowStatus
 from .checkpointer import Checkpointer
-from .delivery_state import LoggedInput
+from .delivery_state import logged_input
 from .inlet import Delivery
 from .journal import Journal, Kind, close_journal
 from .mailbox import Mailbox
 from .outlets import OutletOpener, Outlets
+from .quarantine import Quarantine
 from .restoring import ActorRestorer, FailureLog
 from .stage_commands import CommandReceiver, StageCommand
 from .stage_metrics import StageMetrics
@@ -59,6 +60,7 @@ class Stage:
         on_evicted: Callable[[str], None] = lambda _consumer: None,
         journal: Journal | None = None,
         heartbeat: Heartbeat | None = None,
+        suspects: asyncio.Lock | None = None,
     ) -> None:
         """Create the actor and restore its last saved state.
 
@@ -72,6 +74,7 @@ class Stage:
             on_evicted: Called with the name of an evicted consumer.
             journal: Receiver of the journal entries.
             heartbeat: Heartbeat of this process; None if no parent process reads it.
+            suspects: Lock that all stages of this process share; see `Quarantine`.
         """
         self._transport = transport
         self._config = config = config or SupervisionConfig()
@@ -88,6 +91,8 @@ class Stage:
         self._actor = self._restorer.restore()
         self.name = self._actor.name
         self._restorer.open_budget(self.name)
+        self._quarantine = Quarantine(store.quarantine_folder(self.name), suspects)
+        self._metrics.quarantined = self._quarantine.count
         self._epoch = new_epoch()
         self._drain_requested = False
         self._is_idle_failed = False  # The last idle work failed.
@@ -120,6 +125,9 @@ class Stage:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
+        except asyncio.CancelledError:
+            self._quarantine.withdraw()
+            raise
         finally:
             for task in tasks:
                 task.cancel()
@@ -208,7 +216,11 @@ class Stage:
         if isinstance(delivery, StageCommand):
             await self._execute(delivery, mailbox)
             return
-        message = self._reader.message_of(delivery)
+        is_due = self._quarantine.is_due(delivery)
+        if is_due:
+            self._metrics.quarantined = self._quarantine.add(self.name, delivery)
+            await self._saver.save(self._actor, delivery)
+        message = None if is_due else self._reader.message_of(delivery)
         if message is not None:
             self._journal.record_input(delivery, message.stamp_ns)
             await self._step(message, delivery)
@@ -221,7 +233,7 @@ class Stage:
                 if attempt:
                     self._restorer.charge()  # The message has no fault: its repetition succeeded.
                 return
-        self._metrics.dead_lettered += 1
+        self._metrics.record_dead_letter()
         self._journal.record_step("dead_lettered", FlowStatus())
         await self._saver.save(self._actor, delivery)
         self._failure_log.dead_lettered(self.name, message, self._metrics.dead_lettered)
@@ -269,10 +281,12 @@ class Stage:
         """
         self._update_flow_status()
         try:
-            with self._metrics.step():
-                produced = await self._worker.run(lambda: produce(self._actor, work()))
+            async with self._quarantine.counting(delivery):
+                with self._metrics.step():
+                    produced = await self._worker.run(lambda: produce(self._actor, work()))
             self._outlets.stage_outputs(produced)
-            is_saved = await self._saver.save(self._actor, delivery, self._logged(delivery))
+            logged = logged_input(self._actor, delivery)
+            is_saved = await self._saver.save(self._actor, delivery, logged)
         except UnsavedStateError:
             raise
         except Exception as error:
@@ -283,13 +297,6 @@ class Stage:
         self._journal.record_step(kinds[0], self._actor.situation, produced)
         await self._outlets.release(is_saved=is_saved)
         return produced
-
-    def _logged(self, delivery: Delivery | None) -> LoggedInput | None:
-        """Return the write-ahead log entry of a step; None unless `Actor.lags`."""
-        if not self._actor.lags:
-            return None
-        topic, body = (delivery.port.topic.name, delivery.body) if delivery else ("", b"")
-        return LoggedInput.of(topic, body, self._actor.situation)
 
     async def _save_and_send(self, produced: list[Produced], *, whole: bool = False) -> None:
         self._outlets.stage_outputs(produced)

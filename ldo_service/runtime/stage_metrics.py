@@ -17,6 +17,10 @@ from ._heartbeat import Heartbeat
 from .process import resident_mb
 from .supervision_policy import RunningClock
 
+# Consecutive dead letters after which an actor counts as failing: one or two have their cause in
+# the messages, more of them in the actor.
+FAILING_AFTER = 3
+
 
 @dataclass
 class StageMetrics:
@@ -28,6 +32,8 @@ class StageMetrics:
     failures: int = 0
     restarts: int = 0
     dead_lettered: int = 0
+    dead_lettered_in_a_row: int = 0  # Dead letters since the last message that was handled.
+    quarantined: int = 0  # Messages that ended the process repeatedly, since the first start.
     # Durations of the last 200 timed steps, ms; see `record_step`.
     step_ms: deque[float] = field(default_factory=lambda: deque(maxlen=200))
     last_step_ms: float = 0.0
@@ -62,10 +68,16 @@ class StageMetrics:
                 their input are not added, because they would lower the percentiles.
         """
         self.steps += 1
+        self.dead_lettered_in_a_row = 0
         if is_timed:
             self.step_ms.append(self.last_step_ms)
         self.last_stamp_ns = message.stamp_ns
         self.finished_at_s = time.monotonic()
+
+    def record_dead_letter(self) -> None:
+        """Count a message that failed twice."""
+        self.dead_lettered += 1
+        self.dead_lettered_in_a_row += 1
 
     @property
     def busy_s(self) -> float:
@@ -92,5 +104,7 @@ class StageMetrics:
             rss_mb=resident_mb(),
             # A metric that is no number must not suppress the heartbeat.
             metrics={name: value for name, value in self.facts.items() if isfinite(value)},
+            failing=self.dead_lettered_in_a_row >= FAILING_AFTER,
+            quarantined=self.quarantined,
             **of_the_stage,
         )

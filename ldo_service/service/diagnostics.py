@@ -112,6 +112,19 @@ def _waits_for_server(health: Health) -> bool:
 
 
 def _of_failures(health: Health) -> Iterator[Problem]:
+    if health.failing:
+        yield Problem(
+            f"fails on every message and produces nothing ({health.dead_lettered} dead letters)",
+            "the log of `ldo serve` has the traceback; restart the service with the settings that "
+            "worked last, or start with an empty map by `ldo control reset`",
+        )
+    if health.quarantined:
+        yield Problem(
+            f"has quarantined {health.quarantined} messages, because each of them ended its "
+            "process three times",
+            f"report the files in state/{health.actor}.quarantine of the state folder; delete that "
+            "folder while the service is stopped to clear the count",
+        )
     if health.dead_lettered or health.restarts:
         yield Problem(
             f"failed {health.failures} times, was restarted {health.restarts} times and discarded "

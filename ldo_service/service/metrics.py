@@ -7,6 +7,8 @@ It listens on loopback by default.
   of its last heartbeat.
 - `/healthz`: 200 while every actor sends heartbeats, else 503 with the names of the silent actors.
   The reply describes only the current state.
+- `/readyz`: 200 while no actor is silent and no actor fails on every message, else 503 with the
+  names of these actors. A restart of the service does not help an actor that fails.
 """
 
 import socket
@@ -51,6 +53,16 @@ OF_ACTOR: dict[Row, Callable[[Health], float]] = {
         "dead_letters",
         "Messages that the actor discarded because their handling failed twice.",
     ): lambda h: h.dead_lettered,
+    (
+        CounterMetricFamily,
+        "quarantined",
+        "Messages that ended the process of the actor repeatedly.",
+    ): lambda h: h.quarantined,
+    (
+        GaugeMetricFamily,
+        "failing",
+        "1 if the actor failed on each of its last messages.",
+    ): lambda h: h.failing,
     (GaugeMetricFamily, "step_age_seconds", "Time since the last step ended."): lambda h: (
         h.step_age_s
     ),
@@ -187,6 +199,11 @@ class HealthCollector(Collector):
             heard = {actor for actor, (at_s, _) in self._last.items() if at_s > since_s}
         return sorted({*self._actors} - heard)
 
+    def failing_actors(self) -> list[str]:
+        """Return the names of the actors that failed on each of their last messages."""
+        with self._lock:
+            return sorted(actor for actor, (_, health) in self._last.items() if health.failing)
+
     @staticmethod
     def _ages(last: dict[str, tuple[float, Health]]) -> Metric:
         ages = GaugeMetricFamily(
@@ -309,7 +326,10 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
 
     def answer(environ: Any, start_response: Any) -> Iterable[bytes]:
         if environ["PATH_INFO"] == "/healthz":
-            return _how_it_is(collector.silent_actors(), start_response)
+            return _how_it_is(collector.silent_actors(), [], start_response)
+        if environ["PATH_INFO"] == "/readyz":
+            silent, failing = collector.silent_actors(), collector.failing_actors()
+            return _how_it_is(silent, failing, start_response)
         return metrics(environ, start_response)
 
     try:
@@ -331,8 +351,9 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
         thread.join()
 
 
-def _how_it_is(silent: list[str], start_response: Any) -> list[bytes]:
-    status = "503 Service Unavailable" if silent else "200 OK"
+def _how_it_is(silent: list[str], failing: list[str], start_response: Any) -> list[bytes]:
+    status = "503 Service Unavailable" if silent or failing else "200 OK"
     start_response(status, [("Content-Type", "text/plain; charset=utf-8")])
-    help_text = f"no heartbeat: {', '.join(silent)}" if silent else "every actor reports"
-    return [f"{help_text}\n".encode()]
+    problems = [f"no heartbeat: {', '.join(silent)}"] if silent else []
+    problems += [f"failing on every message: {', '.join(failing)}"] if failing else []
+    return [f"{'; '.join(problems) or 'every actor reports'}\n".encode()]

@@ -195,6 +195,7 @@ class Service:
         """Create the stages and child processes, in the order in which they finish."""
         children: dict[str, ChildProcess] = {}
         runners: list[Runner] = []
+        suspects = asyncio.Lock()  # Shared by all stages of this process.
         for box in finish_order(GRAPH):
             is_elsewhere = not self.only and box.name in self.config.service.remote_actors
             if is_elsewhere or (self.only and box.name not in self.only):
@@ -203,11 +204,15 @@ class Service:
                 children[box.name] = self._child(box, transport)
                 runners.append(children[box.name])
             else:
-                runners.append(self._stage(box, transport, children))
+                runners.append(self._stage(box, transport, children, suspects))
         return runners
 
     def _stage(
-        self, box: ActorSpec, transport: ZenohTransport, children: dict[str, ChildProcess]
+        self,
+        box: ActorSpec,
+        transport: ZenohTransport,
+        children: dict[str, ChildProcess],
+        suspects: asyncio.Lock,
     ) -> Stage:
         def evicted(consumer: str) -> None:
             if consumer in children:
@@ -233,6 +238,7 @@ class Service:
                 on_evicted=evicted,
                 journal=self._journal(box.name, Path(config.mapper.image_folder)),
                 heartbeat=start_heartbeat() if self.only else None,
+                suspects=suspects,
             )
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise ConfigError(

@@ -53,6 +53,14 @@ class StateStore(Protocol):
         """
         ...
 
+    def quarantine_folder(self, actor: str) -> Path | None:
+        """Return the folder for messages that end an actor's process.
+
+        Returns:
+            The folder; None if the store is in memory, which does not survive the process either.
+        """
+        ...
+
     def save(self, actor: str, state: State) -> None:
         """Replace the state of an actor; an empty state is ignored."""
         ...
@@ -76,6 +84,10 @@ class MemoryStore:
 
     def backlog_folder(self, actor: str) -> None:  # noqa: ARG002
         """Return None: unhandled messages are kept in memory, as the states are."""
+        return
+
+    def quarantine_folder(self, actor: str) -> None:  # noqa: ARG002
+        """Return None: the deliveries of messages are not counted."""
         return
 
     def save(self, actor: str, state: State) -> None:
@@ -114,6 +126,10 @@ class FolderStore:
     def backlog_folder(self, actor: str) -> Path:
         """Return the folder for messages that an actor's consumers have not handled."""
         return self._folder / f"{actor}.backlog"
+
+    def quarantine_folder(self, actor: str) -> Path:
+        """Return the folder for messages that end an actor's process."""
+        return self._folder / f"{actor}.quarantine"
 
     def save(self, actor: str, state: State) -> None:
         """Replace the state of an actor; an empty state is ignored.

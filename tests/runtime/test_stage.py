@@ -16,6 +16,7 @@ from ldo_service.runtime.stage import Stage, SupervisionConfig, new_epoch
 from ldo_service.runtime.stage_metrics import StageMetrics
 from ldo_service.runtime.supervision_policy import RunningClock
 from ldo_service.schemas import Health, Message, decode
+from ldo_service.service.diagnostics import ActorStatus, diagnose
 from ldo_service.storage.state_store import FolderStore, MemoryStore, State
 from ldo_service.transport.interface import MemoryTransport
 
@@ -164,6 +165,24 @@ async def test_undeclared_output_is_a_failed_step() -> None:
     async with running(stage):
         await send(numbers, number(1))
         await eventually(lambda: stage.health().dead_lettered == 1)
+
+
+async def test_actor_that_fails_on_every_message_is_failing_until_one_is_handled() -> None:
+    config = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001)
+    transport = MemoryTransport()
+    stage = Stage(lambda: Adder(_fail_below(3)), transport, config=config)
+    numbers = source(transport, "adder")
+    async with running(stage):
+        for value, dead_letters in enumerate((1, 2, 3)):
+            assert not stage.health().failing
+            await send(numbers, number(value))
+            await eventually(lambda n=dead_letters: stage.health().dead_lettered == n)
+        assert stage.health().failing
+        problems = [str(problem) for problem in diagnose(ActorStatus("a", True, stage.health(), 1))]
+        assert any("fails on every message" in problem for problem in problems)
+        await send(numbers, number(3))
+        await eventually(lambda: stage.health().steps == 1)
+        assert not stage.health().failing
 
 
 async def test_messages_that_always_fail_do_not_end_the_stage() -> None:

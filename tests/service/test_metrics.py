@@ -50,10 +50,10 @@ def labels(*own: tuple[str, str]) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((("robot", "mule"), *own)))
 
 
-def read_healthz(port: int) -> tuple[int, str]:
-    """Return the status and text of /healthz."""
+def read_healthz(port: int, path: str = "healthz") -> tuple[int, str]:
+    """Return the status and text of /healthz or /readyz."""
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=60) as reply:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/{path}", timeout=60) as reply:
             return reply.status, reply.read().decode().strip()
     except urllib.error.HTTPError as error:
         return error.code, error.read().decode().strip()
@@ -74,6 +74,19 @@ def test_healthz_requires_a_recent_heartbeat_of_every_actor(
         later_s = time.monotonic() + 2 * (10 + COMES_BACK_S)
         monkeypatch.setattr("ldo_service.service.metrics.time.monotonic", lambda: later_s)
         assert read_healthz(port) == (503, "no heartbeat: mapper, tracker")
+
+
+def test_readyz_names_an_actor_that_fails_on_every_message_and_healthz_does_not() -> None:
+    collector, port = HealthCollector("mule", ["mapper"]), free_port()
+    with serve_metrics(collector, port):
+        for failing, expected in (
+            (True, (503, "failing on every message: mapper")),
+            (False, (200, "every actor reports")),
+        ):
+            health = msgspec.structs.replace(EXAMPLES["health"], failing=failing)
+            collector.on_health(b"", memoryview(encode(health)))
+            assert read_healthz(port, "readyz") == expected
+            assert read_healthz(port) == (200, "every actor reports")
 
 
 def test_actor_is_silent_only_after_its_heartbeat_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,6 +155,8 @@ def test_every_value_of_a_health_message_is_exported(port: int) -> None:
         ("ldo_restarts_total", labels(mapper)): 2,
         ("ldo_process_restarts_total", labels(mapper)): 0,
         ("ldo_dead_letters_total", labels(mapper)): 1,
+        ("ldo_quarantined_total", labels(mapper)): 0,
+        ("ldo_failing", labels(mapper)): 0,
         ("ldo_step_age_seconds", labels(mapper)): 0.25,
         ("ldo_current_step_seconds", labels(mapper)): 0.125,
         ("ldo_step_seconds", labels(mapper, ("quantile", "0.5"))): 0.02,

@@ -1,0 +1,161 @@
+"""Quarantine of messages that end the process of their actor.
+
+A message that raises an exception becomes a dead letter. A message that kills the process (SIGSEGV,
+out of memory) or hangs would be delivered again after every restart. The stage therefore counts the
+deliveries on the disk, before it handles a message.
+"""
+
+import asyncio
+import hashlib
+import logging
+import os
+import struct
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, nullcontext, suppress
+from pathlib import Path
+
+import msgspec
+
+from ldo_service.storage.atomic_write import write_atomically
+
+from .actor import Lossless
+from .inlet import Delivery
+
+log = logging.getLogger(__name__)
+
+MAX_DELIVERIES = 3  # Deliveries after which a message that ended its process is not handled again.
+MAX_FILES = 20  # Messages that are kept on the disk; older ones are deleted.
+SUFFIX = ".message"
+_RECORD = struct.Struct("<16sII")  # Digest of the last message, its deliveries, all quarantined.
+
+
+class QuarantinedMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """Content of a file in the quarantine folder, as MessagePack."""
+
+    topic: str
+    source: str
+    epoch: int
+    seq: int
+    stamp_ns: int
+    deliveries: int
+    body: bytes
+
+
+class Quarantine:
+    """Count of the deliveries of the current message, and folder of quarantined messages.
+
+    Only lossless inputs deliver a message again. A message that ended its process before is
+    handled alone: the other suspected messages of the process wait. If a process with several
+    actors ends, a message of another actor therefore gets no second count.
+
+    Attributes:
+        count: Number of quarantined messages since the state folder is in use.
+    """
+
+    def __init__(self, folder: Path | None, suspects: asyncio.Lock | None = None) -> None:
+        """Read the count of the previous process.
+
+        Args:
+            folder: Folder of the counts and messages; None: nothing is counted.
+            suspects: Lock of this process for the handling of suspected messages.
+        """
+        self._folder, self._suspects = folder, suspects or asyncio.Lock()
+        self._key, self._deliveries, self.count = b"", 0, 0
+        if folder is not None:
+            with suppress(OSError, struct.error):
+                self._key, self._deliveries, self.count = _RECORD.unpack(self._path.read_bytes())
+
+    def is_due(self, delivery: Delivery) -> bool:
+        """Return whether a message has ended the process too often to be handled again."""
+        return self._deliveries_of(delivery) >= MAX_DELIVERIES
+
+    @asynccontextmanager
+    async def counting(self, delivery: Delivery | None) -> AsyncIterator[None]:
+        """Count a delivery while the block handles it.
+
+        The count stays if the process ends inside the block, or if the block is cancelled; see
+        `withdraw`. It is cleared if the block ends in any other way.
+        """
+        if self._folder is None or delivery is None or not _is_repeated(delivery):
+            yield
+            return
+        is_suspect = self._deliveries_of(delivery) > 0
+        async with self._suspects if is_suspect else nullcontext():
+            self._store(_key_of(delivery), self._deliveries_of(delivery) + 1)
+            try:
+                yield
+            except Exception:
+                self._store(b"", 0)
+                raise
+            self._store(b"", 0)
+
+    def withdraw(self) -> None:
+        """Take back the count of the current message, which a stop of the service interrupted."""
+        if self._deliveries:
+            self._store(self._key, self._deliveries - 1)
+
+    def add(self, actor: str, delivery: Delivery) -> int:
+        """Write a message to the folder, log it, and return the new `count`."""
+        assert self._folder is not None
+        self.count += 1
+        deliveries = self._deliveries
+        self._store(self._key, deliveries)  # The message stays due until the stage has saved.
+        header, topic = delivery.header, delivery.port.topic.name
+        path = self._folder / f"{topic.replace('/', '.')}-{header.epoch}-{header.seq}{SUFFIX}"
+        message = QuarantinedMessage(
+            topic=topic,
+            source=header.source,
+            epoch=header.epoch,
+            seq=header.seq,
+            stamp_ns=header.stamp_ns,
+            deliveries=deliveries,
+            body=bytes(delivery.body),
+        )
+        try:
+            write_atomically(path, msgspec.msgpack.encode(message))
+            self._remove_oldest()
+            where = f"It is saved as {path}"
+        except OSError as error:
+            where = f"It cannot be saved: {error}"
+        log.error(
+            "%s: message %d of %s (stamp %d ns) ended this actor's process %d times and is "
+            "quarantined (%d so far). %s. Please report it with the log of the process.",
+            actor, header.seq, topic, header.stamp_ns, deliveries, self.count, where,
+        )  # fmt: skip
+        return self.count
+
+    @property
+    def _path(self) -> Path:
+        assert self._folder is not None
+        return self._folder / "deliveries"
+
+    def _deliveries_of(self, delivery: Delivery) -> int:
+        is_last = self._deliveries and _is_repeated(delivery) and self._key == _key_of(delivery)
+        return self._deliveries if is_last else 0
+
+    def _store(self, key: bytes, deliveries: int) -> None:
+        """Write the count; without disk space, the count of this process is lost with it."""
+        self._key, self._deliveries = key, deliveries
+        with suppress(OSError):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            number = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o600)
+            try:
+                os.pwrite(number, _RECORD.pack(key, deliveries, self.count), 0)
+            finally:
+                os.close(number)
+
+    def _remove_oldest(self) -> None:
+        assert self._folder is not None
+        files = sorted(self._folder.glob(f"*{SUFFIX}"), key=lambda file: file.stat().st_mtime_ns)
+        for file in files[:-MAX_FILES]:
+            file.unlink(missing_ok=True)
+
+
+def _is_repeated(delivery: Delivery) -> bool:
+    return isinstance(delivery.port.policy, Lossless)
+
+
+def _key_of(delivery: Delivery) -> bytes:
+    header = delivery.header
+    text = f"{delivery.port.topic.name} {header.source} {header.epoch} {header.seq}"
+    return hashlib.blake2b(text.encode(), digest_size=16).digest()
