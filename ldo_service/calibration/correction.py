@@ -37,7 +37,7 @@ class CameraCorrection:
 
     The bias has no constant term and no linear terms. Such terms would scale and tilt the depth.
     Changed poses would have nearly the same effect on the measurements, so the two could hardly be
-    told apart.
+    separated.
     """
 
     depth_bias: tuple[float, ...] = (0.0,) * BIAS_TERMS  # b1, b2, b3 in 1/m.
