@@ -42,6 +42,11 @@ class MovingCamera:
             index,
         )
 
+    def depth_m(self, T_world_depth: np.ndarray) -> np.ndarray:
+        """Return the depth [H, W] that a camera at a pose [4, 4] measures."""
+        poses = np.broadcast_to(T_world_depth, (CAMERA.height, 4, 4))
+        return self._renderer.render(CAMERA, poses).depth_m.astype(np.float32)
+
     def _render(self, time_s: float, readout_s: float):
         rows = (np.arange(CAMERA.height) - (CAMERA.height - 1) / 2) / (CAMERA.height - 1)
         return self._renderer.render(CAMERA, self._motion.poses(time_s + rows * readout_s))

@@ -19,6 +19,10 @@ from .shutter import ShutterTiming
 
 BIAS_TERMS = 3  # x^2, x y, y^2.
 VIGNETTING_TERMS = 3  # r^2, r^4, r^6.
+# Names of the entries of the covariance of the depth bias among the metrics.
+BIAS_COVARIANCE = {
+    f"depth_bias_covariance_{i + 1}{j + 1}": (i, j) for i in range(BIAS_TERMS) for j in range(i + 1)
+}
 # Gray level from which a pixel may be clipped. The true brightness of such a pixel is unknown.
 CLIPPED_GRAY = 250
 MIN_INVERSE_DEPTH = 0.02  # 1/m. A bias cannot move a surface beyond 50 m.

@@ -27,18 +27,21 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import RgbdFrame, se3
 
 from .comparison import TIME_TERMS
-from .correction import BIAS_TERMS, VIGNETTING_TERMS, CameraCorrection, CorrectionChange
+from .correction import (
+    BIAS_COVARIANCE,
+    BIAS_TERMS,
+    VIGNETTING_TERMS,
+    CameraCorrection,
+    CorrectionChange,
+)
 from .estimation import DEPTH_PRIOR, Estimate, estimate
 from .knowledge import CameraKnowledge
+from .outlines import Extrinsics
 from .shutter import FrameMotion, ShutterTiming
 from .views import CalibrationView, ViewMaker, ViewPair, median_depth_m, pair_of
 
 log = logging.getLogger(__name__)
 
-# Maximum held-out residual, relative to that without correction, at which a depth bias or
-# vignetting that was confirmed before stays in use. It was 0.90 to 0.93 on bonn_crowd, where people
-# walk through the views, and 1.00 where there is no bias.
-MAX_KEPT_RATIO = 0.97
 PAIR_DISTANCES = (1, 2, 3, 5, 8)  # A new view is paired with the views this many views before it.
 WORK_PER_FRAME = 12.0  # Work of an estimate in one frame, in the unit of `estimate`: 10 ms.
 VIEW_WORK = 6.0  # Work of making a view, in the same unit.
@@ -93,6 +96,7 @@ class SelfCalibration:
         self.ratios = (1.0, 1.0)  # Held-out residuals of the last estimate: depth, color.
         # Covariance of the last estimate of the depth bias, [3, 3] 1/m^2; 0 before the first one.
         self.depth_bias_covariance = np.zeros((BIAS_TERMS, BIAS_TERMS))
+        self.extrinsics: Extrinsics | None = None  # By the estimate from most views.
         self.is_finished = not self.config.views
         self._maker = ViewMaker()
         self._views: dict[int, CalibrationView] = {}
@@ -252,7 +256,9 @@ class SelfCalibration:
             self._end_stage()
             return
         views = {number: view for number, view in self._views.items() if number < count}
-        self._running = estimate(views, pairs, self._depth_bias, self._times_s, self._vignetting)
+        start = self._depth_bias, self._times_s, self._vignetting
+        is_last = count >= max(self.config.views, default=0)
+        self._running = estimate(views, pairs, *start, finds_extrinsics=is_last)
         self._steps_done = 0
 
     def _continue(self, work: float = 0.0) -> CorrectionChange | None:
@@ -278,33 +284,13 @@ class SelfCalibration:
         self.ratios = found.depth_ratio, found.color_ratio
         poses = {(pair.first, pair.second): pair for pair in found.pairs}
         self._pairs = [poses.get((pair.first, pair.second), pair) for pair in self._pairs]
-        new = self._confirmed(found)
+        self.extrinsics = found.extrinsics or self.extrinsics
+        limits = self.config.max_depth_ratio, self.config.max_color_ratio
+        new = found.confirmed(self.correction, limits, is_known=self._is_renewed)
         change = CorrectionChange(self.correction, new)
         self.correction = new
         self._end_stage()
         return None if change.old == new else change
-
-    def _confirmed(self, found: Estimate) -> CameraCorrection:
-        """Return a correction with the confirmed parts of an estimate; other parts are 0.
-
-        The parts are the depth bias and the vignetting. A part takes its new estimate if held-out
-        pairs of views confirm it. A part that was confirmed before stays in use, unless its
-        held-out residual exceeds `MAX_KEPT_RATIO`. It then takes its new estimate too, or keeps its
-        value if it comes from an earlier run.
-        """
-        nothing, before = CameraCorrection(), self.correction
-        depth_bias, vignetting = nothing.depth_bias, nothing.vignetting
-        new_bias = tuple(found.depth_bias.tolist())
-        new_vignetting = tuple(map(tuple, found.vignetting.tolist()))
-        if found.depth_ratio <= self.config.max_depth_ratio:
-            depth_bias = new_bias
-        elif before.has_depth_bias and found.depth_ratio <= MAX_KEPT_RATIO:
-            depth_bias = before.depth_bias if self._is_renewed else new_bias
-        if found.color_ratio <= self.config.max_color_ratio:
-            vignetting = new_vignetting
-        elif before.has_vignetting and found.color_ratio <= MAX_KEPT_RATIO:
-            vignetting = before.vignetting if self._is_renewed else new_vignetting
-        return CameraCorrection(depth_bias, vignetting)
 
     def _end_stage(self) -> None:
         """Select the next entry of `config.views` that is not reached yet, or finish."""
@@ -332,6 +318,7 @@ class SelfCalibration:
             **self.correction.pack(),
             "ratios": list(self.ratios),
             "depth_bias_covariance": self.depth_bias_covariance,
+            "extrinsics": self.extrinsics and [self.extrinsics.xi, self.extrinsics.covariance],
             "is_finished": self.is_finished,
             "last_depth_bias": self._depth_bias,
             "last_vignetting": self._vignetting,
@@ -361,6 +348,7 @@ class SelfCalibration:
         self.ratios = (float(now["ratios"][0]), float(now["ratios"][1]))
         unknown = np.zeros((BIAS_TERMS, BIAS_TERMS))
         self.depth_bias_covariance = now.get("depth_bias_covariance", unknown)
+        self.extrinsics = Extrinsics(*now["extrinsics"]) if now.get("extrinsics") else None
         # If `config.views` is empty, the calibration is off: the restored correction stays.
         self.is_finished = bool(now["is_finished"]) or not self.config.views
         self._depth_bias, self._vignetting = now["last_depth_bias"], now["last_vignetting"]
@@ -397,4 +385,16 @@ class SelfCalibration:
             "calibration_views": float(len(self._views)),
             "depth_bias_corrected": float(self.correction.has_depth_bias),
             "vignetting_corrected": float(self.correction.has_vignetting),
+        }
+
+    def evidence(self) -> dict[str, float]:
+        """Return how certain the last estimate is, and the errors that are not corrected."""
+        return {
+            # 1 after the estimate from all views.
+            "calibration_finished": float(self.is_finished),
+            # Held-out residuals of the last estimate, relative to those without a correction.
+            "depth_bias_residual_ratio": self.ratios[0],
+            "vignetting_residual_ratio": self.ratios[1],
+            **{name: float(self.depth_bias_covariance[at]) for name, at in BIAS_COVARIANCE.items()},
+            **(self.extrinsics.metrics() if self.extrinsics else {}),
         }

@@ -12,6 +12,8 @@ import numpy as np
 from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.pnp import solve_pnp
 
+from .outlines import COLUMNS, outline_points
+
 VIEW_WIDTH = 160  # Pixels; the smooth errors need no finer images.
 DEPTH_STRIDE = 8  # The median depth uses every eighth pixel along each axis.
 MAX_DEPTH_M = 6.0  # Structured light and time of flight measure mostly noise beyond this depth.
@@ -59,6 +61,8 @@ class CalibrationView:
     # Velocity of the camera, [6] rotation in rad/s, then translation in m/s, in the camera frame; 0
     # if unknown.
     velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    # Points on outlines of near surfaces, [M, COLUMNS]; see `outlines`.
+    outlines: np.ndarray = field(default_factory=lambda: np.zeros((0, COLUMNS), np.float32))
 
     def pack(self) -> dict[str, Any]:
         """Return the view as arrays and plain values."""
@@ -152,6 +156,7 @@ class ViewMaker:
             self._corner_depth_m,
             T_odom_camera,
             np.zeros(6) if velocity is None else velocity,
+            outline_points(frame.color, frame.depth_m, camera),
         )
         self._T_odom_last = T_odom_camera
         self._count += 1
