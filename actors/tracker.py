@@ -322,12 +322,8 @@ class Tracker(Actor):
             "prior_rejected": refused,
             "prior_restarts": restarts,
             **self._calibration.metrics(),
+            **self._calibration.evidence(),
             **self._shutter.metrics(),
-            # 1 if the estimate from all views is done.
-            "calibration_finished": float(self._calibration.is_finished),
-            # Held-out residuals of the last estimate, relative to those without a correction.
-            "depth_bias_residual_ratio": self._calibration.ratios[0],
-            "vignetting_residual_ratio": self._calibration.ratios[1],
         }
 
 

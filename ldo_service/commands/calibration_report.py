@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.calibration.correction import (
+    BIAS_COVARIANCE,
+    BIAS_TERMS,
     CameraCorrection,
     bias_basis,
     read_corrections,
     unbiased_depth,
 )
+from ldo_service.calibration.outlines import NAMES, SHIFT_DEPTH_M, SIGMA_NAMES
 from ldo_service.calibration.self_calibration import SelfCalibrationConfig
 from ldo_service.config import load_config
 from ldo_service.errors import DataError
@@ -34,6 +37,10 @@ UNCERTAIN_TIME_MS = 5.0
 # Maximum held-out residual, relative to that without a correction, at which an unconfirmed depth
 # bias is probable. The sequence kitchen has 0.93, and a correction of its depth does harm.
 PROBABLE_RATIO = 0.90
+# Errors that the report warns of must exceed this many standard deviations, and a limit. The limits
+# are 2 to 3 of 640 pixels for a camera with a usual lens, and the accuracy of a Kinect.
+SIGMAS = 3.0
+LARGE_ROTATION_DEG, LARGE_TRANSLATION_MM, LARGE_SHIFT_MRAD = 0.3, 10.0, 5.0
 CHANNELS = "red", "green", "blue"
 TIMES = {  # Names in the metrics, and in the report.
     "readout": "readout of color",
@@ -44,7 +51,7 @@ MOVE = "move the camera by half a meter and turn it by 30 degrees at the start o
 
 
 def camera_findings(folder: Path) -> Iterator[Finding]:
-    """Report depth bias, vignetting and timing of the shutter of the camera of a finished run.
+    """Report what a finished run has found about its camera.
 
     Args:
         folder: Folder of the run.
@@ -75,11 +82,7 @@ def camera_findings(folder: Path) -> Iterator[Finding]:
         "scale of depth: unknown, because it cannot be estimated from images. Measure a known "
         "length in the map, and correct depth_scale of the camera",
     )
-    yield Finding(
-        "note",
-        "pose of the depth camera relative to the color camera: not estimated. Depth must be "
-        "registered to color",
-    )
+    yield _extrinsics(metrics)
 
 
 def depth_errors_mm(correction: CameraCorrection, camera: Camera, depth_m: float) -> np.ndarray:
@@ -137,8 +140,8 @@ def _depth_bias(
             f"depth bias: corrected. A measured depth of {DEPTHS_M[0]:g} m is wrong by "
             f"{near[0]:+.0f} mm at the top left and bottom right, and by {near[1]:+.0f} mm at the "
             f"top right and bottom left. A measured depth of {DEPTHS_M[1]:g} m is wrong by "
-            f"{far[0]:+.0f} mm and {far[1]:+.0f} mm there. In the center, the error is 0"
-            f"{evidence}",
+            f"{far[0]:+.0f} mm and {far[1]:+.0f} mm there{_bias_sigma(metrics, camera)}. In the "
+            f"center, the error is 0{evidence}",
         )
     if ratio is not None and limit < ratio <= PROBABLE_RATIO:
         return Finding(
@@ -150,6 +153,52 @@ def _depth_bias(
     if ratio is None:
         return Finding("note", f"depth bias: not corrected{evidence}")
     return Finding("ok", f"depth bias: not corrected, none found{evidence}")
+
+
+def _bias_sigma(metrics: Mapping[str, float], camera: Camera) -> str:
+    """Return the standard deviations of the depth error in two corners at the larger depth."""
+    covariance = np.zeros((BIAS_TERMS, BIAS_TERMS))
+    for name, (i, j) in BIAS_COVARIANCE.items():
+        covariance[i, j] = covariance[j, i] = metrics.get(name, 0.0)
+    if not covariance.any():
+        return ""
+    u, v = np.array([0.0, camera.width - 1.0]), np.zeros(2)
+    basis = bias_basis(u, v, camera)
+    sigmas = np.sqrt(np.einsum("ni,ij,nj->n", basis, covariance, basis))
+    left, right = (1e3 * DEPTHS_M[-1] ** 2 * sigmas).tolist()
+    return f" (1 sigma at {DEPTHS_M[-1]:g} m: {left:.0f} and {right:.0f} mm)"
+
+
+def _extrinsics(metrics: Mapping[str, float]) -> Finding:
+    """Report the error of the pose between depth and color camera."""
+    pose = "pose of the depth camera relative to the color camera"
+    if NAMES[0] not in metrics:
+        return Finding(
+            "note",
+            f"{pose}: not estimated. The estimate needs near objects whose outlines are visible in "
+            "color and depth",
+        )
+    values = [metrics[name] for name in NAMES]
+    sigmas = [metrics[name] for name in SIGMA_NAMES]
+    parts = []
+    for name, part, unit in (
+        ("rotation", slice(0, 3), "degrees"),
+        ("translation", slice(3, 6), "mm"),
+        (f"shift at {SHIFT_DEPTH_M:g} m", slice(6, 8), "mrad"),
+    ):
+        found = ", ".join(f"{value:+.1f}" for value in values[part])
+        sigma = ", ".join(f"{value:.1f}" for value in sigmas[part])
+        parts.append(f"{name} {found} {unit} (1 sigma {sigma})")
+    text = f"{pose}: error of {'; '.join(parts)}"
+    limits = [LARGE_ROTATION_DEG] * 3 + [LARGE_TRANSLATION_MM] * 3 + [LARGE_SHIFT_MRAD] * 2
+    each = zip(values, sigmas, limits, strict=True)
+    if any(abs(value) > max(SIGMAS * sigma, limit) for value, sigma, limit in each):
+        return Finding(
+            "warn",
+            f"{text}. Edges of near objects get the color of the surface behind them. Register "
+            "depth to color with the calibration of this camera, or calibrate the camera again",
+        )
+    return Finding("ok", text)
 
 
 def _vignetting(correction: CameraCorrection, metrics: Mapping[str, float]) -> Finding:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from ldo_service import kernels, versions
+from ldo_service.calibration import outlines
+from ldo_service.calibration.correction import BIAS_COVARIANCE
 
 from .folder import RunWriter
 
@@ -19,6 +21,9 @@ CALIBRATION = (  # Metrics of the tracker about the certainty of the camera's ca
     *("calibration_finished", "calibration_views"),
     *("depth_bias_residual_ratio", "vignetting_residual_ratio"),
     *(f"{time}{kind}_ms" for time in TIMES for kind in ("", "_estimate", "_sigma")),
+    *BIAS_COVARIANCE,
+    *outlines.NAMES,
+    *outlines.SIGMA_NAMES,
 )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ldo_service.calibration.correction import CameraCorrection, vignetting_basis
+from ldo_service.calibration.outlines import Extrinsics
 from ldo_service.calibration.shutter import ShutterTiming
 from ldo_service.commands.calibration_report import corner_brightness, depth_errors_mm
 from ldo_service.geometry import Camera
@@ -31,6 +32,9 @@ METRICS = {
     "depth_delay_estimate_ms": -15.0,
     "depth_delay_sigma_ms": 0.5,
 }
+EXTRINSICS = Extrinsics(
+    np.array([0.002, 0.001, 0.0, 0.001, 0.0, 0.0]), np.diag([4e-6] * 3 + [2.5e-5] * 3)
+)
 LARGE = CameraCorrection(
     (-0.016, 0.01, -0.01), ((-0.3, -0.1, -0.1),) * 3, ShutterTiming(0.0257, 0.0252, -0.015)
 )
@@ -107,6 +111,48 @@ def test_values_are_printed_with_their_evidence(capsys, handheld_run: Path) -> N
     assert f"red {np.exp(-0.5):.2f}" in text
     assert "readout of color: compensated, 25.7 ms (1 sigma 0.4 ms)" in text
     assert "delay of depth after color: compensated, -15.0 ms (1 sigma 0.5 ms)" in text
+
+
+def test_sigma_of_the_depth_bias_is_that_of_the_corners(capsys, handheld_run: Path) -> None:
+    sigmas = np.array([0.0003, 0.0005, 0.0008])
+    entries = {f"depth_bias_covariance_{i + 1}{i + 1}": s**2 for i, s in enumerate(sigmas)}
+    change(handheld_run / "summary.json", calibration={**METRICS, **entries})
+    camera = json.loads((handheld_run / "keyframes.json").read_text())[-1]["camera"]
+    ratio = (camera["height"] - 1) / camera["width"]  # y of the top row; x is about 1.
+    sigma_mm = 1e3 * 9 * np.sqrt(np.sum((sigmas * [1, ratio, ratio**2]) ** 2))
+    (line,) = [x for x in report(capsys, handheld_run) if "depth bias: corrected" in x]
+    found = line.split("1 sigma at 3 m: ")[1].split(" and ")[0]
+    assert abs(float(found) - sigma_mm) < 0.6
+
+
+def test_small_errors_of_depth_are_printed_with_sigma(capsys, run: Path) -> None:
+    change(run / "summary.json", calibration={**METRICS, **EXTRINSICS.metrics()})
+    lines = report(capsys, run)
+    (pose,) = [x for x in lines if "pose of the depth camera" in x]
+    assert pose.startswith("ok")
+    assert "rotation +0.1, +0.1, +0.0 degrees (1 sigma 0.1, 0.1, 0.1)" in pose
+    assert "shift at 2 m +1.5, -2.0 mrad (1 sigma 3.2, 3.2)" in pose
+
+
+@pytest.mark.parametrize(
+    ("changed", "name"),
+    [
+        ({"depth_color_rotation_z_deg": 0.5}, "pose of the depth camera"),
+        ({"depth_color_translation_y_mm": -16.0}, "pose of the depth camera"),
+        ({"depth_color_shift_u_mrad": 10.0}, "pose of the depth camera"),
+    ],
+)
+def test_large_errors_of_depth_are_warned_of_if_they_are_significant(
+    capsys, run: Path, changed: dict[str, float], name: str
+) -> None:
+    metrics = {**METRICS, **EXTRINSICS.metrics(), **changed}
+    change(run / "summary.json", calibration=metrics)
+    (line,) = [x for x in report(capsys, run) if name in x]
+    assert line.startswith("warn")
+    uncertain = {key: 9.9 for key in metrics if key.startswith("depth_") and "_sigma_" in key}
+    change(run / "summary.json", calibration={**metrics, **uncertain})
+    (line,) = [x for x in report(capsys, run) if name in x]
+    assert line.startswith("ok")
 
 
 def test_large_errors_are_warned_of_with_the_setting_that_helps(capsys, handheld_run: Path) -> None:
