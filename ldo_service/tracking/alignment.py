@@ -29,6 +29,7 @@ from .pose_covariance import (
     BRIGHTNESS_PRIOR,
     POSE,
     CovarianceConfig,
+    contradiction,
     pose_covariance,
     without_brightness,
 )
@@ -36,6 +37,10 @@ from .pyramid import DepthNoise, Level, Pyramid, ReferencePoints
 
 DEGREES_OF_FREEDOM = 5.0  # Kerl et al. 2013, III.B; the kernel uses the same value.
 INLIER_SIGMA = 3.0
+# Noise that removes one kind of residuals from the normal equations: gray levels, or a multiple of
+# `DepthNoise`.
+NO_WEIGHT = 1e5
+CUE_LEVEL = 1  # Pyramid level on which color and depth are compared; a quarter of the points.
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +232,9 @@ class Alignment:
     converged: bool  # The last step on the finest level was below stop_px.
     # Condition number of the Hessian, with translation in median depths; inf if singular.
     condition: float
+    # Difference of the poses by color and by depth where they contradict each other, [6]; see
+    # `pose_covariance.contradiction`.
+    contradiction: np.ndarray = field(default_factory=lambda: np.zeros(6))
 
     @property
     def appearance(self) -> BrightnessModel:
@@ -297,6 +305,8 @@ def evaluate(
     cells = reference.cells
     e = normal_equations(points, frame.levels[0], T, appearance, config.residuals, cells)
     covariance = pose_covariance(e.hessian, e.cells.reshape(-1, 8), config.covariance)
+    difference = _contradiction(reference, frame, T, appearance, config.residuals)
+    covariance += np.outer(difference, difference)
     total = max(points.shape[1], 1)
     return Alignment(
         T_reference_camera=se3.inverse(T),
@@ -312,6 +322,29 @@ def evaluate(
         iterations=iterations,
         converged=converged,
         condition=_condition(without_brightness(e.hessian), reference.median_depth_m),
+        contradiction=difference,
+    )
+
+
+def _contradiction(
+    reference: ReferencePoints,
+    frame: Pyramid,
+    T_camera_reference: np.ndarray,
+    appearance: BrightnessModel,
+    config: ResidualConfig,
+) -> np.ndarray:
+    """Return by how much color and depth contradict each other at a pose, [6]."""
+    level = min(CUE_LEVEL, len(frame.levels) - 1, len(reference.points) - 1)
+    points, target = reference.points[level], frame.levels[level]
+    color, depth = (
+        normal_equations(points, target, T_camera_reference, noise, config)
+        for noise in (
+            replace(appearance, depth_noise_scale=NO_WEIGHT),
+            replace(appearance, intensity_sigma=NO_WEIGHT),
+        )
+    )
+    return contradiction(
+        color.hessian, color.gradient, depth.hessian[POSE, POSE], depth.gradient[POSE]
     )
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.geometry import se3
 
-from .alignment import BrightnessModel, ResidualConfig, normal_equations
+from .alignment import NO_WEIGHT, BrightnessModel, ResidualConfig, normal_equations
 from .pose_covariance import BRIGHTNESS_PRIOR, POSE
 from .pyramid import Level, Pyramid, ReferencePoints
 
@@ -40,9 +40,6 @@ NOISE_RATIO = 3.0
 # are correlated. The measured pose errors correspond to a fraction of 0.1 on exact renders, and of
 # 1e-4 to 3e-5 on a Kinect. The value lies between them.
 INDEPENDENT_FRACTION = 2e-3
-# Noise that removes one kind of residuals from the normal equations: gray levels, or a multiple of
-# `DepthNoise`.
-NO_WEIGHT = 1e5
 # Equations of a prior: readouts of 0 to 20 ms and delays of 0 to 10 ms are usual.
 PRIOR = np.c_[np.diag([0.02**-2, 0.02**-2, 0.01**-2]), np.zeros(3)]
 MIN_GROUPS, MAX_GROUPS = 12, 24  # Groups of the jackknife; two are merged beyond the maximum.

@@ -47,6 +47,7 @@ class TrackedFrame:
     depth_noise_scale: float = 0.0  # Geometric noise as a multiple of `DepthNoise`.
     iterations: int = 0  # Iterations of alignment over all pyramid levels.
     hypothesis_spread_rad: float = 0.0  # Spread of the supported hypotheses; 0 for a single one.
+    is_contradictory: bool = False  # True if color and depth contradict each other.
     # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
     dynamic_mask: np.ndarray | None = None
     needed_keyframe: KeyframeKind | None = None  # Set for OK frames only.
@@ -97,6 +98,7 @@ class TrackedFrame:
             depth_noise_scale=alignment.depth_noise_scale,
             iterations=alignment.iterations,
             hypothesis_spread_rad=hypothesis_spread_rad,
+            is_contradictory=bool(alignment.contradiction.any()),
             dynamic_mask=dynamic_mask,
             needed_keyframe=needed_keyframe,
         )
@@ -151,6 +153,7 @@ class TrackingResult:
     depth_noise_scale: float  # Geometric noise as a multiple of `DepthNoise`.
     iterations: int  # Iterations of alignment over all pyramid levels.
     hypothesis_spread_rad: float  # Spread of the supported hypotheses; 0 for a single one.
+    is_contradictory: bool  # True if color and depth contradict each other.
     # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
     dynamic_mask: np.ndarray | None
     has_prior: bool  # True if the odometry prior covers the time of the frame.
@@ -216,6 +219,7 @@ def make_tracking_result(
         depth_noise_scale=tracked.depth_noise_scale,
         iterations=tracked.iterations,
         hypothesis_spread_rad=tracked.hypothesis_spread_rad,
+        is_contradictory=tracked.is_contradictory,
         dynamic_mask=tracked.dynamic_mask,
         has_prior=has_prior,
         motion=motion,

@@ -6,6 +6,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.tracking.pose_covariance import (
     BRIGHTNESS_PRIOR,
     CovarianceConfig,
+    contradiction,
     pose_covariance,
     without_brightness,
 )
@@ -82,3 +83,54 @@ def test_covariance_of_a_tracked_pose_fits_its_error(source: str) -> None:
     assert len(nees) > 50
     assert 0.3 < nees.mean() < 12
     assert np.mean(nees > 30) < 0.05
+
+
+def cues(error: np.ndarray, depth_scale: np.ndarray | float = 1.0) -> tuple[np.ndarray, ...]:
+    """Return Hessian and gradient of color and of depth at their common solution.
+
+    The depth residuals are those of a pose that is wrong by `error`, [6]; color has no error. The
+    Jacobian of depth is multiplied by `depth_scale`, [6].
+    """
+    rng = np.random.default_rng(6)
+    J_color, J_depth = (jacobians(rng).reshape(-1, 8) for _ in range(2))
+    J_depth[:, 6:] = 0.0
+    J_depth[:, :6] *= depth_scale
+    r_color, r_depth = rng.normal(size=(2, CELLS * POINTS))
+    r_depth = r_depth + J_depth[:, :6] @ error
+    H_color, H_depth = J_color.T @ J_color, J_depth.T @ J_depth
+    x = np.linalg.solve(H_color + H_depth, J_color.T @ r_color + J_depth.T @ r_depth)
+    g_color, g_depth = J_color.T @ (r_color - J_color @ x), J_depth.T @ (r_depth - J_depth @ x)
+    return H_color, g_color, H_depth[:6, :6], g_depth[:6]
+
+
+def test_cues_that_agree_do_not_contradict_each_other() -> None:
+    assert not contradiction(*cues(np.zeros(6))).any()
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_contradiction_is_the_error_of_one_cue(axis: int) -> None:
+    error = np.zeros(6)
+    error[axis] = 0.03
+    found = contradiction(*cues(error))
+    # The sign is that of the step from the pose by depth to the pose by color.
+    np.testing.assert_allclose(np.abs(found), np.abs(error), atol=0.003)
+
+
+def test_cue_without_information_along_a_direction_contradicts_nothing_there() -> None:
+    wall = np.array([1.0, 1.0, 1.0, 1.0, 1e-4, 1.0])
+    found = contradiction(*cues(np.array([0.03, 0, 0, 0, 0, 0]), wall))
+    assert abs(found[0]) > 0.02
+    assert abs(found[4]) < 0.02  # The poses by color and by depth alone differ by more than 1 here.
+
+
+def test_errors_of_an_uncalibrated_camera_are_within_three_sigma() -> None:
+    """Vignetting, depth bias and a rolling shutter move color and depth by several sigma."""
+    sequence = open_sequence("synthetic:room-handheld")
+    errors, covariances = errors_and_covariances(sequence, 40, is_calibrated=False)
+    sigmas = np.sqrt(np.einsum("nii->ni", covariances))
+    is_beyond = np.zeros(len(errors), bool)
+    for part in (slice(0, 3), slice(3, 6)):
+        size, sigma = (np.linalg.norm(each[:, part], axis=1) for each in (errors, sigmas))
+        is_beyond |= size > 3 * sigma
+    assert len(errors) > 30
+    assert is_beyond.mean() < 0.1
