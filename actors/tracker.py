@@ -162,6 +162,8 @@ class Tracker(Actor):
         self._prior = OdometryPriorBuffer()
         # Numbers of keyframes that were made, not made for lack of credit, and reused.
         self._made = self._without_room = self._reused = 0
+        # Numbers of frames aligned, and of those in which color and depth contradicted each other.
+        self._aligned = self._contradictory = 0
         # Numbers of prior poses by outcome of their check.
         self._prior_checks: Counter[PriorCheck] = Counter()
         # Numbers of frames with and without a prior, since the first pose of the prior.
@@ -222,6 +224,8 @@ class Tracker(Actor):
         self._made += result.keyframe is not None
         self._reused += result.reused_keyframe is not None
         self._without_room += result.denied_keyframe is not None and not is_held_out
+        self._aligned += result.information.any() and result.status is not TrackingStatus.LOST
+        self._contradictory += result.is_contradictory
         if not self._prior.poses:
             return
         self._with_prior += result.has_prior
@@ -317,6 +321,9 @@ class Tracker(Actor):
             "keyframes": self._made,
             "keyframes_without_credit": self._without_room,
             "keyframes_reused": self._reused,
+            "frames_aligned": int(self._aligned),
+            # Frames in which color and depth contradicted each other.
+            "frames_contradictory": self._contradictory,
             "frames_with_prior": self._with_prior,
             "frames_without_prior": self._without_prior,  # Since the first pose of the prior.
             "prior_rejected": refused,

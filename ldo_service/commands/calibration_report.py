@@ -41,6 +41,9 @@ PROBABLE_RATIO = 0.90
 # are 2 to 3 of 640 pixels for a camera with a usual lens, and the accuracy of a Kinect.
 SIGMAS = 3.0
 LARGE_ROTATION_DEG, LARGE_TRANSLATION_MM, LARGE_SHIFT_MRAD = 0.3, 10.0, 5.0
+# Minimum fraction of frames with contradictions of color and depth that the report warns of.
+# It is 10 % with exact cameras.
+MANY_CONTRADICTIONS = 0.3
 CHANNELS = "red", "green", "blue"
 TIMES = {  # Names in the metrics, and in the report.
     "readout": "readout of color",
@@ -76,6 +79,7 @@ def camera_findings(folder: Path) -> Iterator[Finding]:
     yield _vignetting(correction, metrics)
     for name, text in TIMES.items():
         yield _time(name, text, correction, metrics)
+    yield _contradiction(correction, metrics)
     yield from _large(folder, correction, camera)
     yield Finding(
         "note",
@@ -260,6 +264,38 @@ def _time(
         f"{sigma_ms:.1f} ms). The readouts of color and depth and the delay of depth are "
         f"compensated once one of them exceeds {1e3 * config.min_s:g} ms and {config.sigmas:g} "
         "sigma",
+    )
+
+
+def _contradiction(correction: CameraCorrection, metrics: Mapping[str, float]) -> Finding:
+    """Report in how many frames color and depth contradicted each other."""
+    aligned = metrics.get("frames_aligned", 0.0)
+    if not aligned:
+        return Finding("note", "color and depth: not compared in this run")
+    ratio = metrics["frames_contradictory"] / aligned
+    text = (
+        f"color and depth: they favor different poses in {100 * ratio:.0f} % of {aligned:.0f} "
+        "frames, whose uncertainty is increased"
+    )
+    if ratio < MANY_CONTRADICTIONS:
+        return Finding("ok", text)
+    errors = {
+        "depth bias": correction.has_depth_bias,
+        "vignetting": correction.has_vignetting,
+        "timing of the shutter": bool(correction.timing),
+    }
+    found = [name for name, is_found in errors.items() if is_found]
+    if found:
+        return Finding(
+            "ok",
+            f"{text}. Errors of the camera that can cause this were found and are corrected: "
+            f"{', '.join(found)}",
+        )
+    return Finding(
+        "warn",
+        f"{text}. The camera has an error that was not found, such as {', '.join(errors)}, or a "
+        "wrong pose of the depth camera relative to the color camera. To find it, set "
+        f"tracker.self_calibration=true, and {MOVE}",
     )
 
 

@@ -18,7 +18,7 @@ from .folder import RunWriter
 Percentiles = dict[str, float]  # Values of p50 and p95.
 TIMES = "readout", "depth_readout", "depth_delay"  # Times of the shutter.
 CALIBRATION = (  # Metrics of the tracker about the certainty of the camera's calibration.
-    *("calibration_finished", "calibration_views"),
+    *("calibration_finished", "calibration_views", "frames_aligned", "frames_contradictory"),
     *("depth_bias_residual_ratio", "vignetting_residual_ratio"),
     *(f"{time}{kind}_ms" for time in TIMES for kind in ("", "_estimate", "_sigma")),
     *BIAS_COVARIANCE,

@@ -155,6 +155,25 @@ def test_large_errors_of_depth_are_warned_of_if_they_are_significant(
     assert line.startswith("ok")
 
 
+@pytest.mark.parametrize(("count", "level"), [(4.0, "ok"), (40.0, "warn")])
+def test_frames_with_contradictions_are_warned_of_if_they_are_many(
+    capsys, run: Path, count: float, level: str
+) -> None:
+    counts = {"frames_aligned": 50.0, "frames_contradictory": count}
+    change(run / "summary.json", calibration={**METRICS, **counts})
+    (line,) = [x for x in report(capsys, run) if "color and depth: " in x]
+    assert line.startswith(level)
+    assert f"in {2 * count:.0f} % of 50 frames" in line
+
+
+def test_contradictions_name_the_errors_that_were_found(capsys, handheld_run: Path) -> None:
+    counts = {"frames_aligned": 50.0, "frames_contradictory": 40.0}
+    change(handheld_run / "summary.json", calibration={**METRICS, **counts})
+    (line,) = [x for x in report(capsys, handheld_run) if "color and depth: " in x]
+    assert line.startswith("ok")
+    assert "depth bias, vignetting, timing of the shutter" in line
+
+
 def test_large_errors_are_warned_of_with_the_setting_that_helps(capsys, handheld_run: Path) -> None:
     warnings = [line for line in report(capsys, handheld_run) if line.startswith("warn")]
     assert len(warnings) == 2
