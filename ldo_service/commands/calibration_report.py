@@ -42,8 +42,8 @@ PROBABLE_RATIO = 0.90
 SIGMAS = 3.0
 LARGE_ROTATION_DEG, LARGE_TRANSLATION_MM, LARGE_SHIFT_MRAD = 0.3, 10.0, 5.0
 # Minimum fraction of frames with contradictions of color and depth that the report warns of.
-# It is 10 % with exact cameras.
-MANY_CONTRADICTIONS = 0.3
+# It is 10 to 23 % with exact cameras.
+MANY_CONTRADICTIONS = 0.5
 CHANNELS = "red", "green", "blue"
 TIMES = {  # Names in the metrics, and in the report.
     "readout": "readout of color",
