@@ -34,8 +34,8 @@ BRIGHTNESS_PRIOR = np.array([1e3, 0.1])
 PRIOR = np.eye(6)
 # Minimum squared difference of color and depth along a direction, divided by its variance, at which
 # they contradict each other. The variance takes all residuals as independent. A frame has such a
-# direction in 10 to 23 % of the frames of exact cameras, and in all frames of a simulated handheld camera
-# without self-calibration, where the median of the largest ratio is 1300.
+# direction in 10 to 23 % of the frames of exact cameras, and in all frames of a simulated handheld
+# camera without self-calibration, where the median of the largest ratio is 1300.
 MIN_CONTRADICTION = 20.0
 
 
