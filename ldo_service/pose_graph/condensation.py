@@ -66,6 +66,10 @@ class CondensedKeyframes:
         """Return the condensed keyframe of one row, as arrays of length 1."""
         return CondensedKeyframes(*(getattr(self, name)[row : row + 1] for name in self.__slots__))
 
+    def head_and_tail(self, row: int) -> tuple[int, int]:
+        """Return the ids of the head and of the tail of the condensed keyframe of one row."""
+        return int(self.start_variables[row]), int(self.end_variables[row])
+
     def index(self) -> dict[int, int]:
         """Return the row of each condensed keyframe, by id."""
         return {int(k): row for row, k in enumerate(self.keyframes)}
@@ -87,8 +91,7 @@ class CondensedKeyframes:
             pose: Function that returns T_map_keyframe [4, 4] of the head and of the tail, by id.
         """
         one = self.only(row)
-        ends = int(one.start_variables[0]), int(one.end_variables[0])
-        T_head, T_tail = (pose(k)[None] for k in ends)
+        T_head, T_tail = (pose(k)[None] for k in one.head_and_tail(0))
         return one.interpolated_poses(T_head, T_tail)[0]
 
     def poses_with_variables(

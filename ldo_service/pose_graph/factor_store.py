@@ -149,10 +149,7 @@ class FactorStore:
         in proportion to `CondensedKeyframes.fractions`.
         """
         row = self.rows[keyframe]
-        head, tail = (
-            int(self.interpolated.start_variables[row]),
-            int(self.interpolated.end_variables[row]),
-        )
+        head, tail = self.interpolated.head_and_tail(row)
         share, T_head = float(self.interpolated.fractions[row]), self.interpolated.T_head[row]
         edge = self.condensed.pop((head, tail))
         T_tail = se3.inverse(T_head) @ edge.T_a_b
@@ -179,10 +176,7 @@ class FactorStore:
         if row is None:
             return 0.0
         inner = self.interpolated.only(row)
-        T_head, T_tail = (
-            variables[int(inner.start_variables[0])],
-            variables[int(inner.end_variables[0])],
-        )
+        T_head, T_tail = (variables[k] for k in inner.head_and_tail(0))
         by_head, by_tail = T_head @ inner.T_head[0], T_tail @ inner.T_tail[0]
         off, share = np.abs(se3.log(se3.inverse(by_head) @ by_tail)), float(inner.fractions[0])
         sigmas = np.repeat([self._noise.sigma_loop_rad, self._noise.sigma_loop_m], 3)
@@ -255,10 +249,7 @@ class FactorStore:
         for keyframe, (variable, _), T in zip((m.a, m.b), self.ends(m), T_b_end, strict=True):
             if (row := self.rows.get(keyframe)) is None:
                 continue
-            pair = (
-                int(self.interpolated.start_variables[row]),
-                int(self.interpolated.end_variables[row]),
-            )
+            pair = self.interpolated.head_and_tail(row)
             share = self.interpolated.fractions[row]
             away = share if variable == pair[0] else 1 - share
             # Adjoint of T_b_tail.
