@@ -240,18 +240,16 @@ class Outlet:
         """Restart numbering at 0 under a new epoch; all consumers must connect again."""
         self._cancel_repeating()
         self._epoch, self._seq = epoch, 0
-        self._consumers = Consumers(
-            self._consumers.expected, with_backlog=self._consumers.with_backlog
-        )
+        past = self._consumers
+        self._consumers = Consumers(past.expected, with_backlog=past.with_backlog)
         self._outbox.restart(epoch)
         for forgotten in (self._unsent, self._ahead, self._last_value):
             forgotten.clear()
         self._post_hellos()
 
     def _post_hellos(self) -> None:
-        self._hellos.post(
-            b"", encode_link(ProducerHello(self._epoch, self._consumers.next_seq_by_consumer()))
-        )
+        hello = ProducerHello(self._epoch, self._consumers.next_seq_by_consumer())
+        self._hellos.post(b"", encode_link(hello))
 
     def _granted(self, grant: Credit) -> None:
         if grant.arrived > self._seq:
@@ -300,12 +298,7 @@ class Outlet:
             if name not in self._backlogs:
                 key = retransmit_key(self.topic.name, name)
                 self._backlogs[name] = self._transport.publisher(key)
-            for seq in messages:
-                message = await asyncio.to_thread(self._outbox.read, seq)
-                if message is None:
-                    self._skip_lost(seq)
-                    return
-                await self._backlogs[name].send(message.header, message.body)
+            await self._send_again(messages, self._backlogs[name])
         finally:
             if self._pushing.get(name) is asyncio.current_task():
                 del self._pushing[name]
@@ -331,15 +324,19 @@ class Outlet:
 
     async def _resend(self, lost: range) -> None:
         try:
-            for seq in lost:
-                message = await asyncio.to_thread(self._outbox.read, seq)
-                if message is None:
-                    self._skip_lost(seq)
-                    return
-                await self._retransmissions.send(message.header, message.body)
+            await self._send_again(lost, self._retransmissions)
         finally:
             if self._repeating is asyncio.current_task():
                 self._repeating = None
+
+    async def _send_again(self, numbers: range, publisher: Publisher) -> None:
+        """Send messages from the outbox; stop at the first one that the outbox has lost."""
+        for seq in numbers:
+            message = await asyncio.to_thread(self._outbox.read, seq)
+            if message is None:
+                self._skip_lost(seq)
+                return
+            await publisher.send(message.header, message.body)
 
     def _skip_lost(self, seq: int) -> None:
         """Let consumers skip message `seq`, which is lost, if they handled all earlier messages."""
@@ -362,10 +359,7 @@ class Outlet:
             self._changed.set()
 
     def evict_stalled(self) -> None:
-        """Evict connected consumers that have made no progress for over `evict_after_s`.
-
-        Their window of unhandled messages has been full for this time.
-        """
+        """Evict connected consumers whose window has been full for over `evict_after_s`."""
         overdue = self._consumers.stalled(self._loop.time(), self._evict_after_s, self._next)
         for name in overdue:
             log.error(
