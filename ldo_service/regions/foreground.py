@@ -353,3 +353,21 @@ class RegionDetections:
         """Return the arrays of detections that have no masks yet, for a checkpoint."""
         labels = self.labels, self.confidences, self.open_labels, self.open_confidences
         return [self.boxes, *labels]
+
+
+def share_a_class(classes: np.ndarray) -> np.ndarray:
+    """Return which pairs of M regions may show objects of one class, [M, M] bool.
+
+    Two regions share a class if any label of one equals any label of the other.
+
+    Args:
+        classes: Labels by the detector and by the labeller, [M, 2]; -1 if missing. See
+            `RegionDetections.classes`.
+
+    >>> share_a_class(np.array([[3, -1], [-1, 3], [-1, -1]])).astype(int)
+    array([[1, 1, 0],
+           [1, 1, 0],
+           [0, 0, 0]])
+    """
+    is_same = (classes[:, None, :, None] == classes[:, None]) & (classes >= 0)[:, None]
+    return np.any(is_same, axis=(2, 3))

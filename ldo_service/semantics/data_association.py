@@ -20,6 +20,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ldo_service.geometry import Camera
 from ldo_service.geometry.boxes import areas, intersections, ious
+from ldo_service.regions.foreground import share_a_class
 
 from .distributions import common_mass, mean_distributions
 from .object_landmarks import MEMBERS, NO_MEMBER, reliable_members, rows_of, shuffled, trimmed
@@ -224,23 +225,6 @@ def find_containing_regions(
         if len(around):
             whole[part] = whole[around[np.argmax(area[around])]]
     return whole
-
-
-def share_a_class(classes: np.ndarray) -> np.ndarray:
-    """Return which pairs of M regions may show objects of one class, [M, M] bool.
-
-    Two regions share a class if any label of one equals any label of the other.
-
-    Args:
-        classes: Labels by the detector and by the labeller, [M, 2]; -1 if missing.
-
-    >>> share_a_class(np.array([[3, -1], [-1, 3], [-1, -1]])).astype(int)
-    array([[1, 1, 0],
-           [1, 1, 0],
-           [0, 0, 0]])
-    """
-    is_same = (classes[:, None, :, None] == classes[:, None]) & (classes >= 0)[:, None]
-    return np.any(is_same, axis=(2, 3))
 
 
 def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.ndarray) -> np.ndarray:
