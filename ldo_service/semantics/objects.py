@@ -10,7 +10,6 @@ from ldo_service.geometry import Camera, se3
 from .data_association import (
     AssociationCosts,
     MapView,
-    PredictedBoxes,
     RegionStatistics,
     associate,
     association_costs,
@@ -25,7 +24,6 @@ from .object_landmarks import (
     derive_in_batches,
     distributions,
     entropies,
-    labels_of,
     merged_members,
     moved,
     new_landmarks,
@@ -37,6 +35,7 @@ from .observations import (
     ObservedObject,
     add_views,
     boxes_overlap,
+    find_missed,
     inside,
     merge_into,
     neighbors,
@@ -111,7 +110,8 @@ class Objects:
         observations = self._update(
             view, near[k], r, predicted.rows[k], predicted.shown[k], regions
         )
-        missed = self._missed(near, predicted, excused, undetectable)
+        is_missed = find_missed(self._table[near], predicted, undetectable, self.config)
+        missed = np.flatnonzero(is_missed & ~excused)
         observations += self._miss(near[missed], predicted.boxes[missed])
         # New, merged and removed objects.
         created = self._promote(near[k])
@@ -225,28 +225,6 @@ class Objects:
         return tuple(ids.tolist())
 
     # --- misses -----------------------------------------------------------------------------------
-    def _missed(
-        self,
-        near: np.ndarray,
-        predicted: PredictedBoxes,
-        excused: np.ndarray,
-        undetectable: np.ndarray | None,
-    ) -> np.ndarray:
-        """Return the positions in `near` of the landmarks that count as missed in the keyframe.
-
-        A landmark is missed if it should be visible and the detector did not find it. It is also
-        missed if the depth camera measured a surface behind it, so that it must be gone. Landmarks
-        in `excused` are never missed.
-        """
-        sides = np.clip(predicted.boxes[:, 2:] - predicted.boxes[:, :2], 0, None)
-        is_large = np.sqrt(np.prod(sides, axis=1)) >= self.config.min_side_px
-        is_visible = (predicted.shown >= self.config.min_visible) & is_large
-        if undetectable is not None:
-            is_visible &= ~undetectable[labels_of(self._table[near])]
-        return np.flatnonzero(
-            (is_visible | (predicted.through >= self.config.min_visible)) & ~excused
-        )
-
     def _miss(self, which: np.ndarray, boxes: np.ndarray) -> list[ObservedObject]:
         for name in ("missed", "misses"):
             self._table[name][which] += 1

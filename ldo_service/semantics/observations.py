@@ -1,4 +1,4 @@
-"""Observations of objects in a keyframe, and updates of their landmarks: views, votes, merges."""
+"""Observations and misses of objects in a keyframe; updates of landmarks: views, votes, merges."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 from ldo_service.regions.foreground import RegionDetections
 from ldo_service.regions.region import Region
 
-from .data_association import MapView
+from .data_association import MapView, PredictedBoxes
 from .label_assignment import HIDDEN
 from .object_landmarks import (
     MAX_VOTES,
@@ -18,6 +18,7 @@ from .object_landmarks import (
     reliable_members,
     rows_of,
 )
+from .objects_config import ObjectsConfig
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -129,6 +130,35 @@ def add_view(
         values = np.concatenate([table[name], np.asarray(new)[:, None]], axis=1)
         at = order.reshape(*order.shape, *[1] * (values.ndim - 2))
         table[name] = np.take_along_axis(values, at, axis=1)
+
+
+def find_missed(
+    table: np.ndarray,
+    predicted: PredictedBoxes,
+    undetectable: np.ndarray | None,
+    config: ObjectsConfig,
+) -> np.ndarray:
+    """Find landmarks that count as missed in a keyframe if no region was associated with them.
+
+    A landmark counts as missed if it should be visible and the detector knows its label. It also
+    counts as missed if the depth camera measured a surface behind it, so that it must be gone.
+
+    Args:
+        table: Landmarks, [K] records of `LANDMARK`.
+        predicted: Their predicted boxes and visibility in the keyframe.
+        undetectable: Labels that the detector does not know, [256] bool. None: the detector knows
+            all labels.
+        config: Settings of the objects.
+
+    Returns:
+        [K] bool.
+    """
+    sides = np.clip(predicted.boxes[:, 2:] - predicted.boxes[:, :2], 0, None)
+    is_large = np.sqrt(np.prod(sides, axis=1)) >= config.min_side_px
+    is_visible = (predicted.shown >= config.min_visible) & is_large
+    if undetectable is not None:
+        is_visible &= ~undetectable[labels_of(table)]
+    return is_visible | (predicted.through >= config.min_visible)
 
 
 def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[tuple[int, int]]:
