@@ -5,11 +5,13 @@
 
 import ast
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from ldo_service.errors import ConfigError, ModelError
@@ -259,3 +261,38 @@ class Vocabulary:
             raise ValueError("a name of the stored vocabulary is repeated; each must occur once")
         vocabulary.refused = packed["refused"]
         return vocabulary
+
+
+@dataclass(frozen=True, slots=True)
+class LabelSources:
+    """Labels that the detector and the labeller have given in a map.
+
+    Attributes:
+        by_detector: Labels that the detector has given.
+        by_labeller: Labels that the labeller has given.
+    """
+
+    by_detector: set[int] = field(default_factory=set)
+    by_labeller: set[int] = field(default_factory=set)
+
+    def is_labellers(self, label: int) -> bool:
+        """Return whether the labeller has given this label and the detector never has."""
+        return label in self.by_labeller and label not in self.by_detector
+
+    def undetectable(self) -> np.ndarray | None:
+        """Return the labels that only the labeller has given, [256] bool; None if it gave no label.
+
+        The detector does not know these labels, so its silence about such an object is no miss.
+        """
+        if not self.by_labeller:
+            return None
+        return np.array([self.is_labellers(label) for label in range(CAP)])
+
+    def pack(self) -> list[list[int]]:
+        """Return the sorted labels by the detector and by the labeller, for a checkpoint."""
+        return [sorted(self.by_detector), sorted(self.by_labeller)]
+
+    @staticmethod
+    def unpack(packed: Sequence[Sequence[int]]) -> "LabelSources":
+        """Restore the sources from `pack`."""
+        return LabelSources(*map(set, packed))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.detection.dynamic_classes import Box, dynamic_class_mask
-from ldo_service.detection.vocabulary import Vocabulary
+from ldo_service.detection.vocabulary import LabelSources, Vocabulary
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.renderer import Contributions
 from ldo_service.gaussians.training_views import TrainingView
@@ -16,7 +16,7 @@ from ldo_service.regions.open_vocabulary import OpenVocabularyLabeling
 from ldo_service.regions.region import Region, RegionLabelResult
 
 from .data_association import MapView
-from .gaussian_labels import BACKGROUND, MAX_LABELS, Disagreement, top_labels
+from .gaussian_labels import BACKGROUND, Disagreement, top_labels
 from .objects import Objects
 from .observations import KeyframeSemantics
 from .semantic_fusion import (
@@ -67,7 +67,7 @@ class SemanticMap:
         )
         self._map, self._threads = map_, threads
         self._before_fusion, self._changes_map = before_fusion, changes_map
-        self._by_detector, self._by_labeller = set[int](), set[int]()  # Labels given by each.
+        self._sources = LabelSources()
         self._done: dict[int, None] = {}  # Newest fused keyframes, in the order of fusion.
         # Detections of keyframes that are not mapped yet, the oldest first.
         self._waiting: dict[int, RegionDetections | None] = {}
@@ -155,7 +155,7 @@ class SemanticMap:
         self._disagreement = labelled.disagreement
         # Update the objects.
         seen = self._map_view(view, made_by.indices, labelled.assigned.regions, detections)
-        observed = self.objects.observe(seen, self._undetectable_labels())
+        observed = self.objects.observe(seen, self._sources.undetectable())
         return KeyframeSemantics(keyframe, received, observed, requested)
 
     def _seen(self, keyframe: int) -> tuple[TrainingView, Contributions]:
@@ -193,7 +193,7 @@ class SemanticMap:
         Returns:
             The detections with the known labels, and the regions to send to the labeller.
         """
-        self._by_detector.update(detections.labels.astype(int).tolist())
+        self._sources.by_detector.update(detections.labels.astype(int).tolist())
         if self.naming is None:
             return detections, ()
         is_labelled = reliable_label_mask(
@@ -205,19 +205,6 @@ class SemanticMap:
         )
         return detections, tuple(request.region for request in requests)
 
-    def _is_labellers(self, label: int) -> bool:
-        """Return whether the labeller has given this label and the detector never has."""
-        return label in self._by_labeller and label not in self._by_detector
-
-    def _undetectable_labels(self) -> np.ndarray | None:
-        """Return the labels that only the labeller has given, [256] bool; None if it gave no label.
-
-        The detector does not know these labels, so its silence about such an object is no miss.
-        """
-        if not self._by_labeller:
-            return None
-        return np.array([self._is_labellers(label) for label in range(MAX_LABELS)])
-
     def _label(
         self,
         view: TrainingView,
@@ -228,7 +215,7 @@ class SemanticMap:
     ) -> FusionResult:
         """Fuse labels of regions into the Gaussians `indices` [V], and mark changed Gaussians."""
         is_labelled = detections.open_confidences > 0
-        self._by_labeller.update(detections.open_labels[is_labelled].astype(int).tolist())
+        self._sources.by_labeller.update(detections.open_labels[is_labelled].astype(int).tolist())
         gaussians = self._map.gaussians
         before = gaussians.labels[indices]
         labelled = fuse_detections(
@@ -241,7 +228,7 @@ class SemanticMap:
             detections,
             self.config.labelling,
             is_late=is_late,
-            undetectable=self._undetectable_labels(),
+            undetectable=self._sources.undetectable(),
             threads=self._threads,
         )
         is_new = np.any(gaussians.labels[indices] != before, axis=1)
@@ -284,7 +271,7 @@ class SemanticMap:
         labelled = self._label(view, made_by.indices, detections, is_late=True)
         self.refresh(view)
         at = self._map_view(view, made_by.indices, labelled.assigned.regions, detections)
-        is_undetectable = self._is_labellers(int(detections.open_labels[0]))
+        is_undetectable = self._sources.is_labellers(int(detections.open_labels[0]))
         # If the detector found the region, its detections in each keyframe already observe the
         # object.
         if self.config.uses_labeller and (is_undetectable or detections.confidences[0] == 0):
@@ -350,7 +337,7 @@ class SemanticMap:
         assert other.naming is not None
         self.objects = objects
         self.naming.adopt(other.naming)
-        self._by_detector, self._by_labeller = other._by_detector, other._by_labeller
+        self._sources = other._sources
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state without the labels, which are stored in the map."""
@@ -361,7 +348,7 @@ class SemanticMap:
             "labelled": self._labelled,
             "waiting": [(k, found.pack() if found else []) for k, found in self._waiting.items()],
             "naming": self.naming and self.naming.pack(),
-            "given": [sorted(self._by_detector), sorted(self._by_labeller)],
+            "given": self._sources.pack(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -373,7 +360,7 @@ class SemanticMap:
             keyframe: RegionDetections(*arrays) if arrays else None
             for keyframe, arrays in state["waiting"]
         }
-        self._by_detector, self._by_labeller = map(set, state["given"])
+        self._sources = LabelSources.unpack(state["given"])
         if self.naming and state["naming"]:
             is_fused = self.config.uses_labeller
             self.naming = OpenVocabularyLabeling.unpack(

@@ -452,7 +452,7 @@ def test_label_unknown_to_the_detector_is_undetectable_after_a_late_result() -> 
     messages += walk(mapper, AHEAD[None], first=5, known=(COUCH,))
     names = replicate(messages).label_names
     assert "samovar" in names
-    undetectable = mapper._semantics._undetectable_labels()
+    undetectable = mapper._semantics._sources.undetectable()
     assert undetectable is not None
     assert np.flatnonzero(undetectable).tolist() == [names.index("samovar")]
 
