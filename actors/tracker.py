@@ -59,8 +59,7 @@ from ldo_service.schemas.topics import (
     ODOMETRY_PRIOR,
     POSE_TRACKED,
 )
-from ldo_service.tracking.keyframe_database import load_keyframe_database
-from ldo_service.tracking.localizer import Localizer
+from ldo_service.tracking.localizer import Localizer, load_keyframe_database
 from ldo_service.tracking.odometry import Odometry
 from ldo_service.tracking.odometry_config import OdometryConfig
 from ldo_service.tracking.odometry_prior import OdometryPriorBuffer, PriorCheck

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from ldo_service.config import Config
 from ldo_service.runs.job import Advance
 from ldo_service.synthetic import SCENES
-from ldo_service.tracking.keyframe_database import load_keyframe_database
+from ldo_service.tracking.localizer import load_keyframe_database
 
 NO_DEFAULTS = ("None", "False", "", "''")  # Default values that the help does not print.
 LINES = 10  # Lines of progress per command if the output is no terminal.

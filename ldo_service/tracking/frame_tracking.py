@@ -53,11 +53,7 @@ class FrameTracker:
             config.relocalization,
         )
         self._guesses = InitialGuessAligner(
-            config.align,
-            config.features,
-            config.shape,
-            config.candidates,
-            config.large_motion,
+            config.align, config.features, config.shape, config.candidates, config.large_motion
         )
         self._compensator = FrameCompensator(config, self._guesses)
         self._prior: PriorPose | None = None  # Prior of the last frame.

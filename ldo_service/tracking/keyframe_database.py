@@ -8,18 +8,15 @@ from these images when frames are aligned to it again. Conventions: `ldo_service
 from collections.abc import Sequence, Set
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
-from pathlib import Path
 from statistics import median
 from typing import Any
 
 import cv2
-import msgspec
 import numpy as np
 
 from ldo_service.calibration.correction import CorrectionChange
-from ldo_service.errors import ConfigError, DataError, named
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, codecs, se3
-from ldo_service.storage.state_codec import decode_state
 
 from .features import FeatureConfig, Features, detect, detect_sift
 from .keyframes import ReferenceKeyframe
@@ -373,36 +370,3 @@ def _apart(records: tuple[KeyframeRecord, ...], other: KeyframeRecord) -> np.nda
 
 def _poses(records: Sequence[KeyframeRecord]) -> np.ndarray:
     return np.array([record.T_odom_keyframe for record in records]).reshape(-1, 4, 4)
-
-
-def load_keyframe_database(folder: Path) -> KeyframeDatabase:
-    """Load the keyframe database of a finished run from its folder.
-
-    Raises:
-        DataError: The folder has no keyframe database, or the database is unreadable or empty.
-    """
-    files = [folder / name for name in (DATABASE_FILE, OLD_DATABASE_FILE)]
-    path = next((file for file in files if file.is_file()), None)
-    if path is None:
-        raise DataError(
-            f"{folder} has no {DATABASE_FILE}, which localization needs. Give a folder that "
-            "`ldo run SOURCE --out DIR` wrote. If an older version wrote the folder, repeat the "
-            "run."
-        )
-    try:
-        kept = decode_state(path.read_bytes())
-        database = KeyframeDatabase(
-            tuple(KeyframeRecord.unpack(record) for record in kept["places"])
-        )
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}. Repeat the run.") from error
-    except (msgspec.DecodeError, ValueError, KeyError, TypeError) as error:
-        raise DataError(
-            f"{path} is not a valid keyframe database ({error!r}). Repeat the run (`ldo run`)."
-        ) from error
-    if not len(database):
-        raise DataError(
-            f"{path} contains no keyframe, because the run made none. Check that the recording "
-            "has depth images, and repeat the run."
-        )
-    return database

@@ -7,14 +7,23 @@ odometry are continuous; T_map_odom may jump (REP-105).
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ldo_service.calibration.knowledge import CameraKnowledge
+from ldo_service.errors import DataError
 from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.storage.state_codec import decode_state
 
-from .keyframe_database import KeyframeDatabase
+from .keyframe_database import (
+    DATABASE_FILE,
+    OLD_DATABASE_FILE,
+    KeyframeDatabase,
+    KeyframeRecord,
+)
 from .map_frame import MapCorrection
 from .odometry import Odometry
 from .odometry_config import OdometryConfig
@@ -168,3 +177,36 @@ class Localizer(Odometry):
         median_depth_m = keyframe.reference.median_depth_m
         look = SubmapMatch(tracked.submap, MAP, T_map_odom, tracked.T_odom_camera, median_depth_m)
         self._fix = self._fix.with_search_result(look, self.config.submaps)
+
+
+def load_keyframe_database(folder: Path) -> KeyframeDatabase:
+    """Load the keyframe database of a finished run from its folder.
+
+    Raises:
+        DataError: The folder has no keyframe database, or the database is unreadable or empty.
+    """
+    files = [folder / name for name in (DATABASE_FILE, OLD_DATABASE_FILE)]
+    path = next((file for file in files if file.is_file()), None)
+    if path is None:
+        raise DataError(
+            f"{folder} has no {DATABASE_FILE}, which localization needs. Give a folder that "
+            "`ldo run SOURCE --out DIR` wrote. If an older version wrote the folder, repeat the "
+            "run."
+        )
+    try:
+        kept = decode_state(path.read_bytes())
+        database = KeyframeDatabase(
+            tuple(KeyframeRecord.unpack(record) for record in kept["places"])
+        )
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}. Repeat the run.") from error
+    except (msgspec.DecodeError, ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{path} is not a valid keyframe database ({error!r}). Repeat the run (`ldo run`)."
+        ) from error
+    if not len(database):
+        raise DataError(
+            f"{path} contains no keyframe, because the run made none. Check that the recording "
+            "has depth images, and repeat the run."
+        )
+    return database

@@ -13,7 +13,8 @@ from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import se3
 from ldo_service.schemas import TrackedPose
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.tracking.keyframe_database import DATABASE_FILE, load_keyframe_database
+from ldo_service.tracking.keyframe_database import DATABASE_FILE
+from ldo_service.tracking.localizer import load_keyframe_database
 
 
 def localizing_tracker(finished_run: Path) -> Tracker:

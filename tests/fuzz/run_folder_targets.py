@@ -26,11 +26,8 @@ from ldo_service.schemas import CameraRgbd, MapObjects
 from ldo_service.semantics.semantics_file import read_semantics, write_semantics
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.storage.state_store import STATE_VERSION, FolderStore
-from ldo_service.tracking.keyframe_database import (
-    DATABASE_FILE,
-    KeyframeRecord,
-    load_keyframe_database,
-)
+from ldo_service.tracking.keyframe_database import DATABASE_FILE, KeyframeRecord
+from ldo_service.tracking.localizer import load_keyframe_database
 from tests.schemas.examples import EXAMPLES
 
 from .dataset_targets import DEPTH, TRAJECTORY, png
