@@ -251,7 +251,7 @@ def test_name_without_text_encoder_is_refused_and_kept_in_restored_state(
     embeddings(tmp_path / "embeddings.npz")
     cached = VlmLabeller(VlmLabellerConfig(model=str(tmp_path)))
     answer = add_name(cached, "teapot")
-    assert "--text and --vocabulary" in answer.error
+    assert "--text (text encoder) and --vocabulary" in answer.error
     assert answer.names == ("red", "green", "blue")
     assert cached.metrics()["names_refused"] == 1
     cached.restore({"added": ["teapot"]})
