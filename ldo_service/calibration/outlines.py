@@ -31,7 +31,7 @@ HOLE_PX = 15  # Window that fills the shadow of a near surface with the depth be
 # Ratio of the depths of both sides of an outline. Errors of the depth camera stay below it.
 MIN_JUMP_RATIO = 1.12
 NEAR_SIDE = 0.97  # A pixel is on the near side if its inverse depth is this close to the nearest.
-MIN_CONTRAST = 8.0  # Gray levels per pixel; a point without such a gradient tells nothing.
+MIN_CONTRAST = 8.0  # Minimum gradient of color at a point, gray levels per pixel.
 BLUR_PX = 1.0  # Standard deviation of the blur of the gray image.
 SHARED = slice(0, 6)  # Columns of a point: derivatives n J, row of the image, and the profile.
 ROW, PROFILE = 6, slice(7, 7 + 2 * REACH_PX + 1)
@@ -61,7 +61,7 @@ UNKNOWNS = len(PRIOR_SIGMAS)
 # Distance at which the shift of depth in the image is stated.
 SHIFT_DEPTH_M = 2.0
 # Components of the pose as they are reported: rotation in degrees, translation in mm, and the shift
-# in the center of the image, mrad. The outlines tell the shift better than its two parts.
+# in the center of the image, mrad. Outlines determine the shift better than its two parts.
 COMPONENTS = np.zeros((8, 6))
 COMPONENTS[:3, :3], COMPONENTS[3:6, 3:] = np.rad2deg(np.eye(3)), 1e3 * np.eye(3)
 COMPONENTS[6, 1], COMPONENTS[6, 3] = 1e3, 1e3 / SHIFT_DEPTH_M

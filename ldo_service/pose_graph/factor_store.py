@@ -228,7 +228,8 @@ class FactorStore:
     def between_variables(self, m: RelativePose) -> RelativePose:
         """Return a measurement between two keyframes as one between variables of the graph.
 
-        If both keyframes are variables, the measurement is returned unchanged.
+        A condensed keyframe is no variable; `ends` chooses the variable that replaces it. If both
+        keyframes are variables, the measurement is returned unchanged.
         """
         (a, T_a), (b, T_b) = self.ends(m)
         if (a, b) == (m.a, m.b):

@@ -138,11 +138,11 @@ class Quarantine:
         self._key, self._deliveries = key, deliveries
         with suppress(OSError):
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            number = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o600)
+            descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o600)
             try:
-                os.pwrite(number, _RECORD.pack(key, deliveries, self.count), 0)
+                os.pwrite(descriptor, _RECORD.pack(key, deliveries, self.count), 0)
             finally:
-                os.close(number)
+                os.close(descriptor)
 
     def _remove_oldest(self) -> None:
         assert self._folder is not None

@@ -1,4 +1,4 @@
-"""Label distributions of the Gaussians over time, and their consistency among neighbors."""
+"""Label distributions of the Gaussians over time, and their smoothing among neighbors."""
 
 from dataclasses import dataclass
 from typing import Literal

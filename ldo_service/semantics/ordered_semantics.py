@@ -219,7 +219,7 @@ class OrderedSemantics:
 
 @dataclass(frozen=True, slots=True)
 class OrderedStep:
-    """Result of `OrderedSemantics.step`."""
+    """Label requests of a step of `OrderedSemantics`, and whether its copy is finished."""
 
     requests: tuple[Region, ...]  # Regions to send to the labeller.
     is_done: bool  # True if the copy has replaced the live semantics.

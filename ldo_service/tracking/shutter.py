@@ -114,7 +114,7 @@ class ShutterState:
 
         The motion is the mean velocity since the last frame. An extrapolation to the frame would
         amplify the noise of the poses. The noise would enter the compensation more strongly than
-        the equations, and the estimated times would grow without bound.
+        the equations for the timing, and the estimated times would grow without bound.
 
         Args:
             before: Pose and time of the last frame that has a pose.
