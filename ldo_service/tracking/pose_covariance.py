@@ -37,6 +37,7 @@ PRIOR = np.eye(6)
 # direction in 10 to 23 % of the frames of exact cameras, and in all frames of a simulated handheld
 # camera without self-calibration, where the median of the largest ratio is 1300.
 MIN_CONTRADICTION = 20.0
+MIN_CONDITION = 1e-15  # Fraction of the largest eigenvalue; double precision resolves no less.
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +89,12 @@ def pose_covariance(
     brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
     by_brightness = np.linalg.solve(brightness, hessian[BRIGHTNESS, POSE])
     g = gradients[:, POSE] - gradients[:, BRIGHTNESS] @ by_brightness
-    inverse = np.linalg.inv(without_brightness(hessian) + PRIOR)
-    spread = g.T @ g
-    ratio = max(float(np.trace(inverse @ spread)) / 6, 1.0)
+    root = _inverse_root(without_brightness(hessian) + PRIOR)
+    normalized = g @ root.T
+    errors = normalized @ root  # Those of the pose by the gradient of each group.
+    ratio = max(float(np.sum(normalized**2)) / 6, 1.0)
     floor = np.diag([config.floor_rad**2] * 3 + [config.floor_m**2] * 3)
-    return config.scale * (inverse @ spread @ inverse + ratio * inverse) + floor
+    return config.scale * (errors.T @ errors + ratio * (root.T @ root)) + floor
 
 
 def contradiction(
@@ -121,10 +123,20 @@ def contradiction(
     by_brightness = np.linalg.solve(brightness, color_hessian[BRIGHTNESS, POSE])
     g_color = color_gradient[POSE] - color_gradient[BRIGHTNESS] @ by_brightness
     H_color = without_brightness(color_hessian)
-    root = np.linalg.inv(np.linalg.cholesky(H_color + depth_hessian + PRIOR))
+    root = _inverse_root(H_color + depth_hessian + PRIOR)
     share, directions = np.linalg.eigh(root @ H_color @ root.T)
     share = share.clip(1e-6, 1 - 1e-6)
     V = root.T @ directions
     difference = V.T @ depth_gradient / (1 - share) - V.T @ g_color / share
     is_contradicted = difference**2 * share * (1 - share) > MIN_CONTRADICTION
     return np.asarray(V @ np.where(is_contradicted, difference, 0.0))
+
+
+def _inverse_root(H: np.ndarray) -> np.ndarray:
+    """Return R with R H R^T = I for a positive definite matrix H [N, N].
+
+    Eigenvalues below the fraction MIN_CONDITION of the largest one are raised to it. Rounding can
+    make them negative: few pixels at a millimeter from the camera have such a Hessian.
+    """
+    values, Q = np.linalg.eigh(H)
+    return np.asarray((Q / np.sqrt(values.clip(MIN_CONDITION * values[-1]))).T)

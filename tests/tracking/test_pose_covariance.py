@@ -123,6 +123,19 @@ def test_cue_without_information_along_a_direction_contradicts_nothing_there() -
     assert abs(found[4]) < 0.02  # The poses by color and by depth alone differ by more than 1 here.
 
 
+def test_hessian_that_rounding_makes_indefinite_is_accepted() -> None:
+    rng = np.random.default_rng(7)
+    J = 1e10 * rng.normal(size=(3, 8))  # Three residuals, as of few pixels at a millimeter.
+    J[:, 6:] = 0.0
+    hessian, gradient = J.T @ J, J.T @ np.ones(3)
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(hessian[:6, :6] + np.eye(6))
+    assert np.isfinite(contradiction(hessian, gradient, hessian[:6, :6], gradient[:6])).all()
+    covariance = pose_covariance(hessian, gradient[None], CovarianceConfig())
+    assert np.linalg.eigvalsh(covariance)[0] > 0
+
+
+@pytest.mark.slow
 def test_errors_of_an_uncalibrated_camera_are_within_three_sigma() -> None:
     """Vignetting, depth bias and a rolling shutter move color and depth by several sigma."""
     sequence = open_sequence("synthetic:room-handheld")
