@@ -77,6 +77,7 @@ def test_merged_map_has_a_single_submap(finished: Path) -> None:
     assert {keyframe["submap"] for keyframe in keyframes} == {0}
 
 
+@pytest.mark.slow
 def test_merged_map_is_refitted_at_the_end_of_the_run(
     finished: Path, walk_with_return: Rearranged, tmp_path: Path
 ) -> None:

@@ -17,6 +17,7 @@ def ldo_control(service: LiveService, *arguments: str) -> subprocess.CompletedPr
     return subprocess.run(command, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_live_service_pauses_refines_resumes_saves_and_resets(
     tmp_path: Path, room: Sequence
 ) -> None:

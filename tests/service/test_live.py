@@ -113,6 +113,7 @@ def test_used_port_is_reported_without_traceback(tmp_path: Path) -> None:
         assert "Traceback" not in second.stderr
 
 
+@pytest.mark.slow
 def test_state_folder_is_resumed_and_shared_or_partial_ones_rejected(
     tmp_path: Path, room: Sequence
 ) -> None:

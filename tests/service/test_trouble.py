@@ -46,6 +46,7 @@ def tracked(service: LiveService, room: Sequence, indices: Iterable[int]) -> lis
     return [service.pose_of(message(room, index)) for index in indices]
 
 
+@pytest.mark.slow
 def test_process_with_a_hanging_handler_is_restarted(
     faulty_service: Callable, room: Sequence, tmp_path: Path
 ) -> None:

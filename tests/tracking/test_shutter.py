@@ -239,7 +239,7 @@ def test_evidence_that_contradicts_itself_is_uncertain() -> None:
     assert (np.abs(times_s) < 4 * sigmas_s).all()
 
 
-@pytest.mark.parametrize("interval_ns", [5_000_000, 1_000_000, 1_000, 1])
+@pytest.mark.parametrize("interval_ns", [5_000_000, 1])
 def test_wrong_stamp_does_not_move_the_image(
     camera: MovingCamera, frames: list[RgbdFrame], interval_ns: int
 ) -> None:
