@@ -70,7 +70,10 @@ class ComparedPair:
 
 @lru_cache(maxsize=2)
 def block_grid(camera: Camera, block: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rays, bias basis and vignetting basis of the blocks of a view, each [h w, 3]."""
+    """Return values at the centers of the h x w blocks of a view, three arrays [h w, 3].
+
+    The arrays are the rays, and the basis functions of the depth bias and of the vignetting.
+    """
     u, v = block_centers(camera, block)
     bases = bias_basis(u, v, camera), vignetting_basis(u, v, camera)
     rays, bias, vignetting = (b.reshape(-1, 3) for b in (camera.rays_at(u, v), *bases))

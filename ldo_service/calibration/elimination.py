@@ -113,9 +113,9 @@ def solve(blocks: Sequence[Reduced], prior: np.ndarray | float, now: np.ndarray)
 def held_out(
     blocks: Sequence[Reduced], prior: float, now: np.ndarray
 ) -> list[tuple[range, np.ndarray]]:
-    """Return groups of successive blocks, each with the step [..., K] by the other groups.
+    """Return groups of successive blocks, each with a step [..., K] of the shared coefficients.
 
-    The step of the shared coefficients is computed from all blocks outside the group.
+    The step is computed from all blocks outside the group.
     """
     groups = np.array_split(np.arange(len(blocks)), min(GROUPS, len(blocks)))
     ranges = [range(int(group[0]), int(group[-1]) + 1) for group in groups]
@@ -161,7 +161,7 @@ def _weights(prior: np.ndarray | float, now: np.ndarray) -> np.ndarray:
 def check(
     blocks: Sequence[Block], reduced: Sequence[Reduced], prior: float, now: np.ndarray
 ) -> Generator[float, None, list[Check]]:
-    """Evaluate the coefficients on held-out blocks; yields its work after each block.
+    """Evaluate the coefficients on held-out blocks; yield the amount of work after each block.
 
     Returns:
         A check of each independent system.

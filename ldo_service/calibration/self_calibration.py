@@ -6,9 +6,9 @@
         ...  # Track the frame, with `calibration.knowledge`.
         change = calibration.observe(raw, T_odom_camera, motion)
 
-The timing of the shutter is estimated together with the depth bias, since a moving rolling shutter
-distorts the views. It is not part of the correction: tracking compensates it by the motion of each
-frame, and refines it (`ShutterState`).
+The timing of a rolling shutter is estimated together with the depth bias, since it distorts the
+views of a moving camera. The timing is not part of the correction. Tracking compensates the motion
+within each frame by the timing, and refines the timing (`ShutterState`).
 
 Each call of `observe` does a bounded part of the work, so that the tracker skips no frame. An
 estimate is used only if held-out pairs of views confirm it: the correction must reduce their
