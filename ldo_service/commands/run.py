@@ -196,7 +196,8 @@ def kept_front_end(
         return None
     if run.expanduser().resolve() == out.expanduser().resolve():
         raise ConfigError(
-            f"--out {out} would replace the front end that the run reads. Choose another --out."
+            f"--out {out} is also the folder of --reuse-front-end, and the run would replace the "
+            "recording that it reads. Choose another --out."
         )
     return FrontEnd.open(run, settings, sequence, selection)
 

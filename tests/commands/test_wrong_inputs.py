@@ -62,7 +62,7 @@ def example_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (
             "run synthetic:room --out s --reuse-front-end s",
             2,
-            "--out s would replace the front end",
+            "--out s is also the folder of --reuse-front-end",
         ),
         (
             "run synthetic:room --out s --reuse-front-end x --keep-front-end",
