@@ -20,7 +20,7 @@ from .values import (
 class PaperSettings:
     """Constants of the paper, and switches that replace the default rules by those of the paper.
 
-    These settings reproduce the results of the paper. A user need not tune them.
+    With them, the results of the paper can be reproduced. A user need not tune them.
     """
 
     # Rule that labels a Gaussian: the fraction of its splat that a region covers, or the paper's
