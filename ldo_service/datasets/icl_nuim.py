@@ -124,7 +124,7 @@ def _z_of_distances(path: Path) -> np.ndarray:
     """
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise ValueError(f"it has more than {MAX_BYTES} bytes")
+            raise ValueError(f"the file has more than {MAX_BYTES} bytes")
         distance_m = np.array(path.read_bytes().split(), np.float32)
     except (OSError, ValueError) as error:
         raise FrameError(

@@ -58,7 +58,7 @@ class KittiSequence(Sequence):
         if not left.keys() & right.keys():
             raise DataError(
                 f"{folder} has {len(left)} images in {names[0]}/ and {len(right)} in {names[1]}/, "
-                "but no pair of the same number. Download both folders of the benchmark."
+                "but no two of them have the same number. Download both folders of the benchmark."
             )
         self._files = pair_by_number(left, right, folder)
         first, second = (int(name[-1]) for name in names)
@@ -85,8 +85,8 @@ class KittiSequence(Sequence):
         if left.shape != right.shape:
             raise FrameError(
                 f"{self._files.color[index]} is {left.shape[1]}x{left.shape[0]} pixels and "
-                f"{self._files.depth[index]} {right.shape[1]}x{right.shape[0]}, expected one size. "
-                "Download them again."
+                f"{self._files.depth[index]} {right.shape[1]}x{right.shape[0]}, expected equal "
+                "sizes. Download them again."
             )
         disparity_px = self._match(left, right)
         stereo = self._stereo

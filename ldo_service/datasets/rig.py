@@ -88,7 +88,7 @@ class SequenceOptions:
     def __post_init__(self) -> None:
         if unknown := sorted(self.topics.keys() - {"color", "depth", "odometry"}):
             raise ConfigError(
-                f"topics names the unknown stream {unknown[0]!r}. Use color, depth or odometry."
+                f"topics has the unknown key {unknown[0]!r}. Use color, depth or odometry as a key."
             )
         if self.T_color_depth is not None and not is_rigid(self.T_color_depth):
             raise ConfigError(
@@ -114,9 +114,9 @@ class SequenceOptions:
 class RigSequence(Sequence):
     """Sequence of two cameras, whose images are brought to one pixel grid.
 
-    Color is resampled to the depth image if both cameras have equal center and orientation, and
-    depth does not change. Otherwise, or with `SequenceOptions.register_depth`, depth is registered
-    to the color camera. The poses of a data set are assumed to be those of the depth camera.
+    If both cameras have equal center and orientation, color is resampled to the depth image, which
+    does not change. Otherwise, or with `SequenceOptions.register_depth`, depth is registered to the
+    color camera. The poses of a data set are assumed to be those of the depth camera.
 
     Attributes:
         rig: Cameras of the images in the data set.
