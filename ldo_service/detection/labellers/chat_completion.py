@@ -18,7 +18,7 @@ import numpy as np
 
 from ldo_service.detection.labellers import ScoredLabel, fused_over_views
 from ldo_service.detection.vocabulary import LONGEST, canonical, is_name
-from ldo_service.errors import ConfigError, EndpointError
+from ldo_service.errors import ConfigError, EndpointError, named
 from ldo_service.geometry import codecs
 from ldo_service.geometry.codecs import shrunk
 
@@ -167,13 +167,13 @@ class HttpConfig:
 
     def __post_init__(self) -> None:
         if self.confidence not in ("product", "mean"):
-            raise ConfigError(f"http.confidence={self.confidence!r} must be 'product' or 'mean'.")
+            raise ConfigError(named(self, "confidence") + " must be 'product' or 'mean'.")
         if min(self.views, self.side_px, self.max_words, self.max_tokens) < 1:
-            raise ConfigError("http: views, side_px, max_words and max_tokens must be at least 1.")
-        if not 0 <= self.confidence_untold <= 1:
             raise ConfigError(
-                f"http.confidence_untold={self.confidence_untold:g} must be in [0, 1]."
+                named(self, "views", "side_px", "max_words", "max_tokens") + " must be at least 1."
             )
+        if not 0 <= self.confidence_untold <= 1:
+            raise ConfigError(named(self, "confidence_untold") + " must be in [0, 1].")
 
 
 class HttpLabeller:

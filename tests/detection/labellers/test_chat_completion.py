@@ -412,7 +412,7 @@ def test_password_in_the_address_raises_without_repeating_it() -> None:
     "fields", [{"confidence": "max"}, {"views": 0}, {"confidence_untold": 2.0}]
 )
 def test_invalid_settings_raise_config_error(fields: dict) -> None:
-    with pytest.raises(ConfigError, match="http"):
+    with pytest.raises(ConfigError, match="HttpConfig." + next(iter(fields))):
         HttpConfig(**fields)
     with pytest.raises(ConfigError):
         HttpClientConfig(attempts=0)
