@@ -188,7 +188,7 @@ def frames_to_show(errors: ListErrors, count: int = VIEWS) -> list[tuple[int, st
     """Choose frames with objects, spread from the worst to the best.
 
     Frames are ranked by the fraction of their object pixels with the right label. Frames in which
-    at most MIN_OBJECTS of the pixels show an object are not chosen.
+    at most the fraction MIN_OBJECTS of the pixels show an object are not chosen.
 
     Args:
         errors: Errors of one list of names.

@@ -62,7 +62,7 @@ class Lpips:
                 f"{_first_line(error)}. Export it with dynamic height and width."
             ) from error
         if out.size != 1:
-            raise self._misfit(f"its output has the shape {out.shape}, expected one number")
+            raise self._misfit(f"the output has the shape {out.shape}, expected one number")
         return float(out.item())
 
     def _require_layout(self) -> None:
@@ -74,15 +74,15 @@ class Lpips:
         )
         if len(inputs) != 2 or len(outputs) != 1 or not are_images:
             raise self._misfit(
-                f"it has inputs of the shapes {shapes} and {len(outputs)} outputs, expected two "
-                "float32 images [1, 3, H, W] and one output"
+                f"the inputs have the shapes {shapes} and there are {len(outputs)} outputs, "
+                "expected two float32 images [1, 3, H, W] and one output"
             )
 
     def _require_distance(self, image: np.ndarray) -> None:
         itself = self._distance(image, image)
         if not abs(itself) <= OF_EQUAL_IMAGES:
             raise self._misfit(
-                f"its distance of an image to itself is {itself:.3g}, expected almost 0"
+                f"the distance of an image to itself is {itself:.3g}, expected almost 0"
             )
 
     def _misfit(self, finding: str) -> ConfigError:
