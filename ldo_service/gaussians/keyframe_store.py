@@ -131,7 +131,7 @@ class KeyframeStore:
             images = unpack(self._files.read(keyframe))
             if images.keyframe != keyframe:
                 raise DataError(
-                    f"their file contains keyframe {images.keyframe}, expected keyframe {keyframe}"
+                    f"the file contains keyframe {images.keyframe}, expected keyframe {keyframe}"
                 )
         except DataError as error:
             log.warning(

@@ -250,7 +250,7 @@ def unpack(body: bytes | memoryview) -> KeyframeImages:
         mask = None if stored.mask is None else _expanded(stored.mask, np.uint8, size)
     except (zstandard.ZstdError, ValueError, RecursionError) as error:
         raise DataError(
-            f"its {len(body)} bytes cannot be decoded as the images of a keyframe: {error}"
+            f"{len(body)} bytes cannot be decoded as the images of a keyframe: {error}"
         ) from error
     for image in (color, depth_m, mask):
         if image is not None:
