@@ -30,7 +30,7 @@ def read_arrays(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
         announced = sum(_announced_bytes(archive, entry) for entry in archive.infolist())
     if max(packed, announced) > max_bytes:
         raise ValueError(
-            f"its arrays have {max(packed, announced)} bytes, more than the maximum of {max_bytes}"
+            f"the arrays have {max(packed, announced)} bytes, more than the maximum of {max_bytes}"
         )
     with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}

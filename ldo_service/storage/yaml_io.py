@@ -36,7 +36,7 @@ def load_yaml(text: str | bytes) -> Any:
     try:
         return _loaded(text)
     except RecursionError:
-        raise yaml.YAMLError("it is nested too deeply") from None
+        raise yaml.YAMLError("the content is nested too deeply") from None
     except (yaml.YAMLError, ValueError) as error:  # A date such as 2027-13-01 is a ValueError.
         raise yaml.YAMLError(" ".join(str(error).split())) from error
 
