@@ -125,7 +125,7 @@ def read_key(body: bytes) -> PrivateKey:
     """
     key = serialization.load_pem_private_key(body, None)
     if not isinstance(key, PrivateKey):
-        raise ValueError("its key must be a private key of an elliptic curve")
+        raise ValueError("the key must be a private key of an elliptic curve")
     return key
 
 

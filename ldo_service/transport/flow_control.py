@@ -58,7 +58,7 @@ class Header(msgspec.Struct, frozen=True, array_like=True):
     epoch: int  # Changes when the producer restarts its numbering.
     seq: int  # Offset of the message in this epoch.
     stamp_ns: int
-    key: str = ""  # Value of the message field `Topic.key`, for `Latest(per_key=True)`.
+    key: str = ""  # Value of the field that `Topic.key` names, for `Latest(per_key=True)`.
 
     def __post_init__(self) -> None:
         if not (0 <= self.seq < MAX_SEQ and self.epoch > 0):
