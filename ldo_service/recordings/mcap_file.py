@@ -106,7 +106,7 @@ class McapIndex:
 
     def _read_index(self, file: BinaryIO, size: int) -> None:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise ValueError("it is not an MCAP file")
+            raise ValueError("the file is not an MCAP file")
         for opcode, start, length in _records(file, size):
             if opcode == Opcode.CHUNK:
                 data = _read_chunk(file)

@@ -18,7 +18,7 @@ ENTRIES: Mapping[str, Any] = {channel: kind for kind, channel in CHANNELS.items(
 
 
 class JournalFile:
-    """Recorded journal of an actor in one process."""
+    """Recorded journal of an actor, from the start to the end of one process of the actor."""
 
     def __init__(self, path: Path) -> None:
         """Read the index of a file.
