@@ -42,7 +42,7 @@ def T_map_submap(submap: int) -> np.ndarray:
 class KeyframePoses:
     """Keyframe poses in the map by id, from relative poses and corrections of the pose graph.
 
-    Each component that receives keyframes has its own instance. Two instances with the same
+    Each program or actor that receives keyframes has its own instance. Two instances with the same
     keyframes and the same last correction have equal poses, in whatever order the keyframes and the
     correction arrived. An instance needs 0.4 kB of memory per keyframe.
     """
@@ -182,7 +182,7 @@ class KeyframePoses:
         return int(known[-1]) if len(known) else None
 
     def keep_only(self, keyframes: Iterable[int]) -> None:
-        """Remove all keyframes except the given ones, in a component that needs few keyframes."""
+        """Remove all keyframes except the given ones, to save memory."""
         self._known.keep_only(keyframes)
 
     def T_map_odom(self, keyframe: int) -> np.ndarray:
