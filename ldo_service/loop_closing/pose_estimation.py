@@ -153,12 +153,14 @@ def check_depth_consistency(
         z_p < z_q - gate       in the free space of the old camera: conflict
         z_p > z_q + gate       occluded, no information
 
+    Here gate = gate_m + gate_share z_q.
+
     Args:
         points: Points of the new keyframe (see `Reference`), [7, N].
         T_old_new: Pose of the new keyframe in the old one, [4, 4].
         old_depth_m: Depth of the old keyframe, [H, W], meters; 0 where unknown.
         camera: Intrinsics of the old keyframe.
-        config: Limits, of which `gate_m` and `gate_share` are used.
+        config: Limits; only `gate_m` and `gate_share` are used.
 
     Returns:
         The comparison; all values are 0 if no point projects to a pixel with depth.

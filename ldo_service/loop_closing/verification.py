@@ -297,7 +297,7 @@ class Verifier:
     def accept_unverified(self, proposal: LoopHypothesis) -> VerificationResult:
         """Accept the pose from landmarks as a loop closure without refinement or checks.
 
-        This is what the paper's fine step does; it is used for comparison (stages: semantic).
+        This is the fine step of the paper. It is used for comparison, if the mode is `semantic`.
         """
         sigma_m = self._config.landmarks.reach_m / np.sqrt(proposal.inliers)
         sigmas = np.repeat([sigma_m / _depth(proposal), sigma_m], 3)
