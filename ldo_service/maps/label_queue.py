@@ -26,11 +26,11 @@ class WaitingRequest(NamedTuple):
 class LabelRequestQueue:
     """Queue of label requests, at most one for each region.
 
-    A labeller that can receive all waiting requests gets them in order. A slower labeller first
-    gets the requests that show the most new surface. The new surface is the area that the view of
-    the request shows, minus the largest area that an earlier request of the same region showed.
-    The rate of requests therefore follows the speed of the labeller, and large objects get their
-    label first.
+    A labeller that can receive all waiting requests gets the oldest request first. A slower
+    labeller first gets the requests that show the most new surface. The new surface is the area
+    that the view of the request shows, minus the largest area that an earlier request of the same
+    region showed. The rate of requests therefore follows the speed of the labeller, and large
+    objects get their labels first.
     """
 
     def __init__(self) -> None:
