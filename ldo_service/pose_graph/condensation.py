@@ -166,7 +166,9 @@ def condense_between(
     T_head: np.ndarray,
     T_head_tail: np.ndarray,
 ) -> CondensedKeyframes:
-    """Return the condensed keyframes between two variables, at evenly spaced fractions of the way.
+    """Return the keyframes between two variables as condensed keyframes.
+
+    Their `fractions` are evenly spaced: k / (n + 1) for the k-th of n keyframes.
 
     Args:
         head: Id of the first variable.
