@@ -350,7 +350,7 @@ class RegionDetections:
         return np.stack([np.where(sure > 0, one.astype(int), -1) for one, sure in sources], axis=1)
 
     def pack(self) -> list[np.ndarray]:
-        """Return the arrays of detections that have no masks yet, for a checkpoint."""
+        """Return all arrays except the masks, for a checkpoint of detections without masks."""
         labels = self.labels, self.confidences, self.open_labels, self.open_confidences
         return [self.boxes, *labels]
 

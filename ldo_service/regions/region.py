@@ -131,7 +131,7 @@ class RegionObservation:
         return int(np.count_nonzero(self.candidate.part.mask))
 
     def surface_m2(self, camera: Camera) -> float:
-        """Return the visible area of the region in m^2 if its surface faced the camera."""
+        """Return the visible area in m^2, assuming that the surface faces the camera."""
         if not len(self.p_camera):
             return 0.0
         depth_m = float(np.median(self.p_camera[:, 2]))
@@ -272,8 +272,7 @@ def merge_observation(region: Region, seen: RegionObservation, max_boxes: float)
     Args:
         region: The region.
         seen: The observation.
-        max_boxes: Maximum sum of the votes for a label after a vote of a detector's box, see
-            `with_box`.
+        max_boxes: Sum of the votes for a label up to which boxes add votes, see `with_box`.
     """
     proposal = seen.candidate
     surer = max(region, proposal, key=lambda one: one.score)

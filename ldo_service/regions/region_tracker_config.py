@@ -108,5 +108,5 @@ class RegionTrackerConfig:
 
     @property
     def max_boxes(self) -> float:
-        """Maximum sum of the votes of all boxes for one label."""
+        """Sum of the votes for a label up to which boxes add votes; 0 if boxes do not vote."""
         return self.answer_weight if self.boxes_vote else 0.0
