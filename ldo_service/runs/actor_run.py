@@ -77,12 +77,12 @@ class ActorRun:
         self._clock.finish()
 
     def end_stream(self) -> None:
-        """Finish after the last frame, and fix the step times for the summary."""
+        """Finish after the last frame, and store the step times so far for the summary."""
         self.finish()
         self.keep_step_times()
 
     def keep_step_times(self) -> None:
-        """Fix the step times for the summary, so that a later refinement does not count."""
+        """Store the step times so far for the summary, which then excludes a later refinement."""
         self._stage_ms = self._step_percentiles()
 
     @property

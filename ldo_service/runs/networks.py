@@ -19,6 +19,6 @@ def require_usable_networks(config: Config) -> None:
 
 
 def labelled_by(config: Config) -> dict[str, str]:
-    """Return the names of the detector and the labeller of a run; empty if the run had none."""
+    """Return the names of the detector and the labeller of a run; a missing one has the name ""."""
     labeller = config.vlm_labeller.model or config.vlm_labeller.url
     return {"detector": config.detector.model, "labeller": labeller}
