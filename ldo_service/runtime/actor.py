@@ -53,7 +53,7 @@ class Latest:
     """Policy of an input that queues the newest messages; older ones are dropped and counted."""
 
     depth: int = 1  # Maximum number of messages in a queue.
-    per_key: bool = False  # Keep one queue for each value of the message field `Topic.key`.
+    per_key: bool = False  # Keep one queue for each value of the field that `Topic.key` names.
     # Maximum number of queues. If a new key exceeds this number, the queue with the oldest message
     # is dropped.
     max_keys: int = 32
@@ -116,7 +116,7 @@ class Actor:
     """Unit of computation that handles messages.
 
     A step is the handling of one message. The stage is the runtime around the actor. Before each
-    step, it sets `situation` to the current credits and backlogs.
+    step, the stage sets `situation` to the current credits and backlogs.
     """
 
     name: ClassVar[str]

@@ -50,7 +50,7 @@ def trim_memory() -> None:
 
 
 async def exit_with_parent(period_s: float = 0.5) -> None:
-    """Wait until the parent process has ended.
+    """Wait until the parent process has ended, so that the caller can then end this process.
 
     The function waits forever if no `ChildProcess` started this process.
 

@@ -44,9 +44,9 @@ class QuarantinedMessage(msgspec.Struct, frozen=True, kw_only=True):
 class Quarantine:
     """Count of the deliveries of the current message, and folder of quarantined messages.
 
-    Only lossless inputs deliver a message again. A message that ended its process before is
-    handled alone: the other suspected messages of the process wait. If a process with several
-    actors ends, a message of another actor therefore gets no second count.
+    Only lossless inputs deliver a message again. A message is suspected if its process ended
+    during an earlier delivery. A process with several actors handles one suspected message at a
+    time. If the process ends again, only that message gets a further count.
 
     Attributes:
         count: Number of quarantined messages since the state folder is in use.
