@@ -29,7 +29,10 @@ WORSE_OVERLAP, WORSE_NOISE = 0.8, 1.5
 
 
 class FrameCompensator:
-    """Image pyramid of the current frame; only a cache is kept from one frame to the next."""
+    """Maker of the image pyramid of a frame, with the camera motion during the frame compensated.
+
+    Between two frames, only a cache is kept.
+    """
 
     def __init__(self, config: OdometryConfig, guesses: InitialGuessAligner) -> None:
         self.config = config

@@ -317,7 +317,7 @@ class ReusedKeyframe:
     candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
     def measures(self, keyframe: int) -> RelativePose:
-        """Return the pose, in this keyframe, of the new keyframe that the aligned frame becomes."""
+        """Return the pose in this keyframe that the aligned frame has as the new `keyframe`."""
         seen = self.candidate.alignment
         return RelativePose(self.record.id, keyframe, seen.T_reference_camera, seen.information)
 
