@@ -127,7 +127,7 @@ def require_distribution(distribution: Distribution) -> None:
     if not 0 < len(weights) <= MAX_CLASSES:
         raise ValueError(f"distribution has {len(weights)} classes, must have 1 to {MAX_CLASSES}")
     if len({name for name, _ in distribution}) != len(weights):
-        raise ValueError("distribution names a class twice")
+        raise ValueError("a class occurs twice in the distribution")
     if min(weights) < 0 or sum(weights) > 1 + ROUNDING:
         raise ValueError(f"probabilities are {weights}, must not be negative or sum to more than 1")
     if any(not 0 < len(name) <= MAX_LABEL_LENGTH for name, _ in distribution):
