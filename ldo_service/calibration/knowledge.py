@@ -12,8 +12,8 @@ class CameraKnowledge:
     The tracker weights depth by the uncertainty, and compensates frames by the timing.
     """
 
-    # Standard deviation of the depth bias, divided by the one of an unknown camera; 0 if there is
-    # no bias.
+    # Standard deviation of the depth bias, divided by the one of an unknown camera; 0
+    # if there is no bias.
     relative_bias_sigma: float = 0.0
     # Normal equations [3, 4] of the times of the shutter: information [3, 3] in 1/s^2, then the
     # right side [3]. Their solution is the estimate, in the order of `ShutterTiming`. None before

@@ -60,8 +60,8 @@ PRIOR_SIGMAS = np.array([0.0175] * 3 + [0.02] * 3 + [2.0, 0.01])
 UNKNOWNS = len(PRIOR_SIGMAS)
 # Distance at which the shift of depth in the image is stated.
 SHIFT_DEPTH_M = 2.0
-# Components of the pose as they are reported: rotation in degrees, translation in mm, and the shift
-# in the center of the image, mrad. Outlines determine the shift better than its two parts.
+# Components of the pose as they are reported: rotation in degrees, translation in mm, and the
+# shift in the center of the image, mrad. Outlines determine the shift better than its two parts.
 COMPONENTS = np.zeros((8, 6))
 COMPONENTS[:3, :3], COMPONENTS[3:6, 3:] = np.rad2deg(np.eye(3)), 1e3 * np.eye(3)
 COMPONENTS[6, 1], COMPONENTS[6, 3] = 1e3, 1e3 / SHIFT_DEPTH_M
@@ -128,8 +128,8 @@ def outline_points(color: np.ndarray, depth_m: np.ndarray, camera: Camera) -> np
     )
     contrast = np.abs(du * normal[:, :1] + dv * normal[:, 1:])
     strongest = contrast.max(axis=1, keepdims=True)
-    # A mean gradient is no evidence, and all outlines count alike. The square separates an edge
-    # from the texture beside it.
+    # A mean gradient is no evidence, and all outlines count alike. The square separates an
+    # edge from the texture beside it.
     above = np.maximum(contrast - contrast.mean(axis=1, keepdims=True), 0)
     profile = (above / strongest.clip(1e-6)) ** 2
     pixel = np.stack([column, row], axis=1) * step + middle
@@ -173,7 +173,7 @@ def _derivatives(
     by_place = np.zeros((len(pixel), 3))
     by_place[:, 0], by_place[:, 1] = normal[:, 0] * camera.fx / z, normal[:, 1] * camera.fy / z
     by_place[:, 2] = -(by_place[:, :2] * rays[:, :2]).sum(axis=1)
-    # by_place . (rotation x point) = rotation . (point x by_place)
+    # (rotation x point) . by_place = rotation . (point x by_place)
     return np.concatenate([np.cross(rays * z[:, None], by_place), by_place], axis=1)
 
 

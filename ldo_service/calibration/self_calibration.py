@@ -96,7 +96,7 @@ class SelfCalibration:
         self.ratios = (1.0, 1.0)  # Held-out residuals of the last estimate: depth, color.
         # Covariance of the last estimate of the depth bias, [3, 3] 1/m^2; 0 before the first one.
         self.depth_bias_covariance = np.zeros((BIAS_TERMS, BIAS_TERMS))
-        self.extrinsics: Extrinsics | None = None  # By the estimate from most views.
+        self.extrinsics: Extrinsics | None = None  # Result of the estimate from most views.
         self.is_finished = not self.config.views
         self._maker = ViewMaker()
         self._views: dict[int, CalibrationView] = {}
