@@ -27,9 +27,9 @@ class ConsistencyCheckConfig:
     drift: float = 0.1  # Additional drift per meter of path; ten times that of depth cameras.
     turn_rad: float = 0.35  # Allowed rotation drift on any path.
     turn_rad_per_m: float = 0.02  # Additional rotation drift per meter of path; 1.1 degrees.
-    # Maximum pose difference of two cameras that see the same surfaces. view_rad is the rotation,
-    # about the width of a view; view_depths is the distance in median depths. The allowed drift is
-    # added to these limits.
+    # Maximum pose difference of two cameras that see the same surfaces. view_rad is the
+    # rotation, about the width of a view; view_depths is the distance in median depths. The allowed
+    # drift is added to these limits.
     view_rad: float = 1.5
     view_depths: float = 2.0
     # A hypothesis is ambiguous if another one has at least this fraction of its inliers, and if the

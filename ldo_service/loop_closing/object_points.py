@@ -226,8 +226,8 @@ class LandmarkAgreement:
     """Agreement of the landmarks of two subgraphs after alignment by a relative pose."""
 
     count: int  # Number of pairs with matching distributions.
-    # Number of new landmarks that contradict the pose: old landmarks are near them, but none of
-    # these has the same label or a similar distribution.
+    # Number of new landmarks that contradict the pose: old landmarks are near them,
+    # but none of these has the same label or a similar distribution.
     contradicted: int
     divergence: float  # Mean KL divergence over the matching pairs, nats.
     entropy: float  # Mean entropy of the landmarks in the matching pairs, nats.
