@@ -54,8 +54,8 @@ class Latest:
 
     depth: int = 1  # Maximum number of messages in a queue.
     per_key: bool = False  # Keep one queue for each value of the field that `Topic.key` names.
-    # Maximum number of queues. If a new key exceeds this number, the queue with the oldest message
-    # is dropped.
+    # Maximum number of queues. If a new key exceeds this number, the queue with the oldest
+    # message is dropped.
     max_keys: int = 32
 
     def __post_init__(self) -> None:
