@@ -55,16 +55,16 @@ class ObjectsConfig:
     max_divergence: float = 0.2
     # Misses in a row after which an object is removed (paper, III.C).
     miss_limit: int = 10
-    # Misses in a row after which an object is removed if the entropy of its label distribution is
-    # above `uncertain_entropy`.
+    # Misses in a row after which an object is removed if the entropy of its label
+    # distribution is above `uncertain_entropy`.
     uncertain_miss_limit: int = 5
     # Entropy (nats) of the label distribution above which an object is removed earlier
     # (paper, III.C).
     uncertain_entropy: float = 0.5
     # Misses in a row after which a candidate is removed; it can be created again.
     candidate_miss_limit: int = 3
-    # A miss counts only if at least this fraction of an object's sampled Gaussians is in view and
-    # not occluded.
+    # A miss counts only if at least this fraction of an object's sampled Gaussians is in view
+    # and not occluded.
     min_visible: float = 0.5
     # A miss counts only if the square root of the predicted box's area is at least this length,
     # because a detector may overlook smaller objects.

@@ -31,8 +31,8 @@ from .semantic_map_config import SemanticMapConfig
 MAX_KEYFRAMES = 1024
 # Maximum number of stored label results, about 100 B each. 1024 keyframes request fewer.
 MAX_RESULTS = 4096
-# Offset added to region ids in label requests of the copy. It keeps them apart from the region ids
-# in requests of the live semantics.
+# Offset added to region ids in label requests of the copy. It keeps them apart from the region
+# ids in requests of the live semantics.
 FIRST_REGION = 1 << 32
 
 

@@ -19,10 +19,10 @@ class SemanticMapConfig:
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     naming: OpenVocabularyConfig = field(default_factory=OpenVocabularyConfig)
     movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
-    # Minimum score of a detection of a dynamic class, such as a person, that removes the surface
-    # from the map. Detections with this score need no label request either. The score is high: a
-    # false detection of a person in a picture would cut a hole into the map. A hole is worse than
-    # a person left in the map.
+    # Minimum score of a detection of a dynamic class, such as a person, that removes the
+    # surface from the map. Detections with this score need no label request either. The score is
+    # high: a false detection of a person in a picture would cut a hole into the map. A hole is
+    # worse than a person left in the map.
     movable_confidence: float = 0.6
     max_names: int = MAX_LABELS  # Maximum names in the vocabulary; further names become `other`.
     # Maximum number of keyframes whose detections are stored until the keyframe is mapped. It
