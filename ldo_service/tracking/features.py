@@ -41,8 +41,8 @@ class FeatureConfig:
     ratio: float = 0.8
     # Maximum Hamming distance of ORB matches, bits of 256 (ORB-SLAM3: 100 loose, 50 tight).
     max_distance: int = 64
-    # Maximum number of SIFT features of a frame; the strongest ones are kept. A keyframe record has
-    # at most half as many.
+    # Maximum number of SIFT features of a frame; the strongest ones are kept. A keyframe record
+    # has at most half as many.
     count_across_scales: int = 1000
     # SIFT contrast threshold as a fraction of the gray range. OpenCV's default of 0.04 finds few
     # features indoors.

@@ -84,8 +84,8 @@ class KeyframeRecord:
     camera: Camera  # Intrinsics of `gray` and `depth`.
     gray: bytes  # PNG image of the size of `camera`.
     depth: bytes  # Depth of the size of `camera`, 16 bits compressed by zstd.
-    # Change of the camera correction since the record was stored. Images and points are converted
-    # only when they are used, because converting all records at the same time would take long.
+    # Change of the camera correction since the record was stored. Images and points are
+    # converted when they are used, because a conversion of all records at once takes long.
     change: CorrectionChange | None = None
 
     @cached_property

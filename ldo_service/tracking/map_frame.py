@@ -28,8 +28,8 @@ class MapCorrection:
 
     version: int
     roots: Mapping[int, int]  # Oldest submap that each submap is merged with, by submap.
-    # Function that returns T_map_keyframe [4, 4] by id. Its argument lists the ids to return, or is
-    # None for all keyframes. The newest keyframe is always returned too.
+    # Function that returns T_map_keyframe [4, 4] by id. Its argument lists the ids to return,
+    # or is None for all keyframes. The newest keyframe is always returned too.
     read_poses: Callable[[Iterable[int] | None], Mapping[int, np.ndarray]]
 
 

@@ -91,7 +91,7 @@ def pose_covariance(
     g = gradients[:, POSE] - gradients[:, BRIGHTNESS] @ by_brightness
     root = _inverse_root(without_brightness(hessian) + PRIOR)
     normalized = g @ root.T
-    errors = normalized @ root  # Those of the pose by the gradient of each group.
+    errors = normalized @ root  # Errors of the pose by the gradient of each group.
     ratio = max(float(np.sum(normalized**2)) / 6, 1.0)
     floor = np.diag([config.floor_rad**2] * 3 + [config.floor_m**2] * 3)
     return config.scale * (errors.T @ errors + ratio * (root.T @ root)) + floor

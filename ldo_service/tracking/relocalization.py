@@ -68,8 +68,8 @@ class RelocalizationConfig:
     # Number of records that a frame is compared with: those with the most similar thumbnails. The
     # prototype has the same value.
     appearance_candidates: int = 5
-    # Number of further records that a frame is compared with. The next search uses the next ones.
-    # At 30 Hz, all of 1000 records have had their turn after 11 s.
+    # Number of further records that a frame is compared with. The next search uses the next
+    # ones. All of 1000 records have had their turn after 11 s at 30 Hz.
     in_turn: int = 3
     # Number of further records that a lost frame is compared with by SIFT, which matches across
     # scales. The next search uses the next ones. 0: no SIFT.
@@ -287,8 +287,8 @@ class KeyframeReuseConfig:
     # Known keyframes are reused once this many keyframes have been made, including mapping
     # keyframes; 0: never. Before that, new keyframes improve the map and cost a few kB each.
     after: int = 1500
-    # Maximum number of records that a frame is aligned to, the nearest first. Each one takes 8 ms
-    # at 640x480.
+    # Maximum number of records that a frame is aligned to, the nearest first. Each one takes 8
+    # ms at 640x480.
     tries: int = 2
     # Maximum rotation plus parallax between the poses by map and by images: 0.03 rad, or 3 % of the
     # median depth. Above it, new keyframes are made until a loop closure corrects the map.

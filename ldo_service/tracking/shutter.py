@@ -52,8 +52,8 @@ class ShutterConfig:
     # A frame is compensated and aligned again if its measured velocity differs from the expected
     # one by more than this. The unit is the displacement of the image as a fraction of its width.
     realign_ratio: float = 0.75 / 640
-    # Larger limit of the same difference. Below it, the frame is not aligned again: only its pose
-    # is corrected, to first order. Frames that become keyframes are always aligned again. The
+    # Larger limit of the same difference. Below it, the frame is not aligned again: only its
+    # pose is corrected, to first order. Frames that become keyframes are always aligned again. The
     # trajectory error (ATE) on freiburg1_rpy_part is 1.7 cm with 3 pixels and 2.4 cm with 8 pixels.
     max_linear_ratio: float = 3.0 / 640
 

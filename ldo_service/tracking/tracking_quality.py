@@ -69,10 +69,10 @@ class TrackingQualityConfig:
     relocalized_overlap: float = 0.35
     # Residual limit of the first OK frame after a loss, at the pose of the keyframe. The limit
     # grows by relocalized_residual_per_rad per radian of image motion from the keyframe
-    # (`motion.image_motion_rad`), up to weak_residual. The noise of right poses grows with it too:
-    # on the sequence kitchen, its median is 1.4 at 0.15 rad and 2.0 at 0.55 rad. A fixed limit of
-    # 1.6 relocalized a third fewer frames of kitchen. It accepted one more false pose in the
-    # ambiguous corridor of `synthetic:flat`.
+    # (`motion.image_motion_rad`), up to weak_residual. The noise of right poses grows with it
+    # too: on the sequence kitchen, its median is 1.4 at 0.15 rad and 2.0 at 0.55 rad. A fixed
+    # limit of 1.6 relocalized a third fewer frames of kitchen. It accepted one more false pose in
+    # the ambiguous corridor of `synthetic:flat`.
     relocalized_residual: float = 1.3
     relocalized_residual_per_rad: float = 2.0
     # Expected noise while the history is empty. Intensity in gray levels.
