@@ -9,8 +9,8 @@ from ldo_service.schemas.topics import ROBOT_PREFIX
 from .access_control import LOCAL
 from .keys import TlsKeys
 
-# Default address of HTTP servers. They have no access control: on another address, every machine
-# on the network could see where the robot is.
+# Default address of HTTP servers. They have no access control: on another address, every machine on
+# the network could see where the robot is.
 LOOPBACK = "127.0.0.1"
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
