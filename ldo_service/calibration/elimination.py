@@ -2,7 +2,7 @@
 
 A block contains the measurements of one pair of views. The unknowns of a block, such as the
 relative pose, occur in no other block. The coefficients are shared by all blocks. Leading
-dimensions [...] are independent systems that use the same cells, such as the color channels.
+dimensions [...] are independent systems, such as the color channels, at the same pixels.
 """
 
 from collections.abc import Generator, Sequence, Set
