@@ -34,15 +34,16 @@ def with_vote(votes: Votes, name: str, sure: float, weight: float = 1.0) -> Vote
 
 
 def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
-    """Add the vote of a detector's box for a label; limit the label's votes to a sum of `most`.
+    """Add the vote of a detector's box for a label, until the label's votes sum to `most`.
 
-    The sum is limited because the detector finds the same box again in each keyframe.
+    The detector finds the same box again in each keyframe, so boxes alone could outweigh a result
+    of the labeller.
 
     Args:
         votes: Votes before.
         name: Label of the box; if empty, nothing is added.
         sure: Score of the box, 0..1.
-        most: Maximum sum of the votes for the label; if 0, nothing is added.
+        most: Sum of the votes for the label above which the box adds nothing.
 
     >>> with_box(with_box((), "tv", 0.6, 0.4), "tv", 0.5, 0.4)
     (('tv', 0.4, 0.6),)
