@@ -313,7 +313,7 @@ class _Quiet(WSGIRequestHandler):
 
 @contextmanager
 def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK) -> Iterator[None]:
-    """Serve http://ADDRESS:PORT/metrics and /healthz inside the block.
+    """Serve http://ADDRESS:PORT/metrics, /healthz and /readyz inside the block.
 
     Raises:
         ConfigError: The server cannot listen on the address and port.
