@@ -11,7 +11,7 @@ from rich.table import Table
 
 from ldo_service.config import load_config
 from ldo_service.datasets import open_sequence
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import Stream
 from ldo_service.runs.source import layout_of
 from ldo_service.runs.source_info import SourceInfo, describe, estimated_run_s
@@ -33,26 +33,31 @@ def info(
     set: Settings = (),
     topic: Topics = (),
     probe: Annotated[
-        int | None, argument(metavar="N", help="estimate the time of a run from N frames")
-    ] = None,
+        int, argument(metavar="N", help="run N frames to estimate the time of `ldo run`; 0: none")
+    ] = 30,
     json_: Annotated[Json, argument(name="json")] = False,
 ) -> None:
     """Print what is in a source: streams, rate, gaps, calibration, depth and ground truth.
 
     The command reads all stamps and five of the frames. A gap is an interval of more than 1.5
-    median intervals. --probe runs the first N frames to estimate the time of `ldo run` on this
-    machine.
+    median intervals. To estimate the time of `ldo run` on this machine, the command runs the first
+    30 frames, which takes some seconds. --probe 0 skips this.
 
       ldo info ~/data/rgbd_dataset_freiburg1_desk
-      ldo info synthetic:room --probe 30
+      ldo info desk.bag --probe 0
     """
-    if probe is not None and probe < 1:
-        raise ConfigError(f"--probe {probe} must be at least 1.")
+    if probe < 0:
+        raise ConfigError(f"--probe {probe} must be at least 0.")
     layout = layout_of(source)
     settings = load_config(config, with_topics(set, topic))
     sequence = open_sequence(source, settings.dataset.options())
     found = describe(sequence)
-    run_s = None if probe is None else estimated_run_s(sequence, settings, probe)
+    run_s, why_none = None, "not estimated"
+    if probe:
+        try:
+            run_s = estimated_run_s(sequence, settings, probe)
+        except DataError as error:
+            why_none = f"the run of {probe} frames failed: {error}"
     if json_:
         about = {"source": source, "layout": layout, "estimated_run_s": run_s}
         print(json.dumps({**about, **asdict(found)}, indent=1))
@@ -60,9 +65,7 @@ def info(
     table = Table(title=escape(source), show_header=False)
     for name, value in _rows(layout, found).items():
         table.add_row(name, escape(value))
-    estimate = (
-        "--probe 30 estimates it" if run_s is None else f"about {run_s:.0f} s on this machine"
-    )
+    estimate = why_none if run_s is None else f"about {run_s:.0f} s on this machine"
     table.add_row("time of `ldo run`", estimate)
     Console().print(table)
 

@@ -47,7 +47,7 @@ def test_source_without_odometry_is_no_truth(capsys, run: Path, room_folder: Pat
 
 def test_info_counts_the_poses(capsys, scan: Path, room_folder: Path) -> None:
     for source, poses in ((scan, COUNT), (room_folder, 0)):
-        code, out, _ = ldo(capsys, "info", source, "--json")
+        code, out, _ = ldo(capsys, "info", source, "--json", "--probe", "0")
         assert (code, json.loads(out)["odometry_poses"]) == (0, poses)
 
 
