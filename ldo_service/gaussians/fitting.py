@@ -168,6 +168,7 @@ class Fitting:
         plan: Iterable[int],
         rates: tuple[float, float] = (1.0, 1.0),
         effort: float = inf,
+        half_first: bool = False,
         observe: Observer | None = None,
     ) -> np.ndarray:
         """Run one iteration for each usable keyframe of the plan.
@@ -180,6 +181,7 @@ class Fitting:
             plan: Keyframes, in the order of the iterations.
             rates: Factors on the learning rates at the first and at the last iteration.
             effort: Limit of the computation; see `GaussianOptimizer.optimize`.
+            half_first: Start at half resolution; see `GaussianOptimizer.optimize`.
             observe: Function that receives the visible Gaussians of each iteration.
 
         Returns:
@@ -198,6 +200,7 @@ class Fitting:
             rates=rates,
             fixed=first,
             effort=effort,
+            half_first=half_first,
             observe=observe,
         )
         self.iterations += len(losses)

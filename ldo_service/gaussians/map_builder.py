@@ -26,9 +26,8 @@ from .renderer import Contributions, Rendering
 from .training_views import TrainingView, visible_in_mask
 from .visibility import BoundingSpheres, MaxDepthGrid, PlacedCamera, chunk_numbers, plan_offload
 
-# Maximum iterations per unit of effort (see `GaussianOptimizer.optimize`): an iteration in which
-# almost no Gaussians are visible counts as half a unit.
-MAX_ITERATIONS_PER_EFFORT = 2
+# Iterations per unit of effort (`GaussianOptimizer.optimize`) if almost no Gaussian is visible.
+MAX_ITERATIONS_PER_EFFORT = 5
 # Files in a map folder that snapshots of the map refer to: keyframe images, offloaded Gaussians.
 FILE_PATTERNS = ("images/*.keyframe", "gaussians/*.gaussians")
 
@@ -111,7 +110,7 @@ class MapBuilder:
             self.fitting.forget_view(forgotten)
         check = self._confirmation.start(keyframe, len(self.gaussians))
         plan = self.fitting.plan(view, MAX_ITERATIONS_PER_EFFORT * iterations, check.keyframes)
-        touched = self._fit(plan, effort=iterations, observe=check.observe)
+        touched = self._fit(plan, effort=iterations, half_first=True, observe=check.observe)
         mask = check.hidden_mask(self.gaussians.anchors)
         if len(self.views) % self.config.prune_keyframes == 0:
             mask |= self._misshapen_mask(touched)
@@ -227,9 +226,10 @@ class MapBuilder:
         plan: Iterable[int],
         rates: tuple[float, float] = (1.0, 1.0),
         effort: float = inf,
+        half_first: bool = False,
         observe: Observer | None = None,
     ) -> np.ndarray:
-        touched = self.fitting.fit(self.gaussians, plan, rates, effort, observe)
+        touched = self.fitting.fit(self.gaussians, plan, rates, effort, half_first, observe)
         self._log.changed(touched)
         return touched
 

@@ -20,6 +20,9 @@ from .training_views import TrainingView
 # Constants of Adam for keyframe poses. A pose gets few steps, so its moments average over more
 # steps than those of the Gaussians.
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+# Effort of an iteration at half resolution, relative to a full one: the ratio of their times.
+HALF_EFFORT = 0.38
+MIN_HALVED_PX = 32  # Smaller images are not halved: the window of SSIM has 11 pixels.
 WIDTH = 6  # Size of the tangent vector of a pose: rotation, then translation.
 
 
@@ -86,6 +89,9 @@ class GaussianOptimizerConfig:
     # frames of an apartment. Limits of 14 and 10 cost 0.3 and 0.6 dB in the sequence kitchen.
     max_sigma_px: float = 20.0
 
+    # Fraction of the effort after a new keyframe that is spent at half resolution, before the rest.
+    # Such an iteration takes 0.38 of the time of a full one and improves the map almost as much.
+    half_share: float = 0.8
     # Number of visible Gaussians at which an iteration spends half of its time on the pixels and
     # half on the Gaussians.
     usual_reach: int = 60_000
@@ -103,6 +109,8 @@ class GaussianOptimizerConfig:
 
     def __post_init__(self) -> None:
         rates = (self.rotation_rate_rad, self.translation_rate_m)
+        if not 0 <= self.half_share <= 1:
+            raise ConfigError(named(self, "half_share") + " must lie in 0..1.")
         if not (min(rates) >= 0 and 0 <= self.exposure_share <= 1 and self.needle_weight >= 0):
             raise ConfigError(
                 named(
@@ -182,6 +190,7 @@ class GaussianOptimizer:
         rates: tuple[float, float] = (1.0, 1.0),
         fixed: int | None = None,
         effort: float = inf,
+        half_first: bool = False,
         observe: Observer | None = None,
     ) -> list[ImageLoss]:
         """Run one iteration for each training view of a plan.
@@ -197,8 +206,10 @@ class GaussianOptimizer:
             fixed: Keyframe whose pose and exposure stay constant, to fix the pose and the
                 brightness of the map. With None, no keyframe stays constant.
             effort: Limit of the computing time, in iterations with `usual_reach` visible Gaussians.
-                An iteration with r times as many visible Gaussians counts as (1 + r) / 2. No
-                iteration starts once the sum has reached `effort`.
+                An iteration with r times as many visible Gaussians counts as (1 + r) / 2, and at
+                half resolution as HALF_EFFORT times that. No iteration starts once the sum has
+                reached `effort`.
+            half_first: Spend the fraction `half_share` of `effort` at half resolution first.
             observe: Function that is called after each iteration with the keyframe and the visible
                 Gaussians; None for none.
 
@@ -206,17 +217,21 @@ class GaussianOptimizer:
             Loss before each step, for the iterations that were run.
         """
         losses, spent = [], 0.0
+        half_effort = self.config.half_share * effort if half_first else 0.0
         for rate, keyframe in zip(np.geomspace(*rates, len(plan)), plan, strict=True):
             if spent >= effort:
                 break
-            view = views[keyframe]
-            step = self.step(gaussians, view, rate=rate, is_fixed=keyframe == fixed)
+            view, is_half = views[keyframe], spent < half_effort
+            step = self.step(
+                gaussians, view, rate=rate, is_fixed=keyframe == fixed, is_half=is_half
+            )
             if step.view is not view:
                 views[keyframe] = step.view
             if observe is not None:
                 observe(keyframe, step.visible)
             losses.append(step.loss)
-            spent += (1 + len(step.visible.indices) / self.config.usual_reach) / 2
+            full = (1 + len(step.visible.indices) / self.config.usual_reach) / 2
+            spent += HALF_EFFORT * full if is_half else full
         return losses
 
     def step(
@@ -226,6 +241,7 @@ class GaussianOptimizer:
         *,
         rate: float = 1.0,
         is_fixed: bool = False,
+        is_half: bool = False,
     ) -> IterationResult:
         """Run one iteration against one training view.
 
@@ -234,12 +250,32 @@ class GaussianOptimizer:
             view: The training view.
             rate: Factor on all learning rates.
             is_fixed: Keep the exposure and the pose of the view constant.
+            is_half: Render and compare the view at half resolution.
         """
+        if is_half and min(view.camera.width, view.camera.height) >= MIN_HALVED_PX:
+            half = view.halved()
+            found = self._step(gaussians, half, rate, is_fixed, binning=2)
+            if found.view is half:
+                return replace(found, view=view)
+            moved = found.view
+            view = replace(view, exposure=moved.exposure, T_map_camera=moved.T_map_camera)
+            return replace(found, view=view)
+        return self._step(gaussians, view, rate, is_fixed)
+
+    def _step(
+        self,
+        gaussians: GaussianMap,
+        view: TrainingView,
+        rate: float,
+        is_fixed: bool,
+        binning: int = 1,
+    ) -> IterationResult:
+        """Run one iteration against an image whose pixels average binning x binning pixels."""
         config = self.config
         # Render and compute the loss.
         T_camera_map = se3.inverse(view.T_map_camera)
         planes = self._rasterizer.render(
-            gaussians.rows, view.camera, T_camera_map, bounds=gaussians.bounds
+            gaussians.rows, view.camera, T_camera_map, bounds=gaussians.bounds, binning=binning
         )
         if not is_fixed:
             view = self._exposed(view, planes)
@@ -262,8 +298,10 @@ class GaussianOptimizer:
             rate=rate,
             needle_weight=config.needle_weight,
             needle_ratio=config.max_needle_ratio,
-            max_sigma_px=config.max_sigma_px,
+            max_sigma_px=config.max_sigma_px / binning,
         )
+        if binning > 1:  # In pixels of the full image.
+            visible = replace(visible, weights=visible.weights * binning**2)
         if not is_fixed:
             view = self._placed(view, visible.xi, rate)
         return IterationResult(loss, view, visible)

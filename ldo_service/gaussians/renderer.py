@@ -105,6 +105,7 @@ class Rasterizer:
         *,
         bounds: _rasterize.Bounds | None = None,
         tiles: np.ndarray | None = None,
+        binning: int = 1,
     ) -> np.ndarray:
         """Render the image planes that the loss needs.
 
@@ -117,6 +118,8 @@ class Rasterizer:
             tiles: [ceil(H / 16), ceil(W / 16)] uint8. Tiles with value 0 are not rendered, and
                 their pixels are zero. Pass the same array to `image_loss`, so that it ignores these
                 tiles.
+            binning: Side of the square of pixels of the full image that each pixel averages, such
+                as 2 for `Camera.halved`. The splats are averaged in the same way.
 
         Returns:
             Planes [5, H, W] float32: red, green, blue, weighted depth sum w_i z_i in meters, and
@@ -135,7 +138,7 @@ class Rasterizer:
         T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
         intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
         self._visible = _rasterize.rasterize_planes(
-            self._pass, rows, T, *intrinsics, self._planes, self.threads, bounds, tiles
+            self._pass, rows, T, *intrinsics, self._planes, self.threads, bounds, tiles, binning
         )
         self._rows = rows
         return self._planes

@@ -6,15 +6,20 @@ The images of a training view never change and are stored as compressed bytes.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import cv2
 import msgspec
 import numpy as np
 import zstandard
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.kernels import _align
 
 from .exposure import Exposure
 
+# Difference of depths in a block of 2x2 pixels above which they belong to different surfaces, as a
+# fraction of the nearest one. It is that of the tracker's pyramid.
+MAX_DEPTH_STEP = 0.03
 _LEVEL = 1  # Compression level of zstd.
 # A depth image that compresses to less than this fraction of its size counts as quantized: the
 # sensor measures in steps, so the same bytes repeat.
@@ -48,6 +53,26 @@ class TrainingView:
         """Return the training view of a frame, with gain 1, bias 0 and without a mask."""
         planes = np.ascontiguousarray(frame.color.transpose(2, 0, 1))
         return cls(keyframe, frame.camera, planes, frame.depth_m, T_map_camera)
+
+    def halved(self) -> "TrainingView":
+        """Return the view at half resolution; each pixel averages a block of 2x2 pixels.
+
+        Depths that differ by more than MAX_DEPTH_STEP from the nearest one of their block are left
+        out of its average. A block is masked if one of its pixels is.
+        """
+        camera = self.camera.halved()
+        size = (camera.width, camera.height)
+        rows, columns = slice(2 * camera.height), slice(2 * camera.width)
+        color = np.empty((3, camera.height, camera.width), np.uint8)
+        for plane, half in zip(self.color[:, rows, columns], color, strict=True):
+            cv2.resize(np.ascontiguousarray(plane), size, half, interpolation=cv2.INTER_AREA)
+        mask = self.mask
+        if mask is not None:
+            upper, lower = mask[rows, columns][::2], mask[rows, columns][1::2]
+            both = np.minimum(upper, lower)
+            mask = np.minimum(both[:, ::2], both[:, 1::2])
+        depth_m = _align.halve(np.ascontiguousarray(self.depth_m), MAX_DEPTH_STEP)
+        return replace(self, camera=camera, color=color, depth_m=depth_m, mask=mask)
 
 
 def sampled_surface(view: TrainingView, *, step_px: int = 32) -> np.ndarray:

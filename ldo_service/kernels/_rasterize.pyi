@@ -109,6 +109,7 @@ def rasterize_planes(
     threads: int = 1,
     bounds: Bounds | None = None,
     tiles: NDArray[np.uint8] | None = None,
+    binning: int = 1,
 ) -> int:
     """Render red, green, blue, weighted depth and opacity to planes.
 
@@ -127,12 +128,14 @@ def rasterize_planes(
         bounds: Bounds of the blocks of these rows, as for `rasterize`.
         tiles: Tiles to render, [ceil(H / 16), ceil(W / 16)]. The planes of tiles with value 0 are
             zero and are not computed. None renders all tiles.
+        binning: Side of the square of pixels of the full image that each pixel averages, 1 to 64.
 
     Returns:
         The number V of Gaussians that may touch the image.
 
     Raises:
-        ValueError: As for `rasterize`, or `tiles` has the wrong shape, type or strides.
+        ValueError: As for `rasterize`, `tiles` has the wrong shape, type or strides, or `binning`
+            is out of range.
     """
 
 def backpropagate(

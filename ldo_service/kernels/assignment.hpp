@@ -32,7 +32,7 @@ class SplatBoxer {
     const Floats x = p.x * inverse_z, y = p.y * inverse_z;
     Vector3 du, dv;
     project_.jacobian(x, y, inverse_z, du, dv);
-    Floats uu = kLowPass, vv = kLowPass;
+    Floats uu = view_.low_pass, vv = view_.low_pass;
     for (const Vector3& axis : principal_axes(columns).axis) {
       const Floats su = dot(du, axis), sv = dot(dv, axis);
       uu = uu + su * su;

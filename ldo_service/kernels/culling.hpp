@@ -54,7 +54,7 @@ class Measure {
 // all of these conditions.
 //
 // The box of a splat extends by r = sqrt(2 ln(255 o) S_uu) on both sides of u = fx x / z + cx. Its
-// variance is S_uu = 0.3 + |du . axes|^2 <= 0.3 + (fx / z)^2 m^2 sigma^2. Here m^2 bounds
+// variance is S_uu = low_pass + |du . axes|^2 <= 0.3 + (fx / z)^2 m^2 sigma^2. Here m^2 bounds
 // |row_0 - clamp(x / z) row_2|^2 of T_camera_map. Hence r z <= 3.33 (0.55 z + fx m sigma). The
 // conditions u + r >= 0 and u - r <= width - 1, times z > 0, are therefore linear in the mean. The
 // same holds for v.
@@ -86,7 +86,7 @@ class ViewFrustum {
  private:
   static constexpr int kSides = 5;
   static constexpr float kReachSigmas = 3.34f;     // More than sqrt(2 ln 255).
-  static constexpr float kLowPassSigma = 0.5478f;  // More than sqrt(kLowPass).
+  static constexpr float kLowPassSigma = 0.5478f;  // More than the root of any low_pass.
   // Tolerance as a fraction of each term, for the rounding errors of the projection.
   static constexpr float kSlack = 1e-4f;
   struct Side {

@@ -1,6 +1,7 @@
 // Projection of Gaussians in the map to splats in the image. The method is EWA splatting (Zwicker
 // et al. 2001), with the low-pass filter and the clamped Jacobian of Kerbl et al. 2023 (sec. 4 and
-// the published code).
+// the published code). A binned image also averages the splats over its wider pixels. This keeps
+// their integrals, so that the peaks become lower (Yu et al., "Mip-Splatting", 2024).
 #pragma once
 #include <algorithm>
 
@@ -10,7 +11,6 @@
 namespace ldo::LDO_ISA {
 
 constexpr float kNearPlane = 0.05f;  // Meters.
-constexpr float kLowPass = 0.3f;     // Low-pass filter added to the image covariance, px^2.
 constexpr float kLog2e = 1.44269504f;
 constexpr float kLog2MinAlpha = -7.99435344f;  // log2(1 / 255); weaker contributions are dropped.
 
@@ -121,16 +121,20 @@ struct Projection {
     Vector3 du, dv;
     jacobian(x, y, inverse_z, du, dv);
 
-    Floats uu = kLowPass, uv = 0.0f, vv = kLowPass;  // Image covariance, px^2.
+    Floats uu = view.low_pass, uv = 0.0f, vv = view.low_pass;  // Image covariance, px^2.
     for (const Vector3& axis : principal_axes(columns).axis) {
       const Floats su = dot(du, axis), sv = dot(dv, axis);
       uu = uu + su * su;
       uv = uv + su * sv;
       vv = vv + sv * sv;
     }
-    const Floats scale = Floats(-0.5f * kLog2e) / (uu * vv - uv * uv);
-    const Floats log2_opacity =
-        Floats(0.0f) - log2(Floats(1.0f) + exp(Floats(0.0f) - column(kOpacity)));
+    const Floats determinant = uu * vv - uv * uv;
+    const Floats scale = Floats(-0.5f * kLog2e) / determinant;
+    Floats log2_opacity = Floats(0.0f) - log2(Floats(1.0f) + exp(Floats(0.0f) - column(kOpacity)));
+    if (view.box > 0.0f) {  // The peak of the splat, averaged over the wider pixels.
+      const Floats narrow = (uu - view.box) * (vv - view.box) - uv * uv;
+      log2_opacity = log2_opacity + (log2(narrow) - log2(determinant)) * 0.5f;
+    }
     // Largest q = d' C^-1 d at which alpha >= 1/255.
     const Floats reach = (log2_opacity - kLog2MinAlpha) * (2.0f / kLog2e);
 

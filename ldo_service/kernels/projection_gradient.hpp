@@ -38,7 +38,8 @@ struct ProjectionGradient {
     const Axes axes = principal_axes(columns);
 
     // Image covariance S and its inverse K.
-    Floats uu = kLowPass, uv = 0.0f, vv = kLowPass, along_u[3], along_v[3];
+    const View& view = projection.view;
+    Floats uu = view.low_pass, uv = 0.0f, vv = view.low_pass, along_u[3], along_v[3];
     for (int k = 0; k < 3; ++k) {
       along_u[k] = dot(du, axes.axis[k]);
       along_v[k] = dot(dv, axes.axis[k]);
@@ -55,8 +56,15 @@ struct ProjectionGradient {
                  n_uv = Kuu * sums[kVxy] + Kuv * sums[kVyy],
                  n_vu = Kuv * sums[kVxx] + Kvv * sums[kVxy],
                  n_vv = Kuv * sums[kVxy] + Kvv * sums[kVyy];
-    const Floats two_S_uu = n_uu * Kuu + n_uv * Kuv, two_S_uv = n_uu * Kuv + n_uv * Kvv,
-                 two_S_vv = n_vu * Kuv + n_vv * Kvv;
+    Floats two_S_uu = n_uu * Kuu + n_uv * Kuv, two_S_uv = n_uu * Kuv + n_uv * Kvv,
+           two_S_vv = n_vu * Kuv + n_vv * Kvv;
+    if (view.box > 0.0f) {  // ln alpha also has ln(|S - box I| / |S|) / 2.
+      const Floats nn = uu - view.box, mm = vv - view.box;
+      const Floats narrow = sums[kV] / (nn * mm - uv * uv);
+      two_S_uu = two_S_uu + mm * narrow - sums[kV] * Kuu;
+      two_S_uv = two_S_uv - uv * narrow - sums[kV] * Kuv;
+      two_S_vv = two_S_vv + nn * narrow - sums[kV] * Kvv;
+    }
 
     // S = low pass + sum over axes of (du.a, dv.a)(du.a, dv.a)'
     Vector3 g_du{0.0f, 0.0f, 0.0f}, g_dv = g_du, g_axis[3];
@@ -73,7 +81,7 @@ struct ProjectionGradient {
 
     // Point in the camera frame, through the Jacobian and the perspective division.
     const Vector3 g_row_u = to_camera_axes(g_du), g_row_v = to_camera_axes(g_dv);
-    const Floats ju = inverse_z * projection.view.fx, jv = inverse_z * projection.view.fy;
+    const Floats ju = inverse_z * view.fx, jv = inverse_z * view.fy;
     const Floats ku = ju * clamp(x, projection.min_x, projection.max_x),
                  kv = jv * clamp(y, projection.min_y, projection.max_y);
     const Floats ku_moves = inside(x, projection.min_x, projection.max_x),

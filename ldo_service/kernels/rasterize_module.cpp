@@ -18,6 +18,7 @@ namespace ldo {
 namespace {
 
 constexpr int kMaxSide = 32768;             // Pixels.
+constexpr int kMaxBinning = 64;             // Full pixels along each side of a binned pixel.
 constexpr int64_t kMaxGaussians = 1 << 27;  // Splats are counted with 32 bits.
 
 Isa isa = Isa::baseline;  // Set when the module is imported.
@@ -139,13 +140,16 @@ const float* rows_of(const AnyArray& rows, const std::string& name) {
 }
 
 View view_of(const Array& T_camera_map, float fx, float fy, float cx, float cy, int width,
-             int height) {
+             int height, int binning = 1) {
   require(T_camera_map.ndim() == 2 && T_camera_map.shape(0) == 3 && T_camera_map.shape(1) == 4,
           "T_camera_map must have shape [3, 4]: the upper rows of the transform.");
   require(width >= 1 && width <= kMaxSide && height >= 1 && height <= kMaxSide,
           "width and height must be 1 to " + std::to_string(kMaxSide) + " pixels, got " +
               std::to_string(width) + " x " + std::to_string(height) + ".");
+  require(binning >= 1 && binning <= kMaxBinning,
+          "binning must be 1 to " + std::to_string(kMaxBinning) + ".");
   View view{{}, fx, fy, cx, cy, width, height};
+  set_binning(view, binning);
   const float* T = values_of<float>(T_camera_map, "T_camera_map");
   bool finite = std::isfinite(fx) && std::isfinite(fy) && std::isfinite(cx) && std::isfinite(cy);
   for (int i = 0; i < 12; ++i) finite = finite && std::isfinite(view.T_camera_map[i] = T[i]);
@@ -200,7 +204,7 @@ std::tuple<Image, Image, Image, Image> rasterize(const Array& rows, const Array&
 
 int64_t rasterize_planes(PassOfPython& held, const Array& rows, const Array& T_camera_map, float fx,
                          float fy, float cx, float cy, const WritableArray& planes, int threads,
-                         BoundsOfPython* bounds, const std::optional<Array>& tiles) {
+                         BoundsOfPython* bounds, const std::optional<Array>& tiles, int binning) {
   require_threads(threads);
   require(planes.ndim() == 3 && planes.shape(0) == kPlanes, "planes must have shape [5, H, W].");
   require(planes.shape(1) <= kMaxSide && planes.shape(2) <= kMaxSide,
@@ -208,7 +212,7 @@ int64_t rasterize_planes(PassOfPython& held, const Array& rows, const Array& T_c
   const Seen seen(rows, bounds);
   float* images = values_of<float>(planes, "planes");
   const View view = view_of(T_camera_map, fx, fy, cx, cy, static_cast<int>(planes.shape(2)),
-                            static_cast<int>(planes.shape(1)));
+                            static_cast<int>(planes.shape(1)), binning);
   const auto across = [](size_t pixels) { return (pixels + kTile - 1) / kTile; };
   if (tiles) require_shape(*tiles, "tiles", {across(planes.shape(1)), across(planes.shape(2))});
   const uint8_t* wanted = tiles ? values_of<uint8_t>(*tiles, "tiles") : nullptr;
@@ -331,7 +335,7 @@ NB_MODULE(_rasterize, m) {
         "width"_a, "height"_a, "threads"_a = 1, "memory"_a = nb::none(), "bounds"_a = nb::none());
   m.def("rasterize_planes", &rasterize_planes, "forward"_a, "rows"_a, "T_camera_map"_a, "fx"_a,
         "fy"_a, "cx"_a, "cy"_a, "planes"_a, "threads"_a = 1, "bounds"_a = nb::none(),
-        "tiles"_a = nb::none());
+        "tiles"_a = nb::none(), "binning"_a = 1);
   m.def("backpropagate", &backpropagate, "forward"_a, "rows"_a, "planes"_a, "gradients"_a,
         "indices"_a, "row_gradients"_a, "needle_weight"_a = 0.0f, "needle_log_ratio"_a = 0.0f,
         "threads"_a = 1);

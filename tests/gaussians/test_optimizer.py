@@ -190,3 +190,52 @@ def test_effort_weights_iterations_by_visible_gaussians(start: tuple) -> None:
         optimizer = GaussianOptimizer(GaussianOptimizerConfig(usual_reach=usual_reach))
         lengths.append(len(optimizer.optimize(gaussians, views, alternating(30), effort=8)))
     assert 1 <= lengths[0] < lengths[1] < lengths[2] <= 16
+
+
+def in_half_resolution(start: tuple, plan: list[int], **changes) -> tuple:
+    """Return map and views after half of the effort at half resolution, and the visible rows."""
+    config = replace(GaussianOptimizerConfig(usual_reach=1000, half_share=0.5), **changes)
+    gaussians, views, seen = copied(start[0]), list(start[1]), []
+    GaussianOptimizer(config).optimize(
+        gaussians, views, plan, fixed=0, effort=8, half_first=True,
+        observe=lambda _, visible: seen.append((visible.indices.copy(), visible.weights.copy())),
+    )  # fmt: skip
+    return gaussians, views, seen
+
+
+def test_iterations_at_half_resolution_improve_the_full_images(start: tuple) -> None:
+    rates = {"rotation_rate_rad": 1e-5, "translation_rate_m": 1e-5}
+    gaussians, views, seen = in_half_resolution(start, alternating(90), **rates)
+    only_full = in_half_resolution(start, alternating(90), half_share=0.0)[2]
+    assert len(seen) > 1.3 * len(only_full)
+    assert mean_psnr(gaussians, views) > mean_psnr(*start) + 3
+    for before, after in zip(start[1], views, strict=True):
+        assert after.color is before.color
+        assert after.camera == before.camera
+    assert not np.array_equal(views[2].T_map_camera, start[1][2].T_map_camera)
+    assert views[2].exposure != start[1][2].exposure
+    again = in_half_resolution(start, alternating(90), **rates)[0]
+    np.testing.assert_array_equal(again.rows, gaussians.rows)
+
+
+def test_weights_at_half_resolution_count_full_pixels(start: tuple) -> None:
+    (indices, half), *_ = in_half_resolution(start, alternating(1), half_share=1.0)[2]
+    (all_indices, full), *_ = in_half_resolution(start, alternating(1), half_share=0.0)[2]
+    assert half.sum() == pytest.approx(full.sum(), rel=0.02)
+    common = np.isin(all_indices, indices) & (full > 1)
+    assert np.median(half[np.isin(indices, all_indices[common])] / full[common]) == pytest.approx(
+        1, abs=0.05
+    )
+
+
+def test_small_images_are_not_halved(start: tuple) -> None:
+    view = start[1][0]
+    small = replace(
+        view, camera=replace(view.camera, width=20, height=16),
+        color=np.ascontiguousarray(view.color[:, :16, :20]),
+        depth_m=np.ascontiguousarray(view.depth_m[:16, :20]),
+    )  # fmt: skip
+    half, full = (copied(start[0]) for _ in range(2))
+    GaussianOptimizer().step(half, small, is_half=True)
+    GaussianOptimizer().step(full, small)
+    np.testing.assert_array_equal(half.rows, full.rows)

@@ -1,4 +1,7 @@
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from ldo_service.gaussians.training_views import (
     TrainingView,
@@ -75,3 +78,25 @@ def test_view_has_the_colors_of_its_frame() -> None:
     view = TrainingView.of(frame, np.eye(4), 5)
     assert view.color.flags.c_contiguous
     np.testing.assert_array_equal(view.color[1], color[..., 1])
+
+
+def test_halved_view_averages_blocks_of_four_pixels() -> None:
+    rng = np.random.default_rng(0)
+    camera = Camera(65, 49, 50.0, 50.0, 32.0, 24.0)  # The last row and column have no block.
+    depth_m = np.full((49, 65), 2.0, np.float32)
+    depth_m[10, 20], depth_m[10, 21], depth_m[30:32, 40:42] = 0.0, 2.04, 0.0
+    depth_m[20, 30] = 1.0  # In front of the other three pixels of its block.
+    mask = np.ones((49, 65), np.uint8)
+    mask[5, 7] = 0
+    view = TrainingView(
+        3, camera, rng.integers(0, 256, (3, 49, 65), np.uint8), depth_m, np.eye(4), mask=mask
+    )
+    half = view.halved()
+    assert half.camera == camera.halved()
+    means = view.color[:, :48, :64].reshape(3, 24, 2, 32, 2).mean(axis=(2, 4))
+    assert np.abs(half.color - means).max() <= 0.5
+    assert half.depth_m[5, 10] == pytest.approx((2.04 + 2 + 2) / 3)
+    assert (half.depth_m[15, 20], half.depth_m[10, 15], half.depth_m[0, 0]) == (0.0, 1.0, 2.0)
+    assert half.mask is not None
+    assert list(zip(*np.nonzero(half.mask == 0), strict=True)) == [(2, 3)]
+    assert replace(view, mask=None).halved().mask is None

@@ -32,7 +32,8 @@ for name in {key.split("/")[0] for key in given}:
     rows, T, camera, by_planes = (given[f"{name}/{part}"] for part in ("rows", "T", "camera", "by"))
     rasterizer = Rasterizer(threads=2)
     camera = Camera(int(camera[0]), int(camera[1]), *camera[2:])
-    result[f"{name}/planes"] = rasterizer.render(rows, camera, T)
+    binning = 2 if name == "binned" else 1
+    result[f"{name}/planes"] = rasterizer.render(rows, camera, T, binning=binning)
     gradients = rasterizer.gradients(by_planes)
     result[f"{name}/rows"] = np.zeros_like(rows)
     result[f"{name}/rows"][gradients.indices] = gradients.rows
@@ -55,6 +56,7 @@ SCENES = {
     "straddling_the_camera": (gaussians(120, 2, depth_m=(-2, 2)), camera_of(20, 20), np.eye(4)),
     "nearly_opaque": (nearly_opaque(), camera_of(20, 20), np.eye(4)),
     "one_pixel": (gaussians(40, 5), camera_of(1, 1), np.eye(4)),
+    "binned": (gaussians(120, 8), camera_of(28, 20), TURNED),
     "nothing": (gaussians(0, 7), camera_of(9, 9), np.eye(4)),
 }
 
@@ -65,11 +67,15 @@ def by_planes_of(camera: Camera) -> np.ndarray:
     return rng.normal(size=(5, camera.height, camera.width)).astype(np.float32)
 
 
-def loss(rows: np.ndarray, camera: Camera, T: np.ndarray) -> float:
+def loss(rows: np.ndarray, camera: Camera, T: np.ndarray, binning: int = 1) -> float:
     """Compute sum(G * planes), so that G is the gradient by the planes."""
-    G, seen = by_planes_of(camera), render_reference(rows, camera, T, anp)
+    G, seen = by_planes_of(camera), render_reference(rows, camera, T, anp, binning)
     by_color = anp.sum(np.moveaxis(G[:3], 0, -1) * seen.color)
     return by_color + anp.sum(G[3] * seen.weighted_depth_m) + anp.sum(G[4] * seen.opacity)
+
+
+def binning_of(scene: str) -> int:
+    return 2 if scene == "binned" else 1
 
 
 def as_kernel_sees(T: np.ndarray) -> np.ndarray:
@@ -92,7 +98,7 @@ def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
 def by_reference() -> dict[str, np.ndarray]:
     """Return the derivatives of the rows of every scene by the reference."""
     return {
-        name: grad(loss)(rows.astype(float), camera, as_kernel_sees(T))
+        name: grad(loss)(rows.astype(float), camera, as_kernel_sees(T), binning_of(name))
         for name, (rows, camera, T) in SCENES.items()
         if len(rows)
     }
@@ -108,13 +114,16 @@ def test_row_gradients_agree_with_the_derivative_of_the_plain_twin(
         assert error <= 1e-5 * np.linalg.norm(wanted), name
 
 
-@pytest.mark.parametrize("scene", ["many", "turned_camera", "odd_size", "straddling_the_camera"])
+@pytest.mark.parametrize(
+    "scene", ["many", "turned_camera", "odd_size", "straddling_the_camera", "binned"]
+)
 def test_pose_gradient_agrees_with_finite_differences(scene: str, by_kernel: dict) -> None:
     rows, camera, T = SCENES[scene]
     T_map_camera = se3.inverse(as_kernel_sees(T))
 
     def loss_at(xi: np.ndarray) -> float:
-        return loss(rows.astype(float), camera, se3.inverse(T_map_camera @ se3.exp(xi)))
+        T_camera_map = se3.inverse(T_map_camera @ se3.exp(xi))
+        return loss(rows.astype(float), camera, T_camera_map, binning_of(scene))
 
     steps = 1e-6 * np.eye(6)
     expected = np.array([(loss_at(step) - loss_at(-step)) / 2e-6 for step in steps])
@@ -136,6 +145,20 @@ def test_planes_are_the_images_of_the_rasterizer() -> None:
     np.testing.assert_allclose(planes[:3], np.moveaxis(color, -1, 0), atol=1e-6)
     np.testing.assert_allclose(planes[3], depth_m, atol=1e-5)
     np.testing.assert_allclose(planes[4], opacity, atol=1e-6)
+
+
+def test_binned_splat_is_the_mean_of_blocks_of_the_full_image() -> None:
+    rows = gaussians(1, 9)
+    rows[0, :3] = 0.013, -0.02, 2.0
+    rows[0, 3:6] = np.log(2.0 * np.array([2.0, 1.2, 1.5]) / 60)  # 1.2 to 2 px.
+    camera = Camera(48, 40, 60.0, 60.0, 23.5, 19.5)
+    full = Rasterizer().render(rows, camera, np.eye(4)).copy()
+    means = full.reshape(5, 20, 2, 24, 2).mean(axis=(2, 4))
+    binned = Rasterizer().render(rows, camera.halved(), np.eye(4), binning=2)
+    assert means[4].max() > 0.2
+    assert np.abs(binned - means).max() < 0.01 * means[4].max()
+    as_full = Rasterizer().render(rows, camera.halved(), np.eye(4))
+    assert np.abs(as_full - means).max() > 0.03 * means[4].max()
 
 
 def test_early_stop_leaves_out_the_same_splats_forward_and_backward() -> None:
@@ -250,6 +273,16 @@ def test_bad_arguments_raise_value_error(change: dict, message: str) -> None:
     _rasterize.backpropagate(forward, **arguments)
     with pytest.raises(ValueError, match=message):
         _rasterize.backpropagate(forward, **arguments | change)
+
+
+@pytest.mark.parametrize("binning", [0, 65])
+def test_binning_out_of_range_is_refused(binning: int) -> None:
+    rows, planes = gaussians(3, 0), np.zeros((5, 9, 9), np.float32)
+    T = np.eye(4, dtype=np.float32)[:3]
+    with pytest.raises(ValueError, match="binning must be 1 to 64"):
+        _rasterize.rasterize_planes(
+            _rasterize.Pass(), rows, T, 9.0, 9.0, 4.0, 4.0, planes, binning=binning
+        )
 
 
 def test_gradients_before_any_rendering_are_refused() -> None:
