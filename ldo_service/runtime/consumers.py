@@ -229,7 +229,7 @@ class Consumers:
         return names
 
     def evict(self, name: str) -> None:
-        """Treat a stalled consumer as disconnected until it handles another message."""
+        """Treat a stalled consumer as disconnected while `is_still_stuck`."""
         self._evicted[name] = self._known[name].handled
         self.leave(name)
 
@@ -237,6 +237,9 @@ class Consumers:
         """Return whether an evicted consumer sent this credit message without having made progress.
 
         Progress is a message handled since the eviction. Credit messages alone are no progress,
-        because a consumer repeats them with each heartbeat.
+        because a consumer repeats them with each heartbeat. A consumer that has handled all that it
+        received is not stuck: the network lost the other messages, which are retransmitted only to
+        a connected consumer.
         """
-        return grant.handled <= self._evicted.get(grant.consumer, -1)
+        has_work = grant.handled < grant.arrived
+        return has_work and grant.handled <= self._evicted.get(grant.consumer, -1)

@@ -366,7 +366,7 @@ class Outlet:
                 "%s: consumer %s evicted: it took no message for %.0f s "
                 "(supervision.evict_after_s). If the consumer is a child process of the service, "
                 "the service restarts it. Any other consumer is ignored until it handles a "
-                "message.",
+                "message or waits for one.",
                 self.topic.name, name, self._evict_after_s,
             )  # fmt: skip
             self.evicted += 1

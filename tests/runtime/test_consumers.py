@@ -46,6 +46,16 @@ def test_evicted_consumer_returns_after_handling_a_message() -> None:
     assert not consumers.is_still_stuck(Credit("mapper", 1, 3, 4, 7))
 
 
+def test_evicted_consumer_that_received_no_message_returns_with_its_next_credit() -> None:
+    consumers = Consumers(["mapper"])
+    consumers.join("mapper", 0)
+    consumers.grant(Credit("mapper", 1, handled=2, arrived=2, limit=4))
+    consumers.evict("mapper")
+    unchanged = Credit("mapper", 1, handled=2, arrived=2, limit=4)
+    assert not consumers.is_still_stuck(unchanged)
+    assert consumers.grant(unchanged).arrived == 2, "messages 2 and 3 are retransmitted"
+
+
 def test_consumer_waiting_for_its_disk_is_not_stalled() -> None:
     consumers = Consumers(["mapper"])
     consumers.join("mapper", 0)

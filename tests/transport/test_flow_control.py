@@ -247,6 +247,28 @@ async def test_stalled_consumer_is_evicted_and_returns_when_it_continues() -> No
     assert seen == sorted(seen)
 
 
+@pytest.mark.parametrize("lost", [KEYS[:2], KEYS], ids=["messages", "messages and credits"])
+async def test_link_continues_after_a_loss_that_lasted_until_the_eviction(lost: list[str]) -> None:
+    is_losing = False
+    transport = MemoryTransport(lose=lambda key: is_losing and key in lost)
+    seen: list[int] = []
+    source = Outlet(Out(NUMBERS), "producer", 1, transport, ("collector",), evict_after_s=0.05)
+    async with running(collector(transport, seen)):
+        await eventually(lambda: source.credits() == 4)
+        is_losing = True
+        for value in range(4):
+            await send(source, number(value))
+
+        def is_evicted() -> bool:
+            source.evict_stalled()
+            return source.evicted > 0
+
+        await eventually(is_evicted)
+        is_losing = False
+        await eventually(lambda: seen == [0, 1, 2, 3])
+        await eventually(lambda: source.credits() == 4)
+
+
 async def test_malformed_credits_and_handshakes_are_ignored(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
