@@ -49,6 +49,16 @@ def trim_memory() -> None:
         trim(0)
 
 
+def raise_file_limit() -> None:
+    """Raise the soft limit of open files to the hard one.
+
+    systemd and shells set a soft limit of 1024 for programs that use `select`, which this one does
+    not.
+    """
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
 async def exit_with_parent(period_s: float = 0.5) -> None:
     """Wait until the parent process has ended, so that the caller can then end this process.
 

@@ -39,6 +39,7 @@ from ldo_service.runtime.process import (
     ChildProcess,
     exit_with_parent,
     python_command,
+    raise_file_limit,
 )
 from ldo_service.runtime.process_heartbeat import start_heartbeat
 from ldo_service.runtime.stage import Stage
@@ -46,6 +47,7 @@ from ldo_service.runtime.stage_commands import Control
 from ldo_service.runtime.supervision import Runner, StopRequest, Watchdog, supervise
 from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 from ldo_service.storage.state_store import FolderStore
+from ldo_service.transport.gate_process import guarded
 from ldo_service.transport.worker import Worker
 from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport, open_session
 
@@ -118,6 +120,7 @@ class Service:
         self.config.check_timeouts()
         self._require_known(self.only)
         self._require_known(self.config.service.process_actors)
+        raise_file_limit()
         names, silent_after_s = [box.name for box in GRAPH], self.config.service.heartbeat_timeout_s
         health = HealthCollector(self.network.robot, names, silent_after_s)
         if self.recording and not self.only:
@@ -128,7 +131,10 @@ class Service:
             if self.metrics_port is not None:
                 address = self.config.service.metrics_address
                 stack.enter_context(serve_metrics(health, self.metrics_port, address))
-            session = stack.enter_context(open_session(self.network, router=self.is_router))
+            network = self.network
+            if self.is_router and network.keys:
+                network = stack.enter_context(guarded(network))
+            session = stack.enter_context(open_session(network, router=self.is_router))
             try:
                 asyncio.run(self._serve(session, health))
             except StageError as error:

@@ -35,6 +35,8 @@ log = logging.getLogger(__name__)
 # Maximum number of pending queries for values, and of pending commands. Further queries or commands
 # get an error.
 MAX_QUERIES = 16
+# Maximum number of programs at a router. Each takes a file descriptor; Zenoh's default is 1000.
+MAX_SESSIONS = 256
 CONNECT_WITHIN_MS = 3000
 LEAVE_WITHIN_S = 2.0  # Time to send pending messages when a transport closes.
 
@@ -55,7 +57,7 @@ def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        advice = _why_not_listening(network) if router else _why_not_connected(network)
+        advice = why_not_listening(network) if router else _why_not_connected(network)
         raise ConfigError(f"{advice} ({str(error).split(' at /')[0]})") from None
 
 
@@ -63,8 +65,12 @@ def _session_config(network: Endpoint, router: bool) -> zenoh.Config:
     local = [network.local_endpoint] if router and network.local_socket else []
     settings = {
         "mode": "router" if router else "client",
-        "listen/endpoints" if router else "connect/endpoints": [network.endpoint, *local],
+        "listen/endpoints" if router else "connect/endpoints": [
+            (router and network.behind_gate) or network.endpoint,
+            *local,
+        ],
         **CLOSED,
+        "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/link/rx/max_message_size": network.max_message_mb * 1_000_000,
         "connect/timeout_ms": CONNECT_WITHIN_MS,
         **(network.keys.settings(router, network.robot if local else "") if network.keys else {}),
@@ -75,7 +81,7 @@ def _session_config(network: Endpoint, router: bool) -> zenoh.Config:
     return config
 
 
-def _why_not_listening(network: Endpoint) -> str:
+def why_not_listening(network: Endpoint) -> str:
     return (
         f"cannot listen on {network.endpoint}: is another `ldo serve` running there? "
         "Stop it, or choose another port with --endpoint."

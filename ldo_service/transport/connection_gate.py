@@ -1,0 +1,256 @@
+"""Gate in front of the TLS port of the router, run as a process of its own.
+
+Zenoh accepts any number of TCP connections to a TLS port. Each takes a file descriptor of the
+service until its handshake times out, and after each failed handshake Zenoh accepts no connection
+for 0.1 s. The gate therefore owns the port that other machines see, and passes bytes on to the port
+of the router on loopback. It does not decrypt them: programs and router check each other's
+certificates as they do without a gate.
+
+A connection is *unproven* until the router has answered the client's certificate. The gate
+
+- passes nothing on before the first bytes of a TLS handshake have arrived,
+- closes a connection that is unproven for longer than `HANDSHAKE_S`,
+- closes an unproven connection when there are more than `MAX_UNPROVEN`, of the address that has
+  most of them, and among these one that has sent nothing,
+- lets at most `MAX_HANDSHAKES` connections of an address shake hands with the router at a time.
+
+This file runs as a script and imports the standard library only, so that the process starts at once
+and takes little memory: `python -I connection_gate.py DESCRIPTOR HOST PORT MAX_CONNECTIONS`. It
+ends when its standard input ends. It prints how many connections it closed because of these limits,
+at most once in `REPORT_S`.
+"""
+
+import asyncio
+import os
+import resource
+import signal
+import socket
+import sys
+from collections import Counter
+
+# Time from the start of a connection to the router's answer to the client's certificate, seconds:
+# that of Zenoh. At a delay of 0.5 s, a handshake without losses takes 2 s.
+HANDSHAKE_S = 10.0
+MAX_UNPROVEN = 64  # Unproven connections; a robot has fewer than ten programs.
+MAX_HANDSHAKES = 4  # Handshakes of one address at a time.
+LEAVE_WITHIN_S = 2.0  # Time to send the last bytes when a proven connection closes, seconds.
+REPORT_S = 30.0  # Time between two reports, seconds.
+HANDSHAKE_RECORD = b"\x16\x03"  # A TLS record of a handshake begins with these bytes.
+# Random number of a ServerHello that asks for another ClientHello (RFC 8446, section 4.1.3).
+HELLO_RETRY = bytes.fromhex("cf21ad74e59a6111be1d8c021e65b891c2a211167abb8c5e079e09e2c8a8339c")
+# Largest TLS alert with its record, bytes. The router sends an alert if it rejects a certificate.
+MAX_ALERT_BYTES = 64
+
+
+class Connection:
+    """Connection of a program, and the connection to the router that carries its bytes.
+
+    Attributes:
+        address: Address of the program.
+        has_spoken: The first bytes of a handshake have arrived.
+        is_proven: The router has answered the certificate of the client.
+    """
+
+    def __init__(self, gate: "Gate", client: asyncio.Transport) -> None:
+        self._gate, self.client = gate, client
+        self.router: asyncio.Transport | None = None
+        self.address = str((client.get_extra_info("peername") or ("",))[0])
+        self.has_spoken = self.is_proven = self.is_closed = False
+        self.hello = b""
+        self._has_router_spoken = self._has_client_answered = False
+        self._answer_bytes = 0
+        self._deadline = gate.loop.call_later(HANDSHAKE_S, gate.refuse, self)
+
+    def from_client(self, data: bytes) -> None:
+        """Pass bytes of the program on; before the first ones, wait for a turn."""
+        if self.router is not None:
+            self._has_client_answered = self._has_router_spoken
+            self.router.write(data)
+            return
+        self.hello += data
+        if not self.has_spoken and not HANDSHAKE_RECORD.startswith(self.hello[:2]):
+            self.close()
+        elif not self.has_spoken and len(self.hello) >= len(HANDSHAKE_RECORD):
+            self.has_spoken = True
+            self.client.pause_reading()
+            self._gate.wait_for_turn(self)
+
+    def from_router(self, data: bytes) -> None:
+        """Pass bytes of the router on, and note the answer to the client's certificate."""
+        if not self._has_router_spoken:
+            self._has_router_spoken = HELLO_RETRY not in data[:64]
+        elif self._has_client_answered and not self.is_proven:
+            self._answer_bytes += len(data)
+            if self._answer_bytes > MAX_ALERT_BYTES:
+                self.is_proven = True
+                self._deadline.cancel()
+                self._gate.end_handshake(self)
+        self.client.write(data)
+
+    def start(self, router: asyncio.Transport) -> None:
+        """Begin to pass bytes on."""
+        self.router = router
+        router.write(self.hello)
+        self.client.resume_reading()
+
+    def close(self) -> None:
+        """Close both connections."""
+        if self.is_closed:
+            return
+        self.is_closed = True
+        self._deadline.cancel()
+        for transport in (self.client, self.router):
+            if transport is not None and self.is_proven:
+                transport.close()  # Bytes that wait are sent first.
+                self._gate.loop.call_later(LEAVE_WITHIN_S, transport.abort)
+            elif transport is not None:
+                transport.abort()
+        self._gate.forget(self)
+
+
+class Side(asyncio.Protocol):
+    """Protocol of one of the two connections, which slows the sender to the receiver's speed."""
+
+    def __init__(self, gate: "Gate", connection: Connection | None = None) -> None:
+        self._gate, self._connection = gate, connection
+        self._is_client = connection is None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        if self._connection is None:
+            self._connection = Connection(self._gate, transport)
+            self._gate.admit(self._connection)
+
+    def data_received(self, data: bytes) -> None:
+        assert self._connection is not None
+        if not self._connection.is_closed:
+            take = self._connection.from_client if self._is_client else self._connection.from_router
+            take(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
+        if self._connection is not None:
+            self._connection.close()
+
+    def pause_writing(self) -> None:
+        if (sender := self._sender()) is not None:
+            sender.pause_reading()
+
+    def resume_writing(self) -> None:
+        if (sender := self._sender()) is not None and not sender.is_closing():
+            sender.resume_reading()
+
+    def _sender(self) -> asyncio.Transport | None:
+        """Return the connection whose bytes are written to this one."""
+        assert self._connection is not None
+        return self._connection.router if self._is_client else self._connection.client
+
+
+class Gate:
+    """All connections of the gate, and their limits."""
+
+    def __init__(self, host: str, port: int, max_connections: int) -> None:
+        """Initialize inside a running event loop.
+
+        Args:
+            host: Address of the router.
+            port: Port of the router.
+            max_connections: Maximum number of connections, proven ones included.
+        """
+        self.loop = asyncio.get_running_loop()
+        self._router = host, port
+        self._max_connections = max_connections
+        self._open: dict[Connection, None] = {}  # In the order of their arrival.
+        self._waiting: dict[Connection, None] = {}  # Waiting for a turn, in order.
+        self._connecting: dict[Connection, asyncio.Task[None]] = {}
+        self._handshakes: dict[Connection, None] = {}
+        self._refused = 0  # Number of connections closed because of a limit since the last report.
+
+    def admit(self, new: Connection) -> None:
+        """Add a connection, and close an unproven one if there are too many."""
+        self._open[new] = None
+        unproven = [one for one in self._open if not one.is_proven]
+        if len(unproven) > MAX_UNPROVEN or len(self._open) > self._max_connections:
+            addresses = Counter(one.address for one in unproven)
+            most = max(addresses.values())
+            crowd = [one for one in unproven if addresses[one.address] == most]
+            # The oldest one that has sent nothing, or else the oldest one.
+            self.refuse(min(crowd, key=lambda one: one.has_spoken))
+
+    def refuse(self, connection: Connection) -> None:
+        """Close an unproven connection because of a limit, and report the number of these."""
+        connection.close()
+        self._refused += 1
+        if self._refused == 1:
+            self.loop.call_later(REPORT_S, self._report)
+
+    def _report(self) -> None:
+        print(self._refused, flush=True)
+        self._refused = 0
+
+    def wait_for_turn(self, connection: Connection) -> None:
+        """Connect to the router as soon as the address has few handshakes."""
+        self._waiting[connection] = None
+        self._start_waiting()
+
+    def end_handshake(self, connection: Connection) -> None:
+        """Let the next connection shake hands with the router."""
+        self._handshakes.pop(connection, None)
+        self._start_waiting()
+
+    def forget(self, connection: Connection) -> None:
+        """Remove a closed connection."""
+        self._open.pop(connection, None)
+        self._waiting.pop(connection, None)
+        if (task := self._connecting.pop(connection, None)) is not None:
+            task.cancel()
+        self.end_handshake(connection)
+
+    def _start_waiting(self) -> None:
+        busy = Counter(one.address for one in self._handshakes)
+        for connection in list(self._waiting):
+            if busy[connection.address] < MAX_HANDSHAKES:
+                busy[connection.address] += 1
+                del self._waiting[connection]
+                self._handshakes[connection] = None
+                task = self.loop.create_task(self._connect(connection))
+                self._connecting[connection] = task
+
+    async def _connect(self, connection: Connection) -> None:
+        try:
+            router, _ = await self.loop.create_connection(
+                lambda: Side(self, connection), *self._router
+            )
+        except OSError:
+            connection.close()
+            return
+        self._connecting.pop(connection, None)
+        if connection.is_closed:
+            router.abort()
+        else:
+            connection.start(router)
+
+
+async def _run(listener: socket.socket, host: str, port: int, max_connections: int) -> None:
+    loop = asyncio.get_running_loop()
+    gate = Gate(host, port, max_connections)
+    parent_ended = asyncio.Event()
+    os.set_blocking(sys.stdin.fileno(), False)
+    loop.add_reader(sys.stdin.fileno(), parent_ended.set)
+    async with await loop.create_server(lambda: Side(gate), sock=listener):
+        await parent_ended.wait()
+    os._exit(0)  # Connections need no farewell: the router is gone.
+
+
+def main(arguments: list[str]) -> None:
+    """Run the gate until the standard input ends."""
+    descriptor, host, port, max_connections = arguments
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # The service ends the gate after itself.
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    listener = socket.socket(fileno=int(descriptor))
+    asyncio.run(_run(listener, host, int(port), int(max_connections)))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

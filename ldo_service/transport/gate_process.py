@@ -1,0 +1,148 @@
+"""Process of the gate in front of the TLS port of a router; see `connection_gate`."""
+
+import logging
+import resource
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from threading import Event, Thread
+
+from ldo_service.errors import ConfigError
+
+from . import connection_gate
+from .endpoint import LOOPBACK, Endpoint
+from .zenoh_transport import MAX_SESSIONS, why_not_listening
+
+log = logging.getLogger(__name__)
+
+# Time for the gate of a killed service to free its port, seconds.
+BIND_WITHIN_S = 3.0
+RESTART_AFTER_S = 0.5  # Time before a gate that has ended is started again, seconds.
+# The gate admits as many connections as the router has sessions. With a low limit of open files,
+# it leaves three quarters of the descriptors of the service to other uses, saving among them.
+DESCRIPTORS_PER_CONNECTION = 4
+
+
+@contextmanager
+def guarded(network: Endpoint) -> Iterator[Endpoint]:
+    """Run the gate of a router with TLS keys inside the block.
+
+    Args:
+        network: Endpoint of the router. The gate listens on its address.
+
+    Yields:
+        The endpoint for the router, which listens behind the gate.
+
+    Raises:
+        ConfigError: The address is in use or does not exist.
+    """
+    host, port = network.address
+    if not port.isdecimal():  # The address has settings of Zenoh, such as `#iface=eth0`.
+        log.warning(
+            "service: the endpoint %s is no plain tls/ADDRESS:PORT, so connections without keys "
+            "are not limited. Remove what follows the port.",
+            network.endpoint,
+        )
+        yield network
+        return
+    with _listen(network, host, int(port)) as listener:
+        gate = GateProcess(listener, _free_port())
+        try:
+            yield replace(network, behind_gate=f"tls/{LOOPBACK}:{gate.router_port}")
+        finally:
+            gate.close()
+
+
+class GateProcess:
+    """The process of a gate, which is started again when it ends."""
+
+    def __init__(self, listener: socket.socket, router_port: int) -> None:
+        """Start the process.
+
+        Args:
+            listener: Listening socket of the gate.
+            router_port: Port of the router on loopback.
+        """
+        self.router_port = router_port
+        soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        limit = min(MAX_SESSIONS, soft // DESCRIPTORS_PER_CONNECTION)
+        self._listener = listener
+        self._command = (
+            *(sys.executable, "-I", str(Path(connection_gate.__file__))),
+            *(str(listener.fileno()), LOOPBACK, str(router_port), str(limit)),
+        )
+        self._closing = Event()
+        self._process = self._start()
+        self._watch = Thread(target=self._restart, name="gate", daemon=True)
+        self._watch.start()
+
+    @property
+    def pid(self) -> int:
+        """Id of the process."""
+        return self._process.pid
+
+    def close(self) -> None:
+        """End the process."""
+        self._closing.set()
+        self._process.kill()
+        self._watch.join()
+
+    def _start(self) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            self._command,
+            pass_fds=(self._listener.fileno(),),
+            stdin=subprocess.PIPE,  # It ends with this process, and the gate with it.
+            stdout=subprocess.PIPE,
+            process_group=0,
+            text=True,
+        )
+
+    def _restart(self) -> None:
+        """Log the reports of the process, and start it again when it ends."""
+        while True:
+            with self._process as process:
+                assert process.stdout is not None
+                for count in process.stdout:
+                    log.warning(
+                        "service: closed %s connections of programs that showed no keys within "
+                        "%.0f s, or too many of them. Programs with keys are not affected. If this "
+                        "goes on, look for the sender in the network, or close the port to it by "
+                        "a firewall.",
+                        count.strip(), connection_gate.HANDSHAKE_S,
+                    )  # fmt: skip
+            if self._closing.wait(RESTART_AFTER_S):
+                return
+            log.error(
+                "service: the gate of the TLS port ended with %s and is started again; other "
+                "machines connect again by themselves.",
+                process.returncode,
+            )
+            self._process = self._start()
+            if self._closing.is_set():
+                self._process.kill()
+
+
+def _listen(network: Endpoint, host: str, port: int) -> socket.socket:
+    until_s = time.monotonic() + BIND_WITHIN_S
+    while True:
+        try:
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            family, *_, address = found[0]
+            is_any = family == socket.AF_INET6 and address[0] == "::"
+            dual = is_any and socket.has_dualstack_ipv6()
+            return socket.create_server(address[:2], family=family, dualstack_ipv6=dual)
+        except OSError as error:
+            if time.monotonic() > until_s:
+                raise ConfigError(f"{why_not_listening(network)} ({error.strerror})") from None
+            time.sleep(0.1)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return probe.getsockname()[1]
