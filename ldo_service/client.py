@@ -51,7 +51,7 @@ from ldo_service.schemas.topics import (
     Topic,
 )
 from ldo_service.transport.flow_control import Header
-from ldo_service.transport.keys import TlsKeys
+from ldo_service.transport.keys import OF_CLIENT, TlsKeys
 from ldo_service.transport.message_reader import MessageReader
 from ldo_service.transport.message_sender import MessageSender
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT, Endpoint, open_session
@@ -391,5 +391,7 @@ def connect(
         ConfigError: No service replies, or the keys are rejected.
     """
     network = Endpoint(robot, endpoint, TlsKeys.of(keys))
+    if network.keys:
+        network.keys.warn_of_expiry(OF_CLIENT)
     with open_session(network) as session:
         yield Client(session, network)

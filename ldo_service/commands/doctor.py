@@ -6,6 +6,7 @@ import platform
 import shutil
 import time
 from collections.abc import Iterator
+from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,7 +21,8 @@ from ldo_service.errors import ConfigError, ModelError, install_command
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH
 from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
-from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
+from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
+from ldo_service.transport.keys import TlsKeys, expiry_warning
 
 from .calibration_report import camera_findings
 from .findings import Finding, show
@@ -100,7 +102,12 @@ def doctor(
     if run is not None:
         show(camera_findings(run))
         return
-    show((*machine(), *libraries(), *extras(), *networks(), *service(robot, endpoint, keys)))
+    show(
+        (
+            *(*machine(), *libraries(), *extras(), *networks()),
+            *(*certificates(endpoint, keys), *service(robot, endpoint, keys)),
+        )
+    )
 
 
 def machine() -> Iterator[Finding]:
@@ -177,6 +184,24 @@ def service(robot: str, endpoint: str, keys: Path | None) -> Iterator[Finding]:
         return
     for actor in actors:
         yield from of_actor(actor)
+
+
+def certificates(endpoint: str, keys: Path | None) -> Iterator[Finding]:
+    """Check how long the keys and the certificate of the service are valid."""
+    own = TlsKeys.of(keys)
+    if own is None:
+        return
+    host, port = Endpoint(endpoint=endpoint, keys=own).address
+    found = {f"the keys in {own.folder}": own.valid_until_s()}
+    if port.isdecimal():
+        found[f"the certificate of the service on {endpoint}"] = own.server_valid_until_s(
+            host, int(port)
+        )
+    for what, until_s in found.items():
+        if when := expiry_warning(until_s):
+            yield Finding("warn", f"{what} {when}: make new ones by `ldo keys`")
+        elif until_s is not None:
+            yield Finding("ok", f"{what}: valid until {date.fromtimestamp(until_s)}")
 
 
 def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[ActorStatus]:

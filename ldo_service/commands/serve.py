@@ -13,7 +13,7 @@ from ldo_service.service.service import Service
 from ldo_service.service.state_folder import state_folder
 from ldo_service.transport.access_control import LOCAL
 from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
-from ldo_service.transport.keys import TlsKeys
+from ldo_service.transport.keys import OF_SERVICE, TlsKeys
 
 from .options import (
     ActorNames,
@@ -76,7 +76,7 @@ def serve(
     with ExitStack() as stack:
         folder = state_folder(state, stack)
         if is_router and network.keys:
-            network.keys.warn_of_expiry()
+            network.keys.warn_of_expiry(OF_SERVICE)
             private = stack.enter_context(TemporaryDirectory(prefix="ldo-"))  # Mode 0700.
             network = replace(network, local_socket=f"{private}/link")
         Service(

@@ -8,7 +8,8 @@ It listens on loopback by default.
 - `/healthz`: 200 while every actor sends heartbeats, else 503 with the names of the silent actors.
   The reply describes only the current state.
 - `/readyz`: 200 while no actor is silent and no actor fails on every message, else 503 with the
-  names of these actors. A restart of the service does not help an actor that fails.
+  names of these actors. A restart of the service does not help an actor that fails. The reply
+  also warns, without another status, of a certificate that expires within 30 days.
 """
 
 import socket
@@ -29,6 +30,7 @@ from prometheus_client.registry import Collector
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import Health, InputCount, OutputCount, decode
 from ldo_service.transport.endpoint import LOOPBACK
+from ldo_service.transport.keys import expiry_warning
 
 MAX_ACTORS = 64  # Limit of the stored names, because messages may contain any name.
 COMES_BACK_S = 5.0  # Time for an actor to restart after it was killed at its heartbeat timeout.
@@ -134,7 +136,11 @@ class HealthCollector(Collector):
     """Prometheus collector that reads the last heartbeat of each actor of a robot."""
 
     def __init__(
-        self, robot: str, actors: Iterable[str] = (), silent_after_s: float = 10.0
+        self,
+        robot: str,
+        actors: Iterable[str] = (),
+        silent_after_s: float = 10.0,
+        certificate_until_s: float | None = None,
     ) -> None:
         """Initialize without heartbeats.
 
@@ -142,7 +148,10 @@ class HealthCollector(Collector):
             robot: Name of the robot, a label of every metric.
             actors: Names of the actors that must send heartbeats.
             silent_after_s: Heartbeat timeout of the service, seconds.
+            certificate_until_s: End of the validity of the service's certificate, Unix time in
+                seconds; None without keys.
         """
+        self.certificate_until_s = certificate_until_s
         self._robot, self._actors = robot, tuple(actors)
         self._silent_after_s = silent_after_s + COMES_BACK_S
         self._lock = Lock()
@@ -172,6 +181,7 @@ class HealthCollector(Collector):
         now = [health for at_s, health in last.values() if at_s > since_s]
         for metric in (
             self._ages(last),
+            self._certificate(),
             _processes(anew),
             _step_seconds(now),
             _facts(now),
@@ -212,6 +222,17 @@ class HealthCollector(Collector):
         for actor, (heard_at_s, _) in last.items():
             ages.add_metric([actor], time.monotonic() - heard_at_s)
         return ages
+
+    def _certificate(self) -> Metric:
+        expiry = GaugeMetricFamily(
+            "ldo_certificate_expiry_seconds",
+            "Time until the certificate of the service expires, negative after that; absent "
+            "without keys.",
+            labels=[],
+        )
+        if self.certificate_until_s is not None:
+            expiry.add_metric([], self.certificate_until_s - time.time())
+        return expiry
 
 
 def _table(
@@ -329,7 +350,8 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
             return _how_it_is(collector.silent_actors(), [], start_response)
         if environ["PATH_INFO"] == "/readyz":
             silent, failing = collector.silent_actors(), collector.failing_actors()
-            return _how_it_is(silent, failing, start_response)
+            expiry = expiry_warning(collector.certificate_until_s)
+            return _how_it_is(silent, failing, start_response, expiry)
         return metrics(environ, start_response)
 
     try:
@@ -351,9 +373,13 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
         thread.join()
 
 
-def _how_it_is(silent: list[str], failing: list[str], start_response: Any) -> list[bytes]:
+def _how_it_is(
+    silent: list[str], failing: list[str], start_response: Any, expiry: str = ""
+) -> list[bytes]:
     status = "503 Service Unavailable" if silent or failing else "200 OK"
     start_response(status, [("Content-Type", "text/plain; charset=utf-8")])
     problems = [f"no heartbeat: {', '.join(silent)}"] if silent else []
     problems += [f"failing on every message: {', '.join(failing)}"] if failing else []
-    return [f"{'; '.join(problems) or 'every actor reports'}\n".encode()]
+    state = "; ".join(problems) or "every actor reports"
+    warning = f"; the certificate of the service {expiry}" if expiry else ""
+    return [f"{state}{warning}\n".encode()]

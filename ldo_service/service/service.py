@@ -48,6 +48,8 @@ from ldo_service.runtime.supervision import Runner, StopRequest, Watchdog, super
 from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.gate_process import guarded
+from ldo_service.transport.key_renewal import KeyRenewal
+from ldo_service.transport.keys import TlsKeys
 from ldo_service.transport.worker import Worker
 from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport, open_session
 
@@ -122,7 +124,9 @@ class Service:
         self._require_known(self.config.service.process_actors)
         raise_file_limit()
         names, silent_after_s = [box.name for box in GRAPH], self.config.service.heartbeat_timeout_s
-        health = HealthCollector(self.network.robot, names, silent_after_s)
+        keys = self.network.keys
+        until_s = keys.valid_until_s() if keys else None
+        health = HealthCollector(self.network.robot, names, silent_after_s, until_s)
         if self.recording and not self.only:
             prepare_recording(self.recording)
         with ExitStack() as stack:
@@ -131,10 +135,7 @@ class Service:
             if self.metrics_port is not None:
                 address = self.config.service.metrics_address
                 stack.enter_context(serve_metrics(health, self.metrics_port, address))
-            network = self.network
-            if self.is_router and network.keys:
-                network = stack.enter_context(guarded(network))
-            session = stack.enter_context(open_session(network, router=self.is_router))
+            session = self._open_session(stack, health)
             try:
                 asyncio.run(self._serve(session, health))
             except StageError as error:
@@ -143,6 +144,20 @@ class Service:
             _leave_if_busy(0, "stopped")
             if not self.only:
                 log.info("service: stopped; %s", self._state_after_stop())
+
+    def _open_session(self, stack: ExitStack, health: HealthCollector) -> zenoh.Session:
+        """Open the session of this process; a router with keys gets a gate and key renewal."""
+        network, gate = self.network, None
+        if self.is_router and network.keys:
+            network, gate = stack.enter_context(guarded(network))
+        session = stack.enter_context(open_session(network, router=self.is_router))
+        if gate is not None and network.local_socket:
+
+            def renewed(keys: TlsKeys) -> None:
+                health.certificate_until_s = keys.valid_until_s()
+
+            stack.enter_context(KeyRenewal(gate, network, renewed))
+        return session
 
     async def _serve(self, session: zenoh.Session, health: HealthCollector) -> None:
         transport = ZenohTransport(session, self.network)

@@ -15,9 +15,9 @@ A connection is *unproven* until the router has answered the client's certificat
 - lets at most `MAX_HANDSHAKES` connections of an address shake hands with the router at a time.
 
 This file runs as a script and imports the standard library only, so that the process starts at once
-and takes little memory: `python -I connection_gate.py DESCRIPTOR HOST PORT MAX_CONNECTIONS`. It
-ends when its standard input ends. It prints how many connections it closed because of these limits,
-at most once in `REPORT_S`.
+and takes little memory: `python -I connection_gate.py DESCRIPTOR HOST PORT MAX_CONNECTIONS`. A line
+on its standard input is a new port of the router. The process ends when its standard input ends. It
+prints how many connections it closed because of these limits, at most once in `REPORT_S`.
 """
 
 import asyncio
@@ -146,7 +146,7 @@ class Side(asyncio.Protocol):
 
 
 class Gate:
-    """All connections of the gate, and their limits."""
+    """Connections of the gate, and their limits."""
 
     def __init__(self, host: str, port: int, max_connections: int) -> None:
         """Initialize inside a running event loop.
@@ -159,8 +159,10 @@ class Gate:
         self.loop = asyncio.get_running_loop()
         self._router = host, port
         self._max_connections = max_connections
-        self._open: dict[Connection, None] = {}  # In the order of their arrival.
-        self._waiting: dict[Connection, None] = {}  # Waiting for a turn, in order.
+        self._open: dict[Connection, None] = {}  # Open connections, oldest first.
+        self._waiting: dict[
+            Connection, None
+        ] = {}  # Connections that wait for a turn, oldest first.
         self._connecting: dict[Connection, asyncio.Task[None]] = {}
         self._handshakes: dict[Connection, None] = {}
         self._refused = 0  # Number of connections closed because of a limit since the last report.
@@ -186,6 +188,12 @@ class Gate:
     def _report(self) -> None:
         print(self._refused, flush=True)
         self._refused = 0
+
+    def redirect(self, port: int) -> None:
+        """Close all connections, and pass new ones on to another port of the router."""
+        self._router = self._router[0], port
+        for connection in list(self._open):
+            connection.close()
 
     def wait_for_turn(self, connection: Connection) -> None:
         """Connect to the router as soon as the address has few handshakes."""
@@ -234,8 +242,14 @@ async def _run(listener: socket.socket, host: str, port: int, max_connections: i
     loop = asyncio.get_running_loop()
     gate = Gate(host, port, max_connections)
     parent_ended = asyncio.Event()
-    os.set_blocking(sys.stdin.fileno(), False)
-    loop.add_reader(sys.stdin.fileno(), parent_ended.set)
+
+    def take_order() -> None:
+        if order := os.read(sys.stdin.fileno(), 4096):
+            gate.redirect(int(order.split()[-1]))
+        else:
+            parent_ended.set()
+
+    loop.add_reader(sys.stdin.fileno(), take_order)
     async with await loop.create_server(lambda: Side(gate), sock=listener):
         await parent_ended.wait()
     os._exit(0)  # Connections need no farewell: the router is gone.

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
@@ -29,14 +29,15 @@ DESCRIPTORS_PER_CONNECTION = 4
 
 
 @contextmanager
-def guarded(network: Endpoint) -> Iterator[Endpoint]:
+def guarded(network: Endpoint) -> Iterator[tuple[Endpoint, "GateProcess | None"]]:
     """Run the gate of a router with TLS keys inside the block.
 
     Args:
         network: Endpoint of the router. The gate listens on its address.
 
     Yields:
-        The endpoint for the router, which listens behind the gate.
+        The endpoint for the router, which listens behind the gate, and the gate. Without a plain
+        address and port, the same endpoint and None.
 
     Raises:
         ConfigError: The address is in use or does not exist.
@@ -48,12 +49,13 @@ def guarded(network: Endpoint) -> Iterator[Endpoint]:
             "are not limited. Remove what follows the port.",
             network.endpoint,
         )
-        yield network
+        yield network, None
         return
     with _listen(network, host, int(port)) as listener:
-        gate = GateProcess(listener, _free_port())
+        port = free_port()
+        gate = GateProcess(listener, port)
         try:
-            yield replace(network, behind_gate=f"tls/{LOOPBACK}:{gate.router_port}")
+            yield replace(network, behind_gate=f"tls/{LOOPBACK}:{port}"), gate
         finally:
             gate.close()
 
@@ -68,14 +70,10 @@ class GateProcess:
             listener: Listening socket of the gate.
             router_port: Port of the router on loopback.
         """
-        self.router_port = router_port
+        self._router_port = router_port
         soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        limit = min(MAX_SESSIONS, soft // DESCRIPTORS_PER_CONNECTION)
+        self._max_connections = min(MAX_SESSIONS, soft // DESCRIPTORS_PER_CONNECTION)
         self._listener = listener
-        self._command = (
-            *(sys.executable, "-I", str(Path(connection_gate.__file__))),
-            *(str(listener.fileno()), LOOPBACK, str(router_port), str(limit)),
-        )
         self._closing = Event()
         self._process = self._start()
         self._watch = Thread(target=self._restart, name="gate", daemon=True)
@@ -86,6 +84,15 @@ class GateProcess:
         """Id of the process."""
         return self._process.pid
 
+    def redirect(self, router_port: int) -> None:
+        """Close all connections, and pass new ones on to another port of the router."""
+        self._router_port = router_port
+        stdin = self._process.stdin
+        assert stdin is not None
+        with suppress(OSError):  # A process that has ended is started again with the new port.
+            stdin.write(f"{router_port}\n")
+            stdin.flush()
+
     def close(self) -> None:
         """End the process."""
         self._closing.set()
@@ -93,8 +100,12 @@ class GateProcess:
         self._watch.join()
 
     def _start(self) -> subprocess.Popen[str]:
+        limits = str(self._router_port), str(self._max_connections)
         return subprocess.Popen(
-            self._command,
+            (
+                *(sys.executable, "-I", str(Path(connection_gate.__file__))),
+                *(str(self._listener.fileno()), LOOPBACK, *limits),
+            ),
             pass_fds=(self._listener.fileno(),),
             stdin=subprocess.PIPE,  # It ends with this process, and the gate with it.
             stdout=subprocess.PIPE,
@@ -142,7 +153,8 @@ def _listen(network: Endpoint, host: str, port: int) -> socket.socket:
             time.sleep(0.1)
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """Return a port of loopback that no program uses now."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return probe.getsockname()[1]

@@ -13,6 +13,7 @@ import logging
 import socket
 import ssl
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,11 +25,28 @@ from .access_control import Access, access_control, read_access
 log = logging.getLogger(__name__)
 
 CA, CERTIFICATE, KEY, ACCESS = "ca.crt", "tls.crt", "tls.key", "access.yaml"
-EXPIRY_WARNING_DAYS = 30  # Warnings are logged during this time before a certificate expires.
+EXPIRY_WARNING_DAYS = 30  # Warnings are given during this time before a certificate expires.
+DAY_S = 86_400
 OTHERS = 0o007  # Bits of a file mode that give access to all users of the machine.
 # Time limit for reading the TLS error of a server, seconds. A server rejects a client in the
 # handshake or one round trip later.
 ALERT_WITHIN_S = 1.0
+OF_SERVICE = "Other machines cannot connect after that; actors on this machine continue."
+OF_CLIENT = "This program cannot connect after that."
+
+
+def expiry_warning(valid_until_s: float | None) -> str:
+    """Return "expires in ... days" or "expired ... days ago"; empty if that is far or unknown.
+
+    Args:
+        valid_until_s: End of the validity of a certificate, Unix time in seconds; None if unknown.
+    """
+    if valid_until_s is None:
+        return ""
+    days = (valid_until_s - time.time()) / DAY_S
+    if days > EXPIRY_WARNING_DAYS:
+        return ""
+    return f"expires in {days:.1f} days" if days > 0 else f"expired {-days:.1f} days ago"
 
 
 def router_settings(folder: Path, access: Access, local_robot: str = "") -> dict[str, Any]:
@@ -91,30 +109,26 @@ class TlsKeys:
             return router_settings(self.folder, read_access(self.folder / ACCESS), local_robot)
         return {"transport/link/tls": _tls(self.folder, "connect")}
 
-    def days_left(self) -> float | None:
-        """Return the days until the certificate of this machine expires; None if unknown.
-
-        After the expiry, the result is negative. The clock of this machine is used.
-        """
+    def valid_until_s(self) -> float | None:
+        """Return the end of the certificate's validity, Unix time in seconds; None if unknown."""
         # The standard library has no other function that reads a certificate from a file.
         read = getattr(getattr(ssl, "_ssl", None), "_test_decode_cert", None)
         if read is None:
             return None
-        until_s = ssl.cert_time_to_seconds(read(str(self.folder / CERTIFICATE))["notAfter"])
-        return (until_s - time.time()) / 86400
+        return ssl.cert_time_to_seconds(read(str(self.folder / CERTIFICATE))["notAfter"])
 
-    def warn_of_expiry(self) -> None:
-        """Log a warning if the certificate has expired or expires within 30 days."""
-        days = self.days_left()
-        if days is None or days > EXPIRY_WARNING_DAYS:
-            return
-        when = f"expires in {days:.1f} days" if days > 0 else f"expired {-days:.1f} days ago"
-        log.warning(
-            "service: the certificate %s %s by the clock of this machine. Other machines cannot "
-            "connect after that; actors on this machine continue. Run `ldo keys` for new keys, or "
-            "set the clock.",
-            self.folder / CERTIFICATE, when,
-        )  # fmt: skip
+    def warn_of_expiry(self, consequence: str) -> None:
+        """Log a warning if the certificate has expired or expires within 30 days.
+
+        Args:
+            consequence: What happens after that, a sentence.
+        """
+        if when := expiry_warning(self.valid_until_s()):
+            log.warning(
+                "The certificate %s %s by the clock of this machine. %s Run `ldo keys` for new "
+                "keys, or set the clock.",
+                self.folder / CERTIFICATE, when, consequence,
+            )  # fmt: skip
 
     def context(self) -> ssl.SSLContext:
         """Create the TLS context of a client with these keys.
@@ -141,16 +155,39 @@ class TlsKeys:
     def tls_error(self, host: str, port: int) -> str:
         """Connect to a server by TLS, and return the TLS error, or "" if there is none."""
         try:
-            with (
-                socket.create_connection((host, port), ALERT_WITHIN_S) as plain,
-                self.context().wrap_socket(plain, server_hostname=host) as secured,
-            ):
-                secured.recv(1)
+            self._handshake(host, port)
         except ssl.SSLError as error:
             return getattr(error, "verify_message", "") or error.reason or str(error)
         except OSError:
             pass  # The server is absent, or reports no TLS error within the time limit.
         return ""
+
+    def server_valid_until_s(self, host: str, port: int) -> float | None:
+        """Return the end of the validity of a server's certificate, Unix time in seconds.
+
+        The result is None if the server is absent, or if it and these keys reject each other.
+        """
+        try:
+            return self._handshake(host, port)
+        except OSError:
+            return None
+
+    def _handshake(self, host: str, port: int) -> float | None:
+        """Connect to a server, and return the end of the validity of its certificate.
+
+        Raises:
+            OSError: The server is absent, or server and keys reject each other.
+        """
+        with (
+            socket.create_connection((host, port), ALERT_WITHIN_S) as plain,
+            self.context().wrap_socket(plain, server_hostname=host) as secured,
+        ):
+            certificate = secured.getpeercert() or {}
+            # A server that rejects the keys says so after the handshake.
+            with suppress(TimeoutError):
+                secured.recv(1)
+        until = certificate.get("notAfter")
+        return ssl.cert_time_to_seconds(until) if isinstance(until, str) else None
 
     def _require_readable(self, path: Path) -> None:
         try:

@@ -18,6 +18,7 @@ import logging
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from dataclasses import replace
 from threading import BoundedSemaphore, Lock
 from typing import Any
 
@@ -25,9 +26,10 @@ import zenoh
 
 from ldo_service.errors import ConfigError
 
-from .endpoint import CLOSED, DEFAULT_ENDPOINT, Endpoint
+from .endpoint import CLOSED, DEFAULT_ENDPOINT, LOOPBACK, Endpoint
 from .flow_control import ALIVE
 from .interface import LastValues, OnMessage, OnPresence, call_soon
+from .keys import TlsKeys
 from .worker import Worker
 
 log = logging.getLogger(__name__)
@@ -59,6 +61,29 @@ def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
     except zenoh.ZError as error:
         advice = why_not_listening(network) if router else _why_not_connected(network)
         raise ConfigError(f"{advice} ({str(error).split(' at /')[0]})") from None
+
+
+def open_front_router(network: Endpoint, keys: TlsKeys, port: int) -> zenoh.Session:
+    """Open a further router with renewed keys, connected to the router of a service.
+
+    Args:
+        network: Endpoint of the service, with a Unix socket.
+        keys: The renewed keys.
+        port: Port on loopback, behind the gate.
+
+    Raises:
+        ConfigError: The keys or the access list cannot be used.
+    """
+    listen = f"tls/{LOOPBACK}:{port}"
+    config = _session_config(replace(network, keys=keys, behind_gate=listen), router=True)
+    config.insert_json5("listen/endpoints", json.dumps([listen]))
+    config.insert_json5("connect/endpoints", json.dumps([network.local_endpoint]))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise ConfigError(
+            f"no router opens with {keys.folder}: {error}. Copy the folder again."
+        ) from None
 
 
 def _session_config(network: Endpoint, router: bool) -> zenoh.Config:

@@ -10,6 +10,11 @@ import pytest
 from ldo_service.commands import doctor
 from ldo_service.errors import LdoError
 from ldo_service.service.diagnostics import ActorStatus
+from ldo_service.transport.certificate_authority import CertificateAuthority
+from ldo_service.transport.endpoint import Endpoint
+from ldo_service.transport.keys import TlsKeys
+from ldo_service.transport.zenoh_transport import open_session
+from tests.ports import free_port
 from tests.service.test_diagnostics import health, inputs
 
 
@@ -52,3 +57,20 @@ def test_dropped_messages_are_named_by_topic() -> None:
 def test_every_extra_of_the_package_is_checked() -> None:
     pyproject = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     assert set(doctor.EXTRAS) == set(pyproject["project"]["optional-dependencies"])
+
+
+@pytest.mark.parametrize(("days", "mark"), [(40, "ok"), (10, "warn")])
+def test_certificates_that_expire_within_30_days_are_warnings(
+    tmp_path: Path, days: int, mark: str
+) -> None:
+    authority = CertificateAuthority.new(tmp_path / "keys", days=50)
+    for role in ("service", "viewer"):
+        authority.add(role, role, "robot", days=days)
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    network = Endpoint("robot", endpoint, TlsKeys(tmp_path / "keys" / "service"))
+    with open_session(network, router=True):
+        own, service = doctor.certificates(endpoint, tmp_path / "keys" / "viewer")
+    assert (own.mark, service.mark) == (mark, mark)
+    if mark == "warn":
+        assert f"the certificate of the service on {endpoint} expires in 10.0 days" in service.text
+        assert "`ldo keys`" in own.text

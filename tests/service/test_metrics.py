@@ -89,6 +89,21 @@ def test_readyz_names_an_actor_that_fails_on_every_message_and_healthz_does_not(
             assert read_healthz(port) == (200, "every actor reports")
 
 
+def test_certificate_that_expires_within_30_days_is_a_metric_and_a_warning_of_readyz() -> None:
+    collector, port = HealthCollector("mule", ["mapper"]), free_port()
+    collector.on_health(b"", memoryview(encode(EXAMPLES["health"])))
+    name = "ldo_certificate_expiry_seconds"
+    with serve_metrics(collector, port):
+        assert (name, labels()) not in scraped(port), "a service without keys has no certificate"
+        collector.certificate_until_s = time.time() + 31 * 86_400
+        assert 30 * 86_400 < scraped(port)[name, labels()] < 31 * 86_400
+        assert read_healthz(port, "readyz") == (200, "every actor reports")
+        collector.certificate_until_s = time.time() + 9.96 * 86_400
+        status, text = read_healthz(port, "readyz")
+        assert status == 200
+        assert text == "every actor reports; the certificate of the service expires in 10.0 days"
+
+
 def test_actor_is_silent_only_after_its_heartbeat_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
     slow, quick = (HealthCollector("mule", ["mapper"], silent_s) for silent_s in (60, 5))
     for collector in (slow, quick):

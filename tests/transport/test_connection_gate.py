@@ -245,6 +245,22 @@ def test_gate_that_was_killed_is_started_again(router: EchoRouter, keys: Path) -
         process.close()
 
 
+def test_redirected_gate_closes_its_connections_and_leads_to_the_other_router(
+    router: EchoRouter, keys: Path
+) -> None:
+    other = EchoRouter(keys)
+    with socket.create_server((LOOPBACK, 0)) as listener:
+        process, port = GateProcess(listener, router.port), listener.getsockname()[1]
+        with tls_client(port, keys) as client:
+            process.redirect(other.port)
+            with suppress(OSError):
+                assert client.recv(1) == b""
+        with tls_client(port, keys):
+            assert (router.accepted, other.accepted) == (1, 1)
+        process.close()
+    other.close()
+
+
 def test_occupied_port_is_an_error_that_names_the_endpoint(keys: Path) -> None:
     port = free_port()
     with socket.create_server((LOOPBACK, port)):

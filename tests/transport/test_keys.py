@@ -1,6 +1,7 @@
 """Tests of key folders: an unusable folder is reported before a connection is opened."""
 
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -84,3 +85,18 @@ def test_invalid_access_list_is_rejected(folder: Path, text: str | None, message
     path.unlink() if text is None else path.write_text(text)
     with pytest.raises(ConfigError, match=message):
         read_access(path)
+
+
+@pytest.mark.parametrize(
+    ("days", "warning"),
+    [(31, ""), (29, "expires in 29.0 days"), (-1, "expired 1.0 days ago")],
+)
+def test_certificate_is_warned_of_during_the_30_days_before_it_expires(
+    days: int, warning: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    authority = CertificateAuthority.new(tmp_path / "keys", days=60)
+    made_at = datetime.now(UTC) + timedelta(days=days - 50)
+    keys = TlsKeys(authority.add("mule", "service", "mule", days=50, now=made_at))
+    keys.warn_of_expiry("Other machines cannot connect after that.")
+    assert bool(caplog.records) == bool(warning)
+    assert warning in caplog.text

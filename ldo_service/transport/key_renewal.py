@@ -1,0 +1,111 @@
+"""Renewal of the TLS keys of a running router.
+
+Zenoh reads keys and access list when a session opens. If the files change, `KeyRenewal` opens a
+second router with the new files, connects it to the router of the service over the Unix socket, and
+sends the gate there. Programs connect again by themselves.
+"""
+
+import logging
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from threading import Event, Thread
+
+import zenoh
+
+from ldo_service.errors import ConfigError
+
+from .endpoint import Endpoint
+from .gate_process import GateProcess, free_port
+from .keys import ACCESS, CA, CERTIFICATE, DAY_S, KEY, OF_SERVICE, TlsKeys
+from .zenoh_transport import open_front_router
+
+log = logging.getLogger(__name__)
+
+Stamps = tuple[tuple[int, ...], ...]  # Number, time and size of each file.
+
+
+class KeyRenewal:
+    """Thread that watches the files of a router's keys, for a `with` block.
+
+    Once a day it also warns of a certificate that expires soon.
+    """
+
+    # Time between two looks at the files, seconds. Changed files are read when two looks find the
+    # same, so that a copy is complete.
+    PERIOD_S = 2.0
+
+    def __init__(
+        self, gate: GateProcess, network: Endpoint, on_renewed: Callable[[TlsKeys], None]
+    ) -> None:
+        """Remember the files as they are; the router must have read them just now.
+
+        Args:
+            gate: Gate of the router.
+            network: Endpoint of the router, with keys and a Unix socket.
+            on_renewed: Called with the new keys, on the thread of this object.
+        """
+        assert network.keys is not None
+        self._gate, self._network, self._on_renewed = gate, network, on_renewed
+        self._keys = network.keys
+        self._used = self._seen = _stamps(self._keys.folder)
+        self._front: zenoh.Session | None = None  # Router with renewed keys.
+        self._warned_at_s = time.monotonic()
+        self._closing = Event()
+        self._thread = Thread(target=self._watch, name="key renewal", daemon=True)
+
+    def __enter__(self) -> "KeyRenewal":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._close_front()
+
+    def _watch(self) -> None:
+        while not self._closing.wait(self.PERIOD_S):
+            now = _stamps(self._keys.folder)
+            is_complete, self._seen = now == self._seen, now
+            if is_complete and now != self._used:
+                self._used = now
+                self._renew()
+            if time.monotonic() - self._warned_at_s > DAY_S:
+                self._warned_at_s = time.monotonic()
+                self._keys.warn_of_expiry(OF_SERVICE)
+
+    def _renew(self) -> None:
+        port = free_port()
+        try:
+            keys = TlsKeys(self._keys.folder)
+            front = open_front_router(self._network, keys, port)
+        except ConfigError as error:
+            log.error(
+                "service: the keys in %s changed but cannot be used, so the previous ones stay in "
+                "use: %s",
+                self._keys.folder, error,
+            )  # fmt: skip
+            return
+        self._gate.redirect(port)
+        self._close_front()
+        self._front = front
+        log.info("service: uses the new keys in %s; other machines connect again.", keys.folder)
+        keys.warn_of_expiry(OF_SERVICE)
+        self._on_renewed(keys)
+
+    def _close_front(self) -> None:
+        if self._front is not None:
+            with suppress(zenoh.ZError):
+                self._front.close()
+
+
+def _stamps(folder: Path) -> Stamps:
+    found = []
+    for name in (CA, CERTIFICATE, KEY, ACCESS):
+        try:
+            status = (folder / name).stat()
+            found.append((status.st_ino, status.st_mtime_ns, status.st_size))
+        except OSError:
+            found.append(())
+    return tuple(found)
