@@ -73,4 +73,4 @@ def test_invalid_certificate_of_the_robot_stops_no_actor(tmp_path: Path, shift_d
         service.terminate()
         assert service.wait(60) == 0
         assert service.stderr is not None
-        assert "the certificate" in service.stderr.read()
+        assert "The certificate" in service.stderr.read()
