@@ -22,6 +22,12 @@ log = logging.getLogger(__name__)
 # process.
 QUIET_S = 1.0
 
+# Time that all runners together have for a soft stop, and that each has at least, as multiples of
+# `drain_s`. Seven actors and the default of 10 s then need at most 22 s; the unit of systemd allows
+# 30 s.
+ALL_DRAIN = 1.5
+MIN_DRAIN = 0.1
+
 # Notifications per watchdog period. sd_watchdog_enabled(3) recommends two. With three, one may be
 # late on a busy machine.
 PINGS_PER_PERIOD = 3
@@ -92,7 +98,8 @@ async def supervise(
         sources: Number of runners at the start of `runners` that get inputs from outside the
             service. After these sources have ended, the other runners have `drain_s` seconds to
             handle all messages that result from the last outputs of the sources.
-        drain_s: Time that each runner has for a soft stop before it is cancelled, seconds.
+        drain_s: Time that each runner has for a soft stop before it is cancelled, seconds. All
+            together have `ALL_DRAIN * drain_s`; after that, each one has `MIN_DRAIN * drain_s`.
 
     Raises:
         RestartsExhausted: An actor has used up its restart budget.
@@ -103,11 +110,19 @@ async def supervise(
             tasks = [group.create_task(runner.run(), name=runner.name) for runner in runners]
             await stop.wait_soft()
             hard = asyncio.create_task(stop.wait_hard())
+            loop = asyncio.get_running_loop()
+            until_s = loop.time() + ALL_DRAIN * drain_s
+
+            def remaining_s() -> float:
+                return min(drain_s, max(until_s - loop.time(), MIN_DRAIN * drain_s))
+
             try:
                 for number, (runner, task) in enumerate(zip(runners, tasks, strict=True), 1):
-                    await _end(runner, task, hard, drain_s)
+                    await _end(runner, task, hard, remaining_s())
                     if number == sources:
-                        quiet = asyncio.create_task(wait_until_quiet(runners[number:], drain_s))
+                        quiet = asyncio.create_task(
+                            wait_until_quiet(runners[number:], remaining_s())
+                        )
                         await asyncio.wait({quiet, hard}, return_when=asyncio.FIRST_COMPLETED)
                         quiet.cancel()
             finally:

@@ -87,6 +87,38 @@ async def test_stage_that_exceeds_its_drain_time_is_cancelled() -> None:
     await asyncio.wait_for(supervise([stage], stop, drain_s=0.01), 60)
 
 
+async def test_stop_of_many_stages_that_do_not_drain_is_bounded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Slow:
+        name = "slow"
+
+        async def run(self) -> None:
+            await asyncio.Event().wait()
+
+        def drain(self) -> None: ...
+
+        def health(self) -> None: ...
+
+    loop, skipped_s = asyncio.get_running_loop(), 0.0
+    real_time, real_wait = loop.time, asyncio.wait
+
+    async def wait_without_delay(tasks: set, timeout: float | None = None, **options) -> object:
+        """Advance the clock by the time limit instead of waiting for it."""
+        nonlocal skipped_s
+        if timeout is None:
+            return await real_wait(tasks, **options)
+        skipped_s += timeout
+        return await real_wait(tasks, timeout=0, **options)
+
+    monkeypatch.setattr(loop, "time", lambda: real_time() + skipped_s)
+    monkeypatch.setattr(asyncio, "wait", wait_without_delay)
+    stop = StopRequest()
+    stop.request()
+    await supervise([Slow() for _ in range(7)], stop, drain_s=1000)
+    assert 1500 <= skipped_s <= 2100
+
+
 async def test_exhausted_restart_budget_ends_all_stages() -> None:
     tries = count()
 
