@@ -274,5 +274,8 @@ def _is_suspended(pid: int) -> bool:
 
 
 def python_command(*arguments: str) -> list[str]:
-    """Return the command line that runs `ldo` of this installation with the given arguments."""
-    return [sys.executable, "-m", "ldo_service", *arguments]
+    """Return the command line that runs `ldo` of this installation with the given arguments.
+
+    Without `-P`, Python would prefer a package `ldo_service` in the current folder.
+    """
+    return [sys.executable, "-P", "-m", "ldo_service", *arguments]

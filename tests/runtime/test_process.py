@@ -22,6 +22,7 @@ from ldo_service.runtime.process import (
     PARENT_VARIABLE,
     ChildProcess,
     exit_with_parent,
+    python_command,
     resident_mb,
     trim_memory,
 )
@@ -171,6 +172,14 @@ async def test_suspended_process_is_not_killed_before_its_timeout(
         assert process.restarts == 0
         process.kill()
         await eventually(lambda: process.restarts == 1)
+
+
+def test_child_process_ignores_packages_in_the_current_folder(tmp_path: Path) -> None:
+    (tmp_path / "foreign.py").write_text("print('this ran')")
+    command = ["foreign" if word == "ldo_service" else word for word in python_command()]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert "No module named foreign" in done.stderr
+    assert done.stdout == ""
 
 
 async def test_cancelled_child_process_has_ended() -> None:
