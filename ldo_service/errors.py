@@ -4,7 +4,8 @@
     ├── ConfigError               2
     │   ├── LosslessCycle
     │   ├── ModelError
-    │   └── EndpointError
+    │   ├── EndpointError
+    │   └── UnavailableError      6
     ├── DataError                 3
     │   └── FrameError
     ├── StageError                4
@@ -49,6 +50,12 @@ class LosslessCycle(ConfigError):
 
 class EndpointError(ConfigError):
     """Failed request to an HTTP server, such as a labeller: no reply or an invalid reply."""
+
+
+class UnavailableError(ConfigError):
+    """Port, router or state folder that cannot be used now; a later attempt may succeed."""
+
+    exit_code = 6
 
 
 class ModelError(ConfigError):

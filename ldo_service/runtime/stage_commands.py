@@ -9,7 +9,8 @@ The service sends commands to its stages over a network that may lose messages:
 
 Commands:
 
-- `pause`: Take no messages. Latest inputs drop arriving messages and count them as paused.
+- `pause`: Take no messages. Latest inputs drop arriving messages and count them as paused. A file
+  marks a paused service, so that it is paused after a restart too.
 - `resume`: Take messages again.
 - `reset`: Start with an empty state and a new epoch.
 - `save`: Write the whole state now.
@@ -175,6 +176,7 @@ class Control:
         saved_where: str,
         timeout_s: float,
         reset_marker: Path | None = None,
+        pause_marker: Path | None = None,
     ) -> None:
         """Connect to the stages.
 
@@ -186,12 +188,14 @@ class Control:
             timeout_s: Time limit of a command for all actors together, seconds.
             reset_marker: File that exists while a reset is not complete; None: no file. If the
                 previous process left it, this object completes the reset.
+            pause_marker: File that exists while the service is paused; None: no file. If the
+                previous process left it, this object pauses the sources.
         """
-        self._reset_marker = reset_marker
+        self._reset_marker, self._pause_marker = reset_marker, pause_marker
         self._commander = CommandSender(transport)
         self._actors, self._sources = tuple(actors), tuple(sources)
         self._saved_where, self._timeout_s = saved_where, timeout_s
-        self._is_paused = False
+        self._is_paused = pause_marker is not None and pause_marker.exists()
         self._one_at_a_time = asyncio.Lock()
         self._tasks: set[asyncio.Task[object]] = set()
         self._verbs: dict[str, Callable[[], Awaitable[str]]] = {
@@ -203,6 +207,9 @@ class Control:
         self._is_reset_pending = reset_marker is not None and reset_marker.exists()
         if self._is_reset_pending:
             self._start(self._complete_reset())
+        if self._is_paused:
+            log.warning("The service is paused, as it was when it stopped: it drops frames. Run "
+                        "`ldo control resume` to continue.")  # fmt: skip
         transport.watch_liveliness(self._presence)
 
     async def answer(self, body: bytes) -> bytes:
@@ -236,8 +243,17 @@ class Control:
     # --- verbs ------------------------------------------------------------------------------------
     async def _pause(self) -> str:
         self._is_paused = True
+        note = ""
+        try:
+            if self._pause_marker is not None:
+                write_atomically(self._pause_marker, b"")
+        except OSError as error:
+            note = (
+                f" A restart resumes the service too, because {self._pause_marker} cannot be "
+                f"written: {error.strerror}."
+            )
         await self._each("pause", self._sources)
-        return "frames are dropped and counted until `resume`."
+        return f"frames are dropped and counted until `resume`.{note}"
 
     async def _resume(self) -> str:
         if self._is_reset_pending:
@@ -246,6 +262,8 @@ class Control:
                 "`ldo control reset`."
             )
         self._is_paused = False
+        if self._pause_marker is not None:
+            self._pause_marker.unlink(missing_ok=True)
         await self._each("resume", self._sources)
         return "frames are processed again."
 

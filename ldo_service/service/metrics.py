@@ -27,7 +27,7 @@ from prometheus_client import CollectorRegistry, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, UnavailableError
 from ldo_service.schemas import Health, InputCount, OutputCount, decode
 from ldo_service.transport.endpoint import LOOPBACK
 from ldo_service.transport.keys import expiry_warning
@@ -337,7 +337,8 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
     """Serve http://ADDRESS:PORT/metrics, /healthz and /readyz inside the block.
 
     Raises:
-        ConfigError: The server cannot listen on the address and port.
+        ConfigError: The port is no port number.
+        UnavailableError: The server cannot listen on the address and port.
     """
     if not 0 < port < 65536:
         raise ConfigError(f"--metrics-port {port} must be within 1..65535.")
@@ -359,7 +360,7 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
         kind = type("Server", (_Server,), {"address_family": family})
         server = make_server(address, port, answer, kind, _Quiet)
     except OSError as error:
-        raise ConfigError(
+        raise UnavailableError(
             f"--metrics-port {port}: cannot listen on {address}:{port} ({error.strerror}). "
             "Choose another port, or another address with service.metrics_address."
         ) from error

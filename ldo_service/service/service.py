@@ -54,7 +54,7 @@ from ldo_service.transport.worker import Worker
 from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport, open_session
 
 from .metrics import HealthCollector, serve_metrics
-from .state_folder import RESET_MARKER, claim_state
+from .state_folder import PAUSE_MARKER, RESET_MARKER, claim_state
 
 log = logging.getLogger(__name__)
 
@@ -197,6 +197,7 @@ class Service:
             saved_where=self._saved_where(),
             timeout_s=self.config.service.control_timeout_s,
             reset_marker=self.state / RESET_MARKER,
+            pause_marker=self.state / PAUSE_MARKER,
         )
         transport.respond(CONTROL.name, control.answer)
         return control

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, UnavailableError
 from ldo_service.runtime.delivery_state import RestoredState
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
@@ -16,6 +16,7 @@ log = logging.getLogger(__name__)
 
 # File that exists while a reset of the actors is not complete; see `Control`.
 RESET_MARKER = "reset"
+PAUSE_MARKER = "paused"  # File that exists while the service is paused.
 # Actors whose states refer to each other. Each one saves a state before the first keyframe arrives.
 INTERDEPENDENT_ACTORS = ("tracker", "mapper", "optimizer")
 
@@ -70,14 +71,15 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
         remote_actors: Actors that another machine runs; their states are not in the folder.
 
     Raises:
-        ConfigError: Another service uses the folder, or the states do not match.
+        ConfigError: The states do not match.
+        UnavailableError: Another service uses the folder.
         DataError: A state cannot be read because of a disk error.
     """
     lock = stack.enter_context((folder / "lock").open("w"))
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        raise ConfigError(
+        raise UnavailableError(
             f"another service uses the state folder {folder}. Choose another folder with --state."
         ) from error
     store = FolderStore(folder / "state")

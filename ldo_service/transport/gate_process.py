@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import UnavailableError
 
 from . import connection_gate
 from .endpoint import LOOPBACK, Endpoint
@@ -40,7 +40,7 @@ def guarded(network: Endpoint) -> Iterator[tuple[Endpoint, "GateProcess | None"]
         address and port, the same endpoint and None.
 
     Raises:
-        ConfigError: The address is in use or does not exist.
+        UnavailableError: The address is in use or does not exist.
     """
     host, port = network.address
     if not port.isdecimal():  # The address has settings of Zenoh, such as `#iface=eth0`.
@@ -149,7 +149,7 @@ def _listen(network: Endpoint, host: str, port: int) -> socket.socket:
             return socket.create_server(address[:2], family=family, dualstack_ipv6=dual)
         except OSError as error:
             if time.monotonic() > until_s:
-                raise ConfigError(f"{why_not_listening(network)} ({error.strerror})") from None
+                raise UnavailableError(f"{why_not_listening(network)} ({error.strerror})") from None
             time.sleep(0.1)
 
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import zenoh
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, UnavailableError
 
 from .endpoint import CLOSED, DEFAULT_ENDPOINT, LOOPBACK, Endpoint
 from .flow_control import ALIVE
@@ -47,8 +47,8 @@ def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
     """Open a Zenoh session for a `with` block, as a router or as the client of a router.
 
     Raises:
-        ConfigError: The endpoint is malformed, its port is in use, no service replies on it, or the
-            keys are rejected.
+        ConfigError: The endpoint is malformed.
+        UnavailableError: Its port is in use, no service replies on it, or the keys are rejected.
     """
     try:
         config = _session_config(network, router)
@@ -60,7 +60,7 @@ def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         advice = why_not_listening(network) if router else _why_not_connected(network)
-        raise ConfigError(f"{advice} ({str(error).split(' at /')[0]})") from None
+        raise UnavailableError(f"{advice} ({str(error).split(' at /')[0]})") from None
 
 
 def open_front_router(network: Endpoint, keys: TlsKeys, port: int) -> zenoh.Session:

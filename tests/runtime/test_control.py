@@ -56,8 +56,9 @@ class Scene:
         store: StateStore | None = None,
         timeout_s: float = 5.0,
         reset_marker: Path | None = None,
+        pause_marker: Path | None = None,
     ) -> None:
-        self._reset_marker = reset_marker
+        self._markers = reset_marker, pause_marker
         self.transport, self.seen = MemoryTransport(), []
         self.source = Stage(Source, self.transport, config=QUICK, store=store)
         self.collector = Stage(lambda: Collector(self.seen), self.transport, config=QUICK)
@@ -69,7 +70,7 @@ class Scene:
             actors = ("source", "collector")
             self.control = Control(
                 *(self.transport, actors, ("source",), "here", self._timeout_s),
-                self._reset_marker,
+                *self._markers,
             )
             yield
 
@@ -153,6 +154,31 @@ async def test_malformed_request_is_answered_with_an_error() -> None:
             answer = decode(await scene.control.answer(body), ControlAnswer)
             assert not answer.ok
             assert "malformed ControlRequest" in answer.message
+
+
+async def test_paused_service_is_paused_after_a_restart_until_it_is_resumed(
+    tmp_path: Path,
+) -> None:
+    scene = Scene(pause_marker=tmp_path / "paused")
+    async with scene.started():
+        assert (await scene.request("pause")).ok
+    scene = Scene(pause_marker=tmp_path / "paused")
+    async with scene.started():
+        await eventually(lambda: scene.source.health().paused)
+        assert (await scene.request("resume")).ok
+    scene = Scene(pause_marker=tmp_path / "paused")
+    async with scene.started():
+        scene.send(1)
+        await eventually(lambda: scene.seen == [1])
+
+
+async def test_pause_that_cannot_be_written_says_that_a_restart_resumes(tmp_path: Path) -> None:
+    scene = Scene(pause_marker=tmp_path / "absent" / "paused")
+    async with scene.started():
+        answer = await scene.request("pause")
+        assert answer.ok
+        assert "A restart resumes the service too" in answer.message
+        assert scene.source.health().paused
 
 
 async def test_restarted_source_is_paused_again() -> None:
