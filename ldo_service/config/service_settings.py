@@ -117,7 +117,8 @@ class ServiceSettings:
     # Actors that run on another machine, by `ldo serve --client --actor NAME`. This service
     # does not wait for them.
     remote_actors: tuple[Literal["detector", "vlm_labeller", "loop_closer", "optimizer"], ...] = ()
-    # Maximum time for each actor to handle its queued messages when the service stops, seconds.
+    # Maximum time for each actor to handle its queued messages when the service stops, seconds. All
+    # actors together have at most 2.2 times as long.
     shutdown_timeout_s: PositiveFloat = 10.0
     # Seconds without a heartbeat after which a process is killed and started again.
     heartbeat_timeout_s: PositiveFloat = 10.0

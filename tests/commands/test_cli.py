@@ -138,7 +138,7 @@ def test_publishing_without_a_service_suggests_to_start_one(capsys) -> None:
     code, _, err = ldo(
         capsys, "publish", "synthetic:room", "--endpoint", "tcp/127.0.0.1:1", "--max-frames", "1"
     )
-    assert code == 2
+    assert code == 6
     assert_one_paragraph(err)
     assert "ldo serve" in err
 

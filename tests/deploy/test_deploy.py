@@ -130,7 +130,9 @@ def test_dashboard_uses_every_metric_with_existing_labels() -> None:
 def test_prometheus_scrapes_the_metrics_port_of_the_unit() -> None:
     (config,) = read_documents("prometheus.yaml")
     (target,) = config["scrape_configs"][0]["static_configs"][0]["targets"]
-    assert f"--metrics-port {target.rpartition(':')[2]}" in UNIT.read_text()
+    unit = UNIT.read_text()
+    assert "--metrics-port ${LDO_METRICS_PORT}" in unit
+    assert f"LDO_METRICS_PORT={target.rpartition(':')[2]}\n" in unit
 
 
 # --- commands -------------------------------------------------------------------------------------

@@ -78,7 +78,7 @@ def test_prometheus_exports_metrics_of_every_actor(tmp_path: Path) -> None:
             capture_output=True,
             text=True,
         )
-        assert second.returncode == 2
+        assert second.returncode == 6
         assert f"--metrics-port {port}: cannot listen" in second.stderr
         assert "Traceback" not in second.stderr
         assert service.stop() == 0
