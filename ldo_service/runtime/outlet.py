@@ -358,9 +358,9 @@ class Outlet:
             self._forget_handled()
             self._changed.set()
 
-    def evict_stalled(self) -> None:
+    def evict_stalled(self, now_s: float) -> None:
         """Evict connected consumers whose window has been full for over `evict_after_s`."""
-        overdue = self._consumers.stalled(self._loop.time(), self._evict_after_s, self._next)
+        overdue = self._consumers.stalled(now_s, self._evict_after_s, self._next)
         for name in overdue:
             log.error(
                 "%s: consumer %s evicted: it took no message for %.0f s "

@@ -159,10 +159,14 @@ class Outlets:
         for outlet in self._all.values():
             outlet.reset(epoch)
 
-    def check_windows(self) -> None:
-        """Evict every consumer whose window of unhandled messages has been full for too long."""
+    def check_windows(self, now_s: float) -> None:
+        """Evict every consumer whose window of unhandled messages has been full for too long.
+
+        Args:
+            now_s: Time of a clock that stands still while this process does not run, seconds.
+        """
         for outlet in self._all.values():
-            outlet.evict_stalled()
+            outlet.evict_stalled(now_s)
 
     def counts(self) -> tuple[OutputCount, ...]:
         """Return the counters of all outputs for the health message."""

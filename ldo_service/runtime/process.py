@@ -235,10 +235,11 @@ class ChildProcess:
         has expired too.
         """
         clock, period_s = RunningClock(self._loop.time), self._silent_after_s / 10
+        clock.tick(period_s)
         while True:
+            await asyncio.sleep(period_s)
             # This process cannot receive heartbeats of the child while it does not run itself.
             self._heard_until_s += clock.tick(period_s)
-            await asyncio.sleep(period_s)
             now_s = self._loop.time()
             if self.pid is not None and _is_suspended(self.pid):
                 if self._suspended_at_s is None:

@@ -369,7 +369,7 @@ class Stage:
             self._metrics.clock.tick(self._config.heartbeat_s)
             try:
                 mailbox.send_credits()
-                self._outlets.check_windows()
+                self._outlets.check_windows(self._metrics.clock.now_s())
                 self._publish_health()
             except Exception:
                 # A heartbeat only reports on the actor, so a failed heartbeat must not end the

@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from threading import Event
@@ -180,9 +181,9 @@ async def test_consumer_with_a_backlog_is_never_evicted(tmp_path: Path) -> None:
     async with running(slow):
         await send_saved(source, range(10))
         await eventually(lambda: slow.health().current_step_s > 0)
-        source.evict_stalled()
+        source.evict_stalled(time.monotonic())
         await asyncio.sleep(0.05)
-        source.evict_stalled()
+        source.evict_stalled(time.monotonic())
         assert evicted == []
         release.set()
 

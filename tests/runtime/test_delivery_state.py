@@ -271,7 +271,7 @@ async def test_stage_waiting_for_its_disk_is_not_evicted() -> None:
 
         def on_grant(_header: bytes, _body: memoryview) -> None:
             """Check after each credit message, so that a paused process does not count."""
-            loop.call_soon_threadsafe(numbers.evict_stalled)
+            loop.call_soon_threadsafe(numbers.evict_stalled, loop.time())
 
         transport.subscribe(credit_key(NUMBERS.name), on_grant)
         await asyncio.sleep(0.3)  # Three times `evict_after_s`.

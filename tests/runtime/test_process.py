@@ -182,6 +182,28 @@ def test_child_process_ignores_packages_in_the_current_folder(tmp_path: Path) ->
     assert done.stdout == ""
 
 
+async def test_child_is_not_killed_for_time_in_which_its_parent_did_not_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    killed: list[float] = []
+    process = ChildProcess("actor", ["true"], MemoryTransport(), silent_after_s=10)
+    monkeypatch.setattr(process, "kill", lambda: killed.append(now_s))
+    loop = asyncio.get_running_loop()
+    process._loop, process._heard_until_s = loop, 10.0
+    now_s, steps_s = 0.0, iter([1.0] * 5 + [60.0] + [1.0] * 8)
+
+    async def sleep(_period_s: float) -> None:
+        """Advance the clock instead of waiting; in one step this process was frozen."""
+        nonlocal now_s
+        now_s += next(steps_s)
+
+    monkeypatch.setattr(loop, "time", lambda: now_s)
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    with pytest.raises(RuntimeError, match="StopIteration"):
+        await process._kill_when_silent()
+    assert killed == [70.0], "10 s without a heartbeat, and a pause of 59 s"
+
+
 async def test_cancelled_child_process_has_ended() -> None:
     sleeping = child("import time; time.sleep(1e6)")
     async with running(sleeping):

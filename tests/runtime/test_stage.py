@@ -257,6 +257,38 @@ async def test_time_without_running_does_not_count_as_a_hanging_step() -> None:
         assert metrics.busy_s == pytest.approx(31.0)
 
 
+async def test_time_without_running_does_not_evict_a_consumer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    transport, release, beats = MemoryTransport(), Event(), []
+    config = SupervisionConfig(heartbeat_s=0.02, evict_after_s=500)
+    source = Stage(Doubler, transport, config=config)
+
+    class Hanging(DoubleCollector):
+        def handle(self, message: Message) -> Iterator[Message]:  # noqa: ARG002
+            release.wait(60)
+            yield from ()
+
+    consumer = Stage(lambda: Hanging([]), transport, config=config)
+    loop, skipped_s = asyncio.get_running_loop(), 0.0
+    real_time = loop.time
+    monkeypatch.setattr(loop, "time", lambda: real_time() + skipped_s)
+    source._metrics.clock = RunningClock(loop.time)
+    transport.subscribe("health/doubler", lambda _header, body: beats.append(bytes(body)))
+    numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["doubler"])
+    async with running(source, consumer):
+        for value in range(2):
+            await send(numbers, number(value))
+        await eventually(lambda: source.health().outputs[0].sent == 2)
+        before = len(beats)
+        await eventually(lambda: len(beats) > before + 2)  # The window is known to be full.
+        skipped_s = 1000.0  # The process was frozen.
+        before = len(beats)
+        await eventually(lambda: len(beats) > before + 5)
+        assert source.health().outputs[0].evicted_consumers == 0
+        release.set()
+
+
 async def test_unrestorable_state_exhausts_the_restarts() -> None:
     class Unrestorable(Adder):
         def restore(self, state: State) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+import time
 from itertools import pairwise
 from threading import Event
 
@@ -231,7 +232,7 @@ async def test_stalled_consumer_is_evicted_and_returns_when_it_continues() -> No
         sending = asyncio.create_task(send(source, number(4)))
 
         def check() -> bool:
-            source.evict_stalled()
+            source.evict_stalled(time.monotonic())
             return sending.done()
 
         await eventually(check)
@@ -260,7 +261,7 @@ async def test_link_continues_after_a_loss_that_lasted_until_the_eviction(lost: 
             await send(source, number(value))
 
         def is_evicted() -> bool:
-            source.evict_stalled()
+            source.evict_stalled(time.monotonic())
             return source.evicted > 0
 
         await eventually(is_evicted)
