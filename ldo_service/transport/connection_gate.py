@@ -12,7 +12,8 @@ A connection is *unproven* until the router has answered the client's certificat
 - closes a connection that is unproven for longer than `HANDSHAKE_S`,
 - closes an unproven connection when there are more than `MAX_UNPROVEN`, of the address that has
   most of them, and among these one that has sent nothing,
-- lets at most `MAX_HANDSHAKES` connections of an address shake hands with the router at a time.
+- lets at most `MAX_HANDSHAKES` connections of an address, and `MAX_ALL_HANDSHAKES` in all, shake
+  hands with the router at a time.
 
 This file runs as a script and imports the standard library only, so that the process starts at once
 and takes little memory: `python -I connection_gate.py DESCRIPTOR HOST PORT MAX_CONNECTIONS`. A line
@@ -33,9 +34,13 @@ from collections import Counter
 HANDSHAKE_S = 10.0
 MAX_UNPROVEN = 64  # Unproven connections; a robot has fewer than ten programs.
 MAX_HANDSHAKES = 4  # Handshakes of one address at a time.
+MAX_ALL_HANDSHAKES = 16  # Handshakes of all addresses at a time.
 LEAVE_WITHIN_S = 2.0  # Time to send the last bytes when a proven connection closes, seconds.
 REPORT_S = 30.0  # Time between two reports, seconds.
 HANDSHAKE_RECORD = b"\x16\x03"  # A TLS record of a handshake begins with these bytes.
+# Maximum size of what a program sends before the router answers, bytes; a ClientHello has at most
+# 2 kB.
+MAX_HELLO_BYTES = 16_384
 # Random number of a ServerHello that asks for another ClientHello (RFC 8446, section 4.1.3).
 HELLO_RETRY = bytes.fromhex("cf21ad74e59a6111be1d8c021e65b891c2a211167abb8c5e079e09e2c8a8339c")
 # Largest TLS alert with its record, bytes. The router sends an alert if it rejects a certificate.
@@ -68,11 +73,11 @@ class Connection:
             self.router.write(data)
             return
         self.hello += data
-        if not self.has_spoken and not HANDSHAKE_RECORD.startswith(self.hello[:2]):
+        is_tls = HANDSHAKE_RECORD.startswith(self.hello[: len(HANDSHAKE_RECORD)])
+        if not is_tls or len(self.hello) > MAX_HELLO_BYTES:
             self.close()
         elif not self.has_spoken and len(self.hello) >= len(HANDSHAKE_RECORD):
             self.has_spoken = True
-            self.client.pause_reading()
             self._gate.wait_for_turn(self)
 
     def from_router(self, data: bytes) -> None:
@@ -90,8 +95,10 @@ class Connection:
     def start(self, router: asyncio.Transport) -> None:
         """Begin to pass bytes on."""
         self.router = router
-        router.write(self.hello)
-        self.client.resume_reading()
+        if self.is_closed:
+            self._leave_router()
+        else:
+            router.write(self.hello)
 
     def close(self) -> None:
         """Close both connections."""
@@ -99,13 +106,27 @@ class Connection:
             return
         self.is_closed = True
         self._deadline.cancel()
-        for transport in (self.client, self.router):
-            if transport is not None and self.is_proven:
-                transport.close()  # Bytes that wait are sent first.
-                self._gate.loop.call_later(LEAVE_WITHIN_S, transport.abort)
-            elif transport is not None:
-                transport.abort()
+        if self.is_proven:
+            self.client.close()  # Bytes that wait are sent first.
+            self._gate.loop.call_later(LEAVE_WITHIN_S, self.client.abort)
+        else:
+            self.client.abort()
+        if self.router is not None:
+            self._leave_router()
         self._gate.forget(self)
+
+    def _leave_router(self) -> None:
+        """Ask the router to close its connection; an unproven one counts as a handshake until then.
+
+        The router takes 0.1 s for each failed handshake, so its connections would add up if the
+        gate began further handshakes at once.
+        """
+        assert self.router is not None
+        within_s = LEAVE_WITHIN_S if self.is_proven else HANDSHAKE_S
+        self._gate.loop.call_later(within_s, self.router.abort)
+        self.router.resume_reading()
+        if self.router.can_write_eof() and not self.router.is_closing():
+            self.router.write_eof()
 
 
 class Side(asyncio.Protocol):
@@ -130,6 +151,8 @@ class Side(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
         if self._connection is not None:
             self._connection.close()
+            if not self._is_client:
+                self._gate.end_handshake(self._connection)
 
     def pause_writing(self) -> None:
         if (sender := self._sender()) is not None:
@@ -163,7 +186,7 @@ class Gate:
         self._waiting: dict[
             Connection, None
         ] = {}  # Connections that wait for a turn, oldest first.
-        self._connecting: dict[Connection, asyncio.Task[None]] = {}
+        self._connecting: set[asyncio.Task[None]] = set()
         self._handshakes: dict[Connection, None] = {}
         self._refused = 0  # Number of connections closed because of a limit since the last report.
 
@@ -209,19 +232,19 @@ class Gate:
         """Remove a closed connection."""
         self._open.pop(connection, None)
         self._waiting.pop(connection, None)
-        if (task := self._connecting.pop(connection, None)) is not None:
-            task.cancel()
-        self.end_handshake(connection)
 
     def _start_waiting(self) -> None:
         busy = Counter(one.address for one in self._handshakes)
         for connection in list(self._waiting):
+            if len(self._handshakes) >= MAX_ALL_HANDSHAKES:
+                return
             if busy[connection.address] < MAX_HANDSHAKES:
                 busy[connection.address] += 1
                 del self._waiting[connection]
                 self._handshakes[connection] = None
                 task = self.loop.create_task(self._connect(connection))
-                self._connecting[connection] = task
+                self._connecting.add(task)
+                task.add_done_callback(self._connecting.discard)
 
     async def _connect(self, connection: Connection) -> None:
         try:
@@ -230,10 +253,7 @@ class Gate:
             )
         except OSError:
             connection.close()
-            return
-        self._connecting.pop(connection, None)
-        if connection.is_closed:
-            router.abort()
+            self.end_handshake(connection)
         else:
             connection.start(router)
 

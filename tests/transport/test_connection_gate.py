@@ -165,9 +165,11 @@ def test_more_bytes_than_fit_into_buffers_pass_in_both_directions_at_once() -> N
         process = GateProcess(listener, echo.getsockname()[1])
         stack.callback(process.close)
         client = stack.enter_context(socket.create_connection(listener.getsockname(), PATIENCE_S))
-        sending = threading.Thread(target=client.sendall, args=(body,))
-        sending.start()
+        client.sendall(body[:2])
         server, _ = echo.accept()
+        server.sendall(received(server, 2))
+        sending = threading.Thread(target=client.sendall, args=(body[2:],))
+        sending.start()
 
         def reply() -> None:
             while data := server.recv(1 << 16):
@@ -221,6 +223,32 @@ async def test_programs_that_never_show_a_certificate_take_few_connections_to_th
         assert 0 < most <= connection_gate.MAX_HANDSHAKES
     await asyncio.to_thread(eventually, lambda: router.open == 0)
     server.close()
+
+
+async def test_handshakes_that_the_router_has_not_given_up_count_after_the_program_has_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connection_gate, "HANDSHAKE_S", 1000.0)
+    held: list[asyncio.StreamWriter] = []
+    slow = await asyncio.start_server(lambda _reader, writer: held.append(writer), LOOPBACK, 0)
+    gate = connection_gate.Gate(LOOPBACK, slow.sockets[0].getsockname()[1], max_connections=256)
+    server = await gate.loop.create_server(lambda: connection_gate.Side(gate), LOOPBACK, 0)
+    port = server.sockets[0].getsockname()[1]
+    for _ in range(3):
+        with ExitStack() as stack:
+            await asyncio.to_thread(idle, port, 30, stack, client_hello())
+        async with asyncio.timeout(PATIENCE_S):
+            while gate._open:
+                await asyncio.sleep(0.01)
+    assert len(held) == connection_gate.MAX_HANDSHAKES
+    for writer in held:
+        writer.close()
+        await writer.wait_closed()
+    async with asyncio.timeout(PATIENCE_S):
+        while gate._handshakes:
+            await asyncio.sleep(0.01)
+    server.close()
+    slow.close()
 
 
 def test_other_protocols_are_closed_at_once(gate: int, router: EchoRouter) -> None:
