@@ -6,7 +6,8 @@
     │   ├── ModelError
     │   └── EndpointError
     ├── DataError                 3
-    │   └── FrameError
+    │   ├── FrameError
+    │   └── DamagedStateError
     ├── StageError                4
     │   ├── RestartsExhausted
     │   └── StageStalled
@@ -63,6 +64,10 @@ class DataError(LdoError):
 
 class FrameError(DataError):
     """Single unusable frame; callers skip and count such frames, and log the first one."""
+
+
+class DamagedStateError(DataError):
+    """Saved state of an actor that is incomplete or does not match its checksums."""
 
 
 class StageError(LdoError):
