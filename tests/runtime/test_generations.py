@@ -68,9 +68,13 @@ def test_states_that_do_not_fit_are_described(
 def test_missing_state_that_an_older_generation_has_is_a_problem(store: FolderStore) -> None:
     save_consumer(store, "loop_closer", 8)
     assert problem_of_states(store, (*ACTORS, "loop_closer")) is None
-    keep_stopped(store, (*ACTORS, "loop_closer"), 1)
+    store.save("frame_source", {"last_stamp_ns": 1})  # It has no lossless links.
+    everyone = (*ACTORS, "loop_closer", "frame_source")
+    keep_stopped(store, everyone, 1)
+    for is_quick in (False, True):
+        assert problem_of_states(store, everyone, is_quick=is_quick) is None
     (store.folder / "loop_closer" / "contents.msgpack").unlink()
-    assert "no state of loop_closer" in str(problem_of_states(store, (*ACTORS, "loop_closer")))
+    assert "no state of loop_closer" in str(problem_of_states(store, everyone))
 
 
 # --- number of the generation ---------------------------------------------------------------------
