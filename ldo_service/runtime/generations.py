@@ -97,13 +97,11 @@ def problem_of_states(
             pasts[actor] = RestoredState.of(store.load(actor, generation, prefixes))
         except DamagedStateError as error:
             return error
-    # An actor without lossless links has no positions, so a quick check cannot miss its state.
-    is_state_expected = generation == NEWEST and not is_quick
     missing = [
         actor
-        for actor, past in pasts.items()
-        if past.is_none
-        and (actor in INTERDEPENDENT_ACTORS or (is_state_expected and store.is_kept(actor)))
+        for actor in actors
+        if not store.exists(actor, generation)
+        and (actor in INTERDEPENDENT_ACTORS or (generation == NEWEST and store.is_kept(actor)))
     ]
     if missing and any(past.has_passed for past in pasts.values()):
         return f"there is no state of {', '.join(missing)}, but there are states of other actors"

@@ -351,6 +351,10 @@ class FolderStore:
         self._remove_unused(actor, [*unused, *(past.sources.values() if past else ())])
         return new
 
+    def exists(self, actor: str, generation: int = NEWEST) -> bool:
+        """Return whether an actor has a state."""
+        return (self.folder / actor / _list_name(generation)).exists()
+
     def is_kept(self, actor: str) -> bool:
         """Return whether an older generation of the actor's state exists."""
         if actor in self._kept:
