@@ -115,6 +115,7 @@ class Mapper(Actor):
         folder = Path(self.config.folder) if self.config.folder else None
         threads = self.config.thread_count()
         self._map = MapBuilder(self.config.builder, folder=folder, threads=threads)
+        self.files = self._map.files
         self._ordered = OrderedSemantics(
             self._map, self.config.semantics, has_labeller=has_labeller, threads=threads
         )
@@ -359,9 +360,6 @@ class Mapper(Actor):
     def checkpoint(self) -> dict[str, Any]:
         self._checkpoint = {}
         return self.snapshot()
-
-    def on_saved(self) -> None:
-        self._map.saved()
 
     def _take_checkpoint(self) -> None:
         self._checkpoint = {

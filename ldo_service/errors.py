@@ -7,7 +7,8 @@
     │   ├── EndpointError
     │   └── UnavailableError      6
     ├── DataError                 3
-    │   └── FrameError
+    │   ├── FrameError
+    │   └── DamagedStateError
     ├── StageError                4
     │   ├── RestartsExhausted
     │   └── StageStalled
@@ -70,6 +71,10 @@ class DataError(LdoError):
 
 class FrameError(DataError):
     """Single unusable frame; callers skip and count such frames, and log the first one."""
+
+
+class DamagedStateError(DataError):
+    """Saved state of an actor that is incomplete or does not match its checksums."""
 
 
 class StageError(LdoError):

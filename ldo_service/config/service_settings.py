@@ -123,7 +123,7 @@ class ServiceSettings:
     # Seconds without a heartbeat after which a process is killed and started again.
     heartbeat_timeout_s: PositiveFloat = 10.0
     # True calls fsync after each step, before the outputs of the step are published. This takes 12
-    # ms per step. With False, a power cut may lose the state.
+    # ms per step. With False, a power cut loses the keyframes of the last one or two seconds.
     fsync: bool = False
     # Folder with the TLS keys that `ldo keys add` made. The option --keys overrides it.
     keys: str = ""

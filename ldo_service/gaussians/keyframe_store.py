@@ -58,13 +58,16 @@ class KeyframeStore:
     full, a new keyframe is available only while it is in the cache. The content depends only on the
     calls, not on time. Not thread-safe.
 
+    Attributes:
+        files: The folder of the images.
+
     Raises:
         ConfigError: The folder cannot be used.
     """
 
     def __init__(self, folder: Path | None, config: KeyframeStoreConfig | None = None) -> None:
         self.config = config or KeyframeStoreConfig()
-        self._files = ChecksummedFolder(folder, "keyframe", _DISK_FULL)
+        self.files = ChecksummedFolder(folder, "keyframe", _DISK_FULL)
         self._cache: OrderedDict[int, KeyframeImages] = OrderedDict()  # Least recently used first.
         self._reads = self._forgotten = self._damaged = 0
         self._make_room()
@@ -73,7 +76,7 @@ class KeyframeStore:
         """Store copies of the images of a keyframe; images stored earlier for it are replaced."""
         images = images.owned()
         self._remember(images)
-        self._files.write(images.keyframe, pack(images))
+        self.files.write(images.keyframe, pack(images))
         self._make_room()
 
     def get(self, keyframe: int) -> KeyframeImages | None:
@@ -81,19 +84,19 @@ class KeyframeStore:
         images = self._cache.get(keyframe)
         if images is not None:
             self._cache.move_to_end(keyframe)
-        elif keyframe in self._files.sizes:
+        elif keyframe in self.files.sizes:
             images = self._read(keyframe)
         return images
 
     def __contains__(self, keyframe: int) -> bool:
-        return keyframe in self._files.sizes or keyframe in self._cache
+        return keyframe in self.files.sizes or keyframe in self._cache
 
     def __len__(self) -> int:
-        return len(self._files.sizes.keys() | self._cache.keys())
+        return len(self.files.sizes.keys() | self._cache.keys())
 
     def keyframes(self) -> list[int]:
         """Return the ids of all stored keyframes, ascending."""
-        return sorted(self._files.sizes.keys() | self._cache.keys())
+        return sorted(self.files.sizes.keys() | self._cache.keys())
 
     def keep_only(self, keyframes: Iterable[int]) -> None:
         """Drop all keyframes except the given ones, such as the keyframes of a checkpoint."""
@@ -106,12 +109,12 @@ class KeyframeStore:
         """Return the counters of the store."""
         return {
             "keyframes_stored": len(self),
-            "keyframes_disk_mb": sum(self._files.sizes.values()) / 1e6,
+            "keyframes_disk_mb": sum(self.files.sizes.values()) / 1e6,
             "keyframes_cache_mb": self._cached_bytes() / 1e6,
             "keyframes_read": self._reads,
             "keyframes_forgotten": self._forgotten,
             "keyframes_damaged": self._damaged,
-            "keyframes_not_written": self._files.not_written,
+            "keyframes_not_written": self.files.not_written,
         }
 
     # --- memory -----------------------------------------------------------------------------------
@@ -128,7 +131,7 @@ class KeyframeStore:
     def _read(self, keyframe: int) -> KeyframeImages | None:
         self._reads += 1
         try:
-            images = unpack(self._files.read(keyframe))
+            images = unpack(self.files.read(keyframe))
             if images.keyframe != keyframe:
                 raise DataError(
                     f"the file contains keyframe {images.keyframe}, expected keyframe {keyframe}"
@@ -148,11 +151,11 @@ class KeyframeStore:
 
     def _drop(self, keyframe: int) -> None:
         self._cache.pop(keyframe, None)
-        self._files.remove(keyframe)
+        self.files.remove(keyframe)
 
     # --- quota ------------------------------------------------------------------------------------
     def _make_room(self) -> None:
-        sizes, config = self._files.sizes, self.config
+        sizes, config = self.files.sizes, self.config
         while sum(sizes.values()) > 1e6 * config.quota_mb or len(sizes) > config.max_keyframes:
             keyframe = self._most_redundant()
             if keyframe is None:
@@ -172,7 +175,7 @@ class KeyframeStore:
         Returns:
             Id of the keyframe, or None if no keyframe may be dropped.
         """
-        kept = np.array(sorted(self._files.sizes), np.int64)
+        kept = np.array(sorted(self.files.sizes), np.int64)
         gaps = (kept[2:] - kept[:-2])[: max(0, len(kept) - 1 - self.config.newest_kept)]
         return int(kept[1 + np.argmin(gaps)]) if len(gaps) else None
 

@@ -18,6 +18,7 @@ from .fitting import Fitting
 from .keyframe_renderer import KeyframeRenderer
 from .keyframe_store import KeyframeStore, KeyframeViews
 from .map_builder_config import MapBuilderConfig
+from .map_files import MapFiles
 from .model import GaussianBatch, GaussianMap
 from .offloading import OffloadedGaussians, iter_all_gaussians
 from .optimizer import Observer
@@ -57,6 +58,7 @@ class MapBuilder:
         self.gaussians = GaussianMap()
         self.offloaded = OffloadedGaussians(folder and folder / "gaussians")
         self.views = KeyframeViews(KeyframeStore(folder and folder / "images", self.config.store))
+        self.files = MapFiles(self.offloaded, self.views.store)
         self._threads = threads
         self._renderer = KeyframeRenderer(self.views, threads)
         self._confirmation = Confirmation(self.views.store, self.config.pruning, self.config.seed)
@@ -370,10 +372,6 @@ class MapBuilder:
             "newest": self._newest,
             "iterations": self.fitting.iterations,
         }
-
-    def saved(self) -> None:
-        """Remove files that the last snapshot does not need; call it after saving that snapshot."""
-        self.offloaded.saved()
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore the state of a snapshot. The whole map then counts as published."""

@@ -17,6 +17,7 @@ from ldo_service.storage.checksummed_folder import ChecksummedFolder
 from .chunk import Chunk, pack, unpack
 from .chunk_entry import ChunkEntry, LostIdRange
 from .model import GaussianBatch, GaussianMap, new_labels
+from .retired_files import RetiredFiles
 from .rows import ROW
 from .visibility import BoundingSpheres, PlacedCamera
 
@@ -35,21 +36,25 @@ class OffloadedGaussians:
     the motions that are not yet applied to its file. If `folder` is None, a temporary folder is
     used and removed at the end. Not thread-safe.
 
-    The folder contains the chunks of one map only. `restore` removes all files that are not in the
-    snapshot. Without `restore`, the first `put` removes all earlier files. When a chunk is loaded,
-    its file stays, since a process restored from the last snapshot would need the file. The file is
-    removed once a later snapshot, which does not contain the chunk, has been saved (`saved`).
+    The folder contains the chunks of one map only. `restore` removes all files that are newer than
+    the snapshot, and retires the others that are not in it. Without `restore`, the first `put`
+    removes all earlier files. When a chunk is loaded, its file is retired. It stays, since a
+    process restored from the last snapshot would need the file. It is removed once a later
+    snapshot, which does not contain the chunk, has been saved.
+
+    Attributes:
+        files: The folder of the chunks.
+        retired: Files of chunks that were loaded after the last snapshot.
 
     Raises:
         ConfigError: The folder cannot be used.
     """
 
     def __init__(self, folder: Path | None) -> None:
-        self._files = ChecksummedFolder(folder, "gaussians", _DISK_FULL)
+        self.files = ChecksummedFolder(folder, "gaussians", _DISK_FULL)
         self._entries: dict[int, ChunkEntry] = {}  # Key: file number, ascending.
         self._next_number = 0
-        self._retired: list[int] = []  # Files that became unused after the last snapshot.
-        self._retired_before: list[int] = []  # Files that the last snapshot does not need.
+        self.retired = RetiredFiles(self.files)
         self._spheres: BoundingSpheres | None = None  # Cache; None after a change of the entries.
         self._lost: list[LostIdRange] = []  # Ranges that `pop_lost_ids` will return.
         self._slept = self._awoken = self._damaged = 0
@@ -80,7 +85,7 @@ class OffloadedGaussians:
                 "must be at least one row, and one id per row."
             )
         if self._next_number == 0:
-            self._remove_unknown()
+            self._remove_from(0)
         sphere = BoundingSpheres.around(rows, chunk.anchors)
         place = sphere.centers[0], float(sphere.radii_m[0])
         entry = ChunkEntry(chunk.anchor, int(ids[0]), int(ids[-1]), len(ids), *place)
@@ -230,7 +235,7 @@ class OffloadedGaussians:
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return the table of chunks as named arrays; the Gaussians stay in their files."""
-        self._retired_before, self._retired = [*self._retired_before, *self._retired], []
+        self.retired.on_snapshot()
         entries = list(self._entries.values())
         spheres = self._all_spheres()
         motions = [T for entry in entries for T in entry.motions]
@@ -247,15 +252,6 @@ class OffloadedGaussians:
             "next_number": np.array(self._next_number, np.int64),
         }
 
-    def saved(self) -> None:
-        """Remove the files that the last snapshot does not need.
-
-        Call this method once that snapshot is saved to disk.
-        """
-        for number in self._retired_before:
-            self._files.remove(number)
-        self._retired_before = []
-
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore the table of chunks from a snapshot; the folder must contain their files.
 
@@ -270,9 +266,10 @@ class OffloadedGaussians:
             for number, *fields, own in zip(numbers, *columns, motions, strict=True)
         }
         self._next_number, self._spheres = int(state["next_number"]), None
-        self._retired, self._retired_before = [], []
-        self._remove_unknown()
-        for number in self._entries.keys() - self._files.sizes.keys():
+        unused = self.files.sizes.keys() - self._entries.keys()
+        self.retired.restart(sorted(number for number in unused if number < self._next_number))
+        self._remove_from(self._next_number)
+        for number in self._entries.keys() - self.files.sizes.keys():
             self._lose(number, "their file is gone")
 
     def metrics(self) -> dict[str, float]:
@@ -283,13 +280,13 @@ class OffloadedGaussians:
             "gaussians_offloaded_total": self._slept,
             "gaussians_loaded_total": self._awoken,
             "gaussians_lost_on_disk": self._damaged,
-            "chunks_not_written": self._files.not_written,
+            "chunks_not_written": self.files.not_written,
         }
 
     # --- files ------------------------------------------------------------------------------------
     def _write(self, chunk: Chunk, entry: ChunkEntry) -> int | None:
         number = self._next_number
-        if not self._files.write(number, pack(chunk)):
+        if not self.files.write(number, pack(chunk)):
             return None
         self._entries[number] = entry
         self._next_number += 1
@@ -304,7 +301,7 @@ class OffloadedGaussians:
         """
         entry = self._entries[number]
         try:
-            chunk = unpack(self._files.read(number))
+            chunk = unpack(self.files.read(number))
             if (chunk.anchor, len(chunk.ids)) != (entry.anchor, entry.count):
                 raise DataError(
                     f"the file holds {len(chunk.ids)} Gaussians of anchor {chunk.anchor}, "
@@ -336,19 +333,17 @@ class OffloadedGaussians:
         self._damaged += count
         self._spheres = None
         self._lost.append(LostIdRange(entry.first_id, entry.last_id))
-        self._files.remove(number)
+        self.files.remove(number)
 
     def _retire(self, number: int) -> None:
         del self._entries[number]
         self._spheres = None
-        if self._files.is_temporary:  # A restored process cannot use this folder.
-            self._files.remove(number)
-        else:
-            self._retired.append(number)
+        self.retired.add(number)
 
-    def _remove_unknown(self) -> None:
-        for number in self._files.sizes.keys() - self._entries.keys():
-            self._files.remove(number)
+    def _remove_from(self, first: int) -> None:
+        """Remove the files of other maps, and of states newer than the restored one."""
+        for number in [number for number in self.files.sizes if number >= first]:
+            self.files.remove(number)
 
 
 def _members(labels: np.ndarray) -> list[np.ndarray]:

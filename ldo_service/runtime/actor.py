@@ -7,7 +7,8 @@ useful.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
 
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import Message
@@ -112,6 +113,31 @@ class FlowStatus:
     backlog: Mapping[Topic, int] = field(default_factory=dict)
 
 
+class StateFiles(Protocol):
+    """Files to which the saved state of an actor refers."""
+
+    def saved(self) -> None:
+        """Remove files that the last snapshot, which is saved now, does not need."""
+
+    def kept(self, *, is_previous_complete: bool) -> None:
+        """Remove files that neither the last kept generation nor the one before needs.
+
+        Args:
+            is_previous_complete: Whether the generation kept before the last one is complete, so
+                that no older one is needed.
+        """
+
+    def unsynced_files(self) -> list[Path]:
+        """Return the files that may not be on the disk yet."""
+        ...
+
+    def begin_sync(self) -> None:
+        """Note that the stage begins to sync `unsynced_files`."""
+
+    def end_sync(self) -> None:
+        """Note that the files of the last `begin_sync` are on the disk."""
+
+
 class Actor:
     """Unit of computation that handles messages.
 
@@ -135,6 +161,8 @@ class Actor:
     # True if a robot waits for the outputs. This actor's thread then has priority over the
     # threads of other actors.
     is_prompt = False
+
+    files: StateFiles | None = None  # Files to which the state refers; None: there are none.
 
     def __init__(self) -> None:
         self.situation = FlowStatus()
@@ -196,7 +224,12 @@ class Actor:
         return self.snapshot()
 
     def on_saved(self) -> None:
-        """Handle the notification that the last snapshot or checkpoint was written."""
+        """Handle the notification that the last snapshot or checkpoint was written.
+
+        If the stage keeps older generations of the state, it notifies only `files`.
+        """
+        if self.files is not None:
+            self.files.saved()
 
     def restore(self, state: State) -> None:
         """Set the state of this new actor from a snapshot or checkpoint of an earlier instance."""

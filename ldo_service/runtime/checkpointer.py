@@ -2,7 +2,10 @@
 
 import logging
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
+from ldo_service.storage.atomic_write import sync_all, with_folders
+from ldo_service.storage.generation_files import GenerationFiles
 from ldo_service.storage.state_store import State, StateStore
 from ldo_service.transport.flow_control import InletPosition, OutletPosition
 
@@ -23,6 +26,8 @@ class Checkpointer:
         self.past = RestoredState()
         self.is_unsaved = False  # True if the last step is not saved.
         self._failed = 0
+        self._has_fallen_back = False
+        self._last_kept = 0  # Number of the last generation that this stage has kept.
 
     def restore_actor(self, make: Callable[[], Actor]) -> Actor:
         """Create an actor and restore its last saved state, if there is one.
@@ -32,6 +37,7 @@ class Checkpointer:
         """
         fresh = make()
         self.past = RestoredState.of(self._store.load(fresh.name))
+        self._has_fallen_back = self._store.has_fallen_back(fresh.name)
         if self.past.of_actor:
             log.info("%s: restored from its last saved state.", fresh.name)
         return restore_actor(fresh, self.past, make)
@@ -39,6 +45,7 @@ class Checkpointer:
     def forget(self, name: str) -> None:
         """Delete the saved state, so that the actor starts empty."""
         self._store.delete(name)
+        self._last_kept = 0
         self._ledger = DeliveryState()
 
     def links(
@@ -72,16 +79,64 @@ class Checkpointer:
         return {**self._ledger.own(own, taken, is_whole), **links}
 
     def write(self, actor: Actor, state: State) -> None:
-        """Write the state and notify the actor.
+        """Write the state.
 
         Raises:
             OSError: The state cannot be written, for example because the disk is full.
         """
-        self._store.save(actor.name, state)
-        actor.on_saved()
+        files = actor.files
+        if self._store.syncs and files is not None:  # First, because the state refers to them.
+            sync_all(with_folders(files.unsynced_files()))
+            files.begin_sync()
+            files.end_sync()
+        self._store.save(actor.name, state, files.unsynced_files() if files else ())
         if self.is_unsaved:
             self.is_unsaved = False
             log.info("%s: its state is saved again; no action needed.", actor.name)
+
+    def notify(self, actor: Actor) -> None:
+        """Notify the actor that its state is saved.
+
+        Raises:
+            Exception: Any exception of the actor. The state is saved nevertheless, so the step must
+                not be repeated.
+        """
+        if not self._store.is_kept(actor.name):
+            actor.on_saved()
+
+    def is_last_kept(self, generation: int) -> bool:
+        """Return whether this generation is the last one that this stage has kept."""
+        return generation == self._last_kept
+
+    def keep(
+        self, actor: Actor, generation: int, completed: int
+    ) -> tuple[GenerationFiles | None, list[Path]]:
+        """Keep the last saved state as a generation.
+
+        Args:
+            actor: The actor.
+            generation: Number of the generation.
+            completed: Number of the newest generation that all actors have completed.
+
+        Returns:
+            The files of the generation, which the caller must write, and the other files and
+            folders to sync.
+
+        Raises:
+            OSError: A file cannot be read.
+        """
+        is_previous_complete = self.is_last_kept(completed)
+        if actor.files is None:
+            kept, unsynced = self._store.keep(actor.name, generation, completed), []
+        else:
+            if is_previous_complete:
+                actor.files.end_sync()
+            unsynced = actor.files.unsynced_files()
+            kept = self._store.keep(actor.name, generation, completed, unsynced)
+            actor.files.kept(is_previous_complete=is_previous_complete)
+            actor.files.begin_sync()
+        self._last_kept = generation
+        return kept, with_folders(unsynced)
 
     def record_failure(self, name: str, error: OSError) -> bool:
         """Count a failed save, and log the first of several failures in a row.
@@ -101,7 +156,11 @@ class Checkpointer:
         return is_first
 
     def metrics(self) -> dict[str, float]:
-        """Return counters of failed saves; empty if every save succeeded."""
-        if not self._failed:
-            return {}
-        return {"checkpoint_failing": float(self.is_unsaved), "checkpoints_failed": self._failed}
+        """Return counters of failed saves and damaged states; empty if there were none."""
+        metrics: dict[str, float] = {}
+        if self._failed:
+            metrics["checkpoint_failing"] = float(self.is_unsaved)
+            metrics["checkpoints_failed"] = self._failed
+        if self._has_fallen_back:
+            metrics["fell_back"] = 1.0  # The last state was damaged, and an older one is used.
+        return metrics

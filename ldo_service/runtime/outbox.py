@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterable
+from pathlib import Path
 from threading import Lock
 
 from ldo_service.storage.message_log import LoggedMessage, MessageLog
@@ -10,6 +11,9 @@ from ldo_service.transport.flow_control import UnackedMessage
 # Number of newest messages that stay in memory although the log on disk has them.
 # Retransmissions to consumers that are not far behind then need not read the disk.
 MESSAGES_IN_MEMORY = 8
+# Maximum size of handled messages that are retained in memory for the next generation, bytes: some
+# tens of keyframes.
+MAX_RETAINED_BYTES = 64_000_000
 
 
 class Outbox:
@@ -26,6 +30,7 @@ class Outbox:
         unhandled: Iterable[UnackedMessage] = (),
         log: MessageLog | None = None,
         max_bytes: int | None = None,
+        retained_from: int | None = None,
     ) -> None:
         """Initialize with the messages of the previous process.
 
@@ -34,12 +39,16 @@ class Outbox:
             log: Log on disk, which has its own maximum size; None: all messages are in memory.
             max_bytes: Maximum size of an outbox in memory, bytes. The oldest messages beyond it are
                 dropped. None: the log or the consumers' windows limit the size of the outbox.
+            retained_from: Number of the first message that a kept generation of the state needs;
+                None if no generation is kept.
         """
         self._lock = Lock()
         self._memory = deque(unhandled)
         self._log, self._max_bytes = log, max_bytes
         self._bytes = sum(len(message.body) for message in self._memory)
         self._dropped = 0  # Messages dropped from memory.
+        # First unhandled message when each of the last generations was kept; see `keep`.
+        self._handled_at_keeps = [] if retained_from is None else [retained_from]
 
     @property
     def is_logged(self) -> bool:
@@ -119,8 +128,37 @@ class Outbox:
         in_memory = min(later, default=end)
         return min(in_memory, self._log.after(seq, end) if self._log else end)
 
+    def first_needed(self, handled: int) -> int:
+        """Return the number of the first message that a consumer or a kept generation needs.
+
+        Args:
+            handled: Number of the first message that a consumer has not handled.
+        """
+        return min([handled, *self._handled_at_keeps[:1]])
+
+    def keep(self, handled: int, *, is_previous_complete: bool) -> None:
+        """Retain the messages that the next generation needs.
+
+        The consumers keep their states before this producer does. The producer must then still have
+        all messages that they had not handled, although they have handled some of them since. A
+        generation therefore needs the messages that were unhandled when the producer kept the
+        generation before.
+
+        Args:
+            handled: Number of the first message that a consumer has not handled.
+            is_previous_complete: Whether the generation kept before this one is complete.
+        """
+        if is_previous_complete:
+            del self._handled_at_keeps[:-2]
+        self._handled_at_keeps.append(handled)
+
     def forget(self, before: int) -> None:
-        """Delete the messages with numbers below `before`; all consumers have handled them."""
+        """Delete the messages below `before`, which all consumers have handled.
+
+        Messages that a kept generation needs are retained.
+        """
+        if self._bytes <= MAX_RETAINED_BYTES:
+            before = self.first_needed(before)
         with self._lock:
             while self._memory and self._memory[0].seq < before:
                 self._bytes -= len(self._memory.popleft().body)
@@ -135,10 +173,15 @@ class Outbox:
         if self._log:
             self._log.truncate(end)
 
+    def pop_unsynced(self) -> list[Path]:
+        """Return the files of the log that are not synced to the disk yet."""
+        return self._log.pop_unsynced() if self._log else []
+
     def restart(self, epoch: int) -> None:
         """Delete all messages and begin at number 0 of a new epoch."""
         with self._lock:
             self._memory.clear()
             self._bytes = 0
+            self._handled_at_keeps = []
         if self._log:
             self._log.restart(epoch)

@@ -89,7 +89,7 @@ class Outlet:
         self._seq = past.seq
         self._sent_at_s = self._loop.time()
         self._consumers = Consumers(expected, past.handled, with_backlog)
-        self._outbox = outbox or Outbox(past.unhandled)
+        self.outbox = outbox or Outbox(past.unhandled)
         self._unsent = deque(past.unhandled)
         self._changed = asyncio.Event()  # The state of a consumer changed.
         # Consumers that have received messages which this outlet never sent.
@@ -98,8 +98,7 @@ class Outlet:
         # Publisher of each consumer's backlog, and the task that is sending on it, by consumer.
         self._backlogs: dict[str, Publisher] = {}
         self._pushing: dict[str, asyncio.Task[None]] = {}
-        self._closed = False
-        self._last_value = LastValue()
+        self._closed, self._last_value = False, LastValue()
         self.sent = self.waited = self.repeated = self.evicted = 0
         self._open(transport)
 
@@ -140,7 +139,7 @@ class Outlet:
         held = UnackedMessage(self._seq, header, body)
         self._unsent.append(held)
         if self._consumers:
-            self._outbox.add(held)
+            self.outbox.add(held)
         if self.topic.is_state:
             self._last_value.add(message, header, body)
         self._seq += 1
@@ -159,7 +158,7 @@ class Outlet:
     def rollback(self) -> None:
         """Discard the staged messages and reuse their numbers."""
         self._seq = self._next
-        self._outbox.truncate(self._seq)
+        self.outbox.truncate(self._seq)
         self._unsent.clear()
 
     def store(self) -> None:
@@ -168,7 +167,7 @@ class Outlet:
         Raises:
             OSError: The disk is full or cannot be written.
         """
-        self._outbox.store()
+        self.outbox.store()
 
     @property
     def _next(self) -> int:
@@ -198,14 +197,17 @@ class Outlet:
         self._changed.clear()
         await self._changed.wait()
 
+    @property
+    def handled(self) -> int:
+        """Offset of the first message that a consumer has not handled."""
+        return min(self._consumers.handled(self._seq), self._seq)
+
     def position(self) -> OutletPosition | None:
         """Return the position to save; None if there is no required consumer."""
         if not self._consumers.expected:
             return None
-        logged_from = None
-        if self._outbox.is_logged:
-            logged_from = min(self._consumers.handled(self._seq), self._seq)
-        return OutletPosition(self._epoch, self._seq, self._outbox.in_memory, logged_from)
+        logged_from = self.outbox.first_needed(self.handled) if self.outbox.is_logged else None
+        return OutletPosition(self._epoch, self._seq, self.outbox.in_memory, logged_from)
 
     # --- consumers --------------------------------------------------------------------------
     def _requested(self, _header: bytes, body: memoryview) -> None:
@@ -233,7 +235,7 @@ class Outlet:
                 return
         has_backlog = isinstance(request, ConsumerHello) and request.has_backlog
         self._consumers.join(name, self._seq, has_backlog=has_backlog)
-        self._consumers.skip(self._outbox.first(self._seq))
+        self._consumers.skip(self.outbox.first(self._seq))
         self._post_hellos()
 
     def reset(self, epoch: int) -> None:
@@ -242,7 +244,7 @@ class Outlet:
         self._epoch, self._seq = epoch, 0
         past = self._consumers
         self._consumers = Consumers(past.expected, with_backlog=past.with_backlog)
-        self._outbox.restart(epoch)
+        self.outbox.restart(epoch)
         for forgotten in (self._unsent, self._ahead, self._last_value):
             forgotten.clear()
         self._post_hellos()
@@ -276,14 +278,14 @@ class Outlet:
         self._ahead.add(grant.consumer)
 
     def _forget_handled(self) -> None:
-        self._outbox.forget(self._consumers.handled(self._seq))
+        self.outbox.forget(self._consumers.handled(self._seq))
 
     # --- retransmission ---------------------------------------------------------------------
     def _push_backlog(self, name: str) -> None:
         """Send to a consumer those messages of its backlog on disk that fit into its window."""
         if name in self._pushing:
             return
-        if self._consumers.skip(self._outbox.first(self._seq)):
+        if self._consumers.skip(self.outbox.first(self._seq)):
             self._post_hellos()  # The hello has the new first message of the backlog.
             return
         messages = self._consumers.next_of_backlog(
@@ -332,7 +334,7 @@ class Outlet:
     async def _send_again(self, numbers: range, publisher: Publisher) -> None:
         """Send messages from the outbox; stop at the first one that the outbox has lost."""
         for seq in numbers:
-            message = await asyncio.to_thread(self._outbox.read, seq)
+            message = await asyncio.to_thread(self.outbox.read, seq)
             if message is None:
                 self._skip_lost(seq)
                 return
@@ -340,7 +342,7 @@ class Outlet:
 
     def _skip_lost(self, seq: int) -> None:
         """Let consumers skip message `seq`, which is lost, if they handled all earlier messages."""
-        if self._consumers.skip(self._outbox.after(seq, self._seq), since=seq):
+        if self._consumers.skip(self.outbox.after(seq, self._seq), since=seq):
             self._post_hellos()
 
     def _cancel_repeating(self) -> None:
@@ -385,8 +387,8 @@ class Outlet:
             evicted_consumers=self.evicted,
             retransmitted=self.repeated,
             behind=self._consumers.behind(self._seq),
-            backlog_mb=1e-6 * self._outbox.size_bytes,
-            backlog_dropped=self._outbox.dropped,
+            backlog_mb=1e-6 * self.outbox.size_bytes,
+            backlog_dropped=self.outbox.dropped,
         )
 
     def close(self) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from ldo_service.schemas import Message, OutputCount
 from ldo_service.schemas.topics import Topic
@@ -61,10 +62,15 @@ class OutletOpener:
             self.on_evicted,
             position,
             with_backlog=with_backlog,
-            outbox=self._outbox(name, port.topic, position) if with_backlog else None,
+            outbox=self._outbox(name, port.topic, position, is_logged=bool(with_backlog)),
         )
 
-    def _outbox(self, source: str, topic: Topic, past: OutletPosition) -> Outbox:
+    def _outbox(
+        self, source: str, topic: Topic, past: OutletPosition, *, is_logged: bool
+    ) -> Outbox:
+        retained_from = past.handled if self.store.is_kept(source) else None
+        if not is_logged:
+            return Outbox(past.unhandled, retained_from=retained_from)
         max_bytes = round(self.config.backlog_mb * 1e6)
         folder = self.store.backlog_folder(source)
         if folder is None:
@@ -77,7 +83,7 @@ class OutletOpener:
             max_bytes=max_bytes,
             syncs=self.store.syncs,
         )
-        return Outbox(log=log)
+        return Outbox(log=log, retained_from=retained_from)
 
 
 class Outlets:
@@ -158,6 +164,15 @@ class Outlets:
         """Restart numbering of all topics under a new epoch."""
         for outlet in self._all.values():
             outlet.reset(epoch)
+
+    def keep(self, *, is_previous_complete: bool) -> None:
+        """Retain the messages that the next generation of the state needs; see `Outbox.keep`."""
+        for outlet in self._all.values():
+            outlet.outbox.keep(outlet.handled, is_previous_complete=is_previous_complete)
+
+    def pop_unsynced(self) -> list[Path]:
+        """Return the files of the outboxes that are not synced to the disk yet."""
+        return [path for outlet in self._all.values() for path in outlet.outbox.pop_unsynced()]
 
     def check_windows(self, now_s: float) -> None:
         """Evict every consumer whose window of unhandled messages has been full for too long.

@@ -10,6 +10,7 @@ import hashlib
 import logging
 import os
 import struct
+import zlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext, suppress
 from pathlib import Path
@@ -27,6 +28,7 @@ MAX_DELIVERIES = 3  # Deliveries after which a message that ended its process is
 MAX_FILES = 20  # Messages that are kept on the disk; older ones are deleted.
 SUFFIX = ".message"
 _RECORD = struct.Struct("<16sII")  # Digest of the last message, its deliveries, all quarantined.
+_CHECKSUM = struct.Struct("<I")  # CRC-32 of the record, after it.
 
 
 class QuarantinedMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -62,8 +64,7 @@ class Quarantine:
         self._folder, self._suspects = folder, suspects or asyncio.Lock()
         self._key, self._deliveries, self.count = b"", 0, 0
         if folder is not None:
-            with suppress(OSError, struct.error):
-                self._key, self._deliveries, self.count = _RECORD.unpack(self._path.read_bytes())
+            self._load()
 
     def is_due(self, delivery: Delivery) -> bool:
         """Return whether a message has ended the process too often to be handled again."""
@@ -133,6 +134,20 @@ class Quarantine:
         is_last = self._deliveries and _is_repeated(delivery) and self._key == _key_of(delivery)
         return self._deliveries if is_last else 0
 
+    def _load(self) -> None:
+        with suppress(OSError):
+            body = self._path.read_bytes()
+            record, checksum = body[: _RECORD.size], body[_RECORD.size :]
+            # A record without checksum is of an older version.
+            if len(body) == _RECORD.size or checksum == _CHECKSUM.pack(zlib.crc32(record)):
+                self._key, self._deliveries, self.count = _RECORD.unpack(record)
+            else:
+                log.error(
+                    "%s is damaged: the counts of repeated messages start again at 0. Check the "
+                    "disk, unless the power failed.",
+                    self._path,
+                )
+
     def _store(self, key: bytes, deliveries: int) -> None:
         """Write the count; without disk space, the count of this process is lost with it."""
         self._key, self._deliveries = key, deliveries
@@ -140,7 +155,8 @@ class Quarantine:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o600)
             try:
-                os.pwrite(descriptor, _RECORD.pack(key, deliveries, self.count), 0)
+                record = _RECORD.pack(key, deliveries, self.count)
+                os.pwrite(descriptor, record + _CHECKSUM.pack(zlib.crc32(record)), 0)
             finally:
                 os.close(descriptor)
 

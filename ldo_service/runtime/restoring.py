@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 
+from ldo_service.errors import DamagedStateError
 from ldo_service.schemas import Message
 from ldo_service.transport.worker import Worker
 
@@ -62,6 +63,7 @@ class ActorRestorer:
 
         Raises:
             RestartsExhausted: The budget is used up.
+            DamagedStateError: The saved state is damaged.
         """
         while True:
             self._metrics.failures += 1
@@ -70,6 +72,8 @@ class ActorRestorer:
             await asyncio.sleep(record(now_s))
             try:
                 actor = await worker.run(self.restore)
+            except DamagedStateError:
+                raise  # The next start of the service falls back to an older state.
             except Exception:
                 log.exception(
                     "%s: restoring its last state failed; retrying within the restart budget. If "

@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator, Mapping
 from ldo_service.errors import StageStalled
 from ldo_service.schemas import Health, Message, encode
 from ldo_service.schemas.topics import HEALTH
-from ldo_service.storage.state_store import MemoryStore, StateStore
+from ldo_service.storage.memory_store import MemoryStore
+from ldo_service.storage.state_store import StateStore
 from ldo_service.transport.flow_control import Header, encode_link, new_epoch
 from ldo_service.transport.interface import Transport
 from ldo_service.transport.worker import Worker
@@ -94,8 +95,7 @@ class Stage:
         self._quarantine = Quarantine(store.quarantine_folder(self.name), suspects)
         self._metrics.quarantined = self._quarantine.count
         self._epoch = new_epoch()
-        self._drain_requested = False
-        self._is_idle_failed = False  # The last idle work failed.
+        self._drain_requested = self._is_idle_failed = False
         self._failure_log = FailureLog()
         self._mailbox: Mailbox | None = None
         self._reader = MessageDecoder(self.name)
@@ -133,6 +133,7 @@ class Stage:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             self._worker.close()
+            self._saver.close()
             self._close_ports(self._mailbox)
             await close_journal(self._journal, self.name)
 
@@ -338,6 +339,8 @@ class Stage:
                     await self._reset(mailbox)
                 case "save":
                     await self._saver.save_checkpoint(self._actor)
+                case "keep":
+                    return await self._saver.keep(self._actor, order, self._orders.report)
         except Exception as error:
             log.exception(
                 "%s: command %s failed. Repeat `ldo control %s` or restart the service.",

@@ -14,6 +14,7 @@ Commands:
 - `resume`: Take messages again.
 - `reset`: Start with an empty state and a new epoch.
 - `save`: Write the whole state now.
+- `keep`: Keep the last saved state as a generation, to which the service can fall back.
 
 `Control` replies once for the whole service, when all its actors have replied. `reset` first pauses
 every actor, producers first, so that no message of the old run is in flight when the actors
@@ -34,14 +35,18 @@ import time
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
+from ldo_service.errors import DataError
 from ldo_service.schemas import ControlAnswer, ControlRequest, decode, encode
 from ldo_service.storage.atomic_write import write_atomically
 from ldo_service.transport.flow_control import encode_link
 from ldo_service.transport.interface import Transport, call_soon
+
+if TYPE_CHECKING:
+    from .generations import GenerationKeeper
 
 log = logging.getLogger(__name__)
 
@@ -55,9 +60,11 @@ REPEAT_AFTER_S = 0.25
 MIN_S = 2.0
 # Time between two attempts to complete a reset that the previous process began, seconds.
 COMPLETE_AGAIN_S = 2.0
+# Replies that a stage remembers: more than the commands that a service sends at the same time.
+MAX_REPLIES = 8
 
 
-What = Literal["pause", "resume", "reset", "save"]
+What = Literal["pause", "resume", "reset", "save", "keep"]
 
 
 class StageCommand(msgspec.Struct, frozen=True, array_like=True):
@@ -66,6 +73,8 @@ class StageCommand(msgspec.Struct, frozen=True, array_like=True):
     number: int  # Unique number of the command.
     what: What
     stage: str
+    generation: int = 0  # Number of the generation to keep.
+    completed: int = 0  # Number of the last generation that all actors have completed.
 
 
 class StageReply(msgspec.Struct, frozen=True, array_like=True):
@@ -88,15 +97,19 @@ class CommandReceiver:
     ) -> None:
         self._stage, self._take = stage, take
         self._loop = asyncio.get_running_loop()
-        self._under_way = 0
-        self._done: StageReply | None = None
+        # Commands that are waiting or executed, and the last replies, by number.
+        self._under_way: set[int] = set()
+        self._done: dict[int, StageReply] = {}
         self._reports = transport.publisher(REPLY_KEY)
         transport.subscribe(COMMAND_KEY, self._arrived)
 
     def report(self, order: StageCommand, error: str) -> None:
         """Send the reply to a command; an empty error means success."""
-        self._done = StageReply(order.number, self._stage, error)
-        self._reports.post(b"", encode_link(self._done))
+        self._under_way.discard(order.number)
+        reply = self._done[order.number] = StageReply(order.number, self._stage, error)
+        while len(self._done) > MAX_REPLIES:
+            del self._done[next(iter(self._done))]
+        self._reports.post(b"", encode_link(reply))
 
     def close(self) -> None:
         """Close the publisher of replies."""
@@ -110,10 +123,10 @@ class CommandReceiver:
                 call_soon(self._loop, self._take_once, order)
 
     def _take_once(self, order: StageCommand) -> None:
-        if self._done is not None and order.number == self._done.number:
-            self._reports.post(b"", encode_link(self._done))
-        elif order.number != self._under_way:
-            self._under_way = order.number
+        if order.number in self._done:
+            self._reports.post(b"", encode_link(self._done[order.number]))
+        elif order.number not in self._under_way:
+            self._under_way.add(order.number)
             self._take(order)
 
 
@@ -126,14 +139,22 @@ class CommandSender:
         self._orders = transport.publisher(COMMAND_KEY)
         transport.subscribe(REPLY_KEY, self._arrived)
 
-    async def order(self, what: What, stage: str, timeout_s: float) -> str:
+    async def order(
+        self, what: What, stage: str, timeout_s: float, generation: tuple[int, int] = (0, 0)
+    ) -> str:
         """Send a command to a stage and wait for its reply.
+
+        Args:
+            what: The command.
+            stage: Name of the stage.
+            timeout_s: Maximum time to wait for the reply, seconds.
+            generation: Fields `generation` and `completed` of the command `keep`.
 
         Returns:
             An empty text on success. Otherwise, the error of the stage, or a text saying that the
             stage did not reply within `timeout_s` seconds.
         """
-        order = StageCommand(1 + secrets.randbits(62), what, stage)
+        order = StageCommand(1 + secrets.randbits(62), what, stage, *generation)
         report = self._reports[order.number] = self._loop.create_future()
         try:
             async with asyncio.timeout(timeout_s):
@@ -177,6 +198,7 @@ class Control:
         timeout_s: float,
         reset_marker: Path | None = None,
         pause_marker: Path | None = None,
+        generations: "GenerationKeeper | None" = None,
     ) -> None:
         """Connect to the stages.
 
@@ -190,7 +212,9 @@ class Control:
                 previous process left it, this object completes the reset.
             pause_marker: File that exists while the service is paused; None: no file. If the
                 previous process left it, this object pauses the sources.
+            generations: Keeper of older generations, which a reset replaces; None: there is none.
         """
+        self._generations = generations
         self._reset_marker, self._pause_marker = reset_marker, pause_marker
         self._commander = CommandSender(transport)
         self._actors, self._sources = tuple(actors), tuple(sources)
@@ -272,6 +296,12 @@ class Control:
         return f"{', '.join(self._actors)} saved in {self._saved_where}."
 
     async def _reset(self) -> str:
+        if self._generations is None:
+            return await self._reset_actors()
+        async with self._generations.lock:
+            return await self._reset_actors()
+
+    async def _reset_actors(self) -> str:
         try:
             await self._each("pause", self._actors)
             self._mark_reset()
@@ -285,12 +315,19 @@ class Control:
                 f"{error} Frames are dropped until the reset is complete. A restart of the service "
                 "completes it too."
             ) from error
+        await self._replace_generations()
         self._is_reset_pending = False
         if self._reset_marker is not None:
             self._reset_marker.unlink(missing_ok=True)
         await self._resume_actors()
         still = " Frames stay paused." if self._is_paused else ""
         return f"{', '.join(self._actors)} restarted with an empty state.{still}"
+
+    async def _replace_generations(self) -> None:
+        """Keep the empty states, so that no failure brings back the map from before the reset."""
+        if self._generations is not None:
+            with suppress(OSError, DataError):
+                await self._generations.keep()
 
     async def _resume_actors(self) -> None:
         """Resume all actors, except the sources while frames must not be taken."""

@@ -1,8 +1,13 @@
 """Saving of a stage's state after each step, with retries while the disk is full."""
 
 import asyncio
+import logging
 from collections.abc import Callable
+from pathlib import Path
 
+from ldo_service.errors import DataError
+from ldo_service.storage.atomic_write import sync_all
+from ldo_service.storage.generation_files import GenerationFiles
 from ldo_service.storage.state_store import State
 from ldo_service.transport.worker import Worker
 
@@ -13,7 +18,12 @@ from .inlet import Delivery
 from .journal import Journal
 from .mailbox import Mailbox
 from .outlets import Outlets
+from .restoring import LOG_PERIOD_S
+from .stage_commands import StageCommand
 from .stage_metrics import StageMetrics
+from .supervision_policy import LogLimit
+
+log = logging.getLogger(__name__)
 
 # Time between two attempts to save, seconds. A user who frees disk space hardly waits, and the
 # attempts take little time.
@@ -59,6 +69,8 @@ class StateSaver:
         self._metrics, self._journal = metrics, journal
         self._is_draining = is_draining
         self.mailbox: Mailbox | None = None
+        self._failures = LogLimit(LOG_PERIOD_S)
+        self._syncing: set[asyncio.Task[None]] = set()
 
     @property
     def is_unsaved(self) -> bool:
@@ -122,6 +134,50 @@ class StateSaver:
         """
         await self._worker.run(self._write_checkpoint, actor, self._links())
 
+    async def keep(
+        self, actor: Actor, order: StageCommand, report: Callable[[StageCommand, str], None]
+    ) -> None:
+        """Keep the last saved state as a generation, and write it in the background.
+
+        Args:
+            actor: The actor of the stage.
+            order: The command, with the number of the generation.
+            report: Function that is called once the generation is written, with an error or "".
+        """
+        generation = order.generation, order.completed
+        is_previous_complete = self._checkpointer.is_last_kept(order.completed)
+        try:
+            files, paths = await self._worker.run(self._checkpointer.keep, actor, *generation)
+        except (OSError, DataError) as error:
+            report(order, f"cannot keep its state: {error}")
+            return
+        self._outlets.keep(is_previous_complete=is_previous_complete)
+        paths += self._outlets.pop_unsynced()
+        task = asyncio.create_task(self._write_generation(files, paths, order, report))
+        self._syncing.add(task)
+        task.add_done_callback(self._syncing.discard)
+
+    async def _write_generation(
+        self,
+        files: GenerationFiles | None,
+        paths: list[Path],
+        order: StageCommand,
+        report: Callable[[StageCommand, str], None],
+    ) -> None:
+        try:
+            await asyncio.to_thread(sync_all, paths)
+            if files is not None:
+                await asyncio.to_thread(files.write)
+        except (OSError, DataError) as error:
+            report(order, f"cannot keep its state: {error}")
+        else:
+            report(order, "")
+
+    def close(self) -> None:
+        """Stop waiting for the disk; no generation is reported any more."""
+        for task in self._syncing:
+            task.cancel()
+
     def _links(self, delivery: Delivery | None = None) -> State:
         inputs = self.mailbox.past(delivery) if self.mailbox else self._checkpointer.past.inputs
         return self._checkpointer.links(inputs, self._outlets.past())
@@ -147,6 +203,16 @@ class StateSaver:
     def _write(self, actor: Actor, state: State) -> None:
         self._outlets.store()  # First, because the state refers to the messages in backlogs.
         self._checkpointer.write(actor, state)
+        try:
+            self._checkpointer.notify(actor)
+            self._update_metrics(actor)
+        except Exception:  # The step is saved: an exception must not repeat it.
+            self._metrics.failures += 1
+            if self._failures.is_due():
+                log.exception("%s: an error after saving a step; the step counts. Please report "
+                              "the traceback.", actor.name)  # fmt: skip
+
+    def _update_metrics(self, actor: Actor) -> None:
         self._metrics.facts = {
             **actor.metrics(),
             **self._journal.metrics(),

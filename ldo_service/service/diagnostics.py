@@ -154,6 +154,12 @@ def _of_disk(health: Health) -> Iterator[Problem]:
             "cannot save its last step and handles no more keyframes until the save succeeds",
             "free some disk space, or start the service with another folder for --state",
         )
+    if health.metrics.get("fell_back"):
+        yield Problem(
+            "started from an older state, because a newer one was damaged; the keyframes in "
+            "between are lost",
+            "check the disk, unless the power failed; this line disappears with the next start",
+        )
 
 
 def _of_models(health: Health) -> Iterator[Problem]:

@@ -34,6 +34,7 @@ from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import new_path, prepare_recording
 from ldo_service.runtime import check_graph
 from ldo_service.runtime.actor_graph import consumers_with_backlog, finish_order, lossless_consumers
+from ldo_service.runtime.generations import GenerationKeeper
 from ldo_service.runtime.journal import Journal
 from ldo_service.runtime.process import (
     ChildProcess,
@@ -43,7 +44,7 @@ from ldo_service.runtime.process import (
 )
 from ldo_service.runtime.process_heartbeat import start_heartbeat
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.stage_commands import Control
+from ldo_service.runtime.stage_commands import CommandSender, Control
 from ldo_service.runtime.supervision import Runner, StopRequest, Watchdog, supervise
 from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 from ldo_service.storage.state_store import FolderStore
@@ -171,7 +172,9 @@ class Service:
         watchdog = Watchdog({} if self.only else os.environ)
         pings = asyncio.create_task(watchdog.ping())
         runners = self._runners(transport)
-        control = None if self.only else self._open_control(transport)
+        generations = None if self.only else self._open_generations(transport)
+        keeping = asyncio.create_task(generations.run()) if generations else None
+        control = self._open_control(transport, generations) if generations else None
         names = ", ".join(runner.name for runner in runners)
         if self.only:  # The main process has already printed the start message.
             log.info("%s: ready", names)
@@ -185,11 +188,18 @@ class Service:
             watchdog.notify("STOPPING=1")
             pings.cancel()
             watch.cancel()
+            if keeping:
+                keeping.cancel()
             if control:
                 control.close()
             transport.close()
 
-    def _open_control(self, transport: ZenohTransport) -> Control:
+    def _open_generations(self, transport: ZenohTransport) -> GenerationKeeper:
+        names = [box.name for box in GRAPH]
+        local = [name for name in names if name not in self.config.service.remote_actors]
+        return GenerationKeeper(CommandSender(transport), FolderStore(self.state / "state"), local)
+
+    def _open_control(self, transport: ZenohTransport, generations: GenerationKeeper) -> Control:
         control = Control(
             transport,
             actors=[box.name for box in GRAPH],
@@ -198,6 +208,7 @@ class Service:
             timeout_s=self.config.service.control_timeout_s,
             reset_marker=self.state / RESET_MARKER,
             pause_marker=self.state / PAUSE_MARKER,
+            generations=generations,
         )
         transport.respond(CONTROL.name, control.answer)
         return control

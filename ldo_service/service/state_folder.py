@@ -4,12 +4,19 @@ import fcntl
 import logging
 import os
 import tempfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection
 from contextlib import ExitStack
 from pathlib import Path
 
-from ldo_service.errors import ConfigError, UnavailableError
-from ldo_service.runtime.delivery_state import RestoredState
+from ldo_service.errors import ConfigError, DamagedStateError, DataError, UnavailableError
+from ldo_service.runtime.generations import (
+    INTERDEPENDENT_ACTORS,
+    completed_generation,
+    keep_stopped,
+    next_generation,
+    problem_of_states,
+)
+from ldo_service.storage.atomic_write import make_folder, sync_all, with_folders
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 log = logging.getLogger(__name__)
@@ -17,8 +24,6 @@ log = logging.getLogger(__name__)
 # File that exists while a reset of the actors is not complete; see `Control`.
 RESET_MARKER = "reset"
 PAUSE_MARKER = "paused"  # File that exists while the service is paused.
-# Actors whose states refer to each other. Each one saves a state before the first keyframe arrives.
-INTERDEPENDENT_ACTORS = ("tracker", "mapper", "optimizer")
 
 
 def state_folder(folder: Path | None, stack: ExitStack) -> Path:
@@ -37,7 +42,7 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
     if folder is None:
         return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ldo-")))
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         if not os.access(folder, os.W_OK):
             raise ConfigError(f"{folder} cannot be written. Choose another folder with --state.")
         found = {path.name for path in folder.iterdir()}
@@ -62,8 +67,9 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
 def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] = ()) -> None:
     """Lock the folder for this service, and check that the states of all actors match.
 
-    The states of tracker, mapper and optimizer refer to the same keyframe ids and graph versions.
-    If one state were missing or older, the service would connect keyframes of two different runs.
+    The states of the actors refer to the same keyframe ids and graph versions. If one state were
+    missing or older, the service would connect keyframes of two different runs. If a state is
+    damaged, or if the states do not match, all actors fall back to the last complete generation.
 
     Args:
         folder: The state folder.
@@ -71,9 +77,11 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
         remote_actors: Actors that another machine runs; their states are not in the folder.
 
     Raises:
-        ConfigError: The states do not match.
+        ConfigError: The states do not match, and there is no older generation.
         UnavailableError: Another service uses the folder.
-        DataError: A state cannot be read because of a disk error.
+        DamagedStateError: A state is damaged, and there is no undamaged older generation.
+        DataError: A state cannot be read because of a limit of the process, or another version of
+            the service wrote it.
     """
     lock = stack.enter_context((folder / "lock").open("w"))
     try:
@@ -84,21 +92,67 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
         ) from error
     store = FolderStore(folder / "state")
     _complete_reset(folder, store, remote_actors)
-    local = [name for name in INTERDEPENDENT_ACTORS if name not in remote_actors]
-    pasts = {name: RestoredState.of(store.load(name)) for name in local}
-    missing = [name for name, past in pasts.items() if past.is_none]
-    if missing and any(past.has_passed for past in pasts.values()):
-        raise ConfigError(
-            f"{folder} has no readable state of {', '.join(missing)}, but has states of other "
-            "actors. Choose another folder with --state, or delete this folder to start with an "
-            "empty map."
+    found = {path.parent.name for path in store.folder.glob("*/*.msgpack")}
+    actors = sorted((found | set(INTERDEPENDENT_ACTORS)) - set(remote_actors))
+    try:
+        older = completed_generation(store)
+    except DamagedStateError as error:
+        log.error("%s. There is no older generation of the states until the next one is kept.",
+                  error)  # fmt: skip
+        older = None
+    if problem := problem_of_states(store, actors):
+        _fall_back(store, actors, problem, older)
+    try:
+        for actor in actors:
+            sync_all(with_folders(store.unsynced_files(actor)))
+        if older is None:
+            make_folder(store.folder)
+            keep_stopped(store, actors, next_generation(store))
+    except OSError as error:  # Tracking works even if the disk is full.
+        log.error("%s: the states cannot be kept as an older generation: %s. A power cut may lose "
+                  "them until that succeeds. Free some disk space.", folder, error)  # fmt: skip
+
+
+def _fall_back(
+    store: FolderStore, actors: Collection[str], problem: DataError | str, older: int | None
+) -> None:
+    """Replace the states of all actors by the last complete generation.
+
+    Args:
+        store: Store of the states.
+        actors: The actors.
+        problem: Damage of the states after the last step.
+        older: Number of the generation; None if there is none.
+
+    Raises:
+        ConfigError: The states do not match, and there is no older generation.
+        DamagedStateError: A state is damaged, and there is no undamaged older generation.
+    """
+    advice = (
+        "Restore the whole folder from one copy, choose another folder with --state, or delete "
+        "this folder to start with an empty map."
+    )
+    if older is None:
+        if isinstance(problem, str):
+            raise ConfigError(f"in {store.folder.parent} {problem}. {advice}")
+        raise DamagedStateError(f"{problem}. There is no older generation of it. {advice}")
+    if damage := problem_of_states(store, sorted(actors), older):
+        raise DamagedStateError(
+            f"{problem}. The older generation {older} is not usable either: {damage}. {advice}"
         )
-    for topic, producer, consumer, why in _inconsistent_states(pasts):
-        raise ConfigError(
-            f"in {folder} the states of {producer} and {consumer} do not belong together: {why} "
-            f"on {topic}. Restore the whole folder from one copy, choose another folder with "
-            "--state, or delete this folder to start with an empty map."
-        )
+    log.error(
+        "%s: %s. All actors fall back to generation %d of their states. The keyframes since then, "
+        "usually fewer than five, are lost. Check the disk, unless the power failed.",
+        store.folder.parent, problem, older,
+    )  # fmt: skip
+    try:
+        for actor in actors:
+            store.fall_back(actor, older)
+    except OSError as error:
+        raise DataError(
+            f"{store.folder.parent} cannot fall back to generation {older} of the states: {error}. "
+            "Free some disk space; the next start tries again."
+        ) from error
 
 
 def _complete_reset(folder: Path, store: FolderStore, remote_actors: Collection[str]) -> None:
@@ -119,25 +173,3 @@ def _complete_reset(folder: Path, store: FolderStore, remote_actors: Collection[
         store.delete(state.parent.name)
     if not remote_actors:
         marker.unlink()
-
-
-def _inconsistent_states(
-    pasts: Mapping[str, RestoredState],
-) -> Iterator[tuple[str, str, str, str]]:
-    """Yield each topic of which the saved states of producer and consumer do not fit.
-
-    The consumer has then handled messages of another run, or messages unknown to the producer,
-    whose saved state is older. Each item has the topic, the producer, the consumer, and a
-    description of the difference.
-    """
-    for producer, past in pasts.items():
-        for topic, made in past.outputs.items():
-            for consumer, other in pasts.items():
-                had = other.inputs.get(topic)
-                if had is None or not had.handled:
-                    continue
-                if had.epoch != made.epoch:
-                    yield topic, producer, consumer, f"{consumer} has messages of another run"
-                elif had.handled > made.seq:
-                    newer = f"{consumer} is newer than {producer}, and has messages that {producer}"
-                    yield topic, producer, consumer, f"{newer} has not produced"

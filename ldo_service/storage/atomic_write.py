@@ -8,8 +8,8 @@ ends in `UNFINISHED`, and the name of a temporary folder begins with it.
 
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 UNFINISHED = ".new"  # Suffix of a file that is being written.
@@ -62,6 +62,31 @@ def folder_made_atomically(path: Path) -> Iterator[Path]:
         made = Path(temporary) / path.name
         yield made
         made.rename(path)
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder and its parents, and wait until their names are on the disk.
+
+    Raises:
+        OSError: The folder cannot be created.
+    """
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    for folder in missing:
+        sync(folder.parent)
+
+
+def sync_all(paths: Iterable[Path]) -> None:
+    """Sync files and folders, without those that were removed meanwhile."""
+    for path in paths:
+        with suppress(FileNotFoundError):
+            sync(path)
+
+
+def with_folders(files: Iterable[Path]) -> list[Path]:
+    """Return files, and then their folders, which must be synced too if the files are new."""
+    files = list(files)
+    return [*files, *dict.fromkeys(file.parent for file in files)]
 
 
 def sync(path: Path) -> None:

@@ -1,8 +1,8 @@
 """Folder of numbered files with checksums.
 
 A file begins with a checksum of its content, and gets its final name when it is completely written.
-A reader gets exactly the written content or an error. Files are not synced to the disk, so a power
-cut may damage the files written last.
+A reader gets exactly the written content or an error. Files are not synced to the disk when they
+are written, so a power cut may damage them until the caller has synced `unsynced_files`.
 """
 
 import errno
@@ -16,7 +16,7 @@ from pathlib import Path
 
 from ldo_service.errors import ConfigError, DataError
 
-from .atomic_write import UNFINISHED, write_atomically
+from .atomic_write import UNFINISHED, make_folder, write_atomically
 
 log = logging.getLogger(__name__)
 
@@ -50,10 +50,12 @@ class ChecksummedFolder:
         self._is_refusing = False
         self.not_written = 0
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self._folder)
             for unfinished in self._folder.glob(f"*.{suffix}{UNFINISHED}"):
                 unfinished.unlink()
             self._sizes = self._found()
+            self._unsynced: set[int] = set()  # Written after the last `begin_sync`.
+            self._syncing: set[int] = set()  # Written between `begin_sync` and `end_sync`.
         except OSError as error:
             raise ConfigError(
                 f"{self._folder} cannot be used: {error}. Choose a folder that is writable."
@@ -74,6 +76,7 @@ class ChecksummedFolder:
         try:
             header = _HEADER.pack(_MAGIC, zlib.crc32(body))
             self._sizes[number] = write_atomically(self._path(number), header, body)
+            self._unsynced.add(number)
         except OSError as error:
             self.not_written += 1
             if not self._is_refusing:
@@ -92,21 +95,13 @@ class ChecksummedFolder:
             DataError: The file is missing or damaged.
             OSError: This process has reached a limit of memory or open files.
         """
-        path = self._path(number)
-        try:
-            data = memoryview(path.read_bytes())
-        except OSError as error:
-            if error.errno in _OF_PROCESS:
-                raise
-            raise DataError(f"{path} cannot be read: {error}") from error
-        body = data[_HEADER.size :]
-        if bytes(data[: _HEADER.size]) != _HEADER.pack(_MAGIC, zlib.crc32(body)):
-            raise DataError(f"{path} is damaged: its {len(data)} bytes do not match their checksum")
-        return body
+        return read_checked(self._path(number))
 
     def remove(self, number: int) -> None:
         """Remove a file; a failure is logged, and the file then only takes disk space."""
         self._sizes.pop(number, None)
+        self._unsynced.discard(number)
+        self._syncing.discard(number)
         try:
             self._path(number).unlink(missing_ok=True)
         except OSError as error:
@@ -115,12 +110,44 @@ class ChecksummedFolder:
                 self._path(number), error,
             )  # fmt: skip
 
+    def unsynced_files(self) -> list[Path]:
+        """Return the files that this object wrote and that may not be on the disk yet."""
+        return [self._path(number) for number in sorted(self._unsynced | self._syncing)]
+
+    def begin_sync(self) -> None:
+        """Note that the caller begins to sync `unsynced_files`."""
+        self._syncing |= self._unsynced
+        self._unsynced.clear()
+
+    def end_sync(self) -> None:
+        """Note that the files of the last `begin_sync` are on the disk."""
+        self._syncing.clear()
+
     def _path(self, number: int) -> Path:
         return self._folder / f"{number:08d}.{self._suffix}"
 
     def _found(self) -> dict[int, int]:
         files = self._folder.glob(f"*.{self._suffix}")
         return {int(file.stem): file.stat().st_size for file in files if file.stem.isdecimal()}
+
+
+def read_checked(path: Path) -> memoryview:
+    """Read the content of a file of a `ChecksummedFolder`.
+
+    Raises:
+        DataError: The file is missing or damaged.
+        OSError: This process has reached a limit of memory or open files.
+    """
+    try:
+        data = memoryview(path.read_bytes())
+    except OSError as error:
+        if error.errno in _OF_PROCESS:
+            raise
+        raise DataError(f"{path} cannot be read: {error}") from error
+    body = data[_HEADER.size :]
+    if bytes(data[: _HEADER.size]) != _HEADER.pack(_MAGIC, zlib.crc32(body)):
+        raise DataError(f"{path} is damaged: its {len(data)} bytes do not match their checksum")
+    return body
 
 
 def _temporary_folder(owner: object, name: str) -> Path:

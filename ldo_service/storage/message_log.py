@@ -11,7 +11,7 @@ from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
 
-from .atomic_write import sync
+from .atomic_write import make_folder, sync, with_folders
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +78,7 @@ class MessageLog:
         self._segments: list[_Segment] = []
         self._open: _Segment | None = None  # The segment that is being written.
         self._first = first
+        self._unsynced: set[Path] = set()  # Files written since the last `pop_unsynced`.
         self.dropped = 0  # Messages deleted because of the maximum size.
         self._scan(end)
         self.forget(first)
@@ -122,6 +123,7 @@ class MessageLog:
                 end = self._write(segment, message)
                 with self._lock:
                     segment.ends.append(end)
+                    self._unsynced.add(segment.path)
                     self._drop_oldest()
             finally:
                 self._open = None
@@ -142,7 +144,7 @@ class MessageLog:
     def _write(self, segment: _Segment, message: LoggedMessage) -> int:
         """Write a message to the end of a segment, and return the position after it."""
         header, body = message.header, message.body
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self._folder)
         with segment.path.open("r+b" if segment.ends else "wb") as file:
             file.seek(segment.size)
             file.write(_RECORD.pack(message.seq, len(header), len(body), _checksum(header, body)))
@@ -163,6 +165,13 @@ class MessageLog:
             self.dropped += max(0, oldest.next - max(self._first, oldest.first))
             self._first = oldest.next
             _remove(oldest.path)
+
+    def pop_unsynced(self) -> list[Path]:
+        """Return the files written since the last call, and their folders, for `sync_all`."""
+        with self._lock:
+            paths = sorted(self._unsynced)
+            self._unsynced.clear()
+        return with_folders(paths)
 
     def read(self, seq: int) -> LoggedMessage | None:
         """Return a message; None if it was deleted or its file is damaged."""
@@ -250,6 +259,8 @@ class MessageLog:
 
     def _scan(self, end: int) -> None:
         """Index the messages below `end` of this epoch, and delete the files of other epochs."""
+        starts: list[int] = []  # First message of each file, and the end of its whole messages.
+        ends: list[int] = []
         for path in sorted(self._folder.glob("*.log")):
             epoch, _, number = path.stem.partition("-")
             first = int(number) if number.isdecimal() else -1
@@ -258,9 +269,24 @@ class MessageLog:
                 _remove(path)
                 continue
             segment = _Segment(path, first, _ends(path, first))
+            starts.append(first)
+            ends.append(segment.next)
             if segment.ends:
                 self._segments.append(segment)
+                self._unsynced.add(path)
+            else:
+                _remove(path)
         self.truncate(end)
+        for missing, stop in zip(ends or [self._first], [*starts[1:], end], strict=True):
+            self._log_missing(missing, min(stop, end))
+
+    def _log_missing(self, first: int, end: int) -> None:
+        if first < end:
+            log.error(
+                "%s: messages %d to %d are missing or damaged, and are lost. Check the disk, "
+                "unless the power failed.",
+                self._folder, first, end - 1,
+            )  # fmt: skip
 
 
 def _ends(path: Path, first: int) -> list[int]:

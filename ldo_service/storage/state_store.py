@@ -4,19 +4,23 @@ A state consists of a few named parts. A store skips a part that is the same Pyt
 last save. Callers must therefore never modify a part that was saved; they replace it.
 """
 
+import errno
 import logging
-import shutil
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
 
-from ldo_service.errors import DataError
+from ldo_service.errors import DamagedStateError, DataError
 
-from .atomic_write import sync, write_atomically
-from .state_codec import decode_state, encode_state
+from .atomic_write import make_folder, sync, write_atomically
+from .checksummed_folder import read_checked
+from .generation_files import GenerationFiles
+from .state_codec import encode_state
+from .state_contents import StateContents, check_of, read_contents
 
 log = logging.getLogger(__name__)
 
@@ -25,16 +29,8 @@ log = logging.getLogger(__name__)
 # change since the last step is the same object: only new objects are written.
 State = Mapping[str, Any]
 CONTENTS = "contents.msgpack"
-# Version of the content of the parts. Increment it when a change of any actor's state makes older
-# states incompatible. States of version 1 contain no version number.
-STATE_VERSION = 3
-
-
-class _Contents(msgspec.Struct, frozen=True):
-    """Content of `contents.msgpack`: file name of each part of a state, and format version."""
-
-    files: dict[str, str]
-    version: int = STATE_VERSION
+GENERATION = "generation-{}.msgpack"  # File name of the list of a generation.
+NEWEST = 0  # Number that stands for the state after the last step, which is no generation.
 
 
 class StateStore(Protocol):
@@ -61,7 +57,7 @@ class StateStore(Protocol):
         """
         ...
 
-    def save(self, actor: str, state: State) -> None:
+    def save(self, actor: str, state: State, unsynced: Iterable[Path] = ()) -> None:
         """Replace the state of an actor; an empty state is ignored."""
         ...
 
@@ -73,43 +69,32 @@ class StateStore(Protocol):
         """Delete the state of an actor."""
         ...
 
+    def keep(
+        self, actor: str, generation: int, completed: int, unsynced: Iterable[Path] = ()
+    ) -> GenerationFiles | None:
+        """Keep the last saved state as a generation; see `FolderStore.keep`."""
+        ...
 
-class MemoryStore:
-    """Store in memory; the states are lost when the process ends, but not when an actor fails."""
+    def is_kept(self, actor: str) -> bool:
+        """Return whether an older generation of the actor's state exists."""
+        ...
 
-    syncs = False
-
-    def __init__(self) -> None:
-        self._states: dict[str, State] = {}
-
-    def backlog_folder(self, actor: str) -> None:  # noqa: ARG002
-        """Return None: unhandled messages are kept in memory, as the states are."""
-        return
-
-    def quarantine_folder(self, actor: str) -> None:  # noqa: ARG002
-        """Return None: the deliveries of messages are not counted."""
-        return
-
-    def save(self, actor: str, state: State) -> None:
-        """Replace the state of an actor; an empty state is ignored."""
-        if state:
-            self._states[actor] = dict(state)
-
-    def load(self, actor: str) -> State | None:
-        """Return the last state of an actor; None if there is none."""
-        return self._states.get(actor)
-
-    def delete(self, actor: str) -> None:
-        """Delete the state of an actor."""
-        self._states.pop(actor, None)
+    def has_fallen_back(self, actor: str) -> bool:
+        """Return whether the last loaded state is an older generation."""
+        ...
 
 
 class FolderStore:
     """Store in files of a folder `<folder>/<actor>/`, which survive a killed process.
 
-    Each part has a file, and `contents.msgpack` lists the files of the current state. A changed
-    part is written to a new file. The list is replaced last, by one rename. A reader therefore
-    finds the whole old state or the whole new state.
+    Each part has a file that is never changed, and `contents.msgpack` lists the files of the
+    current state with their sizes and checksums. A changed part is written to a new file. The list
+    is replaced last, by one rename. A reader therefore finds the whole old state or the whole new
+    state, or detects the damage.
+
+    A power cut may damage files that are not synced. `keep` therefore keeps synced copies of the
+    current state as an older generation, in the list `generation-<number>.msgpack`. The states of
+    all actors in one generation belong together; see `runtime.generations`.
     """
 
     def __init__(self, folder: Path, *, syncs: bool = False) -> None:
@@ -119,154 +104,288 @@ class FolderStore:
             folder: Folder of all states.
             syncs: Sync every file to the disk, so that the state survives a power cut too.
         """
-        self._folder, self.syncs = folder, syncs
+        self.folder, self.syncs = folder, syncs
         self._saved: dict[str, State] = {}
-        self._files: dict[str, dict[str, str]] = {}  # File of each part, by actor.
+        self._contents: dict[str, StateContents] = {}  # Current state, by actor.
+        self._kept: dict[str, dict[int, StateContents]] = {}  # By actor and generation.
+        self._last_file: dict[str, int] = {}  # Number of the last file, by actor.
+        # File of the last kept generation, by actor and file of the state that it is a copy of.
+        self._copies: dict[str, dict[str, str]] = {}
+        self._writing: dict[str, GenerationFiles] = {}  # Last kept generation, by actor.
+        self._fallen_back: set[str] = set()
 
     def backlog_folder(self, actor: str) -> Path:
         """Return the folder for messages that an actor's consumers have not handled."""
-        return self._folder / f"{actor}.backlog"
+        return self.folder / f"{actor}.backlog"
 
     def quarantine_folder(self, actor: str) -> Path:
         """Return the folder for messages that end an actor's process."""
-        return self._folder / f"{actor}.quarantine"
+        return self.folder / f"{actor}.quarantine"
 
-    def save(self, actor: str, state: State) -> None:
+    # --- current state ----------------------------------------------------------------------------
+    def save(self, actor: str, state: State, unsynced: Iterable[Path] = ()) -> None:
         """Replace the state of an actor; an empty state is ignored.
+
+        Args:
+            actor: Name of the actor.
+            state: The state.
+            unsynced: Files of a `ChecksummedFolder` to which the state refers, and which may not be
+                synced to the disk. `load` checks them.
 
         Raises:
             OSError: The state cannot be written; the old state stays unchanged.
         """
         if not state:
             return
-        folder = self._folder / actor
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = self.folder / actor
         if actor not in self._saved:
-            if self.syncs:
-                sync(self._folder)
-            self._files[actor] = _read_contents_or_nothing(folder)
-            _remove_unreferenced(folder, self._files[actor])
-        saved, old = self._saved.get(actor, {}), self._files[actor]
-        new = dict(old)
-        for part, value in state.items():
-            if part not in saved or saved[part] is not value:
-                new[part] = f"{part}.b" if old.get(part) == f"{part}.a" else f"{part}.a"
-                self._write(folder / new[part], encode_state(value))
-        new = {part: new[part] for part in state}
-        if new != old:
+            make_folder(folder)
+            self._open(actor)
+        saved, old = self._saved.get(actor, {}), self._contents[actor]
+        changed = {p: v for p, v in state.items() if p not in saved or saved[p] is not v}
+        new = self._write_parts(actor, changed)
+        files = {part: new.files.get(part) or old.files[part] for part in state}
+        checks = {part: new.checks.get(part) or old.checks[part] for part in state}
+        paths = self._relative(unsynced)
+        if new.files or files != old.files or paths != old.unsynced:
             self._saved.pop(actor, None)  # The list may now refer to the new files.
-            body = msgspec.msgpack.encode(_Contents(new))
-            write_atomically(folder / CONTENTS, body, syncs=self.syncs)
-        for file in set(old.values()) - set(new.values()):
-            _remove(folder / file)
-        self._saved[actor], self._files[actor] = dict(state), new
+            if self.syncs:
+                sync(folder)
+            self._write_contents(actor, StateContents(files, checks=checks, unsynced=paths))
+        self._remove_unused(actor, [*old.files.values(), *self._pop_copied(actor)])
+        self._saved[actor] = dict(state)
 
-    def _write(self, path: Path, body: bytes) -> None:
-        path.write_bytes(body)
-        if self.syncs:
-            sync(path)
+    def _write_contents(self, actor: str, contents: StateContents) -> None:
+        self._contents[actor] = contents
+        path = self.folder / actor / CONTENTS
+        write_atomically(path, contents.encode(), syncs=self.syncs)
 
-    def load(self, actor: str) -> State | None:
-        """Load the last state of an actor.
+    def _relative(self, paths: Iterable[Path]) -> tuple[str, ...]:
+        return tuple(os.path.relpath(path, self.folder.parent) for path in paths)
 
-        If the state is damaged, the error is logged and the folder of the state is renamed to
-        `<actor>.unreadable`. An earlier folder of that name is deleted.
+    def _write_parts(self, actor: str, parts: State) -> StateContents:
+        """Write parts to new files; if that fails, remove these files."""
+        files: dict[str, str] = {}
+        checks: dict[str, tuple[int, int]] = {}
+        folder = self.folder / actor
+        try:
+            for part, value in parts.items():
+                body = encode_state(value)
+                files[part] = self._new_file(actor, part)
+                path = folder / files[part]
+                path.write_bytes(body)
+                if self.syncs:
+                    sync(path)
+                checks[part] = check_of(body)
+        except OSError:
+            for file in files.values():
+                _remove(folder / file)
+            raise
+        return StateContents(files, checks=checks)
 
-        Returns:
-            The state; None if there is none or it is damaged.
+    def _check_unsynced(self, contents: StateContents) -> None:
+        for file in contents.unsynced:
+            try:
+                read_checked(self.folder.parent / file)
+            except DataError as error:
+                raise ValueError(str(error)) from error
+
+    def unsynced_files(self, actor: str) -> list[Path]:
+        """Return the files to which the saved state refers, and which may not be synced.
 
         Raises:
+            DataError: The list of files is damaged.
+            OSError: The list cannot be read.
+        """
+        contents = read_contents(self.folder / actor / CONTENTS)
+        return [self.folder.parent / file for file in contents.unsynced] if contents else []
+
+    def _new_file(self, actor: str, part: str) -> str:
+        """Return a file name that no other file of the actor has."""
+        self._last_file[actor] += 1
+        return f"{part}.{self._last_file[actor]}"
+
+    def load(
+        self, actor: str, generation: int = NEWEST, prefixes: tuple[str, ...] = ("",)
+    ) -> State | None:
+        """Load a state of an actor, and compare its files with their checksums.
+
+        Args:
+            actor: Name of the actor.
+            generation: Number of an older generation; by default the state after the last step.
+            prefixes: Load only the parts whose names begin with one of these prefixes.
+
+        Returns:
+            The state; None if there is none.
+
+        Raises:
+            DamagedStateError: A file is missing or damaged. The files are unchanged.
             DataError: The state cannot be read because of the disk or a limit of the process, or
                 another version of the service wrote the state.
         """
-        folder = self._folder / actor
+        folder = self.folder / actor
         try:
-            files = _read_contents(folder)
-            parts = {
-                part: decode_state((folder / file).read_bytes()) for part, file in files.items()
+            contents = read_contents(folder / _list_name(generation))
+            parts = contents.files if contents else {}
+            state = {
+                part: contents.read_part(folder, part)
+                for part in parts
+                if contents and part.startswith(prefixes)
             }
+            if contents and prefixes == ("",):
+                self._check_unsynced(contents)
         except (FileNotFoundError, ValueError) as error:  # A file name may contain a null byte.
-            log.error(
-                "%s: the saved state cannot be read: %s. The actor starts with an empty state; the "
-                "damaged state is kept as %s.unreadable.",
-                actor, error, folder,
-            )  # fmt: skip
-            _set_aside(folder)
-            return None
+            raise DamagedStateError(
+                f"the state of {actor} in {folder} is damaged: {error}"
+            ) from error
         except OSError as error:
+            if error.errno == errno.EIO:
+                raise DamagedStateError(
+                    f"the state of {actor} in {folder} cannot be read: {error.strerror}"
+                ) from error
             raise DataError(
                 f"the state of {actor} in {folder} cannot be read: {error.strerror}. The state is "
                 "unchanged: repair the disk, or raise the limit of the process, and start again."
             ) from error
-        return parts or None
+        if contents and generation == NEWEST and contents.generation:
+            self._fallen_back.add(actor)
+        return state or None
 
     def delete(self, actor: str) -> None:
-        """Delete the state of an actor."""
-        folder = self._folder / actor
-        self._saved.pop(actor, None)
-        (folder / CONTENTS).unlink(missing_ok=True)  # First, because unlisted files are not read.
+        """Delete the state of an actor, and all its generations."""
+        folder = self.folder / actor
+        self._forget(actor)
+        for path in (folder / CONTENTS, *folder.glob(GENERATION.format("*"))):
+            path.unlink(missing_ok=True)  # First, because unlisted files are not read.
         for file in folder.glob("*"):
             _remove(file)
 
+    def _pop_copied(self, actor: str) -> Iterable[str]:
+        """Return the files that the last kept generation does not need any more."""
+        writing = self._writing.get(actor)
+        return self._writing.pop(actor).sources.values() if writing and writing.is_written else ()
 
-def _set_aside(folder: Path) -> None:
-    aside = folder.with_name(f"{folder.name}.unreadable")
-    try:
-        shutil.rmtree(aside, ignore_errors=True)
-        folder.rename(aside)
-    except OSError as error:
-        log.error(
-            "cannot move the unreadable state %s to %s (%s); the next checkpoint overwrites it. "
-            "Copy it now if you need it.",
-            folder, aside.name, error.strerror,
-        )  # fmt: skip
+    def _forget(self, actor: str) -> None:
+        for known in (self._saved, self._contents, self._kept, self._copies, self._writing):
+            known.pop(actor, None)
+
+    def _open(self, actor: str) -> None:
+        """Read the lists of files, and remove the files that no list has.
+
+        Killed processes have left them.
+        """
+        folder = self.folder / actor
+        try:
+            contents = read_contents(folder / CONTENTS)
+        except DamagedStateError:
+            contents = None
+        self._contents[actor] = contents or StateContents({})
+        self._kept[actor] = {}
+        for path in folder.glob(GENERATION.format("*")):
+            with suppress(DamagedStateError):
+                if kept := read_contents(path):
+                    self._kept[actor][kept.generation] = kept
+        names = [path.name for path in folder.iterdir()]
+        numbers = [int(n) for name in names if (n := name.rpartition(".")[2]).isdecimal()]
+        self._last_file[actor] = max(numbers, default=0)
+        self._remove_unused(actor, names)
+
+    def _remove_unused(self, actor: str, files: Iterable[str]) -> None:
+        """Remove those of the files that neither the state nor a generation of it needs.
+
+        If that fails, the next process removes them.
+        """
+        kept = self._kept[actor]
+        used = {CONTENTS, *map(_list_name, kept)}
+        if writing := self._writing.get(actor):
+            used.update(writing.sources.values())
+        for contents in (self._contents[actor], *kept.values()):
+            used.update(contents.files.values())
+        for file in set(files) - used:
+            _remove(self.folder / actor / file)
+
+    # --- older generations ------------------------------------------------------------------------
+    def keep(
+        self, actor: str, generation: int, completed: int, unsynced: Iterable[Path] = ()
+    ) -> GenerationFiles:
+        """Keep the last saved state as a generation, and forget all others except one.
+
+        Args:
+            actor: Name of the actor.
+            generation: Number of the generation, which no earlier one has.
+            completed: Number of the newest generation that all actors have completed.
+            unsynced: Files that `save` has got and that are still not synced. The caller syncs them
+                too.
+
+        Returns:
+            The files of the generation, which the caller must write.
+
+        Raises:
+            OSError: A file cannot be read.
+            DataError: Another version of the service wrote the state.
+        """
+        folder = self.folder / actor
+        if actor not in self._saved and folder.is_dir():
+            self._open(actor)
+        now = self._contents.get(actor, StateContents({}))
+        if not now.files:
+            return GenerationFiles(folder)
+        paths = self._relative(unsynced)
+        if now.unsynced != paths:
+            self._write_contents(actor, msgspec.structs.replace(now, unsynced=paths))
+        kept = self._kept[actor]
+        old = [n for n in kept if n != completed]
+        unused = [file for n in old for file in (*kept.pop(n).files.values(), _list_name(n))]
+        checks = now.checks or {
+            p: check_of((folder / f).read_bytes()) for p, f in now.files.items()
+        }
+        copies = self._copies.get(actor, {})
+        safe = set(kept[completed].files.values()) if completed in kept else set()
+        files = {part: copies.get(file, "") for part, file in now.files.items()}
+        sources = {part: now.files[part] for part, copy in files.items() if copy not in safe}
+        files.update((part, self._new_file(actor, part)) for part in sources)
+        self._copies[actor] = {now.files[part]: copy for part, copy in files.items()}
+        kept[generation] = StateContents(files, checks=checks, generation=generation)
+        new = GenerationFiles(folder, _list_name(generation), kept[generation], sources)
+        past, self._writing[actor] = self._writing.get(actor), new
+        self._remove_unused(actor, [*unused, *(past.sources.values() if past else ())])
+        return new
+
+    def exists(self, actor: str, generation: int = NEWEST) -> bool:
+        """Return whether an actor has a state."""
+        return (self.folder / actor / _list_name(generation)).exists()
+
+    def is_kept(self, actor: str) -> bool:
+        """Return whether an older generation of the actor's state exists."""
+        if actor in self._kept:
+            return bool(self._kept[actor])
+        return any((self.folder / actor).glob(GENERATION.format("*")))
+
+    def fall_back(self, actor: str, generation: int) -> None:
+        """Replace the state of an actor by that of a generation.
+
+        If the actor has no state in that generation, its state is deleted.
+
+        Raises:
+            OSError: The state cannot be written.
+        """
+        folder = self.folder / actor
+        self._forget(actor)
+        contents = read_contents(folder / _list_name(generation))
+        if contents is None:
+            (folder / CONTENTS).unlink(missing_ok=True)
+        else:
+            write_atomically(folder / CONTENTS, contents.encode(), syncs=True)
+
+    def has_fallen_back(self, actor: str) -> bool:
+        """Return whether the last loaded state is an older generation."""
+        return actor in self._fallen_back
 
 
-def _remove_unreferenced(folder: Path, files: Mapping[str, str]) -> None:
-    """Remove the files that are not in `files`, such as those that killed processes have left."""
-    for file in folder.glob("*"):
-        if file.name not in (CONTENTS, *files.values()):
-            _remove(file)
+def _list_name(generation: int) -> str:
+    return GENERATION.format(generation) if generation else CONTENTS
 
 
 def _remove(file: Path) -> None:
-    """Remove a file that `contents.msgpack` does not list.
-
-    If that fails, the next process removes it.
-    """
     with suppress(OSError):
         file.unlink()
-
-
-def _read_contents(folder: Path) -> dict[str, str]:
-    """Return the file name of each part of a state; empty if no state was saved.
-
-    Raises:
-        DataError: Another version of the service wrote the state.
-        msgspec.DecodeError: The contents are damaged.
-    """
-    try:
-        body = (folder / CONTENTS).read_bytes()
-    except FileNotFoundError:
-        return {}
-    try:
-        contents = msgspec.msgpack.decode(body, type=_Contents)
-    except msgspec.ValidationError:
-        msgspec.msgpack.decode(
-            body, type=dict[str, str]
-        )  # Format of version 1; an error if damaged.
-        contents = _Contents({}, version=1)
-    if contents.version != STATE_VERSION:
-        raise DataError(
-            f"{folder / CONTENTS} has version={contents.version}, and this service reads "
-            f"{STATE_VERSION}: another version of the service wrote this state. Choose another "
-            "folder with --state, or use the version that wrote it."
-        )
-    return contents.files
-
-
-def _read_contents_or_nothing(folder: Path) -> dict[str, str]:
-    try:
-        return _read_contents(folder)
-    except msgspec.DecodeError:
-        return {}

@@ -25,7 +25,7 @@ from ldo_service.schemas import AddLabel, Image, LabelNames, LabelRequest, Label
 from ldo_service.schemas.labels import MAX_ALTERNATIVES
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_REQUEST, LABEL_RESULT
 from ldo_service.service.service import open_recorder
-from ldo_service.storage.state_store import MemoryStore
+from ldo_service.storage.memory_store import MemoryStore
 from ldo_service.transport.interface import MemoryTransport
 from tests.detection.labellers.encoders import ColorPair, embeddings, plain_image, vocabulary
 from tests.detection.labellers.server import hangs, replies_with, responds, serving

@@ -25,7 +25,8 @@ from ldo_service.runtime.journal import Started, StepRecord, checksum
 from ldo_service.schemas import CameraRgbd, MapObjects
 from ldo_service.semantics.semantics_file import read_semantics, write_semantics
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.storage.state_store import STATE_VERSION, FolderStore
+from ldo_service.storage.state_contents import UNCHECKED_VERSION, StateContents, check_of
+from ldo_service.storage.state_store import FolderStore
 from ldo_service.tracking.keyframe_database import DATABASE_FILE, KeyframeRecord
 from ldo_service.tracking.localizer import load_keyframe_database
 from tests.schemas.examples import EXAMPLES
@@ -171,7 +172,7 @@ def frames_of(folder: Path) -> None:
 
 
 def load_state(folder: Path) -> None:
-    """Load the state of an actor; an unreadable one is logged and loads as None."""
+    """Load the state of an actor; a damaged one is a `DamagedStateError`."""
     FolderStore(folder).load("actor")
 
 
@@ -181,7 +182,9 @@ def states() -> Iterator[bytes]:
     yield encode_state(np.float64(2.5))
 
 
-CONTENTS = msgspec.msgpack.encode({"files": {"sum": "sum.a"}, "version": STATE_VERSION})
+# A state without checksums, so that damaged parts reach the decoder.
+CONTENTS = msgspec.msgpack.encode({"files": {"sum": "sum.a"}, "version": UNCHECKED_VERSION})
+CHECKED = StateContents({"sum": "sum.a"}, checks={"sum": check_of(next(states()))}).encode()
 STATE = {"actor/contents.msgpack": CONTENTS, "actor/sum.a": next(states())}
 RECORDING = bytes_of(record)
 
@@ -224,12 +227,11 @@ TARGETS = [
         in_folder("frame_source.mcap", frames_of, {}),
         [RECORDING, chunked(RECORDING)],
     ),
-    Target("state", in_folder("actor/sum.a", load_state, STATE), list(states()), ()),
+    Target("state", in_folder("actor/sum.a", load_state, STATE), list(states())),
     Target(
         "contents of a state",
         in_folder("actor/contents.msgpack", load_state, STATE),
-        [CONTENTS],
-        (),
+        [CONTENTS, CHECKED],
     ),
     Target(
         "vocabulary", vocabulary, [msgspec.msgpack.encode(Vocabulary().pack())], VOCABULARY_ERRORS

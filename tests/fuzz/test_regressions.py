@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ldo_service.storage.state_store import STATE_VERSION
+from ldo_service.storage.state_contents import UNCHECKED_VERSION
 
 from .dataset_targets import COLOR as IMAGE
 from .dataset_targets import MCAP, METADATA, STRAY, jpeg, png
@@ -49,7 +49,7 @@ FOUND = [
     ("state", msgspec.msgpack.encode(msgspec.msgpack.Ext(1, b"\x93\xa3<q9\x91\x01\xc4\x01\0"))),
     (
         "contents of a state",
-        msgspec.msgpack.encode({"files": {"sum": "\0"}, "version": STATE_VERSION}),
+        msgspec.msgpack.encode({"files": {"sum": "\0"}, "version": UNCHECKED_VERSION}),
     ),
     ("state", bytes.fromhex("d80193a32c666390c4080000008000009a0440")),  # The type is ",fc".
     ("labels of a map", ENCRYPTED),

@@ -163,7 +163,7 @@ def test_keep_only_removes_keyframes_unknown_to_the_checkpoint(tmp_path: Path) -
 def test_temporary_folder_is_removed_with_the_store() -> None:
     store = KeyframeStore(None, KeyframeStoreConfig(cache_mb=0))
     store.put(images_of(1))
-    folder = store._files._folder
+    folder = store.files._folder
     assert_same(store.get(1), images_of(1))
     del store
     gc.collect()

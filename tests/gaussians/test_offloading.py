@@ -353,14 +353,41 @@ def test_files_of_loaded_chunks_are_removed_after_the_next_save(tmp_path: Path) 
     gaussians, offloaded = map_of(5, 6, 7), OffloadedGaussians(tmp_path)
     numbers = offload_anchors(gaussians, offloaded, [0, 1])
     offloaded.snapshot()
-    offloaded.saved()
+    offloaded.retired.saved()
     offloaded.load_into(gaussians, numbers[:1])
-    offloaded.saved()  # The same state again.
+    offloaded.retired.saved()  # The same state again.
     for _ in range(3):
         offloaded.snapshot()  # A full disk does not save this.
     assert len(list(tmp_path.iterdir())) == 2
     offloaded.load_into(gaussians, numbers[1:])
-    offloaded.saved()
+    offloaded.retired.saved()
+    assert [int(file.stem) for file in tmp_path.iterdir()] == numbers[1:]
+
+
+def test_files_that_a_kept_generation_needs_stay(tmp_path: Path) -> None:
+    gaussians, offloaded = map_of(5, 6, 7), OffloadedGaussians(tmp_path)
+    numbers = offload_anchors(gaussians, offloaded, [0, 1])
+    offloaded.snapshot()
+    offloaded.retired.kept(is_previous_complete=True)
+    offloaded.load_into(gaussians, numbers[:1])
+    offloaded.snapshot()
+    for is_complete in (True, False, True):  # The last call makes the first generation needless.
+        assert len(list(tmp_path.iterdir())) == 2
+        offloaded.retired.kept(is_previous_complete=is_complete)
+    assert [int(file.stem) for file in tmp_path.iterdir()] == numbers[1:]
+
+
+def test_restored_map_keeps_files_of_older_generations_until_the_next_ones(tmp_path: Path) -> None:
+    gaussians, offloaded = map_of(5, 6, 7), OffloadedGaussians(tmp_path)
+    numbers = offload_anchors(gaussians, offloaded, [0, 1])
+    offloaded.load_into(gaussians, numbers[:1])
+    state = offloaded.snapshot()
+    restored = OffloadedGaussians(tmp_path)
+    restored.restore(state)
+    assert len(list(tmp_path.iterdir())) == 2
+    restored.retired.kept(is_previous_complete=False)
+    assert len(list(tmp_path.iterdir())) == 2
+    restored.retired.kept(is_previous_complete=True)
     assert [int(file.stem) for file in tmp_path.iterdir()] == numbers[1:]
 
 
@@ -376,7 +403,7 @@ def test_temporary_folder_is_removed_with_its_owner() -> None:
     offloaded = OffloadedGaussians(None)
     offloaded.put(chunk_of(0, 0, 5))
     offloaded.put(chunk_of(1, 5, 5))
-    folder = offloaded._files._folder
+    folder = offloaded.files._folder
     offloaded.load(0)
     assert len(list(folder.iterdir())) == 1
     del offloaded

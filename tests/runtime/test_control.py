@@ -8,7 +8,8 @@ from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.stage_commands import Control
 from ldo_service.schemas import ControlAnswer, ControlRequest, Health, Message, decode, encode
-from ldo_service.storage.state_store import MemoryStore, StateStore
+from ldo_service.storage.memory_store import MemoryStore
+from ldo_service.storage.state_store import StateStore
 from ldo_service.transport.interface import MemoryTransport
 from tests.runtime.fake_actors import (
     LATEST_NUMBER,
@@ -33,7 +34,7 @@ class Source(Actor):
 
 
 class FullStore(MemoryStore):
-    def save(self, actor: str, state) -> None:  # noqa: ARG002
+    def save(self, actor: str, state, unsynced=()) -> None:  # noqa: ARG002
         raise OSError("disk full")
 
 

@@ -1,7 +1,7 @@
 """Tests of the delivery state of a stage: each message takes effect once, also after a kill."""
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from random import Random
 from typing import cast
@@ -19,7 +19,8 @@ from ldo_service.runtime.delivery_state import (
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage, new_epoch
 from ldo_service.schemas import Message, encode
-from ldo_service.storage.state_store import FolderStore, MemoryStore, State
+from ldo_service.storage.memory_store import MemoryStore
+from ldo_service.storage.state_store import FolderStore, State
 from ldo_service.transport.flow_control import (
     InletPosition,
     OutletPosition,
@@ -188,10 +189,10 @@ class FailingStore(MemoryStore):
     is_full = False
     failing_actor = ""  # Saves of this actor fail although the disk is not full.
 
-    def save(self, actor: str, state: State) -> None:
+    def save(self, actor: str, state: State, unsynced: Iterable[Path] = ()) -> None:
         if self.is_full or self.failing_actor == actor:
             raise OSError(28, "No space left on device")
-        super().save(actor, state)
+        super().save(actor, state, unsynced)
 
 
 async def test_unsaved_step_is_neither_acknowledged_nor_published() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from ldo_service.errors import ConfigError, RestartsExhausted, StageStalled
+from ldo_service.errors import ConfigError, DamagedStateError, RestartsExhausted, StageStalled
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage, SupervisionConfig, new_epoch
@@ -17,7 +17,8 @@ from ldo_service.runtime.stage_metrics import StageMetrics
 from ldo_service.runtime.supervision_policy import RunningClock
 from ldo_service.schemas import Health, Message, decode
 from ldo_service.service.diagnostics import ActorStatus, diagnose
-from ldo_service.storage.state_store import FolderStore, MemoryStore, State
+from ldo_service.storage.memory_store import MemoryStore
+from ldo_service.storage.state_store import FolderStore, State
 from ldo_service.transport.interface import MemoryTransport
 
 from .fake_actors import (
@@ -146,6 +147,53 @@ async def test_on_saved_is_called_after_each_save() -> None:
     no_failure = InjectedFailure(value=-1, times=0)
     await run_adder(no_failure, [1, 2, 3])
     assert no_failure.saved[:4] == [0, 1, 3, 6]
+
+
+@pytest.mark.parametrize("method", ["on_saved", "metrics"])
+async def test_error_after_the_save_does_not_repeat_the_step(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, method: str
+) -> None:
+    errors = [RuntimeError("after the save")]
+    own = getattr(Adder, method)
+
+    def fail_once(adder: Adder) -> object:
+        if adder._sum == 3 and errors:
+            raise errors.pop()
+        return own(adder)
+
+    monkeypatch.setattr(Adder, method, fail_once)
+    no_failure = InjectedFailure(value=-1, times=0)
+    sums, stage = await run_adder(no_failure, [1, 2, 3], store=FolderStore(tmp_path))
+    assert errors == []
+    assert sums == [1, 3, 6], "each message counts once"
+    assert (stage.health().failures, stage.health().restarts) == (1, 0)
+
+
+async def test_actor_does_not_start_empty_if_its_state_is_damaged_while_it_runs(
+    tmp_path: Path,
+) -> None:
+    def damage(value: int) -> None:
+        if value == 3:
+            (path,) = (tmp_path / "adder").glob("sum.*")
+            path.write_bytes(b"\xc1")
+            raise RuntimeError("injected")
+
+    transport = MemoryTransport()
+    adder = Stage(lambda: Adder(damage), transport, config=QUICK, store=FolderStore(tmp_path))
+    numbers = source(transport, "adder")
+    async with asyncio.TaskGroup() as group:
+        running_adder = group.create_task(expect_damaged_state(adder))
+        for value in (1, 2, 3):
+            await send(numbers, number(value))
+        await running_adder
+    numbers.close()
+    with pytest.raises(DamagedStateError):
+        FolderStore(tmp_path).load("adder")
+
+
+async def expect_damaged_state(stage: Stage) -> None:
+    with pytest.raises(DamagedStateError, match="the state of adder"):
+        await stage.run()
 
 
 async def test_next_process_continues_from_the_stored_state(tmp_path: Path) -> None:

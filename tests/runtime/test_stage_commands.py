@@ -14,7 +14,8 @@ from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.stage_commands import COMMAND_KEY, CommandSender, StageCommand
 from ldo_service.schemas import Message
 from ldo_service.schemas import encode as encode_message
-from ldo_service.storage.state_store import FolderStore, MemoryStore, State
+from ldo_service.storage.memory_store import MemoryStore
+from ldo_service.storage.state_store import FolderStore, State
 from ldo_service.transport.flow_control import EXTERNAL_HEADER, encode_link
 from ldo_service.transport.interface import MemoryTransport
 

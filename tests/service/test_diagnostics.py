@@ -88,6 +88,7 @@ def test_healthy_actor_has_no_findings(actor: ActorStatus) -> None:
             status(health(metrics={"checkpoint_failing": 1.0, "checkpoints_failed": 3.0})),
             "cannot save its last step",
         ),
+        (status(health(metrics={"fell_back": 1.0})), "started from an older state"),
         (status(health(quarantined=2)), "has quarantined 2 messages"),
         (
             status(health(outputs=outputs(behind={"detector": 900}, backlog_dropped=7))),

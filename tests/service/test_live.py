@@ -11,7 +11,7 @@ import pytest
 from ldo_service.actors.topology import GRAPH
 from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import Sequence
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, DamagedStateError
 from ldo_service.schemas import MapSnapshot, TrackedPose
 from ldo_service.schemas.topics import MAP_SNAPSHOT, POSE_TRACKED
 from tests.ports import free_endpoint
@@ -138,7 +138,7 @@ def test_state_folder_is_resumed_and_shared_or_partial_ones_rejected(
         assert service.stop() == 0
     for part in (state / "state" / "tracker").iterdir():
         part.write_bytes(b"damaged")
-    assert "no readable state of tracker" in start_error(state, exit_code=2)
+    assert "is not usable either" in start_error(state, DamagedStateError.exit_code)
 
 
 def start_error(state: Path, exit_code: int) -> str:

@@ -33,6 +33,23 @@ def test_state_without_keyframes_is_accepted(tmp_path: Path) -> None:
     claim(save_states(tmp_path, 0, *ACTORS))
 
 
+def test_full_disk_is_logged_and_the_service_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    save_states(tmp_path, 5, *ACTORS)
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr(Path, "write_bytes", fail)
+        claim(tmp_path)
+    assert "No space left on device" in caplog.text
+    caplog.clear()
+    claim(tmp_path)
+    assert caplog.records == []
+
+
 @pytest.mark.parametrize("actors", [(), ("optimizer",), ("tracker", "mapper")])
 def test_state_of_a_service_killed_during_start_is_accepted(tmp_path: Path, actors: tuple) -> None:
     claim(save_states(tmp_path, 0, *actors))
@@ -41,7 +58,7 @@ def test_state_of_a_service_killed_during_start_is_accepted(tmp_path: Path, acto
 @pytest.mark.parametrize("missing", ["mapper", "optimizer"])
 def test_state_with_a_missing_actor_is_rejected(tmp_path: Path, missing: str) -> None:
     save_states(tmp_path, 5, *(name for name in ACTORS if name != missing))
-    with pytest.raises(ConfigError, match=f"no readable state of {missing}, but"):
+    with pytest.raises(ConfigError, match=f"no state of {missing}, but"):
         claim(tmp_path)
 
 

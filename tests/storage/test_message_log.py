@@ -125,6 +125,26 @@ def test_log_keeps_older_messages_when_its_end_is_missing(tmp_path: Path) -> Non
         log = open_log(tmp_path, 0, 10)
 
 
+@pytest.mark.parametrize("bit", [3, 70, 100, 120, 140, 1000])
+def test_flipped_bit_in_a_log_is_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, bit: int
+) -> None:
+    open_log(tmp_path, 0, 0).append(message(seq) for seq in range(9))
+    open_log(tmp_path, 0, 9)
+    assert caplog.records == []
+    for path in sorted(tmp_path.iterdir()):
+        body = path.read_bytes()
+        flipped = bytearray(body)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        log = open_log(tmp_path, 0, 9)
+        for seq in range(9):
+            log.read(seq)
+        assert "lost" in caplog.text
+        path.write_bytes(body)
+        caplog.clear()
+
+
 def test_segment_that_is_being_written_is_not_deleted(tmp_path: Path) -> None:
     log = open_log(tmp_path, 0, 0)
     log.append([message(0)])

@@ -8,9 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.errors import DataError
+from ldo_service.errors import DamagedStateError, DataError
 from ldo_service.storage import atomic_write, state_codec, state_store
-from ldo_service.storage.state_store import FolderStore, MemoryStore
+from ldo_service.storage.memory_store import MemoryStore
+from ldo_service.storage.state_store import FolderStore
 
 FULL_STATE: dict[str, Any] = {
     "counters": {"frames": 3, "names": ["a", "b"], "nothing": None},
@@ -217,37 +218,113 @@ def test_many_saves_leave_at_most_two_files_per_part(tmp_path: Path) -> None:
     assert FolderStore(tmp_path).load("mapper") == {"step": [49]}
 
 
-@pytest.mark.parametrize("file", ["step.a", state_store.CONTENTS])
+@pytest.mark.parametrize("file", ["step.1", state_store.CONTENTS])
 @pytest.mark.parametrize("noise", [b"", b"\xc1noise", b"\x93", b"\xc7\x01\x07\x00"])
-def test_broken_file_is_logged_and_loads_as_none(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, file: str, noise: bytes
-) -> None:
+def test_damaged_file_is_an_error_and_unchanged(tmp_path: Path, file: str, noise: bytes) -> None:
     FolderStore(tmp_path).save("mapper", {"step": [1]})
     (tmp_path / "mapper" / file).write_bytes(noise)
     store = FolderStore(tmp_path)
-    assert store.load("mapper") is None
-    assert "cannot be read" in caplog.text
+    with pytest.raises(DamagedStateError, match=file):
+        store.load("mapper")
+    assert (tmp_path / "mapper" / file).read_bytes() == noise
     store.save("mapper", {"step": [2]})
     assert FolderStore(tmp_path).load("mapper") == {"step": [2]}
 
 
-def test_unreadable_state_is_preserved_next_to_the_new_one(tmp_path: Path) -> None:
-    for step in (1, 2):
-        FolderStore(tmp_path).save("mapper", {"one": [step], "two": [step]})
-        (tmp_path / "mapper" / "two.a").write_bytes(b"")
-        assert FolderStore(tmp_path).load("mapper") is None
-        assert FolderStore(tmp_path).load("mapper") is None, "a second load finds no saved state"
-        kept = (tmp_path / "mapper.unreadable" / "one.a").read_bytes()
-        assert state_codec.decode_state(kept) == [step]
+def test_flipped_bits_of_a_state_are_detected(tmp_path: Path) -> None:
+    store = FolderStore(tmp_path)
+    store.save("mapper", FULL_STATE)
+    store.keep("mapper", 7, 0).write()
+    of_generation = {path.name for path in (tmp_path / "mapper").iterdir()} - {
+        state_store.CONTENTS, *(f"{part}.{n + 1}" for n, part in enumerate(FULL_STATE))
+    }  # fmt: skip
+    for path in sorted((tmp_path / "mapper").iterdir()):
+        body = path.read_bytes()
+        generation = 7 if path.name in of_generation else state_store.NEWEST
+        for bit in range(0, 8 * len(body), 11):
+            flipped = bytearray(body)
+            flipped[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(flipped)
+            with pytest.raises(DamagedStateError):
+                FolderStore(tmp_path).load("mapper", generation)
+        path.write_bytes(body)
+    for generation in (7, state_store.NEWEST):
+        loaded = FolderStore(tmp_path).load("mapper", generation)
+        assert loaded is not None
+        assert_same(loaded, FULL_STATE)
 
 
-def test_missing_file_is_logged_and_loads_as_none(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_missing_file_is_an_error(tmp_path: Path) -> None:
     FolderStore(tmp_path).save("mapper", {"step": [1]})
-    (tmp_path / "mapper" / "step.a").unlink()
+    (tmp_path / "mapper" / "step.1").unlink()
+    with pytest.raises(DamagedStateError, match=r"step\.1"):
+        FolderStore(tmp_path).load("mapper")
+
+
+# --- older generations ----------------------------------------------------------------------------
+def test_kept_generation_is_unchanged_by_later_saves(tmp_path: Path) -> None:
+    store, same = FolderStore(tmp_path), [0]
+    store.save("mapper", {"same": same, "step": [1]})
+    store.keep("mapper", 1, 0).write()
+    for step in (2, 3):
+        store.save("mapper", {"same": same, "step": [step]})
+    for reader in (store, FolderStore(tmp_path)):
+        assert reader.load("mapper", 1) == {"same": [0], "step": [1]}
+        assert reader.load("mapper") == {"same": [0], "step": [3]}
+    store.fall_back("mapper", 1)
+    assert not store.has_fallen_back("mapper")
+    assert store.load("mapper") == {"same": [0], "step": [1]}
+    assert store.has_fallen_back("mapper")
+    store.save("mapper", {"same": same, "step": [4]})
+    reader = FolderStore(tmp_path)
+    assert reader.load("mapper") == {"same": [0], "step": [4]}
+    assert not reader.has_fallen_back("mapper")
+
+
+def test_only_the_newest_and_the_last_complete_generation_are_kept(tmp_path: Path) -> None:
+    store = FolderStore(tmp_path)
+    for step in range(1, 30):
+        store.save("mapper", {"step": [step]})
+        store.keep("mapper", step, 5).write()
+        generations = {5, step} if step >= 5 else {step}
+        assert {n for n in range(1, 30) if store.load("mapper", n)} == generations
+    # The lists of three states, their files, and the file that was copied last.
+    assert len(list((tmp_path / "mapper").iterdir())) == 6
+    FolderStore(tmp_path).save("mapper", {"step": [30]})
+    assert FolderStore(tmp_path).load("mapper", 5) == {"step": [5]}
+
+
+def test_actor_without_state_keeps_nothing(tmp_path: Path) -> None:
+    store = FolderStore(tmp_path)
+    store.keep("mapper", 1, 0).write()
+    assert not store.is_kept("mapper")
+    store.save("mapper", {"step": [1]})
+    store.fall_back("mapper", 1)
     assert FolderStore(tmp_path).load("mapper") is None
-    assert "cannot be read" in caplog.text
+
+
+def test_deleted_state_has_no_generations(tmp_path: Path) -> None:
+    store = FolderStore(tmp_path)
+    store.save("mapper", {"step": [1]})
+    store.keep("mapper", 1, 0).write()
+    store.delete("mapper")
+    assert not store.is_kept("mapper")
+    assert list((tmp_path / "mapper").iterdir()) == []
+
+
+def test_state_of_version_3_loads_and_is_kept_with_checksums(tmp_path: Path) -> None:
+    folder = tmp_path / "mapper"
+    folder.mkdir()
+    (folder / "step.a").write_bytes(state_codec.encode_state([1]))
+    body = msgspec.msgpack.encode({"files": {"step": "step.a"}, "version": 3})
+    (folder / state_store.CONTENTS).write_bytes(body)
+    store = FolderStore(tmp_path)
+    assert store.load("mapper") == {"step": [1]}
+    store.keep("mapper", 1, 0).write()
+    assert (folder / state_store.CONTENTS).read_bytes() == body
+    (folder / "step.1").write_bytes(state_codec.encode_state([2]))
+    with pytest.raises(DamagedStateError, match="checksum"):
+        store.load("mapper", 1)
 
 
 @pytest.mark.parametrize("value", [{1, object()}, np.array([object()])])
@@ -275,9 +352,9 @@ def test_files_are_synced_before_the_contents_list_them(
     synced.clear()
     store.save("mapper", {"same": same, "step": [2]})
     contents, new = state_store.CONTENTS, f"{state_store.CONTENTS}.new"
-    assert [name for name, _ in synced] == ["step.b", new, "mapper"]
-    assert new in synced[1][1]
-    assert synced[2][1] == [contents, "same.a", "step.a", "step.b"]
+    assert [name for name, _ in synced] == ["step.3", "mapper", new, "mapper"]
+    assert new in synced[2][1]
+    assert synced[3][1] == [contents, "same.1", "step.2", "step.3"]
     assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [2]}
 
 
@@ -293,6 +370,6 @@ def test_state_of_another_version_is_rejected_and_unchanged(
     file.write_bytes(msgspec.msgpack.encode(contents))
     before = {path.name: path.read_bytes() for path in file.parent.iterdir()}
     for use in (lambda s: s.load("mapper"), lambda s: s.save("mapper", {"step": [2]})):
-        with pytest.raises(DataError, match=f"version={version}, and this service reads 3"):
+        with pytest.raises(DataError, match=f"version={version}, and this service reads 3 and 4"):
             use(FolderStore(tmp_path))
     assert {path.name: path.read_bytes() for path in file.parent.iterdir()} == before

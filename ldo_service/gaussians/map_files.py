@@ -1,0 +1,36 @@
+"""Files to which the saved state of a map refers: offloaded Gaussians and keyframe images."""
+
+from pathlib import Path
+
+from .keyframe_store import KeyframeStore
+from .offloading import OffloadedGaussians
+
+
+class MapFiles:
+    """Files of a map, which the owner of its saved state notifies of each save."""
+
+    def __init__(self, offloaded: OffloadedGaussians, images: KeyframeStore) -> None:
+        self._offloaded = offloaded
+        self._folders = offloaded.files, images.files
+
+    def saved(self) -> None:
+        """Remove files that the last snapshot does not need; call it after saving that snapshot."""
+        self._offloaded.retired.saved()
+
+    def kept(self, *, is_previous_complete: bool) -> None:
+        """Remove files that no kept generation of the state needs; see `RetiredFiles.kept`."""
+        self._offloaded.retired.kept(is_previous_complete=is_previous_complete)
+
+    def unsynced_files(self) -> list[Path]:
+        """Return the files that may not be on the disk yet; see `ChecksummedFolder`."""
+        return [path for folder in self._folders for path in folder.unsynced_files()]
+
+    def begin_sync(self) -> None:
+        """Note that the caller begins to sync `unsynced_files`."""
+        for folder in self._folders:
+            folder.begin_sync()
+
+    def end_sync(self) -> None:
+        """Note that the files of the last `begin_sync` are on the disk."""
+        for folder in self._folders:
+            folder.end_sync()

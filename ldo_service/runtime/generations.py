@@ -1,0 +1,228 @@
+"""Older generations of the states of all actors, to which the service falls back.
+
+A power cut or a bad disk may damage the state that an actor saved after its last step. The actors
+of a service keep their states as a generation about once a second, while messages arrive. A
+generation is synced to the disk. The states of all actors in it belong together: no consumer has
+handled a message that its producer has not produced, and each producer still has all messages that
+a consumer has not handled.
+
+`GenerationKeeper` asks the actors one after the other, consumers first, so that a producer is newer
+than its consumers. It then compares the positions in all states. Only if they fit, it writes the
+number of the generation to the marker file, which completes the generation. The generation before
+is deleted when the next one is kept.
+"""
+
+import asyncio
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+
+from ldo_service.errors import DamagedStateError, DataError
+from ldo_service.storage.atomic_write import write_atomically
+from ldo_service.storage.state_contents import StateContents, read_contents
+from ldo_service.storage.state_store import CONTENTS, GENERATION, NEWEST, FolderStore
+
+from .delivery_state import OFFSETS, OUTBOX, RestoredState
+from .stage_commands import CommandSender
+
+log = logging.getLogger(__name__)
+
+MARKER = "generation.msgpack"  # File with the number of the last complete generation.
+# Time between two generations, seconds. A power cut loses the keyframes of this time and of the
+# time to sync a generation: at two keyframes per second, fewer than five.
+KEEP_EVERY_S = 1.0
+FAILURES_TO_LOG = 5  # Number of failures in a row after which one is logged.
+# Time that an actor has to keep its state, seconds. It includes a step of the actor.
+KEEP_WITHIN_S = 5.0
+# Actors whose states refer to each other. Each one saves a state before the first keyframe arrives.
+INTERDEPENDENT_ACTORS = ("tracker", "mapper", "optimizer")
+
+
+def completed_generation(store: FolderStore) -> int | None:
+    """Return the number of the last complete generation; None if there is none.
+
+    Raises:
+        DamagedStateError: The marker file is damaged.
+        DataError: Another version of the service wrote it.
+        OSError: It cannot be read.
+    """
+    marker = read_contents(store.folder / MARKER)
+    return marker.generation if marker else None
+
+
+def complete_generation(store: FolderStore, number: int) -> None:
+    """Write the number of a complete generation to the disk.
+
+    Raises:
+        OSError: The disk is full or cannot be written.
+    """
+    body = StateContents({}, generation=number).encode()
+    write_atomically(store.folder / MARKER, body, syncs=True)
+
+
+def next_generation(store: FolderStore) -> int:
+    """Return a number that no generation on the disk has."""
+    names = (
+        path.stem.rpartition("-")[2] for path in store.folder.glob("*/" + GENERATION.format("*"))
+    )
+    used = [int(name) for name in names if name.isdecimal()]
+    with suppress(DamagedStateError):
+        used.append(completed_generation(store) or 0)
+    return max(used, default=0) + 1
+
+
+def problem_of_states(
+    store: FolderStore, actors: Sequence[str], generation: int = NEWEST, *, is_quick: bool = False
+) -> DataError | str | None:
+    """Check that the states of all actors are undamaged and belong together.
+
+    Args:
+        store: Store of the states.
+        actors: The actors.
+        generation: Number of a generation; by default the states after the last steps.
+        is_quick: Read only the positions on each topic, and not the states themselves.
+
+    Returns:
+        None if the states are valid. The error of a damaged state. Otherwise a description of two
+        states that do not belong together.
+
+    Raises:
+        DataError: A state cannot be read because of the disk or a limit of the process, or another
+            version of the service wrote the state.
+    """
+    prefixes = (OFFSETS, OUTBOX) if is_quick else ("",)
+    pasts: dict[str, RestoredState] = {}
+    for actor in actors:
+        try:
+            pasts[actor] = RestoredState.of(store.load(actor, generation, prefixes))
+        except DamagedStateError as error:
+            return error
+    missing = [
+        actor
+        for actor in actors
+        if not store.exists(actor, generation)
+        and (actor in INTERDEPENDENT_ACTORS or (generation == NEWEST and store.is_kept(actor)))
+    ]
+    if missing and any(past.has_passed for past in pasts.values()):
+        return f"there is no state of {', '.join(missing)}, but there are states of other actors"
+    return next(_inconsistent_states(pasts), None)
+
+
+def _inconsistent_states(pasts: Mapping[str, RestoredState]) -> Iterator[str]:
+    """Describe each topic of which the saved states of producer and consumer do not fit.
+
+    The consumer has then handled messages of another run, or messages unknown to the producer,
+    whose saved state is older. Or the consumer's state is older, and needs messages that the
+    producer no longer has.
+    """
+    for producer, past in pasts.items():
+        for topic, made in past.outputs.items():
+            for consumer, other in pasts.items():
+                had = other.inputs.get(topic)
+                if had is None:
+                    continue
+                why = ""
+                if not had.handled or had.epoch == made.epoch:
+                    if had.handled > made.seq:
+                        newer = f"{consumer} is newer than {producer}, and has messages that "
+                        why = f"{newer}{producer} has not produced"
+                    elif had.handled < made.handled and made.logged_from is None:
+                        why = f"{consumer} lacks messages that {producer} no longer has"
+                else:
+                    why = f"{consumer} has messages of another run"
+                if why:
+                    yield (
+                        f"the states of {producer} and {consumer} do not belong together: {why} on "
+                        f"{topic}"
+                    )
+
+
+class GenerationKeeper:
+    """Task of a running service that keeps generations of the states of its actors."""
+
+    def __init__(self, commander: CommandSender, store: FolderStore, actors: Sequence[str]) -> None:
+        """Prepare the task; `run` starts it.
+
+        Args:
+            commander: Client of the stages.
+            store: Store of the states.
+            actors: Names of the actors, producers first.
+        """
+        self._commander, self._store = commander, store
+        self._actors = tuple(reversed(actors))
+        self._completed = 0
+        with suppress(DataError, OSError):  # The start of the service has logged the error.
+            self._completed = completed_generation(store) or 0
+        self._positions: list[str] = []
+        self._failures = 0  # Failed generations since the last complete one.
+        self.lock = asyncio.Lock()  # Held while a generation is kept, and during a reset.
+
+    async def run(self) -> None:
+        """Keep a generation every `KEEP_EVERY_S` seconds if messages were handled since."""
+        while True:
+            async with self.lock:
+                try:
+                    await self.keep()
+                except (OSError, DataError) as error:
+                    self._failed(str(error))
+            await asyncio.sleep(KEEP_EVERY_S)
+
+    async def keep(self) -> None:
+        """Keep one generation; the caller must hold `lock`.
+
+        If an actor does not answer, or if the states do not fit, the generation before stays the
+        last complete one.
+
+        Raises:
+            OSError: The disk is full or cannot be written.
+            DataError: A state cannot be read.
+        """
+        positions = await asyncio.to_thread(self._read_positions)
+        if positions == self._positions:
+            return
+        number = await asyncio.to_thread(next_generation, self._store)
+        for actor in self._actors:
+            details = number, self._completed
+            error = await self._commander.order("keep", actor, KEEP_WITHIN_S, details)
+            if error:
+                self._failed(f"{actor} {error}")
+                return
+        problem = await asyncio.to_thread(
+            problem_of_states, self._store, self._actors, number, is_quick=True
+        )
+        if problem:
+            self._failed(str(problem))
+            return
+        await asyncio.to_thread(complete_generation, self._store, number)
+        self._completed, self._positions = number, positions
+        self._failures = 0
+
+    def _failed(self, reason: str) -> None:
+        """Log the first of several failures in a row.
+
+        Single failures are normal: an actor may be busy, or a message was between two actors.
+        """
+        self._failures += 1
+        if self._failures == FAILURES_TO_LOG:
+            log.warning(
+                "the states cannot be kept as an older generation: %s. A power cut would lose all "
+                "keyframes since generation %d. If the disk is full, free some space.",
+                reason, self._completed,
+            )  # fmt: skip
+
+    def _read_positions(self) -> list[str]:
+        """Return names of files that change with each message on a lossless topic."""
+        contents = [read_contents(self._store.folder / a / CONTENTS) for a in self._actors]
+        return [each.files.get(OFFSETS, "") if each else "" for each in contents]
+
+
+def keep_stopped(store: FolderStore, actors: Sequence[str], number: int) -> None:
+    """Keep a complete generation of the states of actors that do not run.
+
+    Raises:
+        OSError: The disk is full or cannot be written.
+        DataError: A state cannot be read.
+    """
+    for actor in actors:
+        store.keep(actor, number, 0).write()
+    complete_generation(store, number)

@@ -1,0 +1,46 @@
+"""Files of one generation of an actor's state, which are copied and synced to the disk."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ldo_service.errors import DamagedStateError
+
+from .atomic_write import sync, write_atomically
+from .state_contents import StateContents, check_of
+
+
+@dataclass
+class GenerationFiles:
+    """Files that a generation adds to the disk; any thread may call `write`.
+
+    A generation has copies of its own, so that a damaged file of the current state leaves it whole.
+    A part that did not change since the last complete generation is not copied again.
+    """
+
+    folder: Path  # Folder of the actor's state.
+    list_name: str = ""  # Name of the list of the files; empty if the actor has no state.
+    contents: StateContents = field(default_factory=lambda: StateContents({}))
+    sources: dict[str, str] = field(default_factory=dict)  # File to copy, by part.
+    is_written: bool = False  # True once `write` has succeeded.
+
+    def write(self) -> None:
+        """Copy the files, write their list, and sync both.
+
+        Raises:
+            DamagedStateError: A file does not match its checksum.
+            OSError: A file cannot be read or written.
+        """
+        if not self.list_name:
+            return
+        for part, source in self.sources.items():
+            body = (self.folder / source).read_bytes()
+            if check_of(body) != self.contents.checks[part]:
+                raise DamagedStateError(
+                    f"{self.folder / source} is damaged: its {len(body)} bytes do not match their "
+                    "checksum"
+                )
+            copy = self.folder / self.contents.files[part]
+            copy.write_bytes(body)
+            sync(copy)
+        write_atomically(self.folder / self.list_name, self.contents.encode(), syncs=True)
+        self.is_written = True

@@ -1,0 +1,54 @@
+"""Store of the last state of each actor in memory."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from .state_store import State
+
+
+class MemoryStore:
+    """Store in memory; the states are lost when the process ends, but not when an actor fails."""
+
+    syncs = False
+
+    def __init__(self) -> None:
+        self._states: dict[str, State] = {}
+
+    def backlog_folder(self, actor: str) -> None:  # noqa: ARG002
+        """Return None: unhandled messages are kept in memory, as the states are."""
+        return
+
+    def quarantine_folder(self, actor: str) -> None:  # noqa: ARG002
+        """Return None: the deliveries of messages are not counted."""
+        return
+
+    def save(self, actor: str, state: State, unsynced: Iterable[Path] = ()) -> None:  # noqa: ARG002
+        """Replace the state of an actor; an empty state is ignored."""
+        if state:
+            self._states[actor] = dict(state)
+
+    def load(self, actor: str) -> State | None:
+        """Return the last state of an actor; None if there is none."""
+        return self._states.get(actor)
+
+    def delete(self, actor: str) -> None:
+        """Delete the state of an actor."""
+        self._states.pop(actor, None)
+
+    def keep(
+        self,
+        actor: str,  # noqa: ARG002
+        generation: int,  # noqa: ARG002
+        completed: int,  # noqa: ARG002
+        unsynced: Iterable[Path] = (),  # noqa: ARG002
+    ) -> None:
+        """Keep nothing: memory does not survive the process."""
+        return
+
+    def is_kept(self, actor: str) -> bool:  # noqa: ARG002
+        """Return False: there are no older generations."""
+        return False
+
+    def has_fallen_back(self, actor: str) -> bool:  # noqa: ARG002
+        """Return False: there are no older generations."""
+        return False

@@ -1,0 +1,134 @@
+"""Tests of the older generations of the states of several actors."""
+
+from pathlib import Path
+
+import pytest
+
+from ldo_service.errors import DamagedStateError
+from ldo_service.runtime.generations import (
+    MARKER,
+    complete_generation,
+    completed_generation,
+    keep_stopped,
+    next_generation,
+    problem_of_states,
+)
+from ldo_service.runtime.outbox import MAX_RETAINED_BYTES, Outbox
+from ldo_service.storage.state_store import FolderStore
+from ldo_service.transport.flow_control import UnackedMessage
+
+ACTORS = ("tracker", "mapper", "optimizer")
+TOPIC = "keyframe/new"
+
+
+def save_producer(store: FolderStore, seq: int, unhandled: tuple[int, ...] = ()) -> None:
+    sent = {f"stage.outbox keyframe.new {n}": UnackedMessage(n, b"", b"") for n in unhandled}
+    offsets = {"in": {}, "out": {TOPIC: (1, seq, None)}}
+    store.save("tracker", {"now": [seq], "stage.offsets": offsets, **sent})
+
+
+def save_consumer(store: FolderStore, actor: str, handled: int, epoch: int = 1) -> None:
+    offsets = {"in": {TOPIC: (epoch, handled)}, "out": {}}
+    store.save(actor, {"map": [handled], "stage.offsets": offsets})
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> FolderStore:
+    """A store of a producer with eight messages, of which two are unhandled."""
+    store = FolderStore(tmp_path / "state")
+    save_producer(store, 8, (6, 7))
+    save_consumer(store, "mapper", 6)
+    save_consumer(store, "optimizer", 8)
+    return store
+
+
+# --- states that belong together ------------------------------------------------------------------
+def test_states_with_all_unhandled_messages_belong_together(store: FolderStore) -> None:
+    for is_quick in (False, True):
+        assert problem_of_states(store, ACTORS, is_quick=is_quick) is None
+
+
+@pytest.mark.parametrize(
+    ("handled", "epoch", "text"),
+    [
+        (9, 1, "mapper is newer than tracker"),
+        (5, 1, "mapper lacks messages that tracker no longer has"),
+        (0, 0, "mapper lacks messages that tracker no longer has"),
+        (7, 2, "mapper has messages of another run"),
+    ],
+)
+def test_states_that_do_not_fit_are_described(
+    store: FolderStore, handled: int, epoch: int, text: str
+) -> None:
+    save_consumer(store, "mapper", handled, epoch)
+    for is_quick in (False, True):
+        assert text in str(problem_of_states(store, ACTORS, is_quick=is_quick))
+
+
+def test_missing_state_that_an_older_generation_has_is_a_problem(store: FolderStore) -> None:
+    save_consumer(store, "loop_closer", 8)
+    assert problem_of_states(store, (*ACTORS, "loop_closer")) is None
+    store.save("frame_source", {"last_stamp_ns": 1})  # It has no lossless links.
+    everyone = (*ACTORS, "loop_closer", "frame_source")
+    keep_stopped(store, everyone, 1)
+    for is_quick in (False, True):
+        assert problem_of_states(store, everyone, is_quick=is_quick) is None
+    (store.folder / "loop_closer" / "contents.msgpack").unlink()
+    assert "no state of loop_closer" in str(problem_of_states(store, everyone))
+
+
+# --- number of the generation ---------------------------------------------------------------------
+def test_number_of_a_generation_is_never_used_again(store: FolderStore) -> None:
+    assert completed_generation(store) is None
+    keep_stopped(store, ACTORS, next_generation(store))
+    assert completed_generation(store) == 1
+    store.keep("mapper", next_generation(store), 1).write()  # Generation 2 is never complete.
+    assert next_generation(store) == 3
+    complete_generation(store, 5)
+    assert next_generation(store) == 6
+    (store.folder / MARKER).write_bytes(b"")
+    with pytest.raises(DamagedStateError):
+        completed_generation(store)
+    assert next_generation(store) == 3
+
+
+# --- messages for the consumers of the next generation --------------------------------------------
+def outbox_of(count: int, size: int = 1) -> Outbox:
+    return Outbox(UnackedMessage(n, b"", bytes(size)) for n in range(count))
+
+
+def test_messages_handled_since_the_generation_before_are_retained() -> None:
+    outbox = outbox_of(30)
+    outbox.keep(3, is_previous_complete=False)
+    outbox.forget(7)
+    assert outbox.in_memory[0].seq == 3
+    outbox.keep(10, is_previous_complete=True)
+    outbox.forget(12)
+    assert outbox.in_memory[0].seq == 3, "consumers of this generation may be at 3"
+    for handled in (15, 20):
+        outbox.keep(handled, is_previous_complete=True)
+    outbox.forget(25)
+    assert outbox.in_memory[0].seq == 10
+    assert outbox.first_needed(25) == 10
+
+
+def test_generation_that_is_not_complete_releases_no_messages() -> None:
+    outbox = outbox_of(30)
+    for handled in (3, 10, 15, 20):
+        outbox.keep(handled, is_previous_complete=False)
+    outbox.forget(25)
+    assert outbox.in_memory[0].seq == 3
+
+
+def test_retained_messages_do_not_exceed_their_maximum_size() -> None:
+    outbox = outbox_of(11, size=MAX_RETAINED_BYTES // 10)
+    outbox.keep(0, is_previous_complete=False)
+    outbox.forget(9)
+    assert outbox.in_memory[0].seq == 9
+
+
+def test_outbox_without_generations_retains_nothing() -> None:
+    outbox = outbox_of(5)
+    outbox.forget(4)
+    assert [message.seq for message in outbox.in_memory] == [4]
+    assert outbox.first_needed(4) == 4
