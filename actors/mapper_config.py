@@ -16,8 +16,9 @@ class MapperConfig:
 
     builder: MapBuilderConfig = field(default_factory=MapBuilderConfig)
     semantics: SemanticMapConfig = field(default_factory=SemanticMapConfig)
-    # Optimization iterations per keyframe. Fewer run where the map is dense or keyframes wait. With
-    # this value, the service reaches 12 FPS on two cores at 640x480.
+    # Effort of the optimizer for each keyframe, in iterations at full resolution. More iterations
+    # run, because most of them have half the resolution; fewer run where the map is dense or
+    # keyframes wait. With this value, the service reaches 12 FPS on two cores at 640x480.
     iterations: int = 12
     # Minimum iterations per keyframe, however many keyframes wait: new Gaussians need some.
     min_iterations: int = 3

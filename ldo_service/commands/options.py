@@ -123,7 +123,7 @@ Json = Annotated[bool, argument(help="print one JSON document and nothing else")
 
 
 def with_topics(settings: tuple[str, ...], topics: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the settings of --set, followed by one setting with all topics of --topic."""
+    """Return the settings of --set, followed by one setting with all topics of --topic, if any."""
     return (*settings, f"dataset.topics=[{', '.join(topics)}]") if topics else settings
 
 

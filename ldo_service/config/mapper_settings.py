@@ -184,8 +184,8 @@ class RefitSettings:
 class MapperSettings:
     """Map of Gaussians and of objects."""
 
-    # Optimizer iterations for each keyframe. The default gives 12 frames per second on two cores at
-    # 640x480.
+    # Effort of the optimizer for each keyframe, in iterations at full resolution; most iterations
+    # have half the resolution. The default gives 12 frames per second on two cores at 640x480.
     iterations: NonNegativeInt = 12
     # Threads of the renderer. 0 uses all cores but one, which is left for the tracker.
     threads: NonNegativeInt = 0

@@ -144,7 +144,8 @@ class OpenNames:
 
         Args:
             frame: Ground-truth labels of the view.
-            truth: True index in the list, or VOID, [H, W] uint8.
+            truth: Index of the true name in the list of names of this object, or VOID,
+                [H, W] uint8.
             shown: Labels of the map, [H, W] uint8.
         """
         self._add_pixels(truth, shown)

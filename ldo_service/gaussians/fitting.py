@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import islice, zip_longest
 from math import inf
 from typing import Any
@@ -168,7 +169,7 @@ class Fitting:
         plan: Iterable[int],
         rates: tuple[float, float] = (1.0, 1.0),
         effort: float = inf,
-        half_first: bool = False,
+        starts_half: bool = False,
         observe: Observer | None = None,
     ) -> np.ndarray:
         """Run one iteration for each usable keyframe of the plan.
@@ -181,33 +182,33 @@ class Fitting:
             plan: Keyframes, in the order of the iterations.
             rates: Factors on the learning rates at the first and at the last iteration.
             effort: Limit of the computation; see `GaussianOptimizer.optimize`.
-            half_first: Start at half resolution; see `GaussianOptimizer.optimize`.
+            starts_half: Start at half resolution; see `GaussianOptimizer.optimize`.
             observe: Function that receives the visible Gaussians of each iteration.
 
         Returns:
             Mask [N] of the Gaussians that changed.
         """
         steps_before = self._optimizer.steps(gaussians).copy()
-        plan = list(plan)
-        usable = {k for k in set(plan) if self._is_usable(k)}
-        self.unusable += len(set(plan)) - len(usable)
-        plan = [k for k in plan if k in usable]
+        is_usable = cache(self._is_usable)
         first = next(iter(self._views.poses), None)
         losses = self._optimizer.optimize(
             gaussians,
             self._views,
-            plan,
+            list(plan),
             rates=rates,
             fixed=first,
             effort=effort,
-            half_first=half_first,
+            starts_half=starts_half,
             observe=observe,
+            is_usable=is_usable,
         )
         self.iterations += len(losses)
         return self._optimizer.steps(gaussians) != steps_before
 
     def _is_usable(self, keyframe: int) -> bool:
-        return self._is_resident(keyframe) and self._views.is_readable(keyframe)
+        is_usable = self._is_resident(keyframe) and self._views.is_readable(keyframe)
+        self.unusable += not is_usable
+        return is_usable
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state of the Gaussian optimizer."""

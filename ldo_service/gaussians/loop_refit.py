@@ -38,8 +38,7 @@ class LoopRefitConfig:
     # Iterations after the deduplication of each keyframe. A new keyframe gets at least this number
     # (`MapperConfig.min_iterations`).
     deduplication_iterations: int = 3
-    # Refit iterations for each displaced keyframe, half of them on other keyframes. A new keyframe
-    # gets the same number of iterations.
+    # Refit iterations for each displaced keyframe, half of them on other keyframes.
     iterations: int = 12
     # Number of pending refit iterations that run with each new keyframe if no further keyframe
     # waits; mapping then takes 50 % longer. The other pending iterations run while no keyframe
@@ -135,7 +134,7 @@ class LoopRefit:
 
     @property
     def deduplication_iterations(self) -> int:
-        """Number of iterations that follow the deduplication done with the next new keyframe."""
+        """Number of iterations after the deduplication that the next new keyframe triggers."""
         config = self.config
         return config.deduplication_iterations * min(
             config.deduplicated_per_keyframe, len(self._to_deduplicate)

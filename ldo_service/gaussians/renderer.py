@@ -118,8 +118,8 @@ class Rasterizer:
             tiles: [ceil(H / 16), ceil(W / 16)] uint8. Tiles with value 0 are not rendered, and
                 their pixels are zero. Pass the same array to `image_loss`, so that it ignores these
                 tiles.
-            binning: Side of the square of pixels of the full image that each pixel averages, such
-                as 2 for `Camera.halved`. The splats are averaged in the same way.
+            binning: Number of full-image pixels along each side of a pixel: 1, or 2 for
+                `Camera.halved`. Splats are averaged over the pixel.
 
         Returns:
             Planes [5, H, W] float32: red, green, blue, weighted depth sum w_i z_i in meters, and

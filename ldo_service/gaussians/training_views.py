@@ -17,9 +17,7 @@ from ldo_service.kernels import _align
 
 from .exposure import Exposure
 
-# Difference of depths in a block of 2x2 pixels above which they belong to different surfaces, as a
-# fraction of the nearest one. It is that of the tracker's pyramid.
-MAX_DEPTH_STEP = 0.03
+ANY_DIFFERENCE = 1e3  # Relative difference of depths in a block that no two depths reach.
 _LEVEL = 1  # Compression level of zstd.
 # A depth image that compresses to less than this fraction of its size counts as quantized: the
 # sensor measures in steps, so the same bytes repeat.
@@ -57,8 +55,8 @@ class TrainingView:
     def halved(self) -> "TrainingView":
         """Return the view at half resolution; each pixel averages a block of 2x2 pixels.
 
-        Depths that differ by more than MAX_DEPTH_STEP from the nearest one of their block are left
-        out of its average. A block is masked if one of its pixels is.
+        A block has a depth if all of its pixels have one. The average includes all surfaces of the
+        block, like the depth of a rendering. A block is masked if any of its pixels is masked.
         """
         camera = self.camera.halved()
         size = (camera.width, camera.height)
@@ -71,7 +69,7 @@ class TrainingView:
             upper, lower = mask[rows, columns][::2], mask[rows, columns][1::2]
             both = np.minimum(upper, lower)
             mask = np.minimum(both[:, ::2], both[:, 1::2])
-        depth_m = _align.halve(np.ascontiguousarray(self.depth_m), MAX_DEPTH_STEP)
+        depth_m = _align.halve(np.ascontiguousarray(self.depth_m), ANY_DIFFERENCE, 4)
         return replace(self, camera=camera, color=color, depth_m=depth_m, mask=mask)
 
 

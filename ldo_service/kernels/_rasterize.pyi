@@ -128,14 +128,15 @@ def rasterize_planes(
         bounds: Bounds of the blocks of these rows, as for `rasterize`.
         tiles: Tiles to render, [ceil(H / 16), ceil(W / 16)]. The planes of tiles with value 0 are
             zero and are not computed. None renders all tiles.
-        binning: Side of the square of pixels of the full image that each pixel averages, 1 to 64.
+        binning: Number of full-image pixels along each side of a pixel, 1 or 2. Splats are averaged
+            over the pixel.
 
     Returns:
         The number V of Gaussians that may touch the image.
 
     Raises:
         ValueError: As for `rasterize`, `tiles` has the wrong shape, type or strides, or `binning`
-            is out of range.
+            is neither 1 nor 2.
     """
 
 def backpropagate(

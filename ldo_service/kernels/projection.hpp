@@ -1,7 +1,7 @@
 // Projection of Gaussians in the map to splats in the image. The method is EWA splatting (Zwicker
 // et al. 2001), with the low-pass filter and the clamped Jacobian of Kerbl et al. 2023 (sec. 4 and
-// the published code). A binned image also averages the splats over its wider pixels. This keeps
-// their integrals, so that the peaks become lower (Yu et al., "Mip-Splatting", 2024).
+// the published code). In a binned image, each splat is also averaged over the wider pixel. Its
+// integral stays the same, so its peak is lower (Yu et al., "Mip-Splatting", 2024).
 #pragma once
 #include <algorithm>
 
@@ -131,7 +131,7 @@ struct Projection {
     const Floats determinant = uu * vv - uv * uv;
     const Floats scale = Floats(-0.5f * kLog2e) / determinant;
     Floats log2_opacity = Floats(0.0f) - log2(Floats(1.0f) + exp(Floats(0.0f) - column(kOpacity)));
-    if (view.box > 0.0f) {  // The peak of the splat, averaged over the wider pixels.
+    if (view.box > 0.0f) {  // Averaging over the wider pixel lowers the peak of the splat.
       const Floats narrow = (uu - view.box) * (vv - view.box) - uv * uv;
       log2_opacity = log2_opacity + (log2(narrow) - log2(determinant)) * 0.5f;
     }

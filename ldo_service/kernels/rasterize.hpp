@@ -24,16 +24,8 @@ struct View {
   float fx, fy, cx, cy;    // Pixels; pixel centers at integers.
   int width, height;
   float low_pass = 0.3f;  // Variance that the image adds to each splat, px^2.
-  float box = 0.0f;  // Part of low_pass by which a binned pixel is wider than a full one, px^2.
+  float box = 0.0f;       // Part of low_pass that comes from binning, px^2.
 };
-
-// Set the filter of an image whose pixels average `binning` x `binning` pixels of the full image.
-// The full image has a low-pass filter of 0.3 px^2. A box of width b has the variance b^2 / 12.
-inline void set_binning(View& view, int binning) {
-  const float full = 1.0f / static_cast<float>(binning * binning);  // Area of a full pixel.
-  view.box = (1.0f - full) / 12.0f;
-  view.low_pass = 0.3f * full + view.box;
-}
 
 // Bound of a block of kBlockRows consecutive rows. Keyframes add Gaussians in the order of their
 // pixels, so that a block covers a small patch of surface. Blocks out of view are not read.

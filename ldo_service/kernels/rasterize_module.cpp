@@ -18,7 +18,6 @@ namespace ldo {
 namespace {
 
 constexpr int kMaxSide = 32768;             // Pixels.
-constexpr int kMaxBinning = 64;             // Full pixels along each side of a binned pixel.
 constexpr int64_t kMaxGaussians = 1 << 27;  // Splats are counted with 32 bits.
 
 Isa isa = Isa::baseline;  // Set when the module is imported.
@@ -146,10 +145,12 @@ View view_of(const Array& T_camera_map, float fx, float fy, float cx, float cy, 
   require(width >= 1 && width <= kMaxSide && height >= 1 && height <= kMaxSide,
           "width and height must be 1 to " + std::to_string(kMaxSide) + " pixels, got " +
               std::to_string(width) + " x " + std::to_string(height) + ".");
-  require(binning >= 1 && binning <= kMaxBinning,
-          "binning must be 1 to " + std::to_string(kMaxBinning) + ".");
+  require(binning == 1 || binning == 2, "binning must be 1 or 2.");
   View view{{}, fx, fy, cx, cy, width, height};
-  set_binning(view, binning);
+  if (binning == 2) {                   // Each pixel is the mean of 2 x 2 full pixels.
+    view.box = (1.0f - 0.25f) / 12.0f;  // A box of width b has the variance b^2 / 12.
+    view.low_pass = 0.25f * view.low_pass + view.box;
+  }
   const float* T = values_of<float>(T_camera_map, "T_camera_map");
   bool finite = std::isfinite(fx) && std::isfinite(fy) && std::isfinite(cx) && std::isfinite(cy);
   for (int i = 0; i < 12; ++i) finite = finite && std::isfinite(view.T_camera_map[i] = T[i]);

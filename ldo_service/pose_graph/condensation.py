@@ -75,7 +75,7 @@ class CondensedKeyframes:
         return {int(k): row for row, k in enumerate(self.keyframes)}
 
     def interpolated_poses(self, T_heads: np.ndarray, T_tails: np.ndarray) -> np.ndarray:
-        """Return T_map_keyframe [F, 4, 4] from the poses of heads and tails in the map.
+        """Return T_map_keyframe [F, 4, 4], between the variables before and after each keyframe.
 
         Args:
             T_heads: T_map_head of each condensed keyframe, [F, 4, 4].

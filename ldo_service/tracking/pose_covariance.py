@@ -14,10 +14,10 @@ and depth, contradict each other. The second term has the shape of H^-1 and the 
 first one. It covers directions in which the few gradients are small by coincidence. Its factor is
 at least 1, the value for independent residuals. `PRIOR` makes H regular.
 
-Errors that all cells have in common, such as a depth bias that looks like a rotation, cancel in
-neither cue, but color and depth then favor different poses. `contradiction` compares the poses that
-color alone and depth alone would yield. The covariance grows along the directions in which they
-contradict each other. Conventions: `ldo_service.geometry`.
+Errors that all cells have in common do not show in the spread of the cells. An example is a depth
+bias that looks like a rotation. Color and depth then favor different poses, so `contradiction`
+compares the poses that color alone and depth alone would yield. The covariance grows along the
+directions in which they contradict each other. Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass

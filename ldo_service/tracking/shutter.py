@@ -152,7 +152,10 @@ class ShutterState:
         return replace(self, reference_velocity=None, has_new_reference=True)
 
     def recorrected(self) -> "ShutterState":
-        """Return the state after another correction of the images; earlier evidence counts less."""
+        """Return the state after the correction of the images was replaced.
+
+        Earlier evidence then counts less.
+        """
         return replace(self, evidence=self.evidence.scaled(EARLIER_WEIGHT), pending=None)
 
     def _with_equations(self, equations: np.ndarray, config: ShutterConfig) -> "ShutterState":

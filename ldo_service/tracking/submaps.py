@@ -161,8 +161,8 @@ class Submaps:
         """Return the state after a LOST frame.
 
         Args:
-            thumbnail: Thumbnail of the frame, [300] int8; None if the frame was not searched,
-                because it has too little depth.
+            thumbnail: Thumbnail of the frame, [300] int8; None if the frame has too little depth
+                to search the keyframes for its place.
             config: Settings.
         """
         after = replace(self, frames_since_search=self.frames_since_search + 1)

@@ -204,9 +204,9 @@ def test_unusable_model_is_a_configuration_error_only_when_needed(capsys, folder
 
 
 # --- live -----------------------------------------------------------------------------------------
-def test_query_without_a_running_service_is_a_configuration_error(capsys) -> None:
+def test_query_without_a_running_service_has_its_own_exit_code(capsys) -> None:
     code, _, err = ldo(capsys, "query", "live", "chair", "--endpoint", free_endpoint())
-    assert code == 2
+    assert code == 6
     assert_one_paragraph(err)
 
 

@@ -26,9 +26,9 @@ def test_folder_without_a_run_is_bad_data(capsys, tmp_path: Path, name: str) -> 
     assert_one_paragraph(err)
 
 
-def test_view_without_a_running_service_is_a_configuration_error(capsys) -> None:
+def test_view_without_a_running_service_has_its_own_exit_code(capsys) -> None:
     code, _, err = ldo(capsys, "view", "live", "--endpoint", free_endpoint())
-    assert code == 2
+    assert code == 6
     assert_one_paragraph(err)
 
 

@@ -13,6 +13,7 @@ from ldo_service.gaussians import (
     ImageLoss,
     TrainingView,
     densify,
+    exposure,
     render,
 )
 from ldo_service.geometry import se3
@@ -173,6 +174,8 @@ def test_step_counts_increase_exactly_for_changed_gaussians(start: tuple) -> Non
     [
         {"exposure_share": -0.1},
         {"exposure_share": 1.1},
+        {"half_share": -0.1},
+        {"half_share": 1.1},
         {"translation_rate_m": -1.0},
         {"max_needle_ratio": 0.5},
         {"max_sigma_px": 0.0},
@@ -192,12 +195,12 @@ def test_effort_weights_iterations_by_visible_gaussians(start: tuple) -> None:
     assert 1 <= lengths[0] < lengths[1] < lengths[2] <= 16
 
 
-def in_half_resolution(start: tuple, plan: list[int], **changes) -> tuple:
+def in_half_resolution(start: tuple, plan: list[int], *, threads: int = 1, **changes) -> tuple:
     """Return map and views after half of the effort at half resolution, and the visible rows."""
     config = replace(GaussianOptimizerConfig(usual_reach=1000, half_share=0.5), **changes)
     gaussians, views, seen = copied(start[0]), list(start[1]), []
-    GaussianOptimizer(config).optimize(
-        gaussians, views, plan, fixed=0, effort=8, half_first=True,
+    GaussianOptimizer(config, threads=threads).optimize(
+        gaussians, views, plan, fixed=0, effort=8, starts_half=True,
         observe=lambda _, visible: seen.append((visible.indices.copy(), visible.weights.copy())),
     )  # fmt: skip
     return gaussians, views, seen
@@ -212,10 +215,40 @@ def test_iterations_at_half_resolution_improve_the_full_images(start: tuple) -> 
     for before, after in zip(start[1], views, strict=True):
         assert after.color is before.color
         assert after.camera == before.camera
-    assert not np.array_equal(views[2].T_map_camera, start[1][2].T_map_camera)
-    assert views[2].exposure != start[1][2].exposure
-    again = in_half_resolution(start, alternating(90), **rates)[0]
+    again = in_half_resolution(start, alternating(90), threads=2, **rates)[0]
     np.testing.assert_array_equal(again.rows, gaussians.rows)
+
+
+def test_iterations_at_half_resolution_change_pose_and_exposure(
+    start: tuple, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exposure, "MIN_BLOCK_PX", 2)  # The images are small.
+    rates = {"rotation_rate_rad": 1e-5, "translation_rate_m": 1e-5}
+    _, views, seen = in_half_resolution(start, alternating(6), half_share=1.0, **rates)
+    assert len(seen) == 6
+    assert not np.array_equal(views[2].T_map_camera, start[1][2].T_map_camera)
+    assert (views[2].exposure.matrix != start[1][2].exposure.matrix).any()
+
+
+def test_size_limit_counts_full_pixels(start: tuple) -> None:
+    config = GaussianOptimizerConfig(max_sigma_px=1.5)
+    sigmas_m = []
+    for is_half in (False, True):
+        gaussians = copied(start[0])
+        step = GaussianOptimizer(config).step(gaussians, start[1][2], is_half=is_half)
+        moved = step.visible.indices[step.visible.weights > 0]
+        sigmas_m.append(np.exp(gaussians.rows[moved, 3:6]).max())
+    assert sigmas_m[1] == pytest.approx(sigmas_m[0], rel=0.1)
+
+
+def test_unusable_keyframes_get_no_iteration(start: tuple) -> None:
+    gaussians, views, seen = copied(start[0]), list(start[1]), []
+    losses = GaussianOptimizer().optimize(
+        gaussians, views, alternating(9), observe=lambda k, _: seen.append(k),
+        is_usable=lambda k: k != 1,
+    )  # fmt: skip
+    assert seen == [2, 0, 2, 0, 2, 0]
+    assert len(losses) == 6
 
 
 def test_weights_at_half_resolution_count_full_pixels(start: tuple) -> None:
@@ -235,7 +268,13 @@ def test_small_images_are_not_halved(start: tuple) -> None:
         color=np.ascontiguousarray(view.color[:, :16, :20]),
         depth_m=np.ascontiguousarray(view.depth_m[:16, :20]),
     )  # fmt: skip
-    half, full = (copied(start[0]) for _ in range(2))
-    GaussianOptimizer().step(half, small, is_half=True)
-    GaussianOptimizer().step(full, small)
-    np.testing.assert_array_equal(half.rows, full.rows)
+    lengths, rows = [], []
+    for starts_half in (True, False):
+        gaussians = copied(start[0])
+        losses = GaussianOptimizer().optimize(
+            gaussians, [small], [0] * 30, effort=4, starts_half=starts_half
+        )
+        lengths.append(len(losses))
+        rows.append(gaussians.rows.copy())
+    assert lengths[0] == lengths[1] < 30
+    np.testing.assert_array_equal(*rows)

@@ -62,7 +62,7 @@ def render_reference(
 ) -> Rendering:
     """Render like `render`, in the precision of `rows`, without the early stop at T < 1e-4.
 
-    With `binning` > 1, each pixel averages a square of that many full pixels along each side.
+    With `binning` b, each pixel is the mean of b x b full pixels.
     """
     box = (1 - 1 / binning**2) / 12
     low_pass = 0.3 / binning**2 + box
