@@ -58,8 +58,8 @@ struct ProjectionGradient {
                  n_vv = Kuv * sums[kVxy] + Kvv * sums[kVyy];
     Floats two_S_uu = n_uu * Kuu + n_uv * Kuv, two_S_uv = n_uu * Kuv + n_uv * Kvv,
            two_S_vv = n_vu * Kuv + n_vv * Kvv;
-    if (view.box >
-        0.0f) {  // With binning, ln alpha has the further term ln(|S - box I| / |S|) / 2.
+    // Binning adds the term ln(|S - box I| / |S|) / 2 to ln alpha.
+    if (view.box > 0.0f) {
       const Floats nn = uu - view.box, mm = vv - view.box;
       const Floats narrow = sums[kV] / (nn * mm - uv * uv);
       two_S_uu = two_S_uu + mm * narrow - sums[kV] * Kuu;

@@ -13,10 +13,15 @@ from ldo_service.gaussians import (
     ImageLoss,
     TrainingView,
     densify,
-    exposure,
     render,
 )
 from ldo_service.geometry import se3
+
+
+@pytest.fixture(autouse=True)
+def _small_images_are_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Halve the images of these tests, which have 80x60 pixels."""
+    monkeypatch.setattr("ldo_service.gaussians.optimizer.MIN_HALVED_PX", 32)
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +227,7 @@ def test_iterations_at_half_resolution_improve_the_full_images(start: tuple) -> 
 def test_iterations_at_half_resolution_change_pose_and_exposure(
     start: tuple, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(exposure, "MIN_BLOCK_PX", 2)  # The images are small.
+    monkeypatch.setattr("ldo_service.gaussians.exposure.MIN_BLOCK_PX", 2)  # The images are small.
     rates = {"rotation_rate_rad": 1e-5, "translation_rate_m": 1e-5}
     _, views, seen = in_half_resolution(start, alternating(6), half_share=1.0, **rates)
     assert len(seen) == 6
