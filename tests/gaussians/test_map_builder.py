@@ -99,7 +99,7 @@ def test_darker_keyframe_keeps_the_brightness_of_the_map(posed_frames: dict) -> 
         6: (replace(frame, color=(0.7 * frame.color + 8).astype(np.uint8)), T),
     }
     builder = build_map(darkened, iterations=4)
-    assert np.abs(builder.views.exposures[1].gain - 0.7).max() < 0.06
+    assert np.abs(builder.views.exposures[1].gain - 0.7).max() < 0.07  # A prior pulls it to 1.
     undarkened = build_map(posed_frames, iterations=4)
     assert mean_psnr(builder, posed_frames) > mean_psnr(undarkened, posed_frames) - 1.5
 
