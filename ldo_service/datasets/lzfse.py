@@ -27,8 +27,9 @@ def decoded_bytes(data: bytes) -> int | None:
     """Compute the decompressed size of a stream from the headers of its blocks.
 
     Returns:
-        The number of bytes. None if the stream is damaged, or if a block could grow to more than
-        MATCH_BYTES / MIN_BYTES_PER_MATCH times the size that its header declares.
+        The number of bytes. None if the stream is damaged, or if the decoder could write more than
+        MATCH_BYTES / MIN_BYTES_PER_MATCH times the decompressed size that the header of a block
+        declares.
     """
     total, position = 0, 0
     try:
