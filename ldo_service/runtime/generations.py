@@ -95,6 +95,8 @@ def problem_of_states(
     for actor in actors:
         try:
             pasts[actor] = RestoredState.of(store.load(actor, generation, prefixes))
+            if not is_quick:
+                store.check_unsynced(actor, generation)
         except DamagedStateError as error:
             return error
     missing = [

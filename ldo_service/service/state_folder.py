@@ -16,7 +16,7 @@ from ldo_service.runtime.generations import (
     next_generation,
     problem_of_states,
 )
-from ldo_service.storage.atomic_write import make_folder, sync_all, with_folders
+from ldo_service.storage.atomic_write import make_folder
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 log = logging.getLogger(__name__)
@@ -104,7 +104,7 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
         _fall_back(store, actors, problem, older)
     try:
         for actor in actors:
-            sync_all(with_folders(store.unsynced_files(actor)))
+            store.sync_files(actor)
         if older is None:
             make_folder(store.folder)
             keep_stopped(store, actors, next_generation(store))

@@ -16,7 +16,7 @@ import msgspec
 
 from ldo_service.errors import DamagedStateError, DataError
 
-from .atomic_write import make_folder, sync, write_atomically
+from .atomic_write import make_folder, sync, sync_all, with_folders, write_atomically
 from .checksummed_folder import read_checked
 from .generation_files import GenerationFiles
 from .state_codec import encode_state
@@ -183,22 +183,33 @@ class FolderStore:
             raise
         return StateContents(files, checks=checks)
 
-    def _check_unsynced(self, contents: StateContents) -> None:
-        for file in contents.unsynced:
-            try:
-                read_checked(self.folder.parent / file)
-            except DataError as error:
-                raise ValueError(str(error)) from error
-
-    def unsynced_files(self, actor: str) -> list[Path]:
-        """Return the files to which the saved state refers, and which may not be synced.
+    def check_unsynced(self, actor: str, generation: int = NEWEST) -> None:
+        """Check, at the start of a service, the files that a power cut may have damaged.
 
         Raises:
-            DataError: The list of files is damaged.
-            OSError: The list cannot be read.
+            DamagedStateError: A file is missing or damaged.
         """
-        contents = read_contents(self.folder / actor / CONTENTS)
-        return [self.folder.parent / file for file in contents.unsynced] if contents else []
+        contents = read_contents(self.folder / actor / _list_name(generation))
+        for file in contents.unsynced if contents else ():
+            try:
+                read_checked(self.folder.parent / file)
+            except (DataError, OSError) as error:
+                raise DamagedStateError(
+                    f"the state of {actor} in {self.folder / actor} is damaged: {error}"
+                ) from error
+
+    def sync_files(self, actor: str) -> None:
+        """Sync the files to which the saved state refers; the actor may then remove them.
+
+        Raises:
+            OSError: The disk is full, or a file cannot be read.
+        """
+        path = self.folder / actor / CONTENTS
+        contents = read_contents(path)
+        if contents and contents.unsynced:
+            sync_all(with_folders([self.folder.parent / file for file in contents.unsynced]))
+            synced = msgspec.structs.replace(contents, unsynced=())
+            write_atomically(path, synced.encode(), syncs=True)
 
     def _new_file(self, actor: str, part: str) -> str:
         """Return a file name that no other file of the actor has."""
@@ -232,8 +243,6 @@ class FolderStore:
                 for part in parts
                 if contents and part.startswith(prefixes)
             }
-            if contents and prefixes == ("",):
-                self._check_unsynced(contents)
         except (FileNotFoundError, ValueError) as error:  # A file name may contain a null byte.
             raise DamagedStateError(
                 f"the state of {actor} in {folder} is damaged: {error}"
