@@ -287,7 +287,8 @@ class Control:
             )
         self._is_paused = False
         if self._pause_marker is not None:
-            self._pause_marker.unlink(missing_ok=True)
+            with suppress(OSError):  # A restart then pauses the service again.
+                self._pause_marker.unlink(missing_ok=True)
         await self._each("resume", self._sources)
         return "frames are processed again."
 
@@ -318,7 +319,8 @@ class Control:
         await self._replace_generations()
         self._is_reset_pending = False
         if self._reset_marker is not None:
-            self._reset_marker.unlink(missing_ok=True)
+            with suppress(OSError):  # The next start then repeats the reset.
+                self._reset_marker.unlink(missing_ok=True)
         await self._resume_actors()
         still = " Frames stay paused." if self._is_paused else ""
         return f"{', '.join(self._actors)} restarted with an empty state.{still}"
