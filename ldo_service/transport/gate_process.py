@@ -89,7 +89,8 @@ class GateProcess:
         self._router_port = router_port
         stdin = self._process.stdin
         assert stdin is not None
-        with suppress(OSError):  # A process that has ended is started again with the new port.
+        # A process that has ended is started again with the new port; its input may be closed.
+        with suppress(OSError, ValueError):
             stdin.write(f"{router_port}\n")
             stdin.flush()
 
@@ -133,9 +134,21 @@ class GateProcess:
                 "machines connect again by themselves.",
                 process.returncode,
             )
-            self._process = self._start()
+            while not self._start_again():
+                if self._closing.wait(RESTART_AFTER_S):
+                    return
             if self._closing.is_set():
                 self._process.kill()
+
+    def _start_again(self) -> bool:
+        """Start the process, and return whether the machine had the memory and descriptors."""
+        try:
+            self._process = self._start()
+        except OSError as error:
+            log.error("service: the gate of the TLS port cannot be started: %s; trying again.",
+                      error.strerror)  # fmt: skip
+            return False
+        return True
 
 
 def _listen(network: Endpoint, host: str, port: int) -> socket.socket:

@@ -68,14 +68,19 @@ class KeyRenewal:
         while not self._closing.wait(self.PERIOD_S):
             now = _stamps(self._keys.folder)
             is_complete, self._seen = now == self._seen, now
-            if is_complete and now != self._used:
-                self._used = now
-                self._renew()
-            if time.monotonic() - self._warned_at_s > DAY_S:
-                self._warned_at_s = time.monotonic()
-                self._keys.warn_of_expiry(OF_SERVICE)
+            try:
+                if is_complete and now != self._used:
+                    self._renew()
+                    self._used = now
+                if time.monotonic() - self._warned_at_s > DAY_S:
+                    self._warned_at_s = time.monotonic()
+                    self._keys.warn_of_expiry(OF_SERVICE)
+            except Exception:  # The thread must look at the files again.
+                log.exception("service: the keys in %s could not be renewed; trying again in %g s.",
+                              self._keys.folder, self.PERIOD_S)  # fmt: skip
 
     def _renew(self) -> None:
+        """Use the keys in the folder, unless they are invalid."""
         port = free_port()
         try:
             keys = TlsKeys(self._keys.folder)
