@@ -27,7 +27,7 @@ from ldo_service.config import (
     recording_parameters,
     stage_parameters,
 )
-from ldo_service.errors import ConfigError, StageError
+from ldo_service.errors import ConfigError, LdoError
 from ldo_service.gaussians.map_builder import FILE_PATTERNS
 from ldo_service.recordings.actor_files import ActorFiles
 from ldo_service.recordings.recorder import Recorder
@@ -139,7 +139,7 @@ class Service:
             session = self._open_session(stack, health)
             try:
                 asyncio.run(self._serve(session, health))
-            except StageError as error:
+            except LdoError as error:
                 _leave_if_busy(error.exit_code, str(error))
                 raise
             _leave_if_busy(0, "stopped")
