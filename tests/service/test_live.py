@@ -153,6 +153,7 @@ def start_error(state: Path, exit_code: int) -> str:
     return done.stderr
 
 
+@pytest.mark.slow
 def test_child_processes_end_when_the_service_is_killed(tmp_path: Path) -> None:
     with live_service(tmp_path, *APART) as service:
         service.wait_for_actors()

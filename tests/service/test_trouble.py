@@ -121,6 +121,7 @@ def malformed_frames(good: CameraRgbd) -> Iterator[bytes]:
     yield bytes(65_000_000)  # Larger than service.max_decoded_message_mb.
 
 
+@pytest.mark.slow
 def test_malformed_frames_are_rejected_and_tracking_continues(
     tmp_path: Path, room: Sequence
 ) -> None:
@@ -155,6 +156,7 @@ def rejected(service: LiveService) -> int:
     return service.update_health()["frame_source"].inputs[0].rejected
 
 
+@pytest.mark.slow
 def test_tracking_recovers_after_frames_without_depth(tmp_path: Path, room: Sequence) -> None:
     """Color and depth come on two topics, and the depth is zero for some frames."""
     with live_service(tmp_path) as service:

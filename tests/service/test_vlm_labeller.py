@@ -51,6 +51,7 @@ def labeller_settings(url: str, *settings: str) -> tuple[str, ...]:
     return (*LIGHT, *(word for setting in use for word in ("--set", setting)))
 
 
+@pytest.mark.slow
 def test_added_label_is_used_for_later_regions(tmp_path: Path, room: Sequence) -> None:
     """The server always returns this label, which is rejected unless it is on the list."""
     (tmp_path / "names.txt").write_text("red\n")

@@ -127,6 +127,7 @@ def test_pose_is_as_exact_with_and_without_a_second_alignment(
         assert se3.distances(se3.inverse(T_true) @ result.T_odom_camera) < 0.014
 
 
+@pytest.mark.slow
 def test_camera_that_records_at_once_is_not_compensated(camera: MovingCamera) -> None:
     at_once = [camera.frame(i / RATE_HZ, ShutterTiming(), i) for i in range(COUNT)]
     odometry, poses = tracked(at_once, CONFIG)
