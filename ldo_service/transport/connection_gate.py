@@ -272,7 +272,7 @@ async def _run(listener: socket.socket, host: str, port: int, max_connections: i
     loop.add_reader(sys.stdin.fileno(), take_order)
     async with await loop.create_server(lambda: Side(gate), sock=listener):
         await parent_ended.wait()
-    os._exit(0)  # No connection needs to be closed in order, because the router is gone.
+    os._exit(0)  # The router is gone, so connections need not be closed in order.
 
 
 def main(arguments: list[str]) -> None:

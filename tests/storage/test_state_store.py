@@ -385,7 +385,7 @@ def test_file_that_an_actor_removes_after_the_start_does_not_damage_its_state(
     store = FolderStore(tmp_path / "state")
     store.save("mapper", {"map": [1]}, images.unsynced_files())
     store.check_unsynced("mapper")
-    FolderStore(tmp_path / "state").sync_files("mapper")  # As at the start of a service.
+    FolderStore(tmp_path / "state").sync_files("mapper")  # A starting service does this.
     for path in images.unsynced_files():
         path.unlink()
     again = FolderStore(tmp_path / "state")
