@@ -184,7 +184,9 @@ def shown_in(
     rng: np.random.Generator,
     framing: Framing,
 ) -> Shown:
-    """Cut one box out of its frame, with a random margin, offset and missing side.
+    """Cut one box out of its frame, with a random margin and offset.
+
+    Sometimes a part of the box at one of its four sides is cut off.
 
     Args:
         material: Training frames.
@@ -273,7 +275,8 @@ def embedded(graph: Graph, crops: str, output: str = "", with_mirror: bool = Tru
     """Add the image encoder to an ONNX graph.
 
     Args:
-        graph: Backend with the weights of the image encoder.
+        graph: Writer of ONNX nodes that has the weights of the image encoder. The nodes are added
+            to its graph.
         crops: Name of the tensor of normalized crops [N, 3, H, W].
         output: Name of the result; empty: an automatic name.
         with_mirror: True: the vectors of a crop and of its mirror image are added and scaled to

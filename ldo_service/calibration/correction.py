@@ -221,11 +221,11 @@ class CorrectionChange:
 
 
 def unbiased_depth(depth_m: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    """Add a bias to the inverse depth.
+    """Correct depth by adding a value to its inverse.
 
     Args:
         depth_m: Depth in meters, [...]; 0 where unknown, which stays 0.
-        bias: Bias of the inverse depth in 1/m, [...].
+        bias: Value to add to the inverse depth in 1/m, [...].
 
     Returns:
         Depth in meters, [...] in the type of `depth_m`.

@@ -117,7 +117,8 @@ def _texts_of(model: str, run: Path | None) -> Encode:
         had = None if run is None else _labeller_of(run)
         if had is None:
             raise TextComparisonError(
-                "there is no encoder pair for the comparison. Choose one with `--model NAME`."
+                "comparing the text with object names needs a text encoder, and the labeller of "
+                "this run has none. Choose a registered encoder pair with `--model NAME`."
             )
         try:
             return open_labeller(had.model, had.dual_encoder).texts.encode(texts)

@@ -192,8 +192,9 @@ class Record3DSequence(Sequence):
             is_valid = max(map(abs, found)) <= LAST_STAMP_NS and bool(np.all(np.diff(found) > 0))
         if not is_valid:
             raise DataError(
-                f"{self._path}: frameTimestamps of the metadata must be one ascending number of "
-                "seconds per frame, or fps a positive number. Export the recording again."
+                f"{self._path}: the metadata need frameTimestamps, a list with one time in seconds "
+                "for each frame, in ascending order, or fps, a positive number. Export the "
+                "recording again."
             )
         return np.array(found, np.int64)
 

@@ -122,13 +122,14 @@ def _of_metadata(text: str) -> tuple[str, ...]:
     if not isinstance(entry, list | tuple):
         raise ModelError(
             f"the entry `names` of the network's metadata is {text[:60]!r}. Expected: a list of "
-            "class names, or a dictionary of them with the keys 0, 1, 2 and so on. Give a file "
-            "with one name per line instead."
+            "class names, or a dictionary of them with the keys 0, 1, 2 and so on. Write the "
+            "names into a file, one per line, and run `ldo models add` with `--names FILE`."
         )
     if not all(map(is_name, entry)):
         raise ModelError(
             f"the network's metadata has class names that are not of 1 to {LONGEST} characters: "
-            f"{text[:60]!r}. Give a file with one name per line instead."
+            f"{text[:60]!r}. Write the names into a file, one per line, and run "
+            "`ldo models add` with `--names FILE`."
         )
     return tuple(entry)
 

@@ -68,7 +68,14 @@ class VisibilityCheck:
         self._largest_px = np.zeros(gaussians, np.float32)
 
     def observe(self, keyframe: int, visible: VisibleGaussians) -> None:
-        """Record the weights of one iteration; ignore keyframes that are not part of the check."""
+        """Record how much each Gaussian contributed to the image in one iteration on a keyframe.
+
+        Keyframes that are not part of the check are ignored.
+
+        Args:
+            keyframe: Keyframe of the iteration.
+            visible: Visible Gaussians with the sums of their blending weights.
+        """
         if keyframe == self._newest or keyframe in self.keyframes:
             self._seen.add(keyframe)
             before = self._largest_px[visible.indices]

@@ -182,7 +182,7 @@ class LoopRefit:
             fitting.threads = usual
 
     def at_end(self) -> None:
-        """Deduplicate at the end of the run, without iterations.
+        """Remove duplicate Gaussians at the end of the run, without iterations of the optimizer.
 
         Iterations could change keyframe poses, which are no longer published at the end.
         """

@@ -111,9 +111,16 @@ def objective(
     lambda_sem: float = 0.5,
     w_sem: float = 0.1,
 ) -> float:
-    """Return G(p) up to a constant.
+    """Return the cost G(p) of class distributions, which `ldo_service.pose_graph` defines.
 
-    Every pair of landmarks in `pairs` counts as similar, even if the likeliest labels differ.
+    A constant that does not depend on p is left out.
+
+    Args:
+        p: Class distribution [C] of each landmark, by landmark.
+        evidence: Observed distributions of each landmark, by landmark.
+        pairs: Pairs of landmarks that count as similar, even if their likeliest labels differ.
+        lambda_sem: Weight of the observations.
+        w_sem: Weight of the similarity.
     """
     observed = sum(
         evidence[k].weight * np.sum(p_k * np.log(p_k)) - p_k @ evidence[k].log_sum

@@ -143,7 +143,7 @@ class Recorder(Journal):
         produced: Iterable[Produced] = (),
         error: str = "",
     ) -> None:
-        """Record a finished step, unless its input was dropped.
+        """Record a finished step, unless the recorder had to drop its input (slow or full disk).
 
         Args:
             kind: Outcome of the step.

@@ -305,8 +305,8 @@ def limit_ratios(
         config: Settings.
 
     Returns:
-        The larger one of translation / max_translation and rotation / max_rotation_rad, [...].
-        Above 1, a new keyframe is needed.
+        The larger one of (translation / median depth) / max_translation and
+        rotation / max_rotation_rad, [...]. Above 1, a new keyframe is needed.
     """
     translation = se3.distances(T_keyframe_camera) / median_depth_m
     rotation_rad = se3.rotation_angles(T_keyframe_camera)

@@ -163,7 +163,13 @@ class Odometry:
         return self._map.correct(correction)
 
     def recorrect(self, change: CorrectionChange) -> None:
-        """Convert all keyframes to a new camera correction; the keyframe poses stay the same."""
+        """Correct the images of all keyframes by new estimates of the camera's errors.
+
+        The poses of the keyframes stay the same.
+
+        Args:
+            change: Correction that the images have now, and the new one.
+        """
         state = self._frames.state
         self._frames.restore(state.recorrected(change, self.config.pyramid))
 

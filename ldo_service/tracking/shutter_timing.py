@@ -209,11 +209,13 @@ class TimingEvidence:
     def estimate(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the times [3] of the shutter in seconds, and their standard deviations [3].
 
+        The times are the readout times of color and depth, and the delay of depth.
+
         The prior determines those times that the frames do not. The variances are the sum of two
         estimates. One is a jackknife over the groups, which allows for the similar errors of
         neighboring frames. The other follows from the information of the equations, because a
         jackknife over few groups may be small by chance. With too few groups, the result is that
-        of the prior alone, or None if no other estimate has set the prior.
+        of the prior alone. It is None if the prior is still the one that a new tracker has.
         """
         if len(self.groups) < MIN_GROUPS:
             if np.array_equal(self.prior, PRIOR):
