@@ -163,13 +163,7 @@ class Odometry:
         return self._map.correct(correction)
 
     def recorrect(self, change: CorrectionChange) -> None:
-        """Correct the images of all keyframes by new estimates of the camera's errors.
-
-        The poses of the keyframes stay the same.
-
-        Args:
-            change: Correction that the images have now, and the new one.
-        """
+        """Replace the camera correction of all keyframe images; their poses stay the same."""
         state = self._frames.state
         self._frames.restore(state.recorrected(change, self.config.pyramid))
 
