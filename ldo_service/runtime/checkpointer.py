@@ -14,6 +14,10 @@ from .delivery_state import DeliveryState, LoggedInput, RestoredState, restore_a
 
 log = logging.getLogger(__name__)
 
+# Number of unsynced files above which a save syncs them. Each saved state lists them, and only a
+# generation syncs them earlier: a service has about 20 of them between two generations.
+MAX_UNSYNCED_FILES = 100
+
 
 class Checkpointer:
     """Writer and reader of the saved state of one stage.
@@ -85,11 +89,13 @@ class Checkpointer:
             OSError: The state cannot be written, for example because the disk is full.
         """
         files = actor.files
-        if self._store.syncs and files is not None:  # First, because the state refers to them.
-            sync_all(with_folders(files.unsynced_files()))
+        unsynced = files.unsynced_files() if files else []
+        if files and (self._store.syncs or len(unsynced) > MAX_UNSYNCED_FILES):
+            sync_all(with_folders(unsynced))  # First, because the state refers to them.
             files.begin_sync()
             files.end_sync()
-        self._store.save(actor.name, state, files.unsynced_files() if files else ())
+            unsynced = []
+        self._store.save(actor.name, state, unsynced)
         if self.is_unsaved:
             self.is_unsaved = False
             log.info("%s: its state is saved again; no action needed.", actor.name)

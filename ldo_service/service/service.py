@@ -108,6 +108,8 @@ class Service:
     # this is the main process, which runs or starts all actors except `service.remote_actors`.
     only: tuple[str, ...] = ()
     is_router: bool = True  # Open a router; False: connect to the network's router.
+    # This process runs actors on another machine than the rest of the service.
+    is_remote: bool = False
     is_state_kept: bool = True  # The state folder remains after the service ends.
     metrics_port: int | None = None  # Port for Prometheus; None: no metrics server.
     recording: Path | None = None  # Folder of the recording; None: no recording.
@@ -255,12 +257,14 @@ class Service:
         assert make is not None
         config = self.config.with_map_folder(self.state / "map")
         parameters = actor_parameters(config)
+        # The state of a remote actor has no older generation, so each save has to be synced.
+        syncs = self.config.service.fsync or self.is_remote
         try:
             return Stage(
                 lambda: make(parameters),
                 transport,
                 config=stage_parameters(self.config),
-                store=FolderStore(self.state / "state", syncs=self.config.service.fsync),
+                store=FolderStore(self.state / "state", syncs=syncs),
                 expected={
                     out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
                 },

@@ -1,0 +1,31 @@
+"""Tests of the stages that a service creates, without starting them."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ldo_service.actors.topology import actor_spec
+from ldo_service.config import Config
+from ldo_service.service import service as module
+from ldo_service.service.service import Service
+from ldo_service.storage.state_store import FolderStore
+from ldo_service.transport.endpoint import Endpoint
+from ldo_service.transport.interface import MemoryTransport
+
+
+@pytest.mark.parametrize("is_remote", [True, False])
+async def test_only_an_actor_on_another_machine_syncs_every_step_by_default(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_remote: bool
+) -> None:
+    stores: list[FolderStore] = []
+
+    def stage(*_: object, store: FolderStore, **__: Any) -> None:
+        stores.append(store)
+
+    monkeypatch.setattr(module, "Stage", stage)
+    network = Endpoint("robot", "tcp/127.0.0.1:1")
+    service = Service(Config(), network, tmp_path, ("optimizer",), is_remote=is_remote)
+    service._stage(actor_spec("optimizer"), MemoryTransport(), {}, asyncio.Lock())
+    assert [store.syncs for store in stores] == [is_remote]
