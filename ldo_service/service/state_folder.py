@@ -16,13 +16,15 @@ from ldo_service.runtime.generations import (
     next_generation,
     problem_of_states,
 )
-from ldo_service.storage.atomic_write import make_folder
+from ldo_service.storage.atomic_write import make_folder, sync, write_atomically
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 log = logging.getLogger(__name__)
 
 # File that exists while a reset of the actors is not complete; see `Control`.
 RESET_MARKER = "reset"
+# File that exists while not all actors have fallen back to the older generation.
+FALL_BACK_MARKER = "falling_back"
 PAUSE_MARKER = "paused"  # File that exists while the service is paused.
 
 
@@ -100,7 +102,10 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
         log.error("%s. There is no older generation of the states until the next one is kept.",
                   error)  # fmt: skip
         older = None
-    if problem := problem_of_states(store, actors):
+    if (folder / FALL_BACK_MARKER).exists():
+        unfinished = "the previous start ended while the actors fell back to an older generation"
+        _fall_back(store, actors, DamagedStateError(unfinished), older)
+    elif problem := problem_of_states(store, actors):
         _fall_back(store, actors, problem, older)
     try:
         for actor in actors:
@@ -118,10 +123,13 @@ def _fall_back(
 ) -> None:
     """Replace the states of all actors by the last complete generation.
 
+    A marker exists until all states are replaced. If this process is killed before, some states are
+    older than others, and the check of the states may not notice that.
+
     Args:
         store: Store of the states.
         actors: The actors.
-        problem: Damage of the states after the last step.
+        problem: Why the states after the last step cannot be used.
         older: Number of the generation; None if there is none.
 
     Raises:
@@ -145,9 +153,13 @@ def _fall_back(
         "usually fewer than five, are lost. Check the disk, unless the power failed.",
         store.folder.parent, problem, older,
     )  # fmt: skip
+    marker = store.folder.parent / FALL_BACK_MARKER
     try:
+        write_atomically(marker, b"", syncs=True)
         for actor in actors:
             store.fall_back(actor, older)
+        marker.unlink()
+        sync(marker.parent)  # Otherwise a power cut could bring the marker back.
     except OSError as error:
         raise DataError(
             f"{store.folder.parent} cannot fall back to generation {older} of the states: {error}. "
@@ -171,5 +183,6 @@ def _complete_reset(folder: Path, store: FolderStore, remote_actors: Collection[
     )
     for state in sorted((folder / "state").glob(f"*/{CONTENTS}")):
         store.delete(state.parent.name)
+    (folder / FALL_BACK_MARKER).unlink(missing_ok=True)
     if not remote_actors:
         marker.unlink()

@@ -383,6 +383,8 @@ class FolderStore:
         contents = read_contents(folder / _list_name(generation))
         if contents is None:
             (folder / CONTENTS).unlink(missing_ok=True)
+            if folder.exists():
+                sync(folder)
         else:
             write_atomically(folder / CONTENTS, contents.encode(), syncs=True)
 

@@ -1,6 +1,6 @@
 """Tests of the state folders from which a service resumes."""
 
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 
 import pytest
@@ -9,7 +9,7 @@ from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.service.state_folder import RESET_MARKER, claim_state
+from ldo_service.service.state_folder import FALL_BACK_MARKER, RESET_MARKER, claim_state
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 ACTORS = {"tracker": Tracker, "mapper": Mapper, "optimizer": Optimizer}
@@ -114,3 +114,71 @@ def test_interrupted_reset_of_remote_actors_stays_marked(tmp_path: Path) -> None
     with ExitStack() as stack:
         claim_state(tmp_path, stack, ("optimizer",))
     assert (tmp_path / RESET_MARKER).exists(), "`Control` still has to reset the optimizer"
+
+
+def steps_of(folder: Path) -> list[int]:
+    """Return the step of each saved state."""
+    store = FolderStore(folder / "state")
+    return [(store.load(actor) or {})["step"][0] for actor in ACTORS]
+
+
+def save_generation_and_newer_states(folder: Path) -> None:
+    """Keep a generation of step 1, save step 2, and damage the state of the mapper."""
+    for step in (1, 2):
+        store = FolderStore(folder / "state")
+        for actor in ACTORS:
+            store.save(actor, {"step": [step]})
+        if step == 1:
+            claim(folder)
+    file = store._contents["mapper"].files["step"]
+    (store.folder / "mapper" / file).write_bytes(b"")
+
+
+@pytest.mark.parametrize("finished", range(4))
+def test_interrupted_fall_back_is_finished_at_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, finished: int
+) -> None:
+    save_generation_and_newer_states(tmp_path)
+    fall_back, done = FolderStore.fall_back, []
+
+    def killed(store: FolderStore, actor: str, generation: int) -> None:
+        if len(done) == finished:
+            raise KeyboardInterrupt
+        fall_back(store, actor, generation)
+        done.append(actor)
+
+    with monkeypatch.context() as context:
+        context.setattr(FolderStore, "fall_back", killed)
+        with pytest.raises(KeyboardInterrupt) if finished < len(ACTORS) else nullcontext():
+            claim(tmp_path)
+    claim(tmp_path)
+    assert steps_of(tmp_path) == [1, 1, 1]
+    assert not (tmp_path / FALL_BACK_MARKER).exists()
+
+
+def test_fall_back_that_the_disk_interrupts_is_finished_at_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_generation_and_newer_states(tmp_path)
+    fall_back = FolderStore.fall_back
+
+    def fail(store: FolderStore, actor: str, generation: int) -> None:
+        if actor == "tracker":
+            raise OSError(28, "No space left on device")
+        fall_back(store, actor, generation)
+
+    with monkeypatch.context() as full:
+        full.setattr(FolderStore, "fall_back", fail)
+        with pytest.raises(DataError, match="the next start tries again"):
+            claim(tmp_path)
+    claim(tmp_path)
+    assert steps_of(tmp_path) == [1, 1, 1]
+
+
+def test_completed_reset_leaves_no_fall_back_to_finish(tmp_path: Path) -> None:
+    save_generation_and_newer_states(tmp_path)
+    for marker in (RESET_MARKER, FALL_BACK_MARKER):
+        (tmp_path / marker).touch()
+    claim(tmp_path)
+    assert FolderStore(tmp_path / "state").load("tracker") is None
+    assert not (tmp_path / FALL_BACK_MARKER).exists()
