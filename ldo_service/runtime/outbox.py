@@ -155,15 +155,16 @@ class Outbox:
     def forget(self, before: int) -> None:
         """Delete the messages below `before`, which all consumers have handled.
 
-        Messages that a kept generation needs are retained.
+        Messages that a kept generation needs are retained. A log has its own maximum size.
         """
-        if self._bytes <= MAX_RETAINED_BYTES:
-            before = self.first_needed(before)
+        needed = self.first_needed(before)
+        if self._log:
+            self._log.forget(needed)
+        elif self._bytes <= MAX_RETAINED_BYTES:
+            before = needed
         with self._lock:
             while self._memory and self._memory[0].seq < before:
                 self._bytes -= len(self._memory.popleft().body)
-        if self._log:
-            self._log.forget(before)
 
     def truncate(self, end: int) -> None:
         """Delete the messages with numbers of at least `end`, which were never sent."""

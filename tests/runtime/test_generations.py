@@ -14,6 +14,7 @@ from ldo_service.runtime.generations import (
     problem_of_states,
 )
 from ldo_service.runtime.outbox import MAX_RETAINED_BYTES, Outbox
+from ldo_service.storage.message_log import MessageLog
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.flow_control import UnackedMessage
 
@@ -125,6 +126,19 @@ def test_retained_messages_do_not_exceed_their_maximum_size() -> None:
     outbox.keep(0, is_previous_complete=False)
     outbox.forget(9)
     assert outbox.in_memory[0].seq == 9
+
+
+def test_logged_messages_of_any_size_are_retained_on_disk_only(tmp_path: Path) -> None:
+    log = MessageLog(tmp_path, 1, 0, 0, max_bytes=10 * MAX_RETAINED_BYTES)
+    outbox = Outbox(log=log, retained_from=0)
+    body = bytes(MAX_RETAINED_BYTES // 7)
+    for seq in range(9):
+        outbox.add(UnackedMessage(seq, b"", body))
+    outbox.store()
+    outbox.forget(9)
+    assert outbox.first_needed(9) == outbox.first(9) == 0
+    assert outbox.read(0) == UnackedMessage(0, b"", body)
+    assert len(outbox._memory) == 0
 
 
 def test_outbox_without_generations_retains_nothing() -> None:
