@@ -1,5 +1,6 @@
 """State folder of a service: its lock, and checks of the actors' saved states."""
 
+import errno
 import fcntl
 import logging
 import os
@@ -26,6 +27,9 @@ RESET_MARKER = "reset"
 # File that exists while not all actors have fallen back to the older generation.
 FALL_BACK_MARKER = "falling_back"
 PAUSE_MARKER = "paused"  # File that exists while the service is paused.
+# Errors of a path that cannot become a folder. After any other error, such as a file system that is
+# read-only, full or not mounted yet, a later attempt may succeed.
+_OF_PATH = (errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
 
 
 def state_folder(folder: Path | None, stack: ExitStack) -> Path:
@@ -39,20 +43,20 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
         The folder, which exists.
 
     Raises:
-        ConfigError: The folder cannot be written, or contains a run or a recording.
+        ConfigError: The path is no folder, or the folder contains a run or a recording.
+        UnavailableError: The folder cannot be written now.
     """
     if folder is None:
         return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ldo-")))
     try:
         make_folder(folder)
         if not os.access(folder, os.W_OK):
-            raise ConfigError(f"{folder} cannot be written. Choose another folder with --state.")
+            is_read_only = os.statvfs(folder).f_flag & os.ST_RDONLY
+            number = errno.EROFS if is_read_only else errno.EACCES
+            raise OSError(number, os.strerror(number))
         found = {path.name for path in folder.iterdir()}
     except OSError as error:
-        raise ConfigError(
-            f"{folder} cannot be used for state: {error.strerror}. Choose another folder with "
-            "--state."
-        ) from error
+        raise _folder_error(folder, error) from error
     if "state" not in found and "frames.csv" in found:
         raise ConfigError(
             f"{folder} contains a run of `ldo run`, not the state of a service. Choose another "
@@ -64,6 +68,16 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
             "with --state."
         )
     return folder
+
+
+def _folder_error(folder: Path, error: OSError) -> ConfigError:
+    """Return the error of a folder that cannot be used, whose exit code tells if it is lasting."""
+    problem = f"{folder} cannot be used for state: {error.strerror or error}"
+    if error.errno in _OF_PATH:
+        return ConfigError(f"{problem}. Choose another folder with --state.")
+    return UnavailableError(
+        f"{problem}. Make the folder writable, or choose another one with --state."
+    )
 
 
 def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] = ()) -> None:
@@ -80,18 +94,25 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
 
     Raises:
         ConfigError: The states do not match, and there is no older generation.
-        UnavailableError: Another service uses the folder.
+        UnavailableError: Another service uses the folder, or it cannot be read or written now.
         DamagedStateError: A state is damaged, and there is no undamaged older generation.
         DataError: A state cannot be read because of a limit of the process, or another version of
             the service wrote it.
     """
-    lock = stack.enter_context((folder / "lock").open("w"))
     try:
+        lock = stack.enter_context((folder / "lock").open("w"))
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+        _check_states(folder, remote_actors)
+    except BlockingIOError as error:
         raise UnavailableError(
             f"another service uses the state folder {folder}. Choose another folder with --state."
         ) from error
+    except OSError as error:
+        raise _folder_error(folder, error) from error
+
+
+def _check_states(folder: Path, remote_actors: Collection[str]) -> None:
+    """Check the states in a locked folder, and fall back if they are damaged; see `claim_state`."""
     store = FolderStore(folder / "state")
     _complete_reset(folder, store, remote_actors)
     found = {path.parent.name for path in store.folder.glob("*/*.msgpack")}

@@ -1,15 +1,26 @@
 """Tests of the state folders from which a service resumes."""
 
+import errno
+import os
+from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
-from ldo_service.errors import ConfigError, DataError
-from ldo_service.service.state_folder import FALL_BACK_MARKER, RESET_MARKER, claim_state
+from ldo_service.errors import ConfigError, DataError, UnavailableError
+from ldo_service.runtime.generations import MARKER
+from ldo_service.service.state_folder import (
+    FALL_BACK_MARKER,
+    RESET_MARKER,
+    claim_state,
+    state_folder,
+)
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 ACTORS = {"tracker": Tracker, "mapper": Mapper, "optimizer": Optimizer}
@@ -29,6 +40,62 @@ def claim(folder: Path) -> None:
         claim_state(folder, stack)
 
 
+# --- folders that cannot be used ------------------------------------------------------------------
+def open_folder(folder: Path) -> None:
+    with ExitStack() as stack:
+        state_folder(folder, stack)
+
+
+def test_file_in_place_of_the_folder_is_a_wrong_argument(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "state", tmp_path / ("x" * 300)):
+        with pytest.raises(ConfigError, match="cannot be used for state") as raised:
+            open_folder(folder)
+        assert raised.value.exit_code == ConfigError.exit_code
+
+
+def test_folder_that_cannot_be_written_may_be_available_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(UnavailableError, match="Permission denied"):
+        open_folder(tmp_path)
+    read_only = SimpleNamespace(f_flag=os.ST_RDONLY)
+    monkeypatch.setattr(os, "statvfs", lambda _: read_only)
+    with pytest.raises(UnavailableError, match="Read-only file system"):
+        open_folder(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["lock", RESET_MARKER, MARKER])
+def test_file_system_that_becomes_read_only_may_be_available_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """The disk refuses to open the lock, to complete a reset, or to read the generation."""
+    claim(save_states(tmp_path, 5, *ACTORS))
+    (tmp_path / RESET_MARKER).touch()
+
+    def refuse(function: Callable) -> Callable:
+        def call(path: Path, *arguments: Any, **options: Any) -> Any:
+            if path.name == name:
+                raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+            return function(path, *arguments, **options)
+
+        return call
+
+    for method in ("open", "unlink", "read_bytes"):
+        monkeypatch.setattr(Path, method, refuse(getattr(Path, method)))
+    with pytest.raises(UnavailableError, match="Read-only file system"):
+        claim(tmp_path)
+
+
+def test_folder_of_a_running_service_may_be_available_later(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        claim_state(tmp_path, stack)
+        with pytest.raises(UnavailableError, match="another service uses"):
+            claim(tmp_path)
+
+
+# --- states of several actors ---------------------------------------------------------------------
 def test_state_without_keyframes_is_accepted(tmp_path: Path) -> None:
     claim(save_states(tmp_path, 0, *ACTORS))
 
