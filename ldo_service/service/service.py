@@ -34,6 +34,7 @@ from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import new_path, prepare_recording
 from ldo_service.runtime import check_graph
 from ldo_service.runtime.actor_graph import consumers_with_backlog, finish_order, lossless_consumers
+from ldo_service.runtime.control import Control
 from ldo_service.runtime.generations import GenerationKeeper
 from ldo_service.runtime.journal import Journal
 from ldo_service.runtime.process import (
@@ -44,7 +45,7 @@ from ldo_service.runtime.process import (
 )
 from ldo_service.runtime.process_heartbeat import start_heartbeat
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.stage_commands import CommandSender, Control
+from ldo_service.runtime.stage_commands import CommandSender
 from ldo_service.runtime.supervision import Runner, StopRequest, Watchdog, supervise
 from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 from ldo_service.storage.state_store import FolderStore

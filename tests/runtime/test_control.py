@@ -5,8 +5,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from ldo_service.runtime import Actor, In, Latest, Out
+from ldo_service.runtime.control import Control
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.stage_commands import Control
 from ldo_service.schemas import ControlAnswer, ControlRequest, Health, Message, decode, encode
 from ldo_service.storage.memory_store import MemoryStore
 from ldo_service.storage.state_store import StateStore

@@ -1,0 +1,257 @@
+"""Control interface of a service: pause, resume, save and reset of all its actors.
+
+`Control` replies once for the whole service, when all its actors have replied. `reset` first pauses
+every actor, producers first, so that no message of the old run is in flight when the actors
+restart. Otherwise a graph correction from before the reset could arrive after it. The graph version
+of this correction would be higher than the first versions after the reset, so the actors would
+ignore the first new corrections.
+
+If a reset does not reach all actors, some states are from before the reset and some from after it.
+`Control` therefore writes a marker to the disk before the first actor is reset, and removes it
+after the last one. While the marker exists, no frames are taken, and the next start of the service
+completes the reset.
+"""
+
+import asyncio
+import logging
+import time
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ldo_service.errors import DataError
+from ldo_service.schemas import ControlAnswer, ControlRequest, decode, encode
+from ldo_service.storage.atomic_write import write_atomically
+from ldo_service.transport.interface import Transport
+
+from .generations import GenerationKeeper
+from .stage_commands import CommandSender, What
+
+log = logging.getLogger(__name__)
+
+# Minimum time that each actor has to reply to a command, seconds: three times the slowest step
+# measured.
+MIN_S = 2.0
+# Time between two attempts to complete a reset that the previous process began, seconds.
+COMPLETE_AGAIN_S = 2.0
+
+
+class ControlError(Exception):
+    """Error of a command that some actors did not execute; its text names these actors."""
+
+
+class Control:
+    """Control interface of the whole service: pause, resume, save and reset."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        actors: Sequence[str],
+        sources: Sequence[str],
+        saved_where: str,
+        timeout_s: float,
+        reset_marker: Path | None = None,
+        pause_marker: Path | None = None,
+        generations: GenerationKeeper | None = None,
+    ) -> None:
+        """Connect to the stages.
+
+        Args:
+            transport: The network.
+            actors: Names of all actors, producers first.
+            sources: Names of the actors with inputs from outside the service.
+            saved_where: Description of the state folder, for replies.
+            timeout_s: Time limit of a command for all actors together, seconds.
+            reset_marker: File that exists while a reset is not complete; None: no file. If the
+                previous process left it, this object completes the reset.
+            pause_marker: File that exists while the service is paused; None: no file. If the
+                previous process left it, this object pauses the sources.
+            generations: Keeper of older generations, which a reset replaces; None: there is none.
+        """
+        self._generations = generations
+        self._reset_marker, self._pause_marker = reset_marker, pause_marker
+        self._commander = CommandSender(transport)
+        self._actors, self._sources = tuple(actors), tuple(sources)
+        self._saved_where, self._timeout_s = saved_where, timeout_s
+        self._is_paused = pause_marker is not None and pause_marker.exists()
+        self._one_at_a_time = asyncio.Lock()
+        self._tasks: set[asyncio.Task[object]] = set()
+        self._verbs: dict[str, Callable[[], Awaitable[str]]] = {
+            "pause": self._pause,
+            "resume": self._resume,
+            "save": self._save,
+            "reset": self._reset,
+        }
+        self._is_reset_pending = reset_marker is not None and reset_marker.exists()
+        if self._is_reset_pending:
+            self._start(self._complete_reset())
+        if self._is_paused:
+            log.warning("The service is paused, as it was when it stopped: it drops frames. Run "
+                        "`ldo control resume` to continue.")  # fmt: skip
+        transport.watch_liveliness(self._presence)
+
+    async def answer(self, body: bytes) -> bytes:
+        """Execute an encoded `ControlRequest` and return the encoded `ControlAnswer`.
+
+        If the bytes are malformed, the answer has the error.
+        """
+        try:
+            request = decode(body, ControlRequest)
+        except msgspec.DecodeError as error:
+            return encode(_answer(0, False, f"malformed ControlRequest: {error}."))
+        verb = self._verbs.get(request.command)
+        if verb is None:
+            known = ", ".join(self._verbs)
+            text = f"unknown command {request.command[:40]!r}; this version has {known}."
+            return encode(_answer(request.stamp_ns, False, text))
+        async with self._one_at_a_time:
+            try:
+                ok, text = True, await verb()
+            except ControlError as failed:
+                ok, text = False, str(failed)
+        log.log(logging.INFO if ok else logging.ERROR, "%s: %s", request.command, text)
+        return encode(_answer(request.stamp_ns, ok, text))
+
+    def close(self) -> None:
+        """Close the publisher of commands."""
+        for task in self._tasks:
+            task.cancel()
+        self._commander.close()
+
+    # --- verbs ------------------------------------------------------------------------------------
+    async def _pause(self) -> str:
+        self._is_paused = True
+        note = ""
+        try:
+            if self._pause_marker is not None:
+                write_atomically(self._pause_marker, b"")
+        except OSError as error:
+            note = (
+                f" A restart resumes the service too, because {self._pause_marker} cannot be "
+                f"written: {error.strerror}."
+            )
+        await self._each("pause", self._sources)
+        return f"frames are dropped and counted until `resume`.{note}"
+
+    async def _resume(self) -> str:
+        if self._is_reset_pending:
+            raise ControlError(
+                "the last reset is not complete, so the actors have states of two runs. Repeat "
+                "`ldo control reset`."
+            )
+        self._is_paused = False
+        if self._pause_marker is not None:
+            with suppress(OSError):  # A restart then pauses the service again.
+                self._pause_marker.unlink(missing_ok=True)
+        await self._each("resume", self._sources)
+        return "frames are processed again."
+
+    async def _save(self) -> str:
+        await self._each("save", self._actors)
+        return f"{', '.join(self._actors)} saved in {self._saved_where}."
+
+    async def _reset(self) -> str:
+        if self._generations is None:
+            return await self._reset_actors()
+        async with self._generations.lock:
+            return await self._reset_actors()
+
+    async def _reset_actors(self) -> str:
+        try:
+            await self._each("pause", self._actors)
+            self._mark_reset()
+            await self._each("reset", self._actors)
+        except ControlError as error:
+            with suppress(ControlError):
+                await self._resume_actors()
+            if not self._is_reset_pending:
+                raise
+            raise ControlError(
+                f"{error} Frames are dropped until the reset is complete. A restart of the service "
+                "completes it too."
+            ) from error
+        await self._replace_generations()
+        self._is_reset_pending = False
+        if self._reset_marker is not None:
+            with suppress(OSError):  # The next start then repeats the reset.
+                self._reset_marker.unlink(missing_ok=True)
+        await self._resume_actors()
+        still = " Frames stay paused." if self._is_paused else ""
+        return f"{', '.join(self._actors)} restarted with an empty state.{still}"
+
+    async def _replace_generations(self) -> None:
+        """Keep the empty states, so that no failure brings back the map from before the reset."""
+        if self._generations is not None:
+            with suppress(OSError, DataError):
+                await self._generations.keep()
+
+    async def _resume_actors(self) -> None:
+        """Resume all actors, except the sources while frames must not be taken."""
+        held = self._sources if self._is_paused or self._is_reset_pending else ()
+        await self._each("resume", [actor for actor in self._actors if actor not in held])
+
+    def _mark_reset(self) -> None:
+        """Write the marker of an incomplete reset to the disk.
+
+        Raises:
+            ControlError: The disk is full or cannot be written. No actor was reset.
+        """
+        if self._reset_marker is not None:
+            try:
+                write_atomically(self._reset_marker, b"", syncs=True)
+            except OSError as error:
+                raise ControlError(
+                    f"no actor was reset, because {self._reset_marker} cannot be written: "
+                    f"{error.strerror}. Free some disk space, then repeat the command."
+                ) from error
+        self._is_reset_pending = True
+
+    async def _complete_reset(self) -> None:
+        """Complete the reset that the previous process began, when all actors are running."""
+        log.warning("completing the reset that the previous process of the service began; frames "
+                    "are dropped until all actors have started.")  # fmt: skip
+        while self._is_reset_pending:
+            async with self._one_at_a_time:
+                with suppress(ControlError):
+                    if self._is_reset_pending:
+                        log.info("reset: %s", await self._reset())
+            await asyncio.sleep(COMPLETE_AGAIN_S)
+
+    async def _each(self, what: What, actors: Sequence[str]) -> None:
+        """Send a command to the actors, one after the other, and wait for each reply.
+
+        The order matters for `pause`: a producer that waits for credit can finish its step only
+        while its consumer is not paused. All actors together have `timeout_s` seconds to reply. If
+        earlier actors have used up this time, each further actor still has `MIN_S` seconds, but not
+        more than `timeout_s`.
+
+        Raises:
+            ControlError: Some actors did not execute the command. The error names them, and is
+                raised after the command was sent to all actors.
+        """
+        failures, until_s = [], time.monotonic() + self._timeout_s
+        for actor in actors:
+            within_s = max(until_s - time.monotonic(), min(MIN_S, self._timeout_s))
+            error = await self._commander.order(what, actor, within_s)
+            failures += [f"{actor} {error}"] if error else []
+        if failures:
+            advice = "Check the actors with `ldo doctor`, then repeat the command."
+            raise ControlError(f"some actors did not {what}: {'; '.join(failures)}. {advice}")
+
+    # --- actors that were restarted ---------------------------------------------------------------
+    def _presence(self, name: str, alive: bool) -> None:
+        """Pause a restarted source actor again; its saved state does not include the pause."""
+        if alive and (self._is_paused or self._is_reset_pending) and name in self._sources:
+            self._start(self._commander.order("pause", name, self._timeout_s))
+
+    def _start(self, work: Coroutine[Any, Any, object]) -> None:
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+
+def _answer(stamp_ns: int, ok: bool, text: str) -> ControlAnswer:
+    return ControlAnswer(stamp_ns=stamp_ns, ok=ok, message=text)
