@@ -22,7 +22,6 @@ from typing import Any
 
 import msgspec
 
-from ldo_service.errors import DataError
 from ldo_service.schemas import ControlAnswer, ControlRequest, decode, encode
 from ldo_service.storage.atomic_write import write_atomically
 from ldo_service.transport.interface import Transport
@@ -185,8 +184,7 @@ class Control:
     async def _replace_generations(self) -> None:
         """Keep the empty states, so that no failure brings back the map from before the reset."""
         if self._generations is not None:
-            with suppress(OSError, DataError):
-                await self._generations.keep()
+            await self._generations.keep()
 
     async def _resume_actors(self) -> None:
         """Resume all actors, except the sources while frames must not be taken."""

@@ -23,7 +23,9 @@ from ldo_service.storage.state_contents import StateContents, read_contents
 from ldo_service.storage.state_store import CONTENTS, GENERATION, NEWEST, FolderStore
 
 from .delivery_state import OFFSETS, OUTBOX, RestoredState
+from .restoring import LOG_PERIOD_S
 from .stage_commands import CommandSender
+from .supervision_policy import LogLimit
 
 log = logging.getLogger(__name__)
 
@@ -157,60 +159,70 @@ class GenerationKeeper:
             self._completed = completed_generation(store) or 0
         self._positions: list[str] = []
         self._failures = 0  # Failed generations since the last complete one.
+        self._errors = LogLimit(LOG_PERIOD_S)
         self.lock = asyncio.Lock()  # Held while a generation is kept, and during a reset.
 
     async def run(self) -> None:
         """Keep a generation every `KEEP_EVERY_S` seconds if messages were handled since."""
         while True:
             async with self.lock:
-                try:
-                    await self.keep()
-                except (OSError, DataError) as error:
-                    self._failed(str(error))
+                await self.keep()
             await asyncio.sleep(KEEP_EVERY_S)
 
-    async def keep(self) -> None:
+    async def keep(self, *, is_forced: bool = False) -> str:
         """Keep one generation; the caller must hold `lock`.
 
         If an actor does not answer, or if the states do not fit, the generation before stays the
         last complete one.
 
-        Raises:
-            OSError: The disk is full or cannot be written.
-            DataError: A state cannot be read.
+        Args:
+            is_forced: Keep a generation even if no messages were handled since the last one.
+
+        Returns:
+            An empty text if the last complete generation has the present states. Otherwise, the
+            reason.
         """
+        try:
+            problem = await self._keep(is_forced=is_forced)
+        except (OSError, DataError) as error:
+            problem = str(error)
+        except Exception as error:  # Without this task, no generation would be kept any more.
+            problem = repr(error)
+            if self._errors.is_due():
+                log.exception("keeping a generation of the states failed; the service tries again. "
+                              "Please report the traceback.")  # fmt: skip
+        self._failures = self._failures + 1 if problem else 0
+        if self._failures == FAILURES_TO_LOG:
+            # Single failures are normal: an actor may be busy, or a message is between two actors.
+            log.warning(
+                "the states cannot be kept as an older generation: %s. A power cut would lose all "
+                "keyframes since generation %d. If the disk is full, free some space.",
+                problem, self._completed,
+            )  # fmt: skip
+        return problem
+
+    async def _keep(self, *, is_forced: bool) -> str:
         positions = await asyncio.to_thread(self._read_positions)
-        if positions == self._positions:
-            return
+        if positions == self._positions and not is_forced:
+            return ""
         number = await asyncio.to_thread(next_generation, self._store)
         for actor in self._actors:
             details = number, self._completed
             error = await self._commander.order("keep", actor, KEEP_WITHIN_S, details)
             if error:
-                self._failed(f"{actor} {error}")
-                return
+                return f"{actor} {error}"
         problem = await asyncio.to_thread(
             problem_of_states, self._store, self._actors, number, is_quick=True
         )
         if problem:
-            self._failed(str(problem))
-            return
+            return str(problem)
         await asyncio.to_thread(complete_generation, self._store, number)
         self._completed, self._positions = number, positions
-        self._failures = 0
+        return ""
 
-    def _failed(self, reason: str) -> None:
-        """Log the first of several failures in a row.
-
-        Single failures are normal: an actor may be busy, or a message was between two actors.
-        """
-        self._failures += 1
-        if self._failures == FAILURES_TO_LOG:
-            log.warning(
-                "the states cannot be kept as an older generation: %s. A power cut would lose all "
-                "keyframes since generation %d. If the disk is full, free some space.",
-                reason, self._completed,
-            )  # fmt: skip
+    def close(self) -> None:
+        """Close the client of the stages."""
+        self._commander.close()
 
     def _read_positions(self) -> list[str]:
         """Return names of files that change with each message on a lossless topic."""

@@ -195,6 +195,8 @@ class Service:
                 keeping.cancel()
             if control:
                 control.close()
+            if generations:
+                generations.close()
             transport.close()
 
     def _open_generations(self, transport: ZenohTransport) -> GenerationKeeper:
