@@ -7,9 +7,9 @@ of this correction would be higher than the first versions after the reset, so t
 ignore the first new corrections.
 
 If a reset does not reach all actors, some states are from before the reset and some from after it.
-`Control` therefore writes a marker to the disk before the first actor is reset, and removes it
-after the last one. While the marker exists, no frames are taken, and the next start of the service
-completes the reset.
+`Control` therefore writes a marker to the disk before the first actor is reset. It removes the
+marker when the empty states of all actors are kept as an older generation. While the marker exists,
+no frames are taken, and the next start of the service completes the reset.
 """
 
 import asyncio
@@ -36,6 +36,9 @@ log = logging.getLogger(__name__)
 MIN_S = 2.0
 # Time between two attempts to complete a reset that the previous process began, seconds.
 COMPLETE_AGAIN_S = 2.0
+# Attempts to keep the empty states after a reset, and the time between two of them, seconds. A
+# stage may still be writing the generation before.
+KEEP_ATTEMPTS, KEEP_AGAIN_S = 3, 1.0
 
 
 class ControlError(Exception):
@@ -163,6 +166,7 @@ class Control:
             await self._each("pause", self._actors)
             self._mark_reset()
             await self._each("reset", self._actors)
+            await self._replace_generations()
         except ControlError as error:
             with suppress(ControlError):
                 await self._resume_actors()
@@ -172,7 +176,6 @@ class Control:
                 f"{error} Frames are dropped until the reset is complete. A restart of the service "
                 "completes it too."
             ) from error
-        await self._replace_generations()
         self._is_reset_pending = False
         if self._reset_marker is not None:
             with suppress(OSError):  # The next start then repeats the reset.
@@ -182,9 +185,25 @@ class Control:
         return f"{', '.join(self._actors)} restarted with an empty state.{still}"
 
     async def _replace_generations(self) -> None:
-        """Keep the empty states, so that no failure brings back the map from before the reset."""
-        if self._generations is not None:
-            await self._generations.keep()
+        """Keep the empty states, so that no failure brings back the map from before the reset.
+
+        Raises:
+            ControlError: The states cannot be kept.
+        """
+        if self._generations is None:
+            return
+        problem = ""
+        for attempt in range(KEEP_ATTEMPTS):
+            if attempt:
+                await asyncio.sleep(KEEP_AGAIN_S)
+            problem = await self._generations.keep(is_forced=True)
+            if not problem:
+                return
+        raise ControlError(
+            f"all actors are empty, but their states cannot be kept as an older generation: "
+            f"{problem}. A power cut could bring back the old map. If the disk is full, free some "
+            "space, then repeat the command."
+        )
 
     async def _resume_actors(self) -> None:
         """Resume all actors, except the sources while frames must not be taken."""

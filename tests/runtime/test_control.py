@@ -1,11 +1,15 @@
 """Tests of the control command: one answer for the whole service, also if an actor fails."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from ldo_service.runtime import Actor, In, Latest, Out
-from ldo_service.runtime.control import Control
+import pytest
+
+from ldo_service.runtime import Actor, In, Latest, Out, control
+from ldo_service.runtime.control import KEEP_ATTEMPTS, Control
+from ldo_service.runtime.generations import GenerationKeeper
 from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import ControlAnswer, ControlRequest, Health, Message, decode, encode
 from ldo_service.storage.memory_store import MemoryStore
@@ -58,8 +62,9 @@ class Scene:
         timeout_s: float = 5.0,
         reset_marker: Path | None = None,
         pause_marker: Path | None = None,
+        generations: GenerationKeeper | None = None,
     ) -> None:
-        self._markers = reset_marker, pause_marker
+        self._markers = reset_marker, pause_marker, generations
         self.transport, self.seen = MemoryTransport(), []
         self.source = Stage(Source, self.transport, config=QUICK, store=store)
         self.collector = Stage(lambda: Collector(self.seen), self.transport, config=QUICK)
@@ -231,3 +236,35 @@ async def test_reset_without_a_marker_on_the_disk_is_refused(tmp_path: Path) -> 
         assert "no actor was reset" in answer.message
         assert [health.epoch for health in scene.health()] == before
         assert not any(health.paused for health in scene.health())
+
+
+class Generations(GenerationKeeper):
+    """Keeper that fails as often as a test wants."""
+
+    def __init__(self, failures: int) -> None:
+        self.failures, self.attempts = failures, 0
+        self.lock = asyncio.Lock()
+
+    async def keep(self, *, is_forced: bool = False) -> str:
+        assert is_forced, "the empty states may have the names of the files before"
+        self.attempts += 1
+        return "disk full" if self.attempts <= self.failures else ""
+
+
+@pytest.mark.parametrize("failures", [0, KEEP_ATTEMPTS - 1, KEEP_ATTEMPTS])
+async def test_reset_is_complete_when_the_empty_states_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failures: int
+) -> None:
+    monkeypatch.setattr(control, "KEEP_AGAIN_S", 0.001)
+    generations, marker = Generations(failures), tmp_path / "reset"
+    scene = Scene(reset_marker=marker, generations=generations)
+    async with scene.started():
+        answer = await scene.request("reset")
+        is_kept = failures < KEEP_ATTEMPTS
+        assert answer.ok is is_kept
+        assert marker.exists() is not is_kept, "the next start has to complete the reset"
+        assert scene.source.health().paused is not is_kept
+        if not is_kept:
+            assert "A power cut could bring back the old map" in answer.message
+            assert (await scene.request("reset")).ok
+            assert not marker.exists()
