@@ -19,6 +19,7 @@ from contextlib import suppress
 
 from ldo_service.errors import DamagedStateError, DataError
 from ldo_service.storage.atomic_write import write_atomically
+from ldo_service.storage.saved_files import SavedFiles
 from ldo_service.storage.state_contents import StateContents, read_contents
 from ldo_service.storage.state_store import CONTENTS, GENERATION, NEWEST, FolderStore
 
@@ -98,7 +99,7 @@ def problem_of_states(
         try:
             pasts[actor] = RestoredState.of(store.load(actor, generation, prefixes))
             if not is_quick:
-                store.check_unsynced(actor, generation)
+                SavedFiles(store, actor).check_unsynced(generation)
         except DamagedStateError as error:
             return error
     missing = [

@@ -18,6 +18,7 @@ from ldo_service.runtime.generations import (
     problem_of_states,
 )
 from ldo_service.storage.atomic_write import make_folder, sync, write_atomically
+from ldo_service.storage.saved_files import SavedFiles
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 log = logging.getLogger(__name__)
@@ -130,7 +131,7 @@ def _check_states(folder: Path, remote_actors: Collection[str]) -> None:
         _fall_back(store, actors, problem, older)
     try:
         for actor in actors:
-            store.sync_files(actor)
+            SavedFiles(store, actor).sync_unsynced()
         if older is None:
             make_folder(store.folder)
             keep_stopped(store, actors, next_generation(store))

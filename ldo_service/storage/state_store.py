@@ -16,8 +16,7 @@ import msgspec
 
 from ldo_service.errors import DamagedStateError, DataError
 
-from .atomic_write import make_folder, sync, sync_all, with_folders, write_atomically
-from .checksummed_folder import read_checked
+from .atomic_write import make_folder, sync, write_atomically
 from .generation_files import GenerationFiles
 from .state_codec import encode_state
 from .state_contents import StateContents, check_of, read_contents
@@ -130,7 +129,7 @@ class FolderStore:
             actor: Name of the actor.
             state: The state.
             unsynced: Files of a `ChecksummedFolder` to which the state refers, and which may not be
-                synced to the disk. `load` checks them.
+                synced to the disk; see `SavedFiles`.
 
         Raises:
             OSError: The state cannot be written; the old state stays unchanged.
@@ -183,34 +182,6 @@ class FolderStore:
             raise
         return StateContents(files, checks=checks)
 
-    def check_unsynced(self, actor: str, generation: int = NEWEST) -> None:
-        """Check, at the start of a service, the files that a power cut may have damaged.
-
-        Raises:
-            DamagedStateError: A file is missing or damaged.
-        """
-        contents = read_contents(self.folder / actor / _list_name(generation))
-        for file in contents.unsynced if contents else ():
-            try:
-                read_checked(self.folder.parent / file)
-            except (DataError, OSError) as error:
-                raise DamagedStateError(
-                    f"the state of {actor} in {self.folder / actor} is damaged: {error}"
-                ) from error
-
-    def sync_files(self, actor: str) -> None:
-        """Sync the files to which the saved state refers; the actor may then remove them.
-
-        Raises:
-            OSError: The disk is full, or a file cannot be read.
-        """
-        path = self.folder / actor / CONTENTS
-        contents = read_contents(path)
-        if contents and contents.unsynced:
-            sync_all(with_folders([self.folder.parent / file for file in contents.unsynced]))
-            synced = msgspec.structs.replace(contents, unsynced=())
-            write_atomically(path, synced.encode(), syncs=True)
-
     def _new_file(self, actor: str, part: str) -> str:
         """Return a file name that no other file of the actor has."""
         self._last_file[actor] += 1
@@ -236,7 +207,7 @@ class FolderStore:
         """
         folder = self.folder / actor
         try:
-            contents = read_contents(folder / _list_name(generation))
+            contents = read_contents(folder / list_name(generation))
             parts = contents.files if contents else {}
             state = {
                 part: contents.read_part(folder, part)
@@ -305,7 +276,7 @@ class FolderStore:
         If that fails, the next process removes them.
         """
         kept = self._kept[actor]
-        used = {CONTENTS, *map(_list_name, kept)}
+        used = {CONTENTS, *map(list_name, kept)}
         if writing := self._writing.get(actor):
             used.update(writing.sources.values())
         for contents in (self._contents[actor], *kept.values()):
@@ -344,7 +315,7 @@ class FolderStore:
             self._write_contents(actor, msgspec.structs.replace(now, unsynced=paths))
         kept = self._kept[actor]
         old = [n for n in kept if n != completed]
-        unused = [file for n in old for file in (*kept.pop(n).files.values(), _list_name(n))]
+        unused = [file for n in old for file in (*kept.pop(n).files.values(), list_name(n))]
         checks = now.checks or {
             p: check_of((folder / f).read_bytes()) for p, f in now.files.items()
         }
@@ -355,14 +326,14 @@ class FolderStore:
         files.update((part, self._new_file(actor, part)) for part in sources)
         self._copies[actor] = {now.files[part]: copy for part, copy in files.items()}
         kept[generation] = StateContents(files, checks=checks, generation=generation)
-        new = GenerationFiles(folder, _list_name(generation), kept[generation], sources)
+        new = GenerationFiles(folder, list_name(generation), kept[generation], sources)
         past, self._writing[actor] = self._writing.get(actor), new
         self._remove_unused(actor, [*unused, *(past.sources.values() if past else ())])
         return new
 
     def exists(self, actor: str, generation: int = NEWEST) -> bool:
         """Return whether an actor has a state."""
-        return (self.folder / actor / _list_name(generation)).exists()
+        return (self.folder / actor / list_name(generation)).exists()
 
     def is_kept(self, actor: str) -> bool:
         """Return whether an older generation of the actor's state exists."""
@@ -380,7 +351,7 @@ class FolderStore:
         """
         folder = self.folder / actor
         self._forget(actor)
-        contents = read_contents(folder / _list_name(generation))
+        contents = read_contents(folder / list_name(generation))
         if contents is None:
             (folder / CONTENTS).unlink(missing_ok=True)
             if folder.exists():
@@ -393,7 +364,8 @@ class FolderStore:
         return actor in self._fallen_back
 
 
-def _list_name(generation: int) -> str:
+def list_name(generation: int) -> str:
+    """Return the name of the file that lists the files of a state."""
     return GENERATION.format(generation) if generation else CONTENTS
 
 

@@ -10,7 +10,6 @@ import pytest
 
 from ldo_service.errors import DamagedStateError, DataError
 from ldo_service.storage import atomic_write, state_codec, state_store
-from ldo_service.storage.checksummed_folder import ChecksummedFolder
 from ldo_service.storage.memory_store import MemoryStore
 from ldo_service.storage.state_store import FolderStore
 
@@ -374,31 +373,3 @@ def test_state_of_another_version_is_rejected_and_unchanged(
         with pytest.raises(DataError, match=f"version={version}, and this service reads 3 and 4"):
             use(FolderStore(tmp_path))
     assert {path.name: path.read_bytes() for path in file.parent.iterdir()} == before
-
-
-def test_file_that_an_actor_removes_after_the_start_does_not_damage_its_state(
-    tmp_path: Path,
-) -> None:
-    """A process that is killed before it saves again leaves a list with the removed file."""
-    images = ChecksummedFolder(tmp_path / "images", suffix="image", consequence="")
-    images.write(1, b"an image")
-    store = FolderStore(tmp_path / "state")
-    store.save("mapper", {"map": [1]}, images.unsynced_files())
-    store.check_unsynced("mapper")
-    FolderStore(tmp_path / "state").sync_files("mapper")  # A starting service does this.
-    for path in images.unsynced_files():
-        path.unlink()
-    again = FolderStore(tmp_path / "state")
-    again.check_unsynced("mapper")
-    assert again.load("mapper") == {"map": [1]}
-
-
-def test_file_that_a_power_cut_damaged_damages_the_state(tmp_path: Path) -> None:
-    images = ChecksummedFolder(tmp_path / "images", suffix="image", consequence="")
-    images.write(1, b"an image")
-    store = FolderStore(tmp_path / "state")
-    store.save("mapper", {"map": [1]}, images.unsynced_files())
-    for path in images.unsynced_files():
-        path.write_bytes(b"")
-    with pytest.raises(DamagedStateError, match="damaged"):
-        store.check_unsynced("mapper")
