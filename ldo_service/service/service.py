@@ -27,7 +27,7 @@ from ldo_service.config import (
     recording_parameters,
     stage_parameters,
 )
-from ldo_service.errors import ConfigError, LdoError
+from ldo_service.errors import ConfigError, DataError, LdoError
 from ldo_service.gaussians.map_builder import FILE_PATTERNS
 from ldo_service.recordings.actor_files import ActorFiles
 from ldo_service.recordings.recorder import Recorder
@@ -35,7 +35,7 @@ from ldo_service.recordings.recording import new_path, prepare_recording
 from ldo_service.runtime import check_graph
 from ldo_service.runtime.actor_graph import consumers_with_backlog, finish_order, lossless_consumers
 from ldo_service.runtime.control import Control
-from ldo_service.runtime.generations import GenerationKeeper
+from ldo_service.runtime.generations import GenerationKeeper, keep_last
 from ldo_service.runtime.journal import Journal
 from ldo_service.runtime.process import (
     ChildProcess,
@@ -109,7 +109,7 @@ class Service:
     # this is the main process, which runs or starts all actors except `service.remote_actors`.
     only: tuple[str, ...] = ()
     is_router: bool = True  # Open a router; False: connect to the network's router.
-    # This process runs actors on another machine than the rest of the service.
+    # This process runs actors on another machine than the main process of the service.
     is_remote: bool = False
     is_state_kept: bool = True  # The state folder remains after the service ends.
     metrics_port: int | None = None  # Port for Prometheus; None: no metrics server.
@@ -147,6 +147,7 @@ class Service:
                 raise
             _leave_if_busy(0, "stopped")
             if not self.only:
+                self._keep_last_generation()
                 log.info("service: stopped; %s", self._state_after_stop())
 
     def _open_session(self, stack: ExitStack, health: HealthCollector) -> zenoh.Session:
@@ -175,9 +176,9 @@ class Service:
         watchdog = Watchdog({} if self.only else os.environ)
         pings = asyncio.create_task(watchdog.ping())
         runners = self._runners(transport)
-        generations = None if self.only else self._open_generations(transport)
+        generations = self._open_generations(transport)
         keeping = asyncio.create_task(generations.run()) if generations else None
-        control = self._open_control(transport, generations) if generations else None
+        control = None if self.only else self._open_control(transport, generations)
         names = ", ".join(runner.name for runner in runners)
         if self.only:  # The main process has already printed the start message.
             log.info("%s: ready", names)
@@ -199,12 +200,34 @@ class Service:
                 generations.close()
             transport.close()
 
-    def _open_generations(self, transport: ZenohTransport) -> GenerationKeeper:
+    @property
+    def _local_actors(self) -> list[str]:
         names = [box.name for box in GRAPH]
-        local = [name for name in names if name not in self.config.service.remote_actors]
-        return GenerationKeeper(CommandSender(transport), FolderStore(self.state / "state"), local)
+        return [name for name in names if name not in self.config.service.remote_actors]
 
-    def _open_control(self, transport: ZenohTransport, generations: GenerationKeeper) -> Control:
+    def _open_generations(self, transport: ZenohTransport) -> GenerationKeeper | None:
+        """Return the keeper of older generations; a temporary state needs none."""
+        if self.only or not self.is_state_kept:
+            return None
+        store = FolderStore(self.state / "state")
+        return GenerationKeeper(CommandSender(transport), store, self._local_actors)
+
+    def _keep_last_generation(self) -> None:
+        """Keep the states of the stopped actors, so that a later power cut loses nothing."""
+        if not self.is_state_kept:
+            return
+        try:
+            keep_last(FolderStore(self.state / "state"), self._local_actors)
+        except (OSError, DataError) as error:
+            log.error(
+                "%s: the last states cannot be kept as an older generation: %s. A power cut within "
+                "the next minute may lose the last keyframes. Check the disk.",
+                self.state, error,
+            )  # fmt: skip
+
+    def _open_control(
+        self, transport: ZenohTransport, generations: GenerationKeeper | None
+    ) -> Control:
         control = Control(
             transport,
             actors=[box.name for box in GRAPH],

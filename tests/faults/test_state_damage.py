@@ -9,9 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.errors import DamagedStateError
-from ldo_service.runtime.generations import MARKER, completed_generation
+from ldo_service.errors import DamagedStateError, DataError
+from ldo_service.runtime.generations import (
+    MARKER,
+    completed_generation,
+    keep_last,
+    problem_of_states,
+)
 from ldo_service.service.state_folder import claim_state
+from ldo_service.storage import saved_files
+from ldo_service.storage.generation_files import GenerationFiles
 from ldo_service.storage.state_contents import read_contents
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
@@ -100,6 +107,52 @@ def test_service_continues_from_the_older_generation(state: Path) -> None:
     flip(newest_file(state, "tracker", "now"))
     claim(state)
     assert asyncio.run(keyframes_after_start(state)) == (FRAMES, 1), "one keyframe is lost"
+
+
+def test_state_of_a_clean_stop_is_whole_after_a_power_cut(
+    state: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stopped service has synced the newest states, and an older generation equals them."""
+    synced: list[Path] = []
+    monkeypatch.setattr(saved_files, "sync_all", synced.extend)
+    before = completed_generation(FolderStore(state / "state"))
+    keep_last(FolderStore(state / "state"), ACTORS)
+    for actor in ACTORS:
+        contents = read_contents(state / "state" / actor / CONTENTS)
+        assert contents is None or {
+            state / "state" / actor / f for f in contents.files.values()
+        } <= set(synced)
+    assert completed_generation(FolderStore(state / "state")) != before
+    flip(newest_file(state, "tracker", "now"))
+    claim(state)
+    assert asyncio.run(keyframes_after_start(state)) == (FRAMES + 1, 1), "no keyframe is lost"
+
+
+@pytest.mark.parametrize("failing", ["write", "check"])
+def test_last_generation_that_cannot_be_kept_leaves_the_older_one_whole(
+    state: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    store = FolderStore(state / "state")
+    before = completed_generation(store)
+    if failing == "check":
+        tracker = dict(store.load("tracker") or {})
+        offsets = tracker["stage.offsets"]
+        tracker["stage.offsets"] = {**offsets, "out": {"keyframe/new": (1, 0, None)}}
+        store.save("tracker", tracker)
+    else:
+
+        def fail(files: GenerationFiles) -> None:
+            if files.folder.name == "tracker":
+                raise OSError(28, "No space left on device")
+            write(files)
+
+        write = GenerationFiles.write
+        monkeypatch.setattr(GenerationFiles, "write", fail)
+    with pytest.raises((OSError, DataError)):
+        keep_last(store, ACTORS)
+    assert completed_generation(store) == before
+    assert before is not None
+    assert problem_of_states(FolderStore(state / "state"), ACTORS, before) is None
 
 
 def test_undamaged_state_does_not_fall_back(state: Path) -> None:

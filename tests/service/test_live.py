@@ -12,8 +12,11 @@ from ldo_service.actors.topology import GRAPH
 from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DamagedStateError
+from ldo_service.runtime.generations import completed_generation
 from ldo_service.schemas import MapSnapshot, TrackedPose
 from ldo_service.schemas.topics import MAP_SNAPSHOT, POSE_TRACKED
+from ldo_service.storage.state_contents import read_contents
+from ldo_service.storage.state_store import NEWEST, FolderStore, list_name
 from tests.ports import free_endpoint
 from tests.service.conftest import LDO, PATIENCE, is_running, live_service, wait_until
 
@@ -126,6 +129,7 @@ def test_state_folder_is_resumed_and_shared_or_partial_ones_rejected(
         wait_until(lambda: service.update_health()["mapper"].metrics["keyframes"] > 2, 10, "a map")
         assert service.stop() == 0
         keyframes = service.health["mapper"].metrics["keyframes"]
+    assert last_generation(state) == newest_states(state), "a power cut now loses nothing"
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         for index in range(30, 60):
@@ -139,6 +143,18 @@ def test_state_folder_is_resumed_and_shared_or_partial_ones_rejected(
     for part in (state / "state" / "tracker").iterdir():
         part.write_bytes(b"damaged")
     assert "is not usable either" in start_error(state, DamagedStateError.exit_code)
+
+
+def newest_states(state: Path, generation: int = NEWEST) -> list[dict[str, tuple[int, int]]]:
+    """Return the size and checksum of each part of each saved state."""
+    lists = (read_contents(state / "state" / a / list_name(generation)) for a in EVERY_ACTOR)
+    return [contents.checks if contents else {} for contents in lists]
+
+
+def last_generation(state: Path) -> list[dict[str, tuple[int, int]]]:
+    number = completed_generation(FolderStore(state / "state"))
+    assert number is not None
+    return newest_states(state, number)
 
 
 def start_error(state: Path, exit_code: int) -> str:

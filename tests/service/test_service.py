@@ -8,6 +8,7 @@ import pytest
 
 from ldo_service.actors.topology import actor_spec
 from ldo_service.config import Config
+from ldo_service.runtime.generations import MARKER
 from ldo_service.service import service as module
 from ldo_service.service.service import Service
 from ldo_service.storage.state_store import FolderStore
@@ -29,3 +30,16 @@ async def test_only_an_actor_on_another_machine_syncs_every_step_by_default(
     service = Service(Config(), network, tmp_path, ("optimizer",), is_remote=is_remote)
     service._stage(actor_spec("optimizer"), MemoryTransport(), {}, asyncio.Lock())
     assert [store.syncs for store in stores] == [is_remote]
+
+
+@pytest.mark.parametrize("is_state_kept", [True, False])
+async def test_temporary_state_has_no_older_generations(
+    tmp_path: Path, is_state_kept: bool
+) -> None:
+    network = Endpoint("robot", "tcp/127.0.0.1:1")
+    service = Service(Config(), network, tmp_path, is_state_kept=is_state_kept)
+    keeper = service._open_generations(MemoryTransport())
+    assert (keeper is not None) is is_state_kept
+    (tmp_path / "state").mkdir()  # The start of a service does this.
+    service._keep_last_generation()
+    assert (tmp_path / "state" / MARKER).exists() is is_state_kept
