@@ -260,9 +260,15 @@ class Control:
 
     # --- actors that were restarted ---------------------------------------------------------------
     def _presence(self, name: str, alive: bool) -> None:
-        """Pause a restarted source actor again; its saved state does not include the pause."""
-        if alive and (self._is_paused or self._is_reset_pending) and name in self._sources:
+        """Send a restarted source actor the command that it may not have found on the disk."""
+        if not alive or name not in self._sources:
+            return
+        markers = self._pause_marker, self._reset_marker
+        if self._is_paused or self._is_reset_pending:
             self._start(self._commander.order("pause", name, self._timeout_s))
+        elif any(marker is not None and marker.exists() for marker in markers):
+            # The disk did not remove the marker, so the actor has started paused.
+            self._start(self._commander.order("resume", name, self._timeout_s))
 
     def _start(self, work: Coroutine[Any, Any, object]) -> None:
         task = asyncio.ensure_future(work)

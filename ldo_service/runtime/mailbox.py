@@ -53,6 +53,8 @@ class Mailbox:
         transport: Transport,
         max_bytes: int = 64_000_000,
         past: Mapping[str, InletPosition] | None = None,
+        *,
+        is_held: bool = False,
     ) -> None:
         """Subscribe to the topics of all inputs.
 
@@ -63,6 +65,7 @@ class Mailbox:
             max_bytes: Maximum size of a message of a Latest input, bytes. Lossless inputs have no
                 limit, because their messages come from actors of the service.
             past: Position of the previous process on each lossless topic, by topic name.
+            is_held: Begin as after `pause`.
         """
         self._consumer, self._max_bytes = consumer, max_bytes
         self._loop = asyncio.get_running_loop()
@@ -70,7 +73,7 @@ class Mailbox:
         self._order: deque[Delivery] = deque()
         self._ready = asyncio.Event()
         self._wake_pending = self._grant_pending = False
-        self._closed = self._held = False
+        self._closed, self._held = False, is_held
         # True while the stage takes no messages because its state cannot be saved. Producers then
         # do not evict this actor.
         self.waits_for_disk = False

@@ -62,6 +62,7 @@ class Stage:
         journal: Journal | None = None,
         heartbeat: Heartbeat | None = None,
         suspects: asyncio.Lock | None = None,
+        starts_paused: Callable[[], bool] = lambda: False,
     ) -> None:
         """Create the actor and restore its last saved state.
 
@@ -76,8 +77,9 @@ class Stage:
             journal: Receiver of the journal entries.
             heartbeat: Heartbeat of this process; None if no parent process reads it.
             suspects: Lock that all stages of this process share; see `Quarantine`.
+            starts_paused: Function that returns True if the stage takes no messages until `resume`.
         """
-        self._transport = transport
+        self._transport, self._starts_paused = transport, starts_paused
         self._config = config = config or SupervisionConfig()
         store = store or MemoryStore()
         self._checkpointer = Checkpointer(store)
@@ -160,6 +162,7 @@ class Stage:
             self._transport,
             max_bytes=round(self._config.max_message_mb * 1e6),
             past=self._checkpointer.past.inputs,
+            is_held=self._starts_paused(),
         )
         self._orders = CommandReceiver(self.name, self._transport, mailbox.put_command)
         if self._drain_requested:
@@ -373,7 +376,8 @@ class Stage:
             try:
                 mailbox.send_credits()
                 self._outlets.check_windows(self._metrics.clock.now_s())
-                self._publish_health()
+                header = Header(self.name, self._epoch, 0, self._metrics.last_stamp_ns)
+                self._health.post(encode_link(header), encode(self.health()))
             except Exception:
                 # A heartbeat only reports on the actor, so a failed heartbeat must not end the
                 # actor.
@@ -384,10 +388,6 @@ class Stage:
             if self._metrics.busy_s > limit_s:
                 raise StageStalled(self.name, self._metrics.busy_s, setting)
             await asyncio.sleep(self._config.heartbeat_s)
-
-    def _publish_health(self) -> None:
-        header = Header(self.name, self._epoch, 0, self._metrics.last_stamp_ns)
-        self._health.post(encode_link(header), encode(self.health()))
 
     def health(self) -> Health:
         """Return the current health message."""

@@ -302,6 +302,7 @@ class Service:
                 journal=self._journal(box.name, Path(config.mapper.image_folder)),
                 heartbeat=start_heartbeat() if self.only else None,
                 suspects=suspects,
+                starts_paused=lambda: _is_fed_from_outside(box) and self._is_paused(),
             )
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise ConfigError(
@@ -309,6 +310,10 @@ class Service:
                 "Choose another folder with --state, or delete this folder to start with an empty "
                 "map."
             ) from error
+
+    def _is_paused(self) -> bool:
+        """Return whether a file says that the service takes no frames; see `Control`."""
+        return any((self.state / marker).exists() for marker in (PAUSE_MARKER, RESET_MARKER))
 
     def _journal(self, actor: str, map_folder: Path) -> Journal:
         if self.recording is None:

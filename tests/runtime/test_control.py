@@ -66,7 +66,9 @@ class Scene:
     ) -> None:
         self._markers = reset_marker, pause_marker, generations
         self.transport, self.seen = MemoryTransport(), []
-        self.source = Stage(Source, self.transport, config=QUICK, store=store)
+        self.source = Stage(
+            Source, self.transport, config=QUICK, store=store, starts_paused=self.has_marker
+        )
         self.collector = Stage(lambda: Collector(self.seen), self.transport, config=QUICK)
         self._timeout_s = timeout_s
 
@@ -79,6 +81,9 @@ class Scene:
                 *self._markers,
             )
             yield
+
+    def has_marker(self) -> bool:
+        return any(marker is not None and marker.exists() for marker in self._markers[:2])
 
     async def request(self, verb: str) -> ControlAnswer:
         body = encode(ControlRequest(stamp_ns=7, command=verb))
@@ -176,6 +181,36 @@ async def test_paused_service_is_paused_after_a_restart_until_it_is_resumed(
     async with scene.started():
         scene.send(1)
         await eventually(lambda: scene.seen == [1])
+
+
+async def test_paused_service_takes_no_frame_before_the_control_has_connected(
+    tmp_path: Path,
+) -> None:
+    marker = tmp_path / "paused"
+    marker.touch()
+    scene = Scene(pause_marker=marker)
+    async with running(scene.source, scene.collector):
+        assert scene.source.health().paused
+        scene.send(1, 2)
+        await eventually(lambda: scene.source.health().inputs[0].dropped_paused == 2)
+        assert scene.seen == []
+
+
+async def test_marker_that_cannot_be_removed_pauses_no_restarted_source(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    scene = Scene(pause_marker=tmp_path / "paused")
+    async with scene.started():
+        assert (await scene.request("pause")).ok
+        monkeypatch.setattr(Path, "unlink", fail)
+        assert (await scene.request("resume")).ok
+        assert scene.has_marker()
+    restarted = Stage(Source, scene.transport, config=QUICK, starts_paused=scene.has_marker)
+    async with running(restarted):
+        await eventually(lambda: not restarted.health().paused)
 
 
 async def test_pause_that_cannot_be_written_says_that_a_restart_resumes(tmp_path: Path) -> None:

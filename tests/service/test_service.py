@@ -1,6 +1,7 @@
 """Tests of the stages that a service creates, without starting them."""
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from ldo_service.config import Config
 from ldo_service.runtime.generations import MARKER
 from ldo_service.service import service as module
 from ldo_service.service.service import Service
+from ldo_service.service.state_folder import PAUSE_MARKER, RESET_MARKER
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.interface import MemoryTransport
@@ -30,6 +32,24 @@ async def test_only_an_actor_on_another_machine_syncs_every_step_by_default(
     service = Service(Config(), network, tmp_path, ("optimizer",), is_remote=is_remote)
     service._stage(actor_spec("optimizer"), MemoryTransport(), {}, asyncio.Lock())
     assert [store.syncs for store in stores] == [is_remote]
+
+
+@pytest.mark.parametrize("marker", [PAUSE_MARKER, RESET_MARKER])
+async def test_only_actors_that_take_frames_start_paused_in_a_paused_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, marker: str
+) -> None:
+    are_paused: list[Callable[[], bool]] = []
+
+    def stage(*_: object, starts_paused: Callable[[], bool], **__: Any) -> None:
+        are_paused.append(starts_paused)
+
+    monkeypatch.setattr(module, "Stage", stage)
+    service = Service(Config(), Endpoint("robot", "tcp/127.0.0.1:1"), tmp_path)
+    for actor in ("frame_source", "mapper"):
+        service._stage(actor_spec(actor), MemoryTransport(), {}, asyncio.Lock())
+    assert [is_paused() for is_paused in are_paused] == [False, False]
+    (tmp_path / marker).touch()
+    assert [is_paused() for is_paused in are_paused] == [True, False]
 
 
 @pytest.mark.parametrize("is_state_kept", [True, False])
