@@ -242,10 +242,19 @@ class Mailbox:
                 if isinstance(inlet, LosslessInlet)
             }
 
-    def put_command(self, order: StageCommand) -> None:
-        """Queue a command; `take` returns it before all deliveries."""
-        self._orders.append(order)
+    def put_command(self, order: StageCommand) -> list[StageCommand]:
+        """Queue a command; `take` returns it before all deliveries.
+
+        A `keep` replaces each one that still waits. Otherwise, an actor that was busy for minutes
+        would keep its state once for each of them.
+
+        Returns:
+            The replaced commands.
+        """
+        replaced = [o for o in self._orders if o.what == order.what == "keep"]
+        self._orders = deque(o for o in [*self._orders, order] if o not in replaced)
         self._ready.set()
+        return replaced
 
     def pause(self) -> None:
         """Let `take` return only commands until `resume`.

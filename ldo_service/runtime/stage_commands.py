@@ -68,8 +68,15 @@ class CommandReceiver:
     """
 
     def __init__(
-        self, stage: str, transport: Transport, take: Callable[[StageCommand], None]
+        self, stage: str, transport: Transport, take: Callable[[StageCommand], list[StageCommand]]
     ) -> None:
+        """Subscribe to the commands.
+
+        Args:
+            stage: Name of the stage.
+            transport: The network.
+            take: Function that takes a command, and returns earlier ones that it replaces.
+        """
         self._stage, self._take = stage, take
         self._loop = asyncio.get_running_loop()
         # Commands that are waiting or executed, and the last replies, by number.
@@ -102,7 +109,8 @@ class CommandReceiver:
             self._reports.post(b"", encode_link(self._done[order.number]))
         elif order.number not in self._under_way:
             self._under_way.add(order.number)
-            self._take(order)
+            for replaced in self._take(order):
+                self.report(replaced, "was replaced by a newer command")
 
 
 class CommandSender:

@@ -124,6 +124,25 @@ async def test_pause_waits_for_the_current_step() -> None:
         assert seen == [1]
 
 
+async def test_busy_stage_keeps_its_state_once_for_all_waiting_commands() -> None:
+    transport, seen, release = MemoryTransport(), [], Event()
+    stage = collector(transport, seen, lambda _value: release.wait(60) and None, policy=Latest(1))
+    commander = CommandSender(transport)
+    async with running(stage):
+        transport.deliver(NUMBERS.name, encode_link(EXTERNAL_HEADER), encode_message(number(1)))
+        await eventually(lambda: stage.health().state == "busy")
+        answers = [
+            asyncio.create_task(commander.order("keep", "collector", 60, (number, 0)))
+            for number in range(1, 6)
+        ]
+        await eventually(lambda: sum(answer.done() for answer in answers) == 4)
+        release.set()
+        assert [await answer for answer in answers] == ["was replaced by a newer command"] * 4 + [
+            ""
+        ]
+        assert seen == [1]
+
+
 async def test_soft_stop_ends_a_paused_stage() -> None:
     transport, seen = MemoryTransport(), []
     stage, commander = collector(transport, seen), CommandSender(transport)
