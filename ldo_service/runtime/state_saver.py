@@ -71,6 +71,7 @@ class StateSaver:
         self.mailbox: Mailbox | None = None
         self._failures = LogLimit(LOG_PERIOD_S)
         self._syncing: set[asyncio.Task[None]] = set()
+        self._unsynced: set[Path] = set()  # Files of outboxes whose last sync has not succeeded.
 
     @property
     def is_unsaved(self) -> bool:
@@ -139,11 +140,16 @@ class StateSaver:
     ) -> None:
         """Keep the last saved state as a generation, and write it in the background.
 
+        While a generation is being written, which takes long on a slow disk, none is begun.
+
         Args:
             actor: The actor of the stage.
             order: The command, with the number of the generation.
             report: Function that is called once the generation is written, with an error or "".
         """
+        if self._syncing:
+            report(order, "is still writing the generation before")
+            return
         generation = order.generation, order.completed
         is_previous_complete = self._checkpointer.is_last_kept(order.completed)
         try:
@@ -152,7 +158,8 @@ class StateSaver:
             report(order, f"cannot keep its state: {error}")
             return
         self._outlets.keep(is_previous_complete=is_previous_complete)
-        paths += self._outlets.pop_unsynced()
+        self._unsynced.update(self._outlets.pop_unsynced())
+        paths += sorted(self._unsynced)
         task = asyncio.create_task(self._write_generation(files, paths, order, report))
         self._syncing.add(task)
         task.add_done_callback(self._syncing.discard)
@@ -166,6 +173,7 @@ class StateSaver:
     ) -> None:
         try:
             await asyncio.to_thread(sync_all, paths)
+            self._unsynced.clear()
             if files is not None:
                 await asyncio.to_thread(files.write)
         except (OSError, DataError) as error:

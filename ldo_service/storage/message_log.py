@@ -167,7 +167,10 @@ class MessageLog:
             _remove(oldest.path)
 
     def pop_unsynced(self) -> list[Path]:
-        """Return the files written since the last call, and their folders, for `sync_all`."""
+        """Return the files written since the last call, and their folders.
+
+        The caller must sync them, again if that fails.
+        """
         with self._lock:
             paths = sorted(self._unsynced)
             self._unsynced.clear()
