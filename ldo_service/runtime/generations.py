@@ -14,6 +14,7 @@ is deleted when the next one is kept.
 
 import asyncio
 import logging
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 
@@ -160,8 +161,16 @@ class GenerationKeeper:
             self._completed = completed_generation(store) or 0
         self._positions: list[str] = []
         self._failures = 0  # Failed generations since the last complete one.
+        self._current_s = time.monotonic()  # Time when the last complete one was up to date.
         self._errors = LogLimit(LOG_PERIOD_S)
         self.lock = asyncio.Lock()  # Held while a generation is kept, and during a reset.
+
+    def age_s(self) -> float:
+        """Return the time since the last complete generation had the states of that time, seconds.
+
+        Any thread may call this method.
+        """
+        return time.monotonic() - self._current_s
 
     async def run(self) -> None:
         """Keep a generation every `KEEP_EVERY_S` seconds if messages were handled since."""
@@ -193,6 +202,8 @@ class GenerationKeeper:
                 log.exception("keeping a generation of the states failed; the service tries again. "
                               "Please report the traceback.")  # fmt: skip
         self._failures = self._failures + 1 if problem else 0
+        if not problem:
+            self._current_s = time.monotonic()
         if self._failures == FAILURES_TO_LOG:
             # Single failures are normal: an actor may be busy, or a message is between two actors.
             log.warning(

@@ -1,42 +1,25 @@
-"""HTTP server with the health of all actors: `ldo serve --metrics-port PORT`.
+"""Metrics of the health of all actors, for Prometheus.
 
-It listens on loopback by default.
-
-- `/metrics`: Metrics of the health messages for Prometheus. Counters restart from 0 with the
-  process of their actor, as Prometheus expects. A silent actor keeps only its counters and the age
-  of its last heartbeat.
-- `/healthz`: 200 while every actor sends heartbeats, else 503 with the names of the silent actors.
-  The reply describes only the current state.
-- `/readyz`: 200 while no actor is silent and no actor fails on every message, else 503 with the
-  names of these actors. A restart of the service does not help an actor that fails. The reply
-  also warns, without another status, of a certificate that expires within 30 days.
+Counters restart from 0 with the process of their actor, as Prometheus expects. A silent actor keeps
+only its counters and the age of its last heartbeat.
 """
 
-import socket
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
-from socketserver import ThreadingMixIn
-from threading import Lock, Thread
+from threading import Lock
 from typing import Any
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 import msgspec
-from prometheus_client import CollectorRegistry, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from ldo_service.errors import ConfigError, UnavailableError
 from ldo_service.schemas import Health, InputCount, OutputCount, decode
-from ldo_service.transport.endpoint import LOOPBACK
 from ldo_service.transport.keys import expiry_warning
 
 MAX_ACTORS = 64  # Limit of the stored names, because messages may contain any name.
 COMES_BACK_S = 5.0  # Time for an actor to restart after it was killed at its heartbeat timeout.
 
-MAX_CONNECTIONS = 16  # Maximum connections of the metrics server; usually two are in use.
-REQUEST_TIMEOUT_S = 5.0  # Maximum time without data from a client of the metrics server.
+OLD_GENERATION_S = 60.0  # Age of the older generation of the states above which `warnings` has it.
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]
 
@@ -152,6 +135,9 @@ class HealthCollector(Collector):
                 seconds; None without keys.
         """
         self.certificate_until_s = certificate_until_s
+        # Function that returns the age of the older generation of all states, seconds; None if the
+        # service keeps none.
+        self.generation_age_s: Callable[[], float] | None = None
         self._robot, self._actors = robot, tuple(actors)
         self._silent_after_s = silent_after_s + COMES_BACK_S
         self._lock = Lock()
@@ -182,6 +168,7 @@ class HealthCollector(Collector):
         for metric in (
             self._ages(last),
             self._certificate(),
+            self._generation(),
             _processes(anew),
             _step_seconds(now),
             _facts(now),
@@ -233,6 +220,28 @@ class HealthCollector(Collector):
         if self.certificate_until_s is not None:
             expiry.add_metric([], self.certificate_until_s - time.time())
         return expiry
+
+    def _generation(self) -> Metric:
+        age = GaugeMetricFamily(
+            "ldo_generation_age_seconds",
+            "Time since the older generation of the states, to which the service falls back, was "
+            "up to date; absent without --state.",
+            labels=[],
+        )
+        if self.generation_age_s is not None:
+            age.add_metric([], self.generation_age_s())
+        return age
+
+    def warnings(self) -> Iterator[str]:
+        """Yield a description of each problem that does not affect the service now."""
+        if expiry := expiry_warning(self.certificate_until_s):
+            yield f"the certificate of the service {expiry}"
+        age_s = self.generation_age_s() if self.generation_age_s else 0.0
+        if age_s > OLD_GENERATION_S:
+            yield (
+                f"the states could not be kept for {age_s:.0f} s, and a power cut could lose the "
+                "keyframes of this time"
+            )
 
 
 def _table(
@@ -290,97 +299,3 @@ def _facts(actors: list[Health]) -> Metric:
         for name, value in health.metrics.items():
             metric.add_metric([health.actor, name], value)
     return metric
-
-
-class _Server(ThreadingMixIn, WSGIServer):
-    """HTTP server with a thread per connection and a maximum number of connections.
-
-    Beyond this number it closes the oldest connection. Idle connections therefore cannot block a
-    new one, and cannot use up the file descriptors that saving the state needs.
-    """
-
-    daemon_threads = True
-    _open: deque[socket.socket]
-    _open_lock: Lock
-
-    def server_activate(self) -> None:
-        self._open, self._open_lock = deque(), Lock()
-        super().server_activate()
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        with self._open_lock:
-            self._open.append(request)
-            oldest = self._open.popleft() if len(self._open) > MAX_CONNECTIONS else None
-        if oldest is not None:
-            with suppress(OSError):
-                oldest.shutdown(socket.SHUT_RDWR)  # The thread of the connection then closes it.
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        with self._open_lock, suppress(ValueError):
-            self._open.remove(request)
-        super().shutdown_request(request)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore an error of a connection, because its client has caused the error."""
-
-
-class _Quiet(WSGIRequestHandler):
-    timeout = REQUEST_TIMEOUT_S
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Suppress the log line of each request."""
-
-
-@contextmanager
-def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK) -> Iterator[None]:
-    """Serve http://ADDRESS:PORT/metrics, /healthz and /readyz inside the block.
-
-    Raises:
-        ConfigError: The port is no port number.
-        UnavailableError: The server cannot listen on the address and port.
-    """
-    if not 0 < port < 65536:
-        raise ConfigError(f"--metrics-port {port} must be within 1..65535.")
-    registry = CollectorRegistry()
-    registry.register(collector)
-    metrics = make_wsgi_app(registry)
-
-    def answer(environ: Any, start_response: Any) -> Iterable[bytes]:
-        if environ["PATH_INFO"] == "/healthz":
-            return _how_it_is(collector.silent_actors(), [], start_response)
-        if environ["PATH_INFO"] == "/readyz":
-            silent, failing = collector.silent_actors(), collector.failing_actors()
-            expiry = expiry_warning(collector.certificate_until_s)
-            return _how_it_is(silent, failing, start_response, expiry)
-        return metrics(environ, start_response)
-
-    try:
-        family = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0][0]
-        kind = type("Server", (_Server,), {"address_family": family})
-        server = make_server(address, port, answer, kind, _Quiet)
-    except OSError as error:
-        raise UnavailableError(
-            f"--metrics-port {port}: cannot listen on {address}:{port} ({error.strerror}). "
-            "Choose another port, or another address with service.metrics_address."
-        ) from error
-    thread = Thread(target=server.serve_forever, name="metrics", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
-
-
-def _how_it_is(
-    silent: list[str], failing: list[str], start_response: Any, expiry: str = ""
-) -> list[bytes]:
-    status = "503 Service Unavailable" if silent or failing else "200 OK"
-    start_response(status, [("Content-Type", "text/plain; charset=utf-8")])
-    problems = [f"no heartbeat: {', '.join(silent)}"] if silent else []
-    problems += [f"failing on every message: {', '.join(failing)}"] if failing else []
-    state = "; ".join(problems) or "every actor reports"
-    warning = f"; the certificate of the service {expiry}" if expiry else ""
-    return [f"{state}{warning}\n".encode()]

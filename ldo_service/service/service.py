@@ -55,7 +55,8 @@ from ldo_service.transport.keys import TlsKeys
 from ldo_service.transport.worker import Worker
 from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport, open_session
 
-from .metrics import HealthCollector, serve_metrics
+from .metrics import HealthCollector
+from .metrics_server import serve_metrics
 from .state_folder import PAUSE_MARKER, RESET_MARKER, claim_state
 
 log = logging.getLogger(__name__)
@@ -177,6 +178,8 @@ class Service:
         pings = asyncio.create_task(watchdog.ping())
         runners = self._runners(transport)
         generations = self._open_generations(transport)
+        if generations:
+            health.generation_age_s = generations.age_s
         keeping = asyncio.create_task(generations.run()) if generations else None
         control = None if self.only else self._open_control(transport, generations)
         names = ", ".join(runner.name for runner in runners)

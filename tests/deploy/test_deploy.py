@@ -21,7 +21,8 @@ from ldo_service.commands.keys import router_yaml
 from ldo_service.schemas import encode
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import CONTROL, ODOMETRY_PRIOR, TOPICS
-from ldo_service.service.metrics import HealthCollector, serve_metrics
+from ldo_service.service.metrics import HealthCollector
+from ldo_service.service.metrics_server import serve_metrics
 from ldo_service.transport.access_control import read_access, rules_of
 from ldo_service.transport.certificate_authority import CertificateAuthority
 from tests.ports import free_port

@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -146,6 +147,25 @@ async def test_failures_in_a_row_are_logged_once(
         await scene.keeper.keep(is_forced=True)
         scene.stages.errors["tracker"] = "is busy"
         scene.handle_message()
+
+
+async def test_age_grows_only_while_messages_are_handled_and_not_kept(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(generations, "time", SimpleNamespace(monotonic=lambda: now_s))
+    await scene.keeper.keep()
+    now_s += 50
+    await scene.keeper.keep()
+    assert scene.keeper.age_s() == 0, "no message was handled since"
+    scene.handle_message()
+    scene.stages.errors["tracker"] = "is busy"
+    now_s += 50
+    await scene.keeper.keep()
+    assert scene.keeper.age_s() == 50
+    scene.stages.errors.clear()
+    await scene.keeper.keep()
+    assert scene.keeper.age_s() == 0
 
 
 async def test_closed_keeper_closes_its_publisher(

@@ -15,12 +15,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import encode
-from ldo_service.service.metrics import (
-    COMES_BACK_S,
-    MAX_CONNECTIONS,
-    HealthCollector,
-    serve_metrics,
-)
+from ldo_service.service.metrics import COMES_BACK_S, HealthCollector
+from ldo_service.service.metrics_server import MAX_CONNECTIONS, serve_metrics
 from tests.ports import free_port
 from tests.schemas.examples import EXAMPLES
 
@@ -102,6 +98,20 @@ def test_certificate_that_expires_within_30_days_is_a_metric_and_a_warning_of_re
         status, text = read_healthz(port, "readyz")
         assert status == 200
         assert text == "every actor reports; the certificate of the service expires in 10.0 days"
+
+
+def test_age_of_the_older_generation_is_a_metric_and_above_a_minute_a_warning_of_readyz() -> None:
+    collector, port = HealthCollector("mule"), free_port()
+    name = "ldo_generation_age_seconds"
+    with serve_metrics(collector, port):
+        assert (name, labels()) not in scraped(port), "a temporary state has no older generation"
+        collector.generation_age_s = lambda: 59.0
+        assert scraped(port)[name, labels()] == 59
+        assert read_healthz(port, "readyz") == (200, "every actor reports")
+        collector.generation_age_s = lambda: 61.0
+        status, text = read_healthz(port, "readyz")
+        assert status == 200
+        assert text.startswith("every actor reports; the states could not be kept for 61 s")
 
 
 def test_actor_is_silent_only_after_its_heartbeat_timeout(monkeypatch: pytest.MonkeyPatch) -> None:

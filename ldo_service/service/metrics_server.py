@@ -1,0 +1,125 @@
+"""HTTP server with the health of all actors: `ldo serve --metrics-port PORT`.
+
+It listens on loopback by default.
+
+- `/metrics`: Metrics of the health messages for Prometheus. Counters restart from 0 with the
+  process of their actor, as Prometheus expects. A silent actor keeps only its counters and the age
+  of its last heartbeat.
+- `/healthz`: 200 while every actor sends heartbeats, else 503 with the names of the silent actors.
+  The reply describes only the current state.
+- `/readyz`: 200 while no actor is silent and no actor fails on every message, else 503 with the
+  names of these actors. A restart of the service does not help an actor that fails. The reply
+  also warns, without another status, of a certificate that expires within 30 days, and if the
+  states could not be kept as an older generation for a minute.
+"""
+
+import socket
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from socketserver import ThreadingMixIn
+from threading import Lock, Thread
+from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+
+from prometheus_client import CollectorRegistry, make_wsgi_app
+
+from ldo_service.errors import ConfigError, UnavailableError
+from ldo_service.transport.endpoint import LOOPBACK
+
+from .metrics import HealthCollector
+
+MAX_CONNECTIONS = 16  # Maximum connections of the metrics server; usually two are in use.
+REQUEST_TIMEOUT_S = 5.0  # Maximum time without data from a client of the metrics server.
+
+
+class _Server(ThreadingMixIn, WSGIServer):
+    """HTTP server with a thread per connection and a maximum number of connections.
+
+    Beyond this number it closes the oldest connection. Idle connections therefore cannot block a
+    new one, and cannot use up the file descriptors that saving the state needs.
+    """
+
+    daemon_threads = True
+    _open: deque[socket.socket]
+    _open_lock: Lock
+
+    def server_activate(self) -> None:
+        self._open, self._open_lock = deque(), Lock()
+        super().server_activate()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        with self._open_lock:
+            self._open.append(request)
+            oldest = self._open.popleft() if len(self._open) > MAX_CONNECTIONS else None
+        if oldest is not None:
+            with suppress(OSError):
+                oldest.shutdown(socket.SHUT_RDWR)  # The thread of the connection then closes it.
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        with self._open_lock, suppress(ValueError):
+            self._open.remove(request)
+        super().shutdown_request(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore an error of a connection, because its client has caused the error."""
+
+
+class _Quiet(WSGIRequestHandler):
+    timeout = REQUEST_TIMEOUT_S
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Suppress the log line of each request."""
+
+
+@contextmanager
+def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK) -> Iterator[None]:
+    """Serve http://ADDRESS:PORT/metrics, /healthz and /readyz inside the block.
+
+    Raises:
+        ConfigError: The port is no port number.
+        UnavailableError: The server cannot listen on the address and port.
+    """
+    if not 0 < port < 65536:
+        raise ConfigError(f"--metrics-port {port} must be within 1..65535.")
+    registry = CollectorRegistry()
+    registry.register(collector)
+    metrics = make_wsgi_app(registry)
+
+    def answer(environ: Any, start_response: Any) -> Iterable[bytes]:
+        if environ["PATH_INFO"] == "/healthz":
+            return _how_it_is(collector.silent_actors(), [], start_response)
+        if environ["PATH_INFO"] == "/readyz":
+            silent, failing = collector.silent_actors(), collector.failing_actors()
+            return _how_it_is(silent, failing, start_response, collector.warnings())
+        return metrics(environ, start_response)
+
+    try:
+        family = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0][0]
+        kind = type("Server", (_Server,), {"address_family": family})
+        server = make_server(address, port, answer, kind, _Quiet)
+    except OSError as error:
+        raise UnavailableError(
+            f"--metrics-port {port}: cannot listen on {address}:{port} ({error.strerror}). "
+            "Choose another port, or another address with service.metrics_address."
+        ) from error
+    thread = Thread(target=server.serve_forever, name="metrics", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def _how_it_is(
+    silent: list[str], failing: list[str], start_response: Any, warnings: Iterable[str] = ()
+) -> list[bytes]:
+    status = "503 Service Unavailable" if silent or failing else "200 OK"
+    start_response(status, [("Content-Type", "text/plain; charset=utf-8")])
+    problems = [f"no heartbeat: {', '.join(silent)}"] if silent else []
+    problems += [f"failing on every message: {', '.join(failing)}"] if failing else []
+    state = "; ".join(problems) or "every actor reports"
+    return [f"{'; '.join([state, *warnings])}\n".encode()]
