@@ -121,6 +121,16 @@ def test_generation_that_is_not_complete_releases_no_messages() -> None:
     assert outbox.in_memory[0].seq == 3
 
 
+def test_generations_that_are_never_complete_take_no_memory() -> None:
+    outbox = outbox_of(3000)
+    for handled in range(1000, 2000):
+        outbox.keep(handled, is_previous_complete=False)
+    assert len(outbox._handled_at_keeps) == 4
+    outbox.keep(2000, is_previous_complete=True)
+    outbox.forget(2500)
+    assert outbox.in_memory[0].seq == 1998
+
+
 def test_retained_messages_do_not_exceed_their_maximum_size() -> None:
     outbox = outbox_of(11, size=MAX_RETAINED_BYTES // 10)
     outbox.keep(0, is_previous_complete=False)
