@@ -21,6 +21,10 @@ class MapFiles:
         """Remove files that no kept generation of the state needs; see `RetiredFiles.kept`."""
         self._offloaded.retired.kept(is_previous_complete=is_previous_complete)
 
+    def retired_bytes(self) -> int:
+        """Return the size of the files that only older generations of the state need, bytes."""
+        return self._offloaded.retired.size_bytes
+
     def unsynced_files(self) -> list[Path]:
         """Return the files that may not be on the disk yet; see `ChecksummedFolder`."""
         return [path for folder in self._folders for path in folder.unsynced_files()]

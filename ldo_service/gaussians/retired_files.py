@@ -31,11 +31,17 @@ class RetiredFiles:
         """Replace all retired files by those that a restored state does not need."""
         self._new, self._unsaved, self._kept = [], numbers, []
 
+    @property
+    def size_bytes(self) -> int:
+        """Size of the files that the last snapshot does not need, bytes."""
+        return sum(self._files.sizes.get(n, 0) for n in (*self._unsaved, *self._kept))
+
     def saved(self) -> None:
         """Remove the files that the last snapshot does not need.
 
         Call this method once that snapshot is saved, if no older states are kept.
         """
+        self._remove(self._kept)
         self._remove(self._unsaved)
 
     def kept(self, *, is_previous_complete: bool) -> None:

@@ -127,6 +127,10 @@ class StateFiles(Protocol):
                 that no older one is needed.
         """
 
+    def retired_bytes(self) -> int:
+        """Return the size of the files that only older generations of the state need, bytes."""
+        ...
+
     def unsynced_files(self) -> list[Path]:
         """Return the files that may not be on the disk yet."""
         ...

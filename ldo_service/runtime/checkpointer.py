@@ -17,6 +17,9 @@ log = logging.getLogger(__name__)
 # Number of unsynced files above which a save syncs them. Each saved state lists them, and only a
 # generation syncs them earlier: a service has about 20 of them between two generations.
 MAX_UNSYNCED_FILES = 100
+# Size of the files that only older generations need above which these are deleted, bytes. A service
+# that completes a generation every second retires a few MB in between.
+MAX_RETIRED_BYTES = 1_000_000_000
 
 
 class Checkpointer:
@@ -107,8 +110,22 @@ class Checkpointer:
             Exception: Any exception of the actor. The state is saved nevertheless, so the step must
                 not be repeated.
         """
+        if self._store.is_kept(actor.name) and actor.files:
+            self._bound_retired_files(actor.name, actor.files.retired_bytes())
         if not self._store.is_kept(actor.name):
             actor.on_saved()
+
+    def _bound_retired_files(self, name: str, size_bytes: int) -> None:
+        """Delete the generations of the state if they need too many files of the actor."""
+        if size_bytes > MAX_RETIRED_BYTES:
+            self._store.give_up(name)
+            self._last_kept = 0
+            log.error(
+                "%s: no generation of the states was completed while %.0f MB of files became "
+                "unused, so the older generation is deleted. A power cut now could damage the only "
+                "state. Check the disk, and the actors with `ldo doctor`.",
+                name, 1e-6 * size_bytes,
+            )  # fmt: skip
 
     def is_last_kept(self, generation: int) -> bool:
         """Return whether this generation is the last one that this stage has kept."""

@@ -160,7 +160,7 @@ class Outbox:
         """
         needed = self.first_needed(before)
         if self._log:
-            self._log.forget(needed)
+            self._log.forget(needed, handled=before)
         elif self._bytes <= MAX_RETAINED_BYTES:
             before = needed
         with self._lock:

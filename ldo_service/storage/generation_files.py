@@ -22,13 +22,14 @@ class GenerationFiles:
     contents: StateContents = field(default_factory=lambda: StateContents({}))
     sources: dict[str, str] = field(default_factory=dict)  # File to copy, by part.
     is_written: bool = False  # True once `write` has succeeded.
+    is_given_up: bool = False  # True if the generation is not needed any more.
 
     def write(self) -> None:
         """Copy the files, write their list, and sync both.
 
         Raises:
             DamagedStateError: A file does not match its checksum.
-            OSError: A file cannot be read or written.
+            OSError: A file cannot be read or written, or the generation was given up.
         """
         if not self.list_name:
             return
@@ -43,4 +44,7 @@ class GenerationFiles:
             copy.write_bytes(body)
             sync(copy)
         write_atomically(self.folder / self.list_name, self.contents.encode(), syncs=True)
+        if self.is_given_up:
+            (self.folder / self.list_name).unlink(missing_ok=True)
+            raise OSError(f"{self.folder / self.list_name} was given up")
         self.is_written = True

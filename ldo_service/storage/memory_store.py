@@ -49,6 +49,9 @@ class MemoryStore:
         """Return False: there are no older generations."""
         return False
 
+    def give_up(self, actor: str) -> None:
+        """Do nothing: there are no older generations."""
+
     def has_fallen_back(self, actor: str) -> bool:  # noqa: ARG002
         """Return False: there are no older generations."""
         return False

@@ -77,7 +77,7 @@ class MessageLog:
         self._lock = Lock()
         self._segments: list[_Segment] = []
         self._open: _Segment | None = None  # The segment that is being written.
-        self._first = first
+        self._first = self._handled = first
         self._unsynced: set[Path] = set()  # Files written since the last `pop_unsynced`.
         self.dropped = 0  # Messages deleted because of the maximum size.
         self._scan(end)
@@ -162,7 +162,7 @@ class MessageLog:
         while size > self._max_bytes and len(self._segments) > 1:
             oldest = self._segments.pop(0)
             size -= oldest.size
-            self.dropped += max(0, oldest.next - max(self._first, oldest.first))
+            self.dropped += max(0, oldest.next - max(self._handled, self._first, oldest.first))
             self._first = oldest.next
             _remove(oldest.path)
 
@@ -219,10 +219,16 @@ class MessageLog:
             later = [segment.first for segment in self._segments if segment.first > seq]
         return min(later, default=end)
 
-    def forget(self, before: int) -> None:
-        """Delete the segments that only hold messages with numbers below `before`."""
+    def forget(self, before: int, handled: int = 0) -> None:
+        """Delete the segments that only hold messages with numbers below `before`.
+
+        Args:
+            before: Number of the first message that is still needed.
+            handled: Number of the first message that a consumer still needs. The earlier ones do
+                not count as dropped if the log exceeds its maximum size.
+        """
         with self._lock:
-            self._first = max(self._first, before)
+            self._first, self._handled = max(self._first, before), max(self._handled, handled)
             while (
                 self._segments
                 and self._segments[0].next <= before
@@ -245,7 +251,7 @@ class MessageLog:
         """Delete all messages and begin at number 0 of a new epoch."""
         with self._lock:
             self._clear()
-            self._epoch, self._first = epoch, 0
+            self._epoch, self._first, self._handled = epoch, 0, 0
 
     def _clear(self) -> None:
         while self._segments:

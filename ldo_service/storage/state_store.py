@@ -78,6 +78,10 @@ class StateStore(Protocol):
         """Return whether an older generation of the actor's state exists."""
         ...
 
+    def give_up(self, actor: str) -> None:
+        """Delete all generations of the state of an actor."""
+        ...
+
     def has_fallen_back(self, actor: str) -> bool:
         """Return whether the last loaded state is an older generation."""
         ...
@@ -330,6 +334,27 @@ class FolderStore:
         past, self._writing[actor] = self._writing.get(actor), new
         self._remove_unused(actor, [*unused, *(past.sources.values() if past else ())])
         return new
+
+    def give_up(self, actor: str) -> None:
+        """Delete all generations of the state of an actor, but not the state itself.
+
+        Raises:
+            OSError: The disk cannot be written.
+        """
+        folder = self.folder / actor
+        if actor in self._writing:
+            self._writing[actor].is_given_up = True
+        lists = list(folder.glob(GENERATION.format("*")))
+        for path in lists:
+            path.unlink(missing_ok=True)
+        if lists:
+            sync(folder)  # The actor may now remove files that only the generations need.
+        copies = {f for kept in self._kept.get(actor, {}).values() for f in kept.files.values()}
+        for known in (self._copies, self._writing):
+            known.pop(actor, None)
+        if actor in self._kept:
+            self._kept[actor] = {}
+            self._remove_unused(actor, copies)
 
     def exists(self, actor: str, generation: int = NEWEST) -> bool:
         """Return whether an actor has a state."""

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from ldo_service.gaussians.retired_files import RetiredFiles
 from ldo_service.runtime import Actor, checkpointer
 from ldo_service.runtime.checkpointer import MAX_UNSYNCED_FILES, Checkpointer
 from ldo_service.storage.checksummed_folder import ChecksummedFolder
@@ -12,13 +13,20 @@ from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 
 class Files(ChecksummedFolder):
-    """Files of an actor, which never retires one."""
+    """Files of an actor, which retires them as the mapper does."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, "img", "The test fails.")
+        self.retired = RetiredFiles(self)
 
     def saved(self) -> None:
-        pass
+        self.retired.saved()
 
     def kept(self, *, is_previous_complete: bool) -> None:
-        pass
+        self.retired.kept(is_previous_complete=is_previous_complete)
+
+    def retired_bytes(self) -> int:
+        return self.retired.size_bytes
 
 
 class Writer(Actor):
@@ -28,7 +36,7 @@ class Writer(Actor):
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
-        self.files = Files(folder, "img", "The test fails.")
+        self.files = Files(folder)
 
 
 def unsynced_of(state: Path) -> tuple[str, ...]:
@@ -52,3 +60,34 @@ def test_unsynced_files_are_synced_and_forgotten_if_no_generation_is_kept(
     assert longest == MAX_UNSYNCED_FILES
     files = [path for path in synced if path.suffix == ".img"]
     assert len(files) == len(set(files)) == 2 * MAX_UNSYNCED_FILES + 2
+
+
+def test_files_that_only_older_generations_need_are_bounded_while_none_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(checkpointer, "MAX_RETIRED_BYTES", 1000)
+    actor, store = Writer(tmp_path / "map"), FolderStore(tmp_path / "state")
+    saver = Checkpointer(store)
+    largest = 0
+    for number in range(60):  # Each step replaces a file of 100 bytes.
+        actor.files.write(number, bytes(92))
+        if number:
+            actor.files.retired.add(number - 1)
+        actor.files.retired.on_snapshot()
+        saver.write(actor, {"keyframe": [number]})
+        saver.notify(actor)
+        files, _ = saver.keep(actor, number + 1, completed=1)  # No later one is completed.
+        assert files is not None
+        files.write()
+        largest = max(largest, sum(actor.files.sizes.values()))
+        if number == 5:
+            assert store.load("writer", 1) == {"keyframe": [0]}
+            assert 0 in actor.files.sizes
+    assert largest <= 1300
+    assert store.load("writer", 1) is None
+    assert store.load("writer") == {"keyframe": [59]}
+    assert store.load("writer", 60) == {"keyframe": [59]}
+    errors = [r for r in caplog.records if r.levelname == "ERROR"]
+    assert 1 <= len(errors) <= 6
+    names = {path.name for path in (tmp_path / "state" / "writer").iterdir()}
+    assert len(names) < 12, "copies of the deleted generations are removed"

@@ -14,6 +14,7 @@ from ldo_service.runtime.generations import (
     problem_of_states,
 )
 from ldo_service.runtime.outbox import MAX_RETAINED_BYTES, Outbox
+from ldo_service.storage import message_log
 from ldo_service.storage.message_log import MessageLog
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.flow_control import UnackedMessage
@@ -149,6 +150,23 @@ def test_logged_messages_of_any_size_are_retained_on_disk_only(tmp_path: Path) -
     assert outbox.first_needed(9) == outbox.first(9) == 0
     assert outbox.read(0) == UnackedMessage(0, b"", body)
     assert len(outbox._memory) == 0
+
+
+def test_retained_messages_that_exceed_the_log_do_not_count_as_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(message_log, "SEGMENT_BYTES", 100)
+    outbox = Outbox(log=MessageLog(tmp_path, 1, 0, 0, max_bytes=1000), retained_from=0)
+    for seq in range(30):
+        outbox.add(UnackedMessage(seq, b"", bytes(100)))
+        outbox.store()
+        outbox.forget(seq)
+    assert outbox.first(30) > 10
+    assert outbox.dropped == 0
+    for seq in range(30, 60):  # The consumer has stopped.
+        outbox.add(UnackedMessage(seq, b"", bytes(100)))
+        outbox.store()
+    assert outbox.dropped == outbox.first(60) - 29
 
 
 def test_outbox_without_generations_retains_nothing() -> None:

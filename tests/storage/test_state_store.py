@@ -294,6 +294,24 @@ def test_only_the_newest_and_the_last_complete_generation_are_kept(tmp_path: Pat
     assert FolderStore(tmp_path).load("mapper", 5) == {"step": [5]}
 
 
+def test_generations_that_are_given_up_leave_only_the_state(tmp_path: Path) -> None:
+    store = FolderStore(tmp_path)
+    store.save("mapper", {"map": [1], "now": [2]})
+    store.keep("mapper", 1, 0).write()
+    being_written = store.keep("mapper", 2, 1)
+    store.give_up("mapper")
+    with pytest.raises(OSError, match="given up"):
+        being_written.write()
+    assert not store.is_kept("mapper")
+    assert [store.load("mapper", generation) for generation in (1, 2)] == [None, None]
+    store.save("mapper", {"map": [3], "now": [4]})
+    assert FolderStore(tmp_path).load("mapper") == {"map": [3], "now": [4]}
+    store.keep("mapper", 3, 1).write()
+    assert FolderStore(tmp_path).load("mapper", 3) == {"map": [3], "now": [4]}
+    FolderStore(tmp_path).save("mapper", {"map": [3], "now": [5]})  # It removes unlisted files.
+    assert len(list((tmp_path / "mapper").iterdir())) == 6
+
+
 def test_actor_without_state_keeps_nothing(tmp_path: Path) -> None:
     store = FolderStore(tmp_path)
     store.keep("mapper", 1, 0).write()
