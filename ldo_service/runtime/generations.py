@@ -196,7 +196,7 @@ class GenerationKeeper:
             problem = await self._keep(is_forced=is_forced)
         except (OSError, DataError) as error:
             problem = str(error)
-        except Exception as error:  # Without this task, no generation would be kept any more.
+        except Exception as error:  # If this task ended, no generation would be kept.
             problem = repr(error)
             if self._errors.is_due():
                 log.exception("keeping a generation of the states failed; the service tries again. "

@@ -150,7 +150,7 @@ class Outbox:
         """
         if is_previous_complete:
             del self._handled_at_keeps[:-2]
-        del self._handled_at_keeps[1:-2]  # Only the first and the last two are ever used.
+        del self._handled_at_keeps[1:-2]  # The others are never used.
         self._handled_at_keeps.append(handled)
 
     def forget(self, before: int) -> None:

@@ -76,7 +76,7 @@ def test_files_that_only_older_generations_need_are_bounded_while_none_is_comple
         actor.files.retired.on_snapshot()
         saver.write(actor, {"keyframe": [number]})
         saver.notify(actor)
-        files, _ = saver.keep(actor, number + 1, completed=1)  # No later one is completed.
+        files, _ = saver.keep(actor, number + 1, completed=1)
         assert files is not None
         files.write()
         largest = max(largest, sum(actor.files.sizes.values()))
