@@ -28,6 +28,8 @@ PATIENCE = 6  # Factor on all time limits, because test machines are busy with o
 RESEND_AFTER_S = 1.0  # Time without a pose after which a frame is sent again.
 MAX_COPIES = 1000  # Maximum number of copies of a frame, stamped 1 ns apart.
 LDO = (sys.executable, "-m", "ldo_service")
+# Options of a service that saves the whole map after each keyframe.
+EVERY_KEYFRAME = ("--set", "mapper.checkpoint_interval_keyframes=1")
 
 
 def wait_until(true: Callable[[], bool], timeout_s: float, what: str) -> None:
@@ -231,3 +233,19 @@ def is_running(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] != "Z"
+
+
+def metric(service: LiveService, actor: str, name: str) -> float:
+    """Return a metric in the last heartbeat of an actor; 0 if it has none."""
+    health = service.update_health().get(actor)
+    return health.metrics.get(name, 0.0) if health else 0.0
+
+
+@contextmanager
+def service_with_map(folder: Path, frames: FrameSequence) -> Iterator[LiveService]:
+    """Run a service whose mapper has saved a map of at least eight keyframes."""
+    with live_service(folder, *EVERY_KEYFRAME) as service:
+        service.wait_for_actors()
+        with service.camera(frames):
+            wait_until(lambda: metric(service, "mapper", "keyframes") >= 8, 60, "a map")
+        yield service

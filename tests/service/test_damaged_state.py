@@ -9,14 +9,15 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import DamagedStateError
 from ldo_service.storage.state_contents import read_contents
 from ldo_service.storage.state_store import CONTENTS
-from tests.service.conftest import LDO, LiveService, free_endpoint, live_service, wait_until
-
-EVERY_KEYFRAME = ("--set", "mapper.checkpoint_interval_keyframes=1")
-
-
-def metric(service: LiveService, actor: str, name: str) -> float:
-    health = service.update_health().get(actor)
-    return health.metrics.get(name, 0.0) if health else 0.0
+from tests.service.conftest import (
+    EVERY_KEYFRAME,
+    LDO,
+    free_endpoint,
+    live_service,
+    metric,
+    service_with_map,
+    wait_until,
+)
 
 
 def newest_parts(state: Path, actor: str) -> list[Path]:
@@ -34,10 +35,8 @@ def cut(path: Path) -> None:
 def test_service_falls_back_once_and_says_so_in_log_and_heartbeat(
     tmp_path: Path, room: Sequence
 ) -> None:
-    with live_service(tmp_path, *EVERY_KEYFRAME) as service:
-        service.wait_for_actors()
+    with service_with_map(tmp_path, room) as service:
         with service.camera(room):
-            wait_until(lambda: metric(service, "mapper", "keyframes") >= 8, 60, "a map")
             generation = service.state / "state" / "generation.msgpack"
             first = read_contents(generation)
             wait_until(lambda: read_contents(generation) != first, 30, "another generation")

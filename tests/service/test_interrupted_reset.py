@@ -10,14 +10,14 @@ from ldo_service.datasets import Sequence
 from ldo_service.service.state_folder import RESET_MARKER
 from ldo_service.storage.state_contents import read_contents
 from ldo_service.storage.state_store import CONTENTS
-from tests.service.conftest import LiveService, live_service, wait_until
-
-EVERY_KEYFRAME = ("--set", "mapper.checkpoint_interval_keyframes=1")
-
-
-def metric(service: LiveService, actor: str, name: str) -> float:
-    health = service.update_health().get(actor)
-    return health.metrics.get(name, 0.0) if health else 0.0
+from tests.service.conftest import (
+    EVERY_KEYFRAME,
+    LiveService,
+    live_service,
+    metric,
+    service_with_map,
+    wait_until,
+)
 
 
 def kill_after_reset_of_tracker(service: LiveService) -> None:
@@ -37,10 +37,7 @@ def kill_after_reset_of_tracker(service: LiveService) -> None:
 def test_reset_that_a_kill_interrupts_is_completed_at_the_next_start(
     tmp_path: Path, room: Sequence
 ) -> None:
-    with live_service(tmp_path, *EVERY_KEYFRAME) as service:
-        service.wait_for_actors()
-        with service.camera(room):
-            wait_until(lambda: metric(service, "mapper", "keyframes") >= 8, 60, "a map")
+    with service_with_map(tmp_path, room) as service:
         killer = Thread(target=kill_after_reset_of_tracker, args=(service,))
         killer.start()
         with pytest.raises(Exception, match="no service replies"):
