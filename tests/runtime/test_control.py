@@ -263,6 +263,20 @@ async def test_reset_of_the_previous_process_is_completed(tmp_path: Path) -> Non
         await eventually(lambda: not scene.health()[0].paused)
 
 
+async def test_marker_that_cannot_be_removed_does_not_hold_the_actors_after_a_reset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    scene = Scene(reset_marker=tmp_path / "reset")
+    async with scene.started():
+        with monkeypatch.context() as read_only:
+            read_only.setattr(Path, "unlink", fail)
+            assert (await scene.request("reset")).ok
+        assert not any(health.paused for health in scene.health())
+
+
 async def test_reset_without_a_marker_on_the_disk_is_refused(tmp_path: Path) -> None:
     scene = Scene(reset_marker=tmp_path / "absent" / "reset")
     async with scene.started():

@@ -9,6 +9,7 @@ import pytest
 
 from ldo_service.actors.topology import actor_spec
 from ldo_service.config import Config
+from ldo_service.errors import DamagedStateError
 from ldo_service.runtime.generations import MARKER
 from ldo_service.service import service as module
 from ldo_service.service.service import Service
@@ -63,3 +64,19 @@ async def test_temporary_state_has_no_older_generations(
     (tmp_path / "state").mkdir()  # The start of a service does this.
     service._keep_last_generation()
     assert (tmp_path / "state" / MARKER).exists() is is_state_kept
+
+
+def test_any_error_of_the_service_leaves_with_its_exit_code_while_a_step_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def fail(*_: object) -> None:
+        raise DamagedStateError("a state is damaged")
+
+    left: list[tuple[int, str]] = []
+    monkeypatch.setattr(Service, "_serve", fail)
+    monkeypatch.setattr(Service, "_open_session", lambda *_: None)
+    monkeypatch.setattr(module, "_leave_if_busy", lambda *arguments: left.append(arguments))
+    service = Service(Config(), Endpoint("robot", "tcp/127.0.0.1:1"), tmp_path)
+    with pytest.raises(DamagedStateError):
+        service.run()
+    assert left == [(DamagedStateError.exit_code, "a state is damaged")]

@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import ssl
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -260,9 +261,21 @@ def test_other_protocols_are_closed_at_once(gate: int, router: EchoRouter) -> No
     assert router.accepted == 0
 
 
-def test_gate_that_was_killed_is_started_again(router: EchoRouter, keys: Path) -> None:
+@pytest.mark.parametrize("failures", [0, 2])
+def test_gate_that_was_killed_is_started_again(
+    router: EchoRouter, keys: Path, monkeypatch: pytest.MonkeyPatch, failures: int
+) -> None:
+    start, failed = GateProcess._start, list[GateProcess]()
+
+    def start_later(process: GateProcess) -> subprocess.Popen[str]:
+        if len(failed) < failures:
+            failed.append(process)
+            raise OSError(12, "Cannot allocate memory")
+        return start(process)
+
     with socket.create_server((LOOPBACK, 0)) as listener:
         process, port = GateProcess(listener, router.port), listener.getsockname()[1]
+        monkeypatch.setattr(GateProcess, "_start", start_later)
         with tls_client(port, keys) as client:
             killed = process.pid
             process._process.kill()

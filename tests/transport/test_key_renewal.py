@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import zenoh
@@ -13,7 +15,7 @@ import zenoh
 from ldo_service.schemas.topics import CAMERA_RGBD, MAP_REFINE
 from ldo_service.transport.certificate_authority import CertificateAuthority
 from ldo_service.transport.endpoint import LOOPBACK, Endpoint
-from ldo_service.transport.gate_process import guarded
+from ldo_service.transport.gate_process import GateProcess, guarded
 from ldo_service.transport.key_renewal import KeyRenewal
 from ldo_service.transport.keys import ACCESS, CERTIFICATE, KEY, TlsKeys
 from ldo_service.transport.zenoh_transport import open_session
@@ -127,3 +129,23 @@ def test_unusable_new_keys_leave_the_previous_ones_in_use(
         eventually(lambda: "cannot be used, so the previous ones stay in use" in caplog.text)
         eventually(arrives(router, camera, CAMERA_RGBD.name))
     assert not router.renewed
+
+
+def test_keys_are_looked_at_again_after_an_unexpected_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    renewals: list[int] = []
+
+    def renew(_: KeyRenewal) -> None:
+        renewals.append(len(renewals))
+        if len(renewals) == 1:
+            raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(KeyRenewal, "PERIOD_S", 0.01)
+    monkeypatch.setattr(KeyRenewal, "_renew", renew)
+    keys = SimpleNamespace(folder=tmp_path)
+    network, gate = cast(Endpoint, SimpleNamespace(keys=keys)), cast(GateProcess, None)
+    with KeyRenewal(gate, network, lambda _: None):
+        (tmp_path / KEY).write_text("a key that only its owner can read")
+        eventually(lambda: len(renewals) == 2)
+    assert "could not be renewed; trying again" in caplog.text
