@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -17,6 +17,12 @@ from ldo_service.service.state_folder import PAUSE_MARKER, RESET_MARKER
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.interface import MemoryTransport
+from ldo_service.transport.zenoh_transport import ZenohTransport
+
+
+def transport() -> ZenohTransport:
+    """Return a network in memory, which suffices for stages that do not run."""
+    return cast(ZenohTransport, MemoryTransport())
 
 
 @pytest.mark.parametrize("is_remote", [True, False])
@@ -31,7 +37,7 @@ async def test_only_an_actor_on_another_machine_syncs_every_step_by_default(
     monkeypatch.setattr(module, "Stage", stage)
     network = Endpoint("robot", "tcp/127.0.0.1:1")
     service = Service(Config(), network, tmp_path, ("optimizer",), is_remote=is_remote)
-    service._stage(actor_spec("optimizer"), MemoryTransport(), {}, asyncio.Lock())
+    service._stage(actor_spec("optimizer"), transport(), {}, asyncio.Lock())
     assert [store.syncs for store in stores] == [is_remote]
 
 
@@ -47,7 +53,7 @@ async def test_only_actors_that_take_frames_start_paused_in_a_paused_service(
     monkeypatch.setattr(module, "Stage", stage)
     service = Service(Config(), Endpoint("robot", "tcp/127.0.0.1:1"), tmp_path)
     for actor in ("frame_source", "mapper"):
-        service._stage(actor_spec(actor), MemoryTransport(), {}, asyncio.Lock())
+        service._stage(actor_spec(actor), transport(), {}, asyncio.Lock())
     assert [is_paused() for is_paused in are_paused] == [False, False]
     (tmp_path / marker).touch()
     assert [is_paused() for is_paused in are_paused] == [True, False]
@@ -59,7 +65,7 @@ async def test_temporary_state_has_no_older_generations(
 ) -> None:
     network = Endpoint("robot", "tcp/127.0.0.1:1")
     service = Service(Config(), network, tmp_path, is_state_kept=is_state_kept)
-    keeper = service._open_generations(MemoryTransport())
+    keeper = service._open_generations(transport())
     assert (keeper is not None) is is_state_kept
     (tmp_path / "state").mkdir()  # The start of a service does this.
     service._keep_last_generation()
