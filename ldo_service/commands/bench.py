@@ -1,67 +1,262 @@
 """Command `ldo bench`."""
 
 import json
-from dataclasses import asdict
-from typing import Annotated, Literal
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
 
+import msgspec
 import tyro
 from rich.console import Console
 from rich.table import Column, Table
 
 from ldo_service import kernels
+from ldo_service.config import actor_parameters, load_config
+from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.iteration import Iteration, bench_camera, iteration_times
+from ldo_service.runs.map_benchmark import HeldOutErrors, MapMeasurement, TrackedSource
 
-from .options import argument
+from .options import ConfigFile, Settings, Source, argument, progress
+
+Json = Annotated[bool, argument(name="json", help="print one JSON object")]
 
 
-def bench(
-    what: Annotated[
-        Literal["render"],
-        tyro.conf.Positional,
-        argument(help="one iteration of the Gaussian optimizer: rendering, loss, gradients, Adam"),
-    ],
-    gaussians: Annotated[int, argument(help="Gaussians in view")] = 100_000,
-    gaussians_out_of_view: Annotated[int, argument(help="additional Gaussians out of view")] = 0,
-    size: Annotated[str, argument(metavar="WxH", help="size of the image, pixels")] = "640x480",
-    threads: Annotated[int, argument(help="threads of the kernels")] = 1,
-    repeats: Annotated[int, argument(help="iterations; the times are medians over them")] = 20,
-    json_: Annotated[bool, argument(name="json", help="print one JSON object")] = False,
-) -> None:
+@dataclass(frozen=True)
+class BenchRender:
     """Measure how long one iteration of the Gaussian optimizer takes on this machine.
 
     The scene is synthetic. The times are medians over all repeats, in milliseconds of wall time.
     The step of Adam runs inside the backward pass: backward_ms is the time of the pass without the
     step, and adam_ms is the time that the step adds. iteration_ms is the time of forward pass,
     loss, backward pass and step together.
+    """
+
+    gaussians: Annotated[int, argument(help="Gaussians in view")] = 100_000
+    gaussians_out_of_view: Annotated[int, argument(help="additional Gaussians out of view")] = 0
+    size: Annotated[str, argument(metavar="WxH", help="size of the image, pixels")] = "640x480"
+    threads: Annotated[int, argument(help="threads of the kernels")] = 1
+    repeats: Annotated[int, argument(help="iterations; the times are medians over them")] = 20
+    json_: Json = False
+
+
+@dataclass(frozen=True)
+class BenchMap:
+    """Measure the mapper alone on a source: frames per second, CPU time by stage, and errors.
+
+    The source is tracked once. Its keyframes are then mapped at their final poses on one thread, so
+    that measurements with different settings differ by the mapper alone. FPS is the number of
+    frames per CPU second of the mapper. PSNR and depth L1 are errors on every fifth frame, which is
+    held out; the exposure of such a frame is interpolated between keyframes.
+
+    CPU times depend on what else the machine does. For a ratio of two settings, run both commands
+    at the same time, or one directly after the other.
+
+      ldo bench map ~/data/kitchen --frames 200 --runs build/bench --save sharp.json
+      ldo bench map ~/data/kitchen --frames 200 --runs build/bench --baseline sharp.json
+    """
+
+    source: Source
+    frames: Annotated[int, argument(metavar="N", help="number of frames")] = 60
+    config: ConfigFile = None
+    set: Settings = ()
+    refine_iterations: Annotated[
+        int, argument(metavar="N", help="measure the map after N more iterations too")
+    ] = 0
+    runs: Annotated[
+        Path | None,
+        argument(
+            metavar="DIR",
+            help="folder in which the tracked source is kept for later calls; default: a temporary "
+            "folder",
+        ),
+    ] = None
+    save: Annotated[
+        Path | None, argument(metavar="FILE", help="store the measurement as a baseline")
+    ] = None
+    baseline: Annotated[
+        Path | None,
+        argument(metavar="FILE", help="print the ratio to a measurement stored with --save"),
+    ] = None
+    json_: Json = False
+
+
+Verb = (
+    Annotated[BenchRender, tyro.conf.subcommand("render")]
+    | Annotated[BenchMap, tyro.conf.subcommand("map")]
+)
+
+
+def bench(verb: Verb) -> None:
+    """Measure the speed of the Gaussian optimizer, or of the mapper on a source.
 
     Set the environment variable LDO_ISA to avx512, avx2 or baseline to choose the instruction set.
     """
-    width, height = _pixels(size)
-    if not min(gaussians, threads, repeats) >= 1:
+    match verb:
+        case BenchRender():
+            bench_render(verb)
+        case BenchMap():
+            bench_map(verb)
+
+
+def bench_render(verb: BenchRender) -> None:
+    """Measure one iteration of the Gaussian optimizer, and print the times of its steps.
+
+    Raises:
+        ConfigError: A number is out of range.
+    """
+    width, height = _pixels(verb.size)
+    if not min(verb.gaussians, verb.threads, verb.repeats) >= 1:
         raise ConfigError(
-            f"--gaussians {gaussians}, --threads {threads} and --repeats {repeats} must each be "
-            "at least 1."
+            f"--gaussians {verb.gaussians}, --threads {verb.threads} and --repeats {verb.repeats} "
+            "must each be at least 1."
         )
-    if gaussians_out_of_view < 0:
-        raise ConfigError(f"--gaussians-out-of-view {gaussians_out_of_view} must be at least 0.")
+    if verb.gaussians_out_of_view < 0:
+        raise ConfigError(
+            f"--gaussians-out-of-view {verb.gaussians_out_of_view} must be at least 0."
+        )
     camera = bench_camera(width, height)
-    iteration = Iteration(gaussians, camera, threads=threads, elsewhere=gaussians_out_of_view)
-    times = asdict(iteration_times(iteration, repeats))
+    iteration = Iteration(
+        verb.gaussians, camera, threads=verb.threads, elsewhere=verb.gaussians_out_of_view
+    )
+    times = asdict(iteration_times(iteration, verb.repeats))
     facts = {
         "isa": kernels.isa(),
-        "gaussians": gaussians,
-        "gaussians_out_of_view": gaussians_out_of_view,
+        "gaussians": verb.gaussians,
+        "gaussians_out_of_view": verb.gaussians_out_of_view,
         "width": width,
         "height": height,
-        "threads": threads,
+        "threads": verb.threads,
     }
-    if json_:
+    if verb.json_:
         print(json.dumps(times | facts))
     else:
         console = Console(highlight=False)
-        console.print(f"{what}: " + ", ".join(f"{name} {fact}" for name, fact in facts.items()))
+        console.print("render: " + ", ".join(f"{name} {fact}" for name, fact in facts.items()))
         console.print(_table(times))
+
+
+def bench_map(verb: BenchMap) -> None:
+    """Measure the mapper on a source, and print the result beside a stored baseline.
+
+    Raises:
+        ConfigError: A number is out of range, or the baseline has other frames.
+    """
+    if verb.frames < 2 or verb.refine_iterations < 0:
+        raise ConfigError(
+            f"--frames {verb.frames} must be at least 2, and --refine-iterations "
+            f"{verb.refine_iterations} must be at least 0."
+        )
+    baseline = read_baseline(verb.baseline) if verb.baseline else None
+    config = load_config(verb.config, verb.set)
+    sequence, mapper = open_sequence(verb.source), actor_parameters(config).mapper
+    with tempfile.TemporaryDirectory() as temporary:
+        runs = (verb.runs or Path(temporary)).expanduser()
+        with progress("track", min(verb.frames, len(sequence)), Console(stderr=True)) as advance:
+            tracked = TrackedSource.record(sequence, verb.frames, config, runs, advance)
+        found = tracked.measure(mapper.builder, mapper.iterations, verb.refine_iterations)
+    if baseline:
+        require_comparable(found, baseline)
+    if verb.save:
+        save_baseline(verb.save, found)
+    if verb.json_:
+        print(json.dumps(_facts(found, baseline)))
+    else:
+        console = Console(highlight=False)
+        console.print(
+            f"map: {found.source}, {found.frames} frames, {found.keyframes} keyframes, effort "
+            f"{found.effort} per keyframe, {found.iterations} iterations, {found.gaussians} "
+            f"Gaussians, isa {kernels.isa()}"
+        )
+        console.print(measurement_table(found, baseline))
+
+
+def save_baseline(path: Path, measured: MapMeasurement) -> None:
+    """Write a measurement to a file.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    try:
+        path.expanduser().write_bytes(msgspec.json.format(msgspec.json.encode(measured)) + b"\n")
+    except OSError as error:
+        raise ConfigError(
+            f"--save {path} cannot be written: {error.strerror}. Choose another file."
+        ) from error
+
+
+def read_baseline(path: Path) -> MapMeasurement:
+    """Read a measurement that `save_baseline` has written.
+
+    Raises:
+        ConfigError: The file cannot be read, or it is no such measurement.
+    """
+    try:
+        return msgspec.json.decode(path.expanduser().read_bytes(), type=MapMeasurement)
+    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"--baseline {path} cannot be read: {error}. Give a file that `ldo bench map --save` "
+            "has written."
+        ) from error
+
+
+def require_comparable(measured: MapMeasurement, baseline: MapMeasurement) -> None:
+    """Check that two measurements have the same keyframes.
+
+    Raises:
+        ConfigError: Source, frames or keyframes differ.
+    """
+    ours, theirs = ((m.source, m.frames, m.keyframes) for m in (measured, baseline))
+    if ours != theirs:
+        raise ConfigError(
+            f"--baseline has {theirs[2]} keyframes in {theirs[1]} frames of {theirs[0]}, this "
+            f"measurement has {ours[2]} in {ours[1]} of {ours[0]}. They must be the same; make a "
+            "new baseline with --save."
+        )
+
+
+def measurement_table(found: MapMeasurement, baseline: MapMeasurement | None) -> Table:
+    """Return a table of a measurement, with a baseline and the ratios to it if there is one."""
+    table = Table("", Column("measured", justify="right"))
+    if baseline:
+        for name in ("baseline", "ratio"):
+            table.add_column(name, justify="right")
+    theirs = _figures(baseline) if baseline else {}
+    for name, value in _figures(found).items():
+        row = [f"{value:.2f}"]
+        if name in theirs:
+            before = theirs[name]
+            row += [f"{before:.2f}", f"{value / before:.2f}" if before else ""]
+        table.add_row(name, *row)
+    return table
+
+
+def _figures(measured: MapMeasurement) -> dict[str, float]:
+    figures = {"FPS": measured.fps}
+    figures |= {f"{stage}, CPU ms per keyframe": ms for stage, ms in measured.cpu_ms.items()}
+    figures |= _error_figures("", measured.online)
+    if measured.refined:
+        figures["refinement, CPU s"] = measured.refinement_cpu_s
+        figures |= _error_figures("refined ", measured.refined)
+    return figures
+
+
+def _error_figures(prefix: str, errors: HeldOutErrors) -> dict[str, float]:
+    return {
+        f"{prefix}PSNR dB, mean": errors.mean_psnr_db,
+        f"{prefix}PSNR dB, median": errors.median_psnr_db,
+        f"{prefix}depth L1 cm, mean": errors.mean_depth_l1_cm,
+        f"{prefix}depth L1 cm, median": errors.median_depth_l1_cm,
+    }
+
+
+def _facts(found: MapMeasurement, baseline: MapMeasurement | None) -> dict[str, Any]:
+    facts = {**msgspec.to_builtins(found), "isa": kernels.isa()}
+    if baseline:
+        facts["cpu_ratio"] = found.cpu_ms["all"] / baseline.cpu_ms["all"]
+        facts["psnr_gain_db"] = found.online.mean_psnr_db - baseline.online.mean_psnr_db
+    return facts
 
 
 def _pixels(size: str) -> tuple[int, int]:
