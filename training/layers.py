@@ -137,7 +137,7 @@ class Graph:
         self._statistics = statistics
 
     def beside(self, weights: Weights, statistics: Statistics) -> "Graph":
-        """Return a backend with other weights, which adds its nodes to the graph of this one."""
+        """Return a `Graph` that has other weights and adds its nodes to the same ONNX graph."""
         other = Graph(weights, statistics)
         other.nodes, other.constants = self.nodes, self.constants
         return other

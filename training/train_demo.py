@@ -183,7 +183,12 @@ def _require_equal(what: str, mine: np.ndarray, theirs: np.ndarray, tolerance: f
 
 
 def score(work: Path, out: Path) -> dict:
-    """Return the scores of the files in `out` on the held-out rooms and on the flat."""
+    """Return the scores of the trained networks on the held-out rooms and on `synthetic:flat`.
+
+    Args:
+        work: Folder with the rendered rooms.
+        out: Folder with the ONNX files of the networks.
+    """
     held_out = HELD_OUT.load(work)
     colors, seen = flat_frames(FLAT_STRIDE)
     return {

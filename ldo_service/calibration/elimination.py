@@ -51,8 +51,8 @@ class Reduced:
         """Eliminate the block's own unknowns.
 
         Args:
-            products: Products of a block, see `Block.products`. Products of several blocks of one
-                pair may be added.
+            products: Products of a block, see `Block.products`, or the sum of the products of
+                several blocks that have the same own unknowns.
             count: Number K of the shared coefficients.
         """
         K, last = count, products.shape[-1] - 1

@@ -74,8 +74,8 @@ def update_votes(
     """Return the votes of the members of K landmarks after a keyframe, [K, 256] int8.
 
     The members of a landmark are a sample of its Gaussians. A member in the region of its landmark
-    gains a vote, up to 8. A member loses a vote if it is visible outside of this region or not in
-    memory. A member without votes stays at 0.
+    gains a vote, up to 8. A member loses a vote if it is visible outside of this region, or if it
+    was removed from the map or offloaded to disk. A member without votes stays at 0.
 
     Args:
         votes: Votes before the keyframe, [K, 256].

@@ -91,8 +91,8 @@ class MapFrame:
         Args:
             keyframe: Id of the new keyframe.
             tracked: The frame.
-            next_reference: Id of the keyframe that the next frame is aligned to. Its pose stays
-                stored too.
+            next_reference: Id of the keyframe that the next frame is aligned to, or None. Only
+                recent poses are stored. The pose of this keyframe is not removed.
         """
         self._poses.add(
             keyframe,

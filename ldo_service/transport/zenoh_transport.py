@@ -82,7 +82,8 @@ def open_front_router(network: Endpoint, keys: TlsKeys, port: int) -> zenoh.Sess
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise ConfigError(
-            f"no router opens with {keys.folder}: {error}. Copy the folder again."
+            f"the router cannot start with the keys in {keys.folder}: {error}. Copy the keys of "
+            "this host into the folder again."
         ) from None
 
 
