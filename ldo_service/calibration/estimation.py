@@ -69,7 +69,7 @@ SURFACE_WORK, PAIR_WORK, COLOR_PAIR_WORK, COLOR_ROUND_WORK = 0.3, 0.5, 0.3, 0.3
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Depth bias and vignetting, with the relative poses that fit the bias."""
+    """Depth bias and vignetting, with the relative poses of the views, estimated together."""
 
     depth_bias: np.ndarray  # [3] 1/m
     depth_bias_covariance: np.ndarray  # [3, 3] 1/m^2

@@ -48,8 +48,8 @@ class DatasetSettings:
         for topic in self.topics:
             if not re.fullmatch(r"(color|depth|odometry)=/\S+", topic):
                 raise ConfigError(
-                    f"dataset.topics={list(self.topics)} must be a list of color=/TOPIC, "
-                    "depth=/TOPIC and odometry=/TOPIC."
+                    f"dataset.topics={list(self.topics)} must be a list whose entries are "
+                    "color=/TOPIC, depth=/TOPIC or odometry=/TOPIC."
                 )
         if len(self.T_color_depth) not in (0, 16):
             raise ConfigError(

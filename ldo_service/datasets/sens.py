@@ -159,8 +159,9 @@ def _header(file: BinaryIO, path: Path) -> _Header:
     )
     if color not in (RAW_COLOR, PNG, JPEG) or depth not in (RAW_DEPTH, ZLIB):
         raise DataError(
-            f"{path} has color of compression {color} and depth of compression {depth}, expected "
-            "raw (0), PNG (1) or JPEG (2), and raw (0) or zlib (1). Export it by SensReader."
+            f"{path} has color of compression {color} and depth of compression {depth}. Expected: "
+            "color raw (0), PNG (1) or JPEG (2), and depth raw (0) or zlib (1). Export the file to "
+            "a folder of images by SensReader."
         )
     if not (is_rigid(T_color) and is_rigid(T_depth)):
         raise DataError(

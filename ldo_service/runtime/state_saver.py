@@ -39,9 +39,9 @@ class StateSaver:
 
     While the disk is full, the saver retries and the stage takes no messages, with two exceptions:
 
-    - A stage with nonblocking outputs and without lossless inputs continues to take messages. The
-      credit of an output is 0 until its staged messages are saved and sent.
-    - A stage without lossless inputs and without required consumers also continues.
+    - A stage continues if it has no lossless inputs and its outputs do not block it. Messages that
+      it makes wait until its state is saved, and the actor sees a credit of 0 for them.
+    - A stage continues if it has no lossless inputs and no consumer needs its outputs.
 
     A stage that is about to end does not wait for the disk.
     """

@@ -44,7 +44,10 @@ class FrameCompensator:
         self.motion: FrameMotion | None = None
 
     def expect(self, frame: RgbdFrame, state: OdometryState) -> Pyramid:
-        """Compensate a frame before it is tracked, by the motion that the last frames predict."""
+        """Compensate the rolling shutter and the delay of depth before a frame is tracked.
+
+        The motion of the camera is predicted from the last frames.
+        """
         expected = state.shutter.expected_motion(state.motion, frame.stamp_ns, self.config.shutter)
         return self._compensate(frame, expected)
 

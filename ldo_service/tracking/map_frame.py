@@ -36,8 +36,10 @@ class MapCorrection:
 class MapFrame:
     """Pose of the odometry frame in the map, by keyframe.
 
-    The class stores the poses of the last keyframes and of the reference keyframe. The poses of
-    older keyframes come from the last correction by the pose-graph optimizer.
+    Each keyframe gives such a pose, as the product of its pose in the map and the inverse of its
+    pose in odometry. This class stores the poses of the last keyframes and of the reference
+    keyframe. It reads the poses of older keyframes from the last correction by the pose-graph
+    optimizer.
     """
 
     def __init__(self) -> None:

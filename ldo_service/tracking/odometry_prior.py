@@ -206,7 +206,7 @@ def interpolated(a: StampedPose, b: StampedPose, stamp_ns: int) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class DeadReckoningStart:
-    """Start of dead reckoning: the last OK frame, with its poses in odometry and in the prior."""
+    """Start of dead reckoning: the last OK frame, with its poses by tracking and by the prior."""
 
     T_odom_camera: np.ndarray  # [4, 4]
     reading: PriorPose  # Pose of the same frame in the prior.

@@ -122,7 +122,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
             "tracker.T_base_camera.quaternion_wxyz=[1.0, 1.0, 0.0, 0.0] must have norm 1",
         ),
         ("dataset.T_color_depth=[1, 0]", "dataset.T_color_depth=[1.0, 0.0] must be 16 numbers"),
-        ("dataset.topics=[ir=/a]", "dataset.topics=['ir=/a'] must be a list of color=/TOPIC, "),
+        ("dataset.topics=[ir=/a]", "dataset.topics=['ir=/a'] must be a list whose entries are "),
     ],
 )
 def test_invalid_setting_is_refused_with_the_reason(setting: str, expected: str) -> None:
