@@ -297,7 +297,8 @@ class Verifier:
     def accept_unverified(self, proposal: LoopHypothesis) -> VerificationResult:
         """Accept the pose from landmarks as a loop closure without refinement or checks.
 
-        This is the fine step of the paper. It is used for comparison, if the mode is `semantic`.
+        The paper of LDO-SLAM closes loops like this, after its comparison of landmarks. The mode
+        `semantic` does the same, for comparison with the other modes.
         """
         sigma_m = self._config.landmarks.reach_m / np.sqrt(proposal.inliers)
         sigmas = np.repeat([sigma_m / _depth(proposal), sigma_m], 3)

@@ -93,7 +93,7 @@ class FileArchive:
         return checksums
 
     def restore(self, checksums: Mapping[str, str], folder: Path) -> None:
-        """Replace the content of a folder by the recorded files of a start.
+        """Replace the content of an actor's folder by the files that it had at a recorded start.
 
         The files become symbolic links to the recording. An actor may remove or replace them, which
         does not change the recording.

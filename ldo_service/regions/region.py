@@ -55,7 +55,10 @@ def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
 
 
 def with_votes_of(votes: Votes, others: Votes, share: float) -> Votes:
-    """Add the votes of another region; their sums and confidences are multiplied by `share`, 0..1.
+    """Add the votes of another region.
+
+    The sums and confidences of the other region are first multiplied by `share`, 0..1. Sums of the
+    same label are then added, and the larger confidence is used.
 
     >>> with_votes_of((("clock", 1.0, 0.5),), (("radiator", 2.0, 0.8), ("clock", 0.5, 0.4)), 0.5)
     (('clock', 1.25, 0.5), ('radiator', 1.0, 0.4))

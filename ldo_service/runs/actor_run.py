@@ -77,7 +77,7 @@ class ActorRun:
         self._clock.finish()
 
     def end_stream(self) -> None:
-        """Finish after the last frame, and store the step times so far for the summary."""
+        """Let the actors finish after the last frame, and store their step times."""
         self.finish()
         self.keep_step_times()
 

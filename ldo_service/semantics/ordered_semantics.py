@@ -79,7 +79,7 @@ class OrderedSemantics:
         return self._noted(self.live.on_keyframe_mapped(keyframe))
 
     def apply_label(self, region: int, keyframe: int, answer: RegionLabelResult) -> bool:
-        """Store a label result, and fuse it if the live semantics requested it.
+        """Store a label result, and fuse it into `live` if that requested it.
 
         Returns:
             True if the label was fused.

@@ -115,7 +115,7 @@ class ChecksummedFolder:
         return [self._path(number) for number in sorted(self._unsynced | self._syncing)]
 
     def begin_sync(self) -> None:
-        """Note that the caller begins to sync `unsynced_files`."""
+        """Mark the files in `unsynced_files` as being synced; the caller syncs them."""
         self._syncing |= self._unsynced
         self._unsynced.clear()
 

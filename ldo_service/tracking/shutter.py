@@ -213,7 +213,10 @@ class ShutterState:
 def displacement_ratio(
     expected: FrameMotion | None, measured: FrameMotion, median_depth_m: float, camera: Camera
 ) -> float:
-    """Return the largest displacement in an image whose motion differs from the expected one.
+    """Return the largest displacement of pixels that the shutter's timing still causes in a frame.
+
+    The frame was compensated with the expected motion. The difference between the measured motion
+    and the expected one displaces pixels.
 
     Args:
         expected: Motion that the frame was compensated with; None without compensation.

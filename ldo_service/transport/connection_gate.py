@@ -101,7 +101,7 @@ class Connection:
             router.write(self.hello)
 
     def close(self) -> None:
-        """Close both connections."""
+        """Close the connection of the program and the one to the router."""
         if self.is_closed:
             return
         self.is_closed = True
