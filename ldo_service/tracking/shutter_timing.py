@@ -194,7 +194,7 @@ class TimingEvidence:
     prior: np.ndarray = field(default_factory=PRIOR.copy)
 
     def extended(self, measurement: np.ndarray) -> "TimingEvidence":
-        """Return the evidence with one more measurement [3, 4]."""
+        """Return the evidence with the equations [3, 4] of one more frame, as in `groups`."""
         groups, size, in_last = list(self.groups), self.size, self.in_last
         if groups and in_last < size:
             groups[-1] = groups[-1] + measurement
@@ -214,8 +214,8 @@ class TimingEvidence:
         The prior determines those times that the frames do not. The variances are the sum of two
         estimates. One is a jackknife over the groups, which allows for the similar errors of
         neighboring frames. The other follows from the information of the equations, because a
-        jackknife over few groups may be small by chance. With too few groups, the result is that
-        of the prior alone. It is None if the prior is still the one that a new tracker has.
+        jackknife over few groups may be small by chance. With fewer than `MIN_GROUPS` groups of
+        frames, the result is that of the prior alone, or None if the prior is still `PRIOR`.
         """
         if len(self.groups) < MIN_GROUPS:
             if np.array_equal(self.prior, PRIOR):
