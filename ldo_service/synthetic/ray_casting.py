@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -71,6 +72,8 @@ class RayCaster:
         depth_m, surface = self._cast_at_shell(origin, direction)
         for k, (solid, window) in enumerate(zip(self._solids, self._windows, strict=True)):
             rays = window.covered(u, v)
+            if not len(rays):
+                continue
             d = solid.direction_to_local(vector(component[rays] for component in direction))
             o = solid.point_to_local(vector(c[rays] if c.ndim else c for c in origin))
             enter, leave = interval(solid.shape, o, d)
@@ -166,13 +169,18 @@ def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
     return _Window(low[0], high[1], low[2], high[3])
 
 
+@lru_cache(maxsize=4096)
+def _corners_m(solid: Solid) -> np.ndarray:
+    return solid.corners_m()
+
+
 def _window_at(solid: Solid, camera: Camera, T: np.ndarray, margin_px: float = 0.0) -> _Window:
     """Return the window of a solid: the bounds of its projected corners.
 
     The window is empty if the solid is outside the field of view. It is the whole image if the
     solid is in view and extends behind the camera.
     """
-    offset = solid.corners_m() - T[:3, 3]
+    offset = _corners_m(solid) - T[:3, 3]
     x, y, z = (
         offset[:, 0] * T[0, i] + offset[:, 1] * T[1, i] + offset[:, 2] * T[2, i] for i in range(3)
     )

@@ -145,14 +145,14 @@ def things(seed: int) -> tuple[tuple[SceneObject, int], ...]:
     furnished = [
         (placed, index)
         for rows, frame, index in rooms
-        for placed in _placed(_built(rows, paint), frame)
+        for placed in placed_in(built(rows, paint), frame)
     ]
-    end = _built(CORRIDOR_END, paint)
-    furnished += [(thing, 2) for frame in ENDS for thing in _placed(end, frame)]
+    end = built(CORRIDOR_END, paint)
+    furnished += [(thing, 2) for frame in ENDS for thing in placed_in(end, frame)]
     return tuple(furnished)
 
 
-def _built(rows: tuple[Row, ...], paint: Materials) -> list[SceneObject]:
+def built(rows: tuple[Row, ...], paint: Materials) -> list[SceneObject]:
     """Build the objects that the rows list, in the frame of their room."""
     made = [(label, CATALOG[label](paint, shape), at, way) for label, shape, at, way in rows]
     return [
@@ -161,7 +161,7 @@ def _built(rows: tuple[Row, ...], paint: Materials) -> list[SceneObject]:
     ]
 
 
-def _placed(built: list[SceneObject], frame: Placement) -> list[SceneObject]:
+def placed_in(built: list[SceneObject], frame: Placement) -> list[SceneObject]:
     return [
         SceneObject(thing.label, tuple(frame(solid) for solid in thing.solids)) for thing in built
     ]

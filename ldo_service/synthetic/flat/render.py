@@ -10,7 +10,7 @@ from ldo_service.synthetic.ray_casting import Hits, RayCaster, outline
 from ldo_service.synthetic.room_render import QUARTERS_PX
 from ldo_service.synthetic.solids import Solid, Vector, vector
 
-from .building import LAMP_SIDE_M, SHELL, Panel, lamp_centers_m
+from .building import LAMP_SIDE_M, Panel
 from .scene import Flat, surfaces
 from .scene_object import WALL
 
@@ -123,7 +123,7 @@ class FlatRenderer:
         self._table = table = surfaces(flat)
         self._class_ids = np.concatenate([np.full(SHELL_FACES, WALL, np.uint8), table.class_ids])
         self._instance_ids = np.concatenate([np.zeros(SHELL_FACES, np.uint16), table.instance_ids])
-        self._lamps = lamp_centers_m()
+        self._lamps = flat.lamps_m
         self._panel_light = [
             self._with_shadows(panel.room, i) for i, panel in enumerate(flat.panels)
         ]
@@ -139,7 +139,7 @@ class FlatRenderer:
             T_world_camera: Camera pose [4, 4], or one for each row, [H, 4, 4].
         """
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
-        view = RayCaster(SHELL, self._table.solids, camera, T_world_camera)
+        view = RayCaster(self._flat.shell, self._table.solids, camera, T_world_camera)
         hits = view.cast(u, v)
         size = (camera.height, camera.width)
         light = self._reflected(view, u, v, hits)

@@ -1,4 +1,4 @@
-"""The whole flat: the building, its objects, and a table of all their solids."""
+"""The whole flat: the building, its objects and lamps, and a table of all solids."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 from ldo_service.synthetic.solids import Solid
 from ldo_service.synthetic.textures import Texture
 
-from .building import Panel, panels
+from .building import SHELL, Panel, lamp_centers_m, panels
 from .furnishing import things
 from .paint import materials
 from .scene_object import CLASS_NAMES, SceneObject
@@ -15,18 +15,27 @@ from .scene_object import CLASS_NAMES, SceneObject
 
 @dataclass(frozen=True, slots=True)
 class Flat:
-    """The building and its objects."""
+    """Building with its objects and lamps."""
 
     panels: tuple[Panel, ...]
     things: tuple[SceneObject, ...]
     rooms: tuple[int, ...]  # Room index of each object; the lamp of that room lights the object.
     textures: dict[str, Texture]
+    lamps_m: tuple[tuple[float, float, float], ...]  # Center of the lamp of each room.
+    shell: Solid  # Encloses the building; never visible.
 
 
 def furnished_flat(seed: int) -> Flat:
     """Return the flat; `seed` determines its textures and the material of each object."""
     placed = things(seed)
-    return Flat(panels(), tuple(t for t, _ in placed), tuple(r for _, r in placed), materials(seed))
+    return Flat(
+        panels=panels(),
+        things=tuple(thing for thing, _ in placed),
+        rooms=tuple(room for _, room in placed),
+        textures=materials(seed),
+        lamps_m=lamp_centers_m(),
+        shell=SHELL,
+    )
 
 
 @dataclass(frozen=True, slots=True)

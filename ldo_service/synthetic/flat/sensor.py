@@ -8,7 +8,7 @@ from ldo_service.geometry import Camera
 from ldo_service.synthetic.room_sequence import DISPARITY_SIGMA_STEPS, DISPARITY_STEP_PER_M
 
 from .render import FlatRendering
-from .walk import FRAMES, RATE_HZ, CameraPath, closed_spline
+from .walk import RATE_HZ, CameraPath, closed_spline
 
 # Exposure time indoors in the evening. A turn of 60 degrees per second blurs over 11 pixels, at an
 # image width of 640.
@@ -63,9 +63,9 @@ class Sensor:
 
     def _drift(self, frame: int) -> float:
         """Return the drift of the gain in -1..1, which varies slowly over the frames."""
-        count = int(FRAMES / RATE_HZ / EXPOSURE_S)
+        count = int(self.walk.frames / RATE_HZ / EXPOSURE_S)
         knots = np.random.default_rng([self.seed, 3]).random((count, 1)) * 2 - 1
-        drift = closed_spline(knots, np.array([frame / FRAMES * count]))[0, 0]
+        drift = closed_spline(knots, np.array([frame / self.walk.frames * count]))[0, 0]
         return float(min(max(drift, -1.0), 1.0))
 
 

@@ -1,4 +1,7 @@
-"""Walk of a hand-held camera, which visits each room twice and passes the corridor in between."""
+"""Walk of a hand-held camera on a closed path, and its path through the flat.
+
+It visits each room of the flat twice and passes the corridor in between.
+"""
 
 from dataclasses import dataclass
 
@@ -7,7 +10,7 @@ import numpy as np
 from ldo_service.synthetic.path import closed_spline, lengths, looking
 
 RATE_HZ = 15
-FRAMES = 640
+FRAMES = 640  # Frames of the walk through the flat.
 
 # Knots of a way around room A and along the corridor to the door of room B. Each knot has the
 # camera position x, y, z in meters and the viewing direction x, y, z. A half turn about the world's
@@ -64,47 +67,61 @@ TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE = 0.2, 0.0015, 0.004
 
 @dataclass(frozen=True, slots=True)
 class CameraPath:
-    """Motion along a closed camera path; one turn takes `FRAMES` frames."""
+    """Motion along a closed camera path; one turn takes `frames` frames."""
 
+    # Knots [K, 6]: camera center in meters and viewing direction.
+    knots: np.ndarray
+    frames: int
     along: np.ndarray  # Spline parameter [M + 1], in knots, at equal time steps.
     # Knots [K, 7] of closed splines that are added to camera center, viewing direction and roll.
     shakes: tuple[np.ndarray, ...]
 
     def pose(self, frame: float) -> np.ndarray:
         """Return T_world_camera [4, 4] at the time `frame`, in frames; fractions are allowed."""
-        turn = frame / FRAMES % 1.0
+        turn = frame / self.frames % 1.0
         x = turn * (len(self.along) - 1)
         cell = int(x)
         place = self.along[cell] + (x - cell) * (self.along[cell + 1] - self.along[cell])
-        state = np.append(_at(KNOTS, place), 0.0)
+        state = np.append(_at(self.knots, place), 0.0)
         for knots in self.shakes:
             state = state + _at(knots, turn * len(knots))
         return looking(state[None, :3], state[None, 3:6], state[None, 6])[0]
 
 
-def hand_held(seed: int) -> CameraPath:
-    """Return the walk with the sway and tremor of a hand; `seed` determines both."""
+def hand_held(
+    seed: int, knots: np.ndarray = KNOTS, frames: int = FRAMES, walk_m_s: float = WALK_M_S
+) -> CameraPath:
+    """Return a walk with the sway and tremor of a hand.
+
+    Args:
+        seed: Seed of sway and tremor.
+        knots: Camera center in meters and viewing direction along the closed path, [K, 6].
+        frames: Number of frames of the walk.
+        walk_m_s: Speed of walking relative to TURN_RAD_S, see `timed_positions`.
+    """
     rng = np.random.default_rng([seed, 2])
-    sway = _shake(rng, SWAY_S, SWAY_EYE_M, SWAY_GAZE)
-    tremor = _shake(rng, TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE)
-    return CameraPath(timed_positions(), (sway, tremor))
+    sway = _shake(rng, frames, SWAY_S, SWAY_EYE_M, SWAY_GAZE)
+    tremor = _shake(rng, frames, TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE)
+    return CameraPath(knots, frames, timed_positions(knots, walk_m_s), (sway, tremor))
 
 
-def _shake(rng: np.random.Generator, period_s: float, eye_m: float, gaze: float) -> np.ndarray:
-    count = int(FRAMES / RATE_HZ / period_s)
+def _shake(
+    rng: np.random.Generator, frames: int, period_s: float, eye_m: float, gaze: float
+) -> np.ndarray:
+    count = int(frames / RATE_HZ / period_s)
     return (rng.random((count, 7)) * 2 - 1) * ([eye_m] * 3 + [gaze] * 4)
 
 
-def timed_positions() -> np.ndarray:
+def timed_positions(knots: np.ndarray = KNOTS, walk_m_s: float = WALK_M_S) -> np.ndarray:
     """Return the spline parameter [M + 1], in knots, at equal time steps around the walk.
 
-    Long steps and steps with a large turn take more time, according to WALK_M_S and TURN_RAD_S. The
+    Long steps and steps with a large turn take more time, according to walk_m_s and TURN_RAD_S. The
     sequence scales all times to its own duration.
     """
-    place = np.arange(len(KNOTS) * STEPS_PER_KNOT + 1) / STEPS_PER_KNOT
-    state = closed_spline(KNOTS, place[:-1])
+    place = np.arange(len(knots) * STEPS_PER_KNOT + 1) / STEPS_PER_KNOT
+    state = closed_spline(knots, place[:-1])
     state = np.concatenate([state, state[:1]])
-    walked = lengths(np.diff(state[:, :3], axis=0)) / WALK_M_S
+    walked = lengths(np.diff(state[:, :3], axis=0)) / walk_m_s
     gaze = state[:, 3:] / lengths(state[:, 3:])[:, None]
     turned = lengths(np.diff(gaze, axis=0)) / TURN_RAD_S
     time = np.concatenate([[0.0], np.cumsum(np.sqrt(walked * walked + turned * turned))])
