@@ -11,7 +11,8 @@ Sequences:
 - `person`: The same room, with a person who walks through it.
 - `room-noisy`, `tour-noisy`, `person-noisy`: The sequences above with the depth errors of a Kinect.
 - `flat`: Two rooms and a corridor with ground-truth labels, designed to be hard for SLAM.
-- `flat-exact`: The flat of `flat`, without motion blur, noise and other sensor errors.
+- `twins`: Four offices along a corridor that look alike and differ only in their objects.
+- `flat-exact`, `twins-exact`: The same scenes without motion blur, noise and other sensor errors.
 - `room-handheld`, `tour-handheld`, `person-handheld`, `flat-handheld`: Faster motion, seen by a
   camera with simulated effects of real cameras, such as motion blur. All effects are on by default.
   A colon and effect names joined by `+` select some: `tour-handheld:rolling-shutter+stereo`.

@@ -1,11 +1,12 @@
-"""Sequence of the flat, with a parallel renderer that fills its cache."""
+"""Sequences of the flat and the twins, with a parallel renderer that fills their cache."""
 
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -18,11 +19,29 @@ from .render import FlatRenderer
 from .scene import Flat, furnished_flat
 from .scene_object import CLASS_NAMES, SceneObject
 from .sensor import Sensor
-from .walk import FRAMES, RATE_HZ, hand_held
+from .twins import furnished_twins
+from .twins_walk import twins_walk
+from .walk import RATE_HZ, CameraPath, hand_held
 
-VERSION = 1  # Part of the cache's identity; increase it if a change alters a byte of any frame.
+
+@dataclass(frozen=True, slots=True)
+class ScenePlan:
+    """Building and walk of a sequence, both as functions of the seed."""
+
+    # Part of the cache's identity; change it if a change alters a byte of any frame.
+    version: str
+    furnish: Callable[[int], Flat]
+    walk: Callable[[int], CameraPath]
+
+
+PLANS = {
+    "flat": ScenePlan("1", furnished_flat, hand_held),
+    "twins": ScenePlan("twins 1", furnished_twins, twins_walk),
+}
 # Focal length in image widths: a horizontal field of view of 63 degrees, as in a Kinect.
 FOCAL_PER_WIDTH = 0.8125
+# The working width of the tracker. The walk is long, and smaller images are rendered faster.
+TWINS_WIDTH_PX, TWINS_HEIGHT_PX = 320, 240
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,22 +53,28 @@ class FlatConfig:
     # True adds motion blur, exposure drift, noise and a Kinect's depth errors.
     noise: bool = True
     seed: int = 0  # Seed of textures, materials, hand shake and noise.
+    scene: Literal["flat", "twins"] = field(default="flat", repr=False)
 
     def __post_init__(self) -> None:
         if self.width_px < 16 or self.height_px < 16:
             raise ConfigError(
-                f"images of synthetic:flat have {self.width_px}x{self.height_px} pixels, must have "
-                "at least 16x16 pixels."
+                f"images of synthetic:{self.scene} have {self.width_px}x{self.height_px} pixels, "
+                "must have at least 16x16 pixels."
             )
         if self.seed < 0:
-            raise ConfigError(f"synthetic:flat: seed={self.seed} must be at least 0.")
+            raise ConfigError(f"synthetic:{self.scene}: seed={self.seed} must be at least 0.")
 
 
-NAMED = {"flat": FlatConfig(), "flat-exact": FlatConfig(noise=False)}
+NAMED = {
+    "flat": FlatConfig(),
+    "flat-exact": FlatConfig(noise=False),
+    "twins": FlatConfig(TWINS_WIDTH_PX, TWINS_HEIGHT_PX, scene="twins"),
+    "twins-exact": FlatConfig(TWINS_WIDTH_PX, TWINS_HEIGHT_PX, noise=False, scene="twins"),
+}
 
 
 class FlatSequence(Sequence):
-    """Walk through the flat, 43 s at 15 Hz; each frame is rendered once and cached on disk."""
+    """Walk through the flat or the twins at 15 Hz; each frame is rendered once and cached."""
 
     class_names = CLASS_NAMES  # Names of the class ids.
 
@@ -58,11 +83,15 @@ class FlatSequence(Sequence):
         focal_px = FOCAL_PER_WIDTH * config.width_px
         center_px = ((config.width_px - 1) / 2, (config.height_px - 1) / 2)
         camera = Camera(config.width_px, config.height_px, focal_px, focal_px, *center_px)
-        super().__init__(name, camera, np.arange(FRAMES, dtype=np.int64) * 10**9 // RATE_HZ)
-        self._walk = hand_held(config.seed)
+        self._plan = PLANS[config.scene]
+        self._walk = self._plan.walk(config.seed)
+        frames = self._walk.frames
+        super().__init__(name, camera, np.arange(frames, dtype=np.int64) * 10**9 // RATE_HZ)
         self._sensor = Sensor(camera, self._walk, config.seed)
-        self._T_world_camera = np.array([self._walk.pose(frame) for frame in range(FRAMES)])
-        self._cache = FrameCache(f"{VERSION} {config}", config.width_px, config.height_px)
+        self._T_world_camera = np.array([self._walk.pose(frame) for frame in range(frames)])
+        self._cache = FrameCache(
+            f"{self._plan.version} {config}", config.width_px, config.height_px
+        )
 
     @staticmethod
     def named(name: str, **changes: int | bool) -> "FlatSequence":
@@ -111,7 +140,7 @@ class FlatSequence(Sequence):
 
     @cached_property
     def _flat(self) -> Flat:
-        return furnished_flat(self.config.seed)
+        return self._plan.furnish(self.config.seed)
 
     @cached_property
     def _renderer(self) -> FlatRenderer:
