@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ldo_service.config import Config
+from ldo_service.config import Config, known_presets
 from ldo_service.runs.job import Advance
 from ldo_service.synthetic import SCENES
 from ldo_service.tracking.localizer import load_keyframe_database
@@ -38,6 +38,14 @@ Settings = Annotated[
         name="set",
         metavar="SECTION.FIELD=VALUE",
         help="change one setting; may be repeated. `ldo config` lists the settings",
+    ),
+]
+Preset = Annotated[
+    str,
+    argument(
+        metavar="NAME",
+        help="settings that --config and --set then change; NAME is "
+        f"{', '.join(known_presets())}: the rules of the paper as printed",
     ),
 ]
 Source = Annotated[
@@ -120,6 +128,11 @@ KeysFolder = Annotated[
 ]
 Overwrite = Annotated[bool, argument(help="replace an earlier run in the folder")]
 Json = Annotated[bool, argument(help="print one JSON document and nothing else")]
+
+
+def with_preset(settings: tuple[str, ...], preset: str) -> tuple[str, ...]:
+    """Return the settings of --set, with one that selects the preset of --preset, if any."""
+    return (f"preset={preset}", *settings) if preset else settings
 
 
 def with_topics(settings: tuple[str, ...], topics: tuple[str, ...]) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ from .options import (
     Localize,
     MaxFrames,
     Overwrite,
+    Preset,
     RecordedOdometry,
     Settings,
     Source,
@@ -35,6 +36,7 @@ from .options import (
     argument,
     localizing,
     progress,
+    with_preset,
     with_topics,
 )
 
@@ -52,6 +54,7 @@ EXCLUSIVE = {
 def run(
     source: Source,
     out: Annotated[Path, argument(metavar="DIR", help="folder for the results")],
+    preset: Preset = "",
     config: ConfigFile = None,
     set: Settings = (),
     topic: Topics = (),
@@ -112,6 +115,7 @@ def run(
       ldo run synthetic:room --out runs/room
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --max-frames 300
       ldo run ~/data/desk_again --out runs/again --localize runs/desk
+      ldo run synthetic:flat --out runs/literal --preset paper
       ldo run synthetic:flat --out runs/half --reuse-front-end runs/flat --set mapper.iterations=7
     """
     require_compatible(
@@ -128,7 +132,11 @@ def run(
     require_separate(localize, out, refine_iterations)
     console = Console(stderr=True)
     settings = localizing(
-        with_options(load_config(config, with_topics(set, topic)), hold_out_every, threads),
+        with_options(
+            load_config(config, with_topics(with_preset(set, preset), topic)),
+            hold_out_every,
+            threads,
+        ),
         localize,
     )
     require_usable_networks(settings)

@@ -21,11 +21,13 @@ from .options import (
     EndpointAddress,
     KeysFolder,
     Localize,
+    Preset,
     Robot,
     Settings,
     StateFolder,
     argument,
     localizing,
+    with_preset,
 )
 
 Insecure = Annotated[
@@ -57,6 +59,7 @@ def serve(
     insecure: Insecure = False,
     client: Client = False,
     metrics_port: MetricsPort = None,
+    preset: Preset = "",
 ) -> None:
     """Run the service: receive frames on camera/rgbd; publish poses, map, objects and health.
 
@@ -66,7 +69,7 @@ def serve(
       ldo serve
       ldo publish synthetic:room --rate 15      (in another terminal)
     """
-    settings = localizing(load_config(config, set), localize)
+    settings = localizing(load_config(config, with_preset(set, preset)), localize)
     is_local = endpoint.startswith(f"{LOCAL}/")  # A child process of a service with keys.
     folder_of_keys = None if is_local else TlsKeys.of(keys or settings.service.keys or None)
     network = Endpoint(robot, endpoint, folder_of_keys, settings.service.max_message_mb)
@@ -109,6 +112,7 @@ def record(
     insecure: Insecure = False,
     client: Client = False,
     metrics_port: MetricsPort = None,
+    preset: Preset = "",
 ) -> None:
     """Run the service as `ldo serve` does, and record the inputs of every actor.
 
@@ -129,4 +133,5 @@ def record(
         insecure=insecure,
         client=client,
         metrics_port=metrics_port,
+        preset=preset,
     )

@@ -4,10 +4,11 @@ from typing import Annotated
 
 from ldo_service.config import explained_yaml, load_config
 
-from .options import ConfigFile, Settings, argument
+from .options import ConfigFile, Preset, Settings, argument, with_preset
 
 
 def show_config(
+    preset: Preset = "",
     config: ConfigFile = None,
     set: Settings = (),
     all_: Annotated[
@@ -22,4 +23,4 @@ def show_config(
       ldo config > my.yaml            then delete what you do not change
       ldo run SOURCE --out DIR --config my.yaml
     """
-    print(explained_yaml(load_config(config, set), with_advanced=all_), end="")
+    print(explained_yaml(load_config(config, with_preset(set, preset)), with_advanced=all_), end="")

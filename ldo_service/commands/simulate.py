@@ -17,6 +17,7 @@ from .options import (
     ConfigFile,
     Json,
     MaxFrames,
+    Preset,
     RecordedOdometry,
     Settings,
     Source,
@@ -24,6 +25,7 @@ from .options import (
     Topics,
     argument,
     progress,
+    with_preset,
     with_topics,
 )
 from .run import with_options
@@ -31,6 +33,7 @@ from .run import with_options
 
 def simulate(
     source: Source,
+    preset: Preset = "",
     config: ConfigFile = None,
     set: Settings = (),
     topic: Topics = (),
@@ -51,7 +54,9 @@ def simulate(
     """
     console = Console(stderr=True, highlight=False)
     settings = with_options(
-        load_config(config, with_topics(set, topic)), hold_out=None, threads=threads
+        load_config(config, with_topics(with_preset(set, preset), topic)),
+        hold_out=None,
+        threads=threads,
     )
     require_usable_networks(settings)
     sequence = open_sequence(source, settings.dataset.options())

@@ -12,7 +12,7 @@ all public settings, and the advanced settings that differ from their defaults. 
 prints all settings.
 """
 
-from .loading import checked, config_of, load_config
+from .loading import checked, config_of, known_presets, load_config
 from .parameters import (
     actor_parameters,
     latency_frames,
@@ -29,6 +29,7 @@ __all__ = [
     "config_of",
     "config_yaml",
     "explained_yaml",
+    "known_presets",
     "latency_frames",
     "load_config",
     "recording_parameters",

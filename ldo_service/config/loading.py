@@ -19,6 +19,8 @@ from ldo_service.storage.yaml_io import dump_yaml, load_yaml
 from .moved_settings import refuse_moved, was_section
 from .sections import Config
 
+PRESETS = Path(__file__).parent / "presets"
+PRESET = "preset"  # Name of the setting that selects a preset.
 KINDS = {
     "int": "a whole number",
     "float": "a number",
@@ -34,19 +36,27 @@ def load_config(
     settings: Sequence[str] = (),
     values: Mapping[str, object] | None = None,
 ) -> Config:
-    """Return the defaults, changed by a YAML file and then by single settings.
+    """Return the defaults, changed by a preset, then by a YAML file and then by single settings.
 
     Args:
         path: The YAML file; None for no file.
-        settings: Settings as `section.field=value`, as on the command line.
+        settings: Settings as `section.field=value`, as on the command line. `preset=NAME` selects a
+            preset, wherever it stands.
         values: Values of settings by dotted name, such as `{"mapper.iterations": 7}`.
 
     Raises:
         ConfigError: A setting cannot be read, is unknown, has moved, or has an invalid value.
+            Or there is no such preset.
     """
-    tree = _read(path) if path else {}
+    tree: dict[str, Any] = {}
     for setting in settings:
-        _apply(tree, setting)
+        if _is_preset(setting):
+            _merge(tree, _preset(setting.partition("=")[2].strip()))
+    if path:
+        _merge(tree, _read(path))
+    for setting in settings:
+        if not _is_preset(setting):
+            _apply(tree, setting)
     for name, value in (values or {}).items():
         _put(tree, name, _plain(value), name)
     return config_of(tree)
@@ -98,6 +108,38 @@ def _read(path: Path) -> dict[str, Any]:
             "sections."
         )
     return tree or {}
+
+
+def known_presets() -> list[str]:
+    """Return the names of the presets."""
+    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
+
+
+def _is_preset(setting: str) -> bool:
+    return setting.partition("=")[0].strip() == PRESET
+
+
+def _preset(name: str) -> dict[str, Any]:
+    """Return the settings of a preset.
+
+    Raises:
+        ConfigError: There is no such preset.
+    """
+    if name not in known_presets():
+        known = f"Known: {', '.join(known_presets())}."
+        raise ConfigError(
+            f"there is no preset {name}. {did_you_mean(name, known_presets(), known)}"
+        )
+    return _read(PRESETS / f"{name}.yaml")
+
+
+def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
+    """Change a tree of settings in place; sections are merged, values are replaced."""
+    for name, value in changes.items():
+        if isinstance(value, dict) and isinstance(tree.get(name), dict):
+            _merge(tree[name], value)
+        else:
+            tree[name] = value
 
 
 def _apply(tree: dict[str, Any], setting: str) -> None:

@@ -33,6 +33,9 @@ class PaperSettings:
     # Maximum distance of a labelled Gaussian from the measured depth, meters. This is delta_z
     # (paper, III.A).
     max_depth_gap_m: PositiveFloat = advanced(0.1)
+    # Depth test of a labelled Gaussian: at the measured depth (two_sided), or not behind it as in
+    # the paper (one_sided, III.A).
+    depth_test: Literal["two_sided", "one_sided"] = advanced("two_sided")
     # Rule of the moving average of labels: that of this implementation (corrected), or that of the
     # paper (III.A).
     ema_rule: Literal["corrected", "paper"] = advanced("corrected")
@@ -70,6 +73,9 @@ class PaperSettings:
     subgraph_min_keyframes: PositiveInt = advanced(3)
     # Maximum number of keyframes in a subgraph (paper, III.C).
     subgraph_max_keyframes: Annotated[int, Meta(ge=2)] = advanced(5)
+    # Information of an observation of a landmark, relative to that of an independent one. The paper
+    # treats all observations as independent, which is 1 (III.C).
+    observation_information_ratio: Annotated[float, Meta(gt=0, le=1)] = advanced(1 / 320)
     # Weight of the observed classes of a landmark (paper, III.C).
     lambda_sem: PositiveFloat = advanced(0.5)
     # Weight of the agreement between landmarks of one class (paper, III.C).

@@ -275,6 +275,7 @@ def _labelling(config: Config) -> SemanticFusionConfig:
             rule=paper.assignment_rule,
             min_overlap=config.mapper.semantics.min_overlap,
             max_depth_gap_m=paper.max_depth_gap_m,
+            depth_test=paper.depth_test,
         ),
         fusion=FusionConfig(
             rule=paper.fusion_rule,
@@ -357,6 +358,7 @@ def _optimizer(config: Config) -> OptimizerConfig:
                 drift_m_per_sqrt_m=optimizer.noise.drift_m_per_sqrt_m,
                 sigma_loop_rad=optimizer.noise.loop_rotation_rad,
                 sigma_loop_m=optimizer.noise.loop_translation_m,
+                independent_observations=paper.observation_information_ratio,
             ),
             closures=LoopClosureConfig(
                 max_sigmas=optimizer.loop_closures.max_residual_sigmas,

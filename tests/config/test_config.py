@@ -1,13 +1,22 @@
 """Configuration from defaults, files and settings, and its errors."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 
-from ldo_service.config import Config, config_of, config_yaml, explained_yaml, load_config
+from ldo_service.config import (
+    Config,
+    actor_parameters,
+    config_of,
+    config_yaml,
+    explained_yaml,
+    load_config,
+)
 from ldo_service.config.printing import settings_of
 from ldo_service.errors import ConfigError
+from ldo_service.pose_graph.factors import NoiseConfig
 
 CHANGED = (
     "tracker.hold_out=5",
@@ -54,6 +63,40 @@ def test_settings_override_the_file(tmp_path: Path) -> None:
     path.write_text("tracker:\n  hold_out: 5\nmapper:\n  threads: 3\n")
     config = load_config(path, ["mapper.threads=2"])
     assert (config.tracker.hold_out, config.mapper.threads) == (5, 2)
+
+
+def test_preset_is_changed_by_the_file_and_by_settings(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("paper: {ema_rule: corrected}\n")
+    config = load_config(file, ["paper.label_region=foreground", "preset=paper"])
+    assert config.paper.assignment_rule == "iou"
+    assert config.paper.ema_rule == "corrected"
+    assert config.paper.label_region == "foreground"
+    assert load_config(file) == load_config(settings=["paper.ema_rule=corrected"])
+
+
+def test_preset_paper_selects_the_rules_of_the_paper() -> None:
+    paper, default = load_config(settings=["preset=paper"]), load_config()
+    assert paper.paper == replace(
+        default.paper,
+        assignment_rule="iou",
+        label_region="box",
+        depth_test="one_sided",
+        ema_rule="paper",
+        ema_hold_back_ratio=0.0,
+        observation_information_ratio=1.0,
+    )
+    assert not paper.mapper.open_vocabulary.detector_votes
+    assert paper.loop_closer.retrieval.mode == "semantic"
+    parameters = actor_parameters(paper)
+    assert parameters.optimizer.graph.noise.independent_observations == 1.0
+    assert parameters.mapper.semantics.labelling.assignment.depth_test == "one_sided"
+    assert actor_parameters(default).optimizer.graph.noise == NoiseConfig()
+
+
+def test_unknown_preset_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match=r"there is no preset papr\. Did you mean paper\?"):
+        load_config(settings=["preset=papr"])
 
 
 def test_setting_one_latency_keeps_the_others(tmp_path: Path) -> None:

@@ -185,3 +185,26 @@ def test_truncated_summed_area_table_raises() -> None:
 def test_unknown_rule_raises_config_error() -> None:
     with pytest.raises(ConfigError, match="coverage"):
         AssignmentConfig(rule="all")  # type: ignore[arg-type]
+
+
+def test_one_sided_depth_test_also_accepts_gaussians_in_front_of_the_surface() -> None:
+    rows = random_gaussians(400)
+    regions = Regions.of_boxes(BOXES, SCORES)
+    two_sided = assign(rows, regions, AssignmentConfig(max_depth_gap_m=0.3))
+    one_sided = assign(rows, regions, AssignmentConfig("coverage", 0.3, 0.3, "one_sided"))
+    p = se3.transform(T_CAMERA_MAP, rows[:, :3].astype(float))
+    u, v = np.rint(CAMERA.project(p)).astype(int).T
+    inside = (u >= 0) & (u < 64) & (v >= 0) & (v < 48)
+    measured_m = depth_image()[np.where(inside, v, 0), np.where(inside, u, 0)]
+    is_seen = inside & (measured_m > 0) & (p[:, 2] - measured_m < 0.3)
+    np.testing.assert_array_equal(one_sided.regions != HIDDEN, is_seen)
+    both = two_sided.regions != HIDDEN
+    assert (both & ~is_seen).sum() == 0
+    assert (is_seen & ~both).sum() > 20
+    np.testing.assert_array_equal(one_sided.regions[both], two_sided.regions[both])
+    assert (one_sided.overlaps[~is_seen] == 0).all()
+
+
+def test_unknown_depth_test_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"depth_test='both' must be 'two_sided' or 'one_sided'"):
+        AssignmentConfig(depth_test="both")  # type: ignore[arg-type]
