@@ -1,4 +1,4 @@
-"""The synthetic twins: offices that look alike and differ in their objects."""
+"""Synthetic offices that look alike and differ in their objects."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -100,7 +100,7 @@ def test_rooms_differ_in_their_objects() -> None:
 
 
 def test_offices_look_alike_except_for_their_objects(exact: FlatSequence, twins: Flat) -> None:
-    """Without the objects that differ, the views into two offices are equal."""
+    """The views into two offices are equal, except for the objects that differ."""
     keep = []
     for room in range(2 * OFFICES):
         own = len((*OFFICE_OBJECTS, *SECTION_OBJECTS)[room])

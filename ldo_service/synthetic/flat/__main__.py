@@ -1,6 +1,6 @@
 """Command that renders a whole sequence into the cache and prints its statistics.
 
-    python -m ldo_service.synthetic.flat [flat | flat-exact | twins | twins-exact] [PROCESSES]
+    python -m ldo_service.synthetic.flat [flat | flat-exact | ...] [PROCESSES]
 
 The statistics show how hard the sequence is: motion, bare walls, missing depth and the number of
 visible objects per class.

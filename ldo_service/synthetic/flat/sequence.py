@@ -1,4 +1,4 @@
-"""Sequences of the flat and the twins, with a parallel renderer that fills their cache."""
+"""Sequences of `flat` and `twins`, with a parallel renderer that fills their cache."""
 
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -74,7 +74,7 @@ NAMED = {
 
 
 class FlatSequence(Sequence):
-    """Walk through the flat or the twins at 15 Hz; each frame is rendered once and cached."""
+    """Walk through a labelled scene at 15 Hz; each frame is rendered once and cached."""
 
     class_names = CLASS_NAMES  # Names of the class ids.
 

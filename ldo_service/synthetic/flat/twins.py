@@ -1,4 +1,4 @@
-"""Twins: four equal offices along a corridor of four equal sections, told apart by their objects.
+"""Four equal offices along a corridor of four equal sections, which differ in their objects.
 
 World frame: x along the corridor, y across the corridor toward the offices, z up; the origin is the
 center of the corridor's floor.
@@ -26,7 +26,7 @@ CORRIDOR_WIDTH_M = 1.7
 DOORWAY_M, LINTEL_M = 1.2, 2.1  # Width and height of the doorways.
 _DOOR_WALL_M = CORRIDOR_WIDTH_M / 2 + 2 * WALL_M  # y of the office side of the door wall.
 _LENGTH_M = OFFICES * PITCH_M
-SHELL = Solid("box", (0.0, 1.0, 1.2), (_LENGTH_M + 2.0, 8.0, 4.0), "")  # Never visible.
+SHELL = Solid("box", (0.0, 1.0, 1.2), (_LENGTH_M + 2.0, 8.0, 4.0), "")  # It is never visible.
 
 # Rows in the frame of an office: origin on the floor at the middle of the door wall, y into the
 # office.
@@ -96,7 +96,7 @@ def section_x_m(number: int) -> float:
 
 
 def furnished_twins(seed: int) -> Flat:
-    """Return the twins; `seed` determines the textures and the material of each object.
+    """Return the building of `twins`; `seed` determines its textures and materials.
 
     Rooms 0 to 3 are the offices, rooms 4 to 7 the sections of the corridor.
     """

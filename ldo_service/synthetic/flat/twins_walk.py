@@ -1,4 +1,4 @@
-"""Walk through the twins, which returns to offices after it has seen others that look the same."""
+"""Walk along equal offices, which returns to some after it has seen others that look the same."""
 
 import numpy as np
 
