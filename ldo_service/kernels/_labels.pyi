@@ -19,6 +19,7 @@ def assign(
     by_iou: bool,
     min_overlap: float,
     max_depth_gap_m: float,
+    max_front_gap_m: float,
     region: NDArray[np.int32],
     overlap: NDArray[np.float32],
     z: NDArray[np.float32],
@@ -46,7 +47,8 @@ def assign(
         by_iou: True if the overlap is the IoU of region and splat. If False, it is the fraction of
             the splat that the region covers.
         min_overlap: Overlap that a region must exceed.
-        max_depth_gap_m: Maximum distance between a Gaussian and the measured surface, meters.
+        max_depth_gap_m: Maximum distance of a Gaussian behind the measured surface, meters.
+        max_front_gap_m: Maximum distance of a Gaussian in front of it, meters; may be infinite.
         region: Output, [V]: number of the matched region; -1 for no region, -2 for a Gaussian that
             is not expected in the image.
         overlap: Output, [V]: overlap with the matched region.

@@ -19,8 +19,8 @@ struct SplatBoxes {
 // Projection of Gaussians to the boxes of their splats.
 class SplatBoxer {
  public:
-  SplatBoxer(const View& view, const float* depth_m, float max_gap_m)
-      : view_(view), project_(view_), depth_m_(depth_m), max_gap_m_(max_gap_m) {}
+  SplatBoxer(const View& view, const float* depth_m, const AssignmentRule& rule)
+      : view_(view), project_(view_), depth_m_(depth_m), rule_(rule) {}
 
   // Compute the boxes of the rows `indices` [count].
   void operator()(const float* rows, const uint32_t* indices, int count, SplatBoxes& out) const {
@@ -51,7 +51,8 @@ class SplatBoxer {
     v.store(out.v);
     const Mask drawn = inside & (p.z >= kNearPlane) & is_finite(columns);
     const Floats measured = depth_at(select(drawn, u, 0.0f), select(drawn, v, 0.0f));
-    const Mask on_surface = (Floats(0.0f) < measured) & (abs(p.z - measured) < max_gap_m_);
+    const Mask on_surface = (Floats(0.0f) < measured) & (p.z - measured < rule_.max_depth_gap_m) &
+                            (measured - p.z < rule_.max_front_gap_m);
     out.expected = bits(drawn & on_surface) & ((1u << count) - 1);
   }
 
@@ -81,7 +82,7 @@ class SplatBoxer {
   const View view_;
   const Projection project_;
   const float* const depth_m_;
-  const float max_gap_m_;
+  const AssignmentRule rule_;
 };
 
 // Return the area of a region's mask left of x and above y, in pixels with fractions. Bilinear

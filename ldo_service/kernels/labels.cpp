@@ -19,7 +19,7 @@ void assign(const float* rows, const uint32_t* indices, int64_t v, const View& v
             const float* depth_m, const Regions& regions, const AssignmentRule& rule,
             const Assignments& out, int threads) {
   const Candidates candidates(regions);
-  const SplatBoxer boxes_of(view, depth_m, rule.max_depth_gap_m);
+  const SplatBoxer boxes_of(view, depth_m, rule);
   each_job(v, threads, [&](int64_t begin, int64_t end) {
     for (int64_t first = begin; first < end; first += kLanes) {
       const int count = static_cast<int>(std::min<int64_t>(kLanes, end - first));

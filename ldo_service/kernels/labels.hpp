@@ -34,7 +34,8 @@ struct Regions {
 struct AssignmentRule {
   bool by_iou;            // Overlap is the IoU; if false, it is the covered fraction of the splat.
   float min_overlap;      // Minimum overlap of an assigned region.
-  float max_depth_gap_m;  // Maximum distance between a Gaussian and the measured surface.
+  float max_depth_gap_m;  // Maximum distance of a Gaussian behind the measured surface.
+  float max_front_gap_m;  // Maximum distance in front of it; infinite if there is no limit.
 };
 
 enum Outcome : int32_t { kUnexpected = -2, kUnmatched = -1 };

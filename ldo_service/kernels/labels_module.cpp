@@ -107,8 +107,8 @@ View view_of(const Array& T_camera_map, float fx, float fy, float cx, float cy,
 void assign(const Array& rows, const Array& indices, const Array& T_camera_map, float fx, float fy,
             float cx, float cy, const Array& depth_m, const Array& boxes, const Array& scores,
             const Array& rects, const Array& sums, bool by_iou, float min_overlap,
-            float max_depth_gap_m, const WritableArray& region, const WritableArray& overlap,
-            const WritableArray& z, int threads) {
+            float max_depth_gap_m, float max_front_gap_m, const WritableArray& region,
+            const WritableArray& overlap, const WritableArray& z, int threads) {
   require_threads(threads);
   require(rows.ndim() == 2 && rows.shape(1) == kRowFloats, "rows must have shape [N, 16].");
   const float* gaussians = values_of<float>(rows, "rows");
@@ -118,6 +118,7 @@ void assign(const Array& rows, const Array& indices, const Array& T_camera_map, 
   const CheckedRegions checked(boxes, scores, rects, sums);
   require(is_share(min_overlap), "min_overlap must lie in 0..1.");
   require(max_depth_gap_m > 0, "max_depth_gap_m must be positive.");
+  require(max_front_gap_m > 0, "max_front_gap_m must be positive.");
   const size_t v = indices.shape(0);
   require_shape(region, "region", {v});
   require_shape(overlap, "overlap", {v});
@@ -126,7 +127,7 @@ void assign(const Array& rows, const Array& indices, const Array& T_camera_map, 
                         values_of<float>(z, "z")};
   nb::gil_scoped_release release;
   kernels.assign(gaussians, which, static_cast<int64_t>(v), view, depth, checked.regions(),
-                 {by_iou, min_overlap, max_depth_gap_m}, out, threads);
+                 {by_iou, min_overlap, max_depth_gap_m, max_front_gap_m}, out, threads);
 }
 
 LabelRow* label_rows_of(const WritableArray& rows) {
@@ -199,7 +200,7 @@ NB_MODULE(_labels, m) {
   kernels = kernels_for(chosen_isa());
   m.def("assign", &assign, "rows"_a, "indices"_a, "T_camera_map"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a,
         "depth_m"_a, "boxes"_a, "scores"_a, "rects"_a, "sums"_a, "by_iou"_a, "min_overlap"_a,
-        "max_depth_gap_m"_a, "region"_a, "overlap"_a, "z"_a, "threads"_a = 1);
+        "max_depth_gap_m"_a, "max_front_gap_m"_a, "region"_a, "overlap"_a, "z"_a, "threads"_a = 1);
   m.def("update", &update, "labels"_a, "indices"_a, "observed"_a, "confidence"_a, "extent_m"_a,
         "is_corrected"_a, "keep"_a, "miss_weight"_a, "miss_limit"_a, "usual_extent_m"_a,
         "hold_back"_a, "threads"_a = 1);

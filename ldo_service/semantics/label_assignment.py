@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 
 from ldo_service.errors import ConfigError, named
-from ldo_service.geometry import Camera, se3
+from ldo_service.geometry import Camera
 from ldo_service.kernels import _labels
 from ldo_service.regions.foreground import Foreground
 
-NEAR_M = 0.05  # Points nearer than this are not in the image.
 HIDDEN, UNMATCHED = -2, -1  # Values in place of a region's number; see `Assignment`.
 
 
@@ -125,10 +124,10 @@ def assign_gaussians(
 
     Each Gaussian is projected as in rendering, S = J R Sigma R' J' + 0.3 px^2 I. Its splat is the
     axis-aligned box of two standard deviations around its center, clipped to the image. A Gaussian
-    is HIDDEN if its center lies outside of the image, or if its depth differs by max_depth_gap_m or
-    more from the measured depth at that pixel. With the depth test `one_sided`, a Gaussian in front
-    of the measured depth is not HIDDEN. Any other Gaussian may be assigned to a region if
-    overlap > min_overlap:
+    is HIDDEN if it is not finite, if its center lies outside of the image, or if its depth differs
+    by max_depth_gap_m or more from the measured depth at that pixel. With the depth test
+    `one_sided`, a Gaussian in front of the measured depth is not HIDDEN. Any other Gaussian may be
+    assigned to a region if overlap > min_overlap:
 
         rule `coverage`:  overlap = area(splat and region) / area(splat)
         rule `iou`:       overlap = area(splat and region) / area(splat or region)
@@ -187,33 +186,14 @@ def assign_gaussians(
         regions.sums,
         config.rule == "iou",
         config.min_overlap,
+        config.max_depth_gap_m,
         config.max_depth_gap_m if config.depth_test == "two_sided" else np.inf,
         out.regions,
         out.overlaps,
         out.depths_m,
         threads,
     )
-    if config.depth_test == "one_sided":
-        p_map = rows[indices, :3].astype(float)
-        is_behind = _is_behind(p_map, camera, T_camera_map, depth_m, config.max_depth_gap_m)
-        out.regions[is_behind] = HIDDEN
-        out.overlaps[is_behind] = 0
     return out
-
-
-def _is_behind(
-    p_map: np.ndarray, camera: Camera, T_camera_map: np.ndarray, depth_m: np.ndarray, gap_m: float
-) -> np.ndarray:
-    """Return which points [V, 3] in the map lie `gap_m` or more behind the measured depth, [V].
-
-    A point outside of the image is compared with the nearest pixel.
-    """
-    p = se3.transform(np.asarray(T_camera_map, float), p_map)
-    z = np.maximum(p[:, 2], NEAR_M)
-    u, v = np.rint(camera.project(np.column_stack([p[:, :2], z]))).T
-    column = np.clip(u, 0, camera.width - 1).astype(np.int64)
-    row = np.clip(v, 0, camera.height - 1).astype(np.int64)
-    return p[:, 2] - depth_m[row, column] >= gap_m
 
 
 _NO_SUMS = np.zeros(0, np.int32)

@@ -56,7 +56,11 @@ def _expected(
     inside = np.all((means >= -0.5) & (means < [width - 0.5, height - 0.5]), axis=1) & (z >= 0.05)
     column, row = np.floor(np.where(inside[:, None], means, 0) + 0.5).astype(int).T
     measured_m = depth_m[row, column]
-    return inside & (measured_m > 0) & (np.abs(z - measured_m) < config.max_depth_gap_m)
+    behind_m = z - measured_m
+    is_near = behind_m < config.max_depth_gap_m
+    if config.depth_test == "two_sided":
+        is_near &= behind_m > -config.max_depth_gap_m
+    return inside & (measured_m > 0) & is_near
 
 
 def _overlap(
