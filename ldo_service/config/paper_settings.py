@@ -41,13 +41,14 @@ class PaperSettings:
     ema_rule: Literal["corrected", "paper"] = advanced("corrected")
     # Fraction of its past that the moving average keeps. This is lambda (paper, III.A).
     ema_keep_ratio: Annotated[float, Meta(ge=0, lt=1)] = advanced(0.9)
-    # Fraction by which the corrected rule weakens uncertain observations of settled Gaussians.
+    # Fraction by which both rules weaken uncertain observations of settled Gaussians. The paper has
+    # no such factor, which is 0 (III.A).
     ema_hold_back_ratio: Ratio = advanced(1.0)
     # Number of successive keyframes without an observation after which the paper's rule removes a
     # label. This is N_miss (III.A).
     label_max_misses: Annotated[int, Meta(ge=1, le=255)] = advanced(5)
-    # Rule that fuses detector and labeller: by entropy (adaptive), by a fixed weight, or not at all
-    # (detector).
+    # Rule that fuses detector and labeller: by their reliabilities as in the paper (adaptive,
+    # III.B), by a fixed weight (fixed), or not at all (detector).
     fusion_rule: Literal["adaptive", "fixed", "detector"] = advanced("adaptive")
     # Constant beta of the adaptive fusion (paper, III.B).
     fusion_beta: PositiveFloat = advanced(2.0)
