@@ -23,7 +23,16 @@ from ldo_service.errors import ConfigError, LdoError
 from ldo_service.runs.export import ExportFormat
 from ldo_service.runs.networks import require_usable_networks
 
-from .options import ConfigFile, HoldOutEvery, MaxFrames, Settings, Stride, argument
+from .options import (
+    ConfigFile,
+    HoldOutEvery,
+    MaxFrames,
+    Preset,
+    Settings,
+    Stride,
+    argument,
+    with_preset,
+)
 from .run import with_options
 
 # Memory for each recording. The peak was 0.4 to 1.4 GB over the recordings of docs/batch.md.
@@ -49,6 +58,7 @@ def batch(
     sources_from: Annotated[
         Path | None, argument(metavar="FILE", help="text file with more SOURCES, one per line")
     ] = None,
+    preset: Preset = "",
     config: ConfigFile = None,
     set: Settings = (),
     max_frames: MaxFrames = None,
@@ -117,7 +127,14 @@ def batch(
     """
     console = Console(stderr=True, highlight=False, markup=False)
     plan = _plan(
-        config, set, hold_out_every, stride, max_frames, refine_iterations, export, threads
+        config,
+        with_preset(set, preset),
+        hold_out_every,
+        stride,
+        max_frames,
+        refine_iterations,
+        export,
+        threads,
     )
     _require_positive(
         workers=workers, threads=threads, memory_gb=memory_gb, max_staged_gb=max_staged_gb

@@ -44,8 +44,8 @@ Preset = Annotated[
     str,
     argument(
         metavar="NAME",
-        help="settings that --config and --set then change; NAME is "
-        f"{', '.join(known_presets())}: the rules of the paper as printed",
+        help="preset whose settings --config and --set then change: "
+        + "; ".join(f"{name} ({about})" for name, about in known_presets().items()),
     ),
 ]
 Source = Annotated[
@@ -131,7 +131,7 @@ Json = Annotated[bool, argument(help="print one JSON document and nothing else")
 
 
 def with_preset(settings: tuple[str, ...], preset: str) -> tuple[str, ...]:
-    """Return the settings of --set, with one that selects the preset of --preset, if any."""
+    """Return the settings of --set, preceded by one that selects the preset of --preset, if any."""
     return (f"preset={preset}", *settings) if preset else settings
 
 

@@ -20,7 +20,7 @@ from .moved_settings import refuse_moved, was_section
 from .sections import Config
 
 PRESETS = Path(__file__).parent / "presets"
-PRESET = "preset"  # Name of the setting that selects a preset.
+PRESET = "preset"  # Name that selects a preset where a setting may stand.
 KINDS = {
     "int": "a whole number",
     "float": "a number",
@@ -42,22 +42,26 @@ def load_config(
         path: The YAML file; None for no file.
         settings: Settings as `section.field=value`, as on the command line. `preset=NAME` selects a
             preset, wherever it stands.
-        values: Values of settings by dotted name, such as `{"mapper.iterations": 7}`.
+        values: Values of settings by dotted name, such as `{"mapper.iterations": 7}`. The key
+            `preset` selects a preset.
 
     Raises:
         ConfigError: A setting cannot be read, is unknown, has moved, or has an invalid value.
             Or there is no such preset.
     """
+    values = dict(values or {})
+    presets: list[object] = [s.partition("=")[2].strip() for s in settings if _is_preset(s)]
+    if PRESET in values:
+        presets.append(values.pop(PRESET))
     tree: dict[str, Any] = {}
-    for setting in settings:
-        if _is_preset(setting):
-            _merge(tree, _preset(setting.partition("=")[2].strip()))
+    for name in presets:
+        _merge(tree, _preset(name))
     if path:
         _merge(tree, _read(path))
     for setting in settings:
         if not _is_preset(setting):
             _apply(tree, setting)
-    for name, value in (values or {}).items():
+    for name, value in values.items():
         _put(tree, name, _plain(value), name)
     return config_of(tree)
 
@@ -110,26 +114,29 @@ def _read(path: Path) -> dict[str, Any]:
     return tree or {}
 
 
-def known_presets() -> list[str]:
-    """Return the names of the presets."""
-    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
+def known_presets() -> dict[str, str]:
+    """Return the description of each preset, the first line of its file, by name."""
+    return {
+        path.stem: path.read_text().partition("\n")[0].removeprefix("#").strip()
+        for path in sorted(PRESETS.glob("*.yaml"))
+    }
 
 
 def _is_preset(setting: str) -> bool:
     return setting.partition("=")[0].strip() == PRESET
 
 
-def _preset(name: str) -> dict[str, Any]:
+def _preset(name: object) -> dict[str, Any]:
     """Return the settings of a preset.
 
     Raises:
         ConfigError: There is no such preset.
     """
-    if name not in known_presets():
-        known = f"Known: {', '.join(known_presets())}."
-        raise ConfigError(
-            f"there is no preset {name}. {did_you_mean(name, known_presets(), known)}"
-        )
+    presets = known_presets()
+    if not isinstance(name, str) or name not in presets:
+        known = f"Known: {', '.join(presets)}."
+        hint = did_you_mean(str(name), presets, known)
+        raise ConfigError(f"preset={name} must be the name of a preset. {hint}")
     return _read(PRESETS / f"{name}.yaml")
 
 
@@ -192,6 +199,11 @@ def _check_names(tree: Any, schema: type, prefix: str) -> None:
 
 
 def _hint(path: str, prefix: str, names: list[str]) -> str:
+    if path == PRESET:
+        return (
+            "A file cannot select a preset: use --preset NAME, or settings={'preset': NAME} in "
+            "Python."
+        )
     if was_section(path):
         return "Its settings have moved: docs/configuration.md lists the current settings."
     known = f"Known: {', '.join(names)}."

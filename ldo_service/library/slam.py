@@ -73,7 +73,7 @@ class Slam:
             depth_scale: Units of the depth images per meter: 1 for meters, 1000 for millimeters.
             config: Configuration, or path of a YAML file with settings; None for the defaults.
             settings: Settings by dotted name, such as `{"mapper.iterations": 7}`, on top of a file
-                or the defaults.
+                or the defaults. The key `preset` selects a preset, which the file then changes.
 
         Raises:
             ConfigError: A setting or the type of an argument is wrong, or a network that the

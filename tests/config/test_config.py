@@ -94,9 +94,31 @@ def test_preset_paper_selects_the_rules_of_the_paper() -> None:
     assert actor_parameters(default).optimizer.graph.noise == NoiseConfig()
 
 
-def test_unknown_preset_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match=r"there is no preset papr\. Did you mean paper\?"):
-        load_config(settings=["preset=papr"])
+def test_values_select_a_preset_and_change_it() -> None:
+    config = load_config(values={"paper.label_region": "foreground", "preset": "paper"})
+    wanted = load_config(settings=["preset=paper", "paper.label_region=foreground"])
+    assert config == wanted
+    assert config != load_config(settings=["paper.label_region=foreground"])
+
+
+@pytest.mark.parametrize(
+    ("settings", "values", "message"),
+    [
+        (["preset=papr"], {}, r"preset=papr must be the name of a preset\. Did you mean paper\?"),
+        (["preset"], {}, r"preset= must be the name of a preset\. Known: paper\."),
+        ([], {"preset": 7}, r"preset=7 must be the name of a preset\. Known: paper\."),
+    ],
+)
+def test_unknown_preset_is_refused_with_the_known_ones(settings, values, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_config(settings=settings, values=values)
+
+
+def test_preset_in_a_file_is_refused_with_the_option(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("preset: paper\n")
+    with pytest.raises(ConfigError, match=r"there is no setting preset\. .* use --preset NAME"):
+        load_config(file)
 
 
 def test_setting_one_latency_keeps_the_others(tmp_path: Path) -> None:
