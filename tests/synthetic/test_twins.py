@@ -152,6 +152,20 @@ def test_walk_is_hand_held_and_keeps_its_distance(exact: FlatSequence, twins: Fl
         assert not (local < reach).all(axis=0).any(), solid
 
 
+@pytest.mark.slow
+def test_walk_sees_each_own_object_in_at_least_four_of_90_frames(twins: Flat) -> None:
+    """An object that fills less than 200 of 320x240 pixels does not count as seen."""
+    tiny = FlatSequence.named("twins-exact", width_px=32, height_px=24)
+    frames = np.zeros(len(twins.things) + 1, int)
+    for T in tiny.truth().T_world_camera[::8]:
+        view = tiny._renderer.render(tiny.raw_camera, T)
+        shown, pixels = np.unique(view.instance_ids, return_counts=True)
+        frames[shown[pixels >= 2]] += 1
+    for room, own in enumerate((*OFFICE_OBJECTS, *SECTION_OBJECTS)):
+        at = [i for i, its_room in enumerate(twins.rooms) if its_room == room][-len(own) :]
+        assert min(frames[i + 1] for i in at) >= 4, [(twins.things[i], frames[i + 1]) for i in at]
+
+
 def test_another_seed_changes_textures_and_camera_shake(exact: FlatSequence, twins: Flat) -> None:
     other = FlatSequence.named("twins-exact", seed=1, **SMALL)
     assert not np.array_equal(other.truth().T_world_camera, exact.truth().T_world_camera)

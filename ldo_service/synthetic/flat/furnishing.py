@@ -162,6 +162,12 @@ def built(rows: tuple[Row, ...], paint: Materials) -> list[SceneObject]:
 
 
 def placed_in(built: list[SceneObject], frame: Placement) -> list[SceneObject]:
+    """Move objects from the frame of their room to the world frame.
+
+    Args:
+        built: The objects in the frame of the room, see `built`.
+        frame: Placement of the room in the world.
+    """
     return [
         SceneObject(thing.label, tuple(frame(solid) for solid in thing.solids)) for thing in built
     ]

@@ -36,7 +36,7 @@ class ScenePlan:
 
 PLANS = {
     "flat": ScenePlan("1", furnished_flat, hand_held),
-    "twins": ScenePlan("twins 1", furnished_twins, twins_walk),
+    "twins": ScenePlan("twins 2", furnished_twins, twins_walk),
 }
 # Focal length in image widths: a horizontal field of view of 63 degrees, as in a Kinect.
 FOCAL_PER_WIDTH = 0.8125

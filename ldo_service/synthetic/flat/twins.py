@@ -76,17 +76,18 @@ OFFICE_OBJECTS: tuple[tuple[Row, ...], ...] = (
         ("trash can", 1, (0.92, 2.3, 0), DOOR),
     ),
 )
-# Rows in the frame of a section of the corridor: origin on the floor in the middle.
+# Rows in the frame of a section of the corridor: origin on the floor in the middle. The walk looks
+# at the door wall, at +y.
 SECTION: tuple[Row, ...] = (
     ("radiator", 0, (0.0, -0.78, 0), BACK),
     ("picture frame", 1, (0.0, -0.85, 1.7), BACK),
     ("picture frame", 2, (0.92, 0.85, 1.6), DOOR),
 )
 SECTION_OBJECTS: tuple[tuple[Row, ...], ...] = (
-    (("fire extinguisher", 0, (0.95, 0.72, 0), DOOR), ("umbrella", 0, (0.85, -0.7, 0), BACK)),
-    (("cardboard box", 1, (0.92, -0.6, 0), BACK),),
-    (("trash can", 0, (0.95, 0.68, 0), DOOR), ("coat rack", 0, (0.85, -0.65, 0), BACK)),
-    (("potted plant", 2, (0.85, -0.62, 0), BACK), ("suitcase", 0, (0.95, 0.68, 0), DOOR)),
+    (("fire extinguisher", 0, (0.72, 0.72, 0), DOOR), ("umbrella", 0, (-0.85, 0.72, 0), DOOR)),
+    (("cardboard box", 1, (-0.8, 0.64, 0), DOOR),),
+    (("trash can", 0, (0.95, 0.68, 0), DOOR), ("coat rack", 0, (-0.95, 0.62, 0), DOOR)),
+    (("potted plant", 2, (-0.9, 0.62, 0), DOOR), ("suitcase", 0, (0.95, 0.68, 0), DOOR)),
 )
 
 
