@@ -22,7 +22,7 @@ from ldo_service.errors import DamagedStateError, DataError
 from ldo_service.storage.atomic_write import write_atomically
 from ldo_service.storage.saved_files import SavedFiles
 from ldo_service.storage.state_contents import StateContents, read_contents
-from ldo_service.storage.state_store import CONTENTS, GENERATION, NEWEST, FolderStore
+from ldo_service.storage.state_store import CONTENTS, GENERATION, NEWEST, FolderStore, list_name
 
 from .delivery_state import OFFSETS, OUTBOX, RestoredState
 from .restoring import LOG_PERIOD_S
@@ -55,13 +55,64 @@ def completed_generation(store: FolderStore) -> int | None:
 
 
 def complete_generation(store: FolderStore, number: int) -> None:
-    """Write the number of a complete generation to the disk.
+    """Write the number of a complete generation to the disk, and the actors that it contains.
+
+    Raises:
+        OSError: The disk is full or cannot be written. The marker file may have the number already.
+    """
+    lists = store.folder.glob("*/" + list_name(number))
+    marker = StateContents({path.parent.name: path.name for path in lists}, generation=number)
+    write_atomically(store.folder / MARKER, marker.encode(), syncs=True)
+
+
+def confirm_completed(store: FolderStore) -> int:
+    """Return the number of the last complete generation once it is certain to be on the disk.
+
+    If syncing the marker file fails, a reader may find its new content, and a power cut may bring
+    back the old one. No generation may be deleted until this function has written it again.
+
+    Returns:
+        The number; 0 if there is no complete generation, or if the marker file is damaged.
 
     Raises:
         OSError: The disk is full or cannot be written.
+        DataError: Another version of the service wrote the marker file.
     """
-    body = StateContents({}, generation=number).encode()
-    write_atomically(store.folder / MARKER, body, syncs=True)
+    try:
+        marker = read_contents(store.folder / MARKER)
+    except DamagedStateError:
+        return 0
+    if marker is None:
+        return 0
+    write_atomically(store.folder / MARKER, marker.encode(), syncs=True)
+    return marker.generation
+
+
+def actors_of_completed(store: FolderStore) -> set[str]:
+    """Return the actors that have a state in the last complete generation.
+
+    Raises:
+        DamagedStateError: The marker file is damaged.
+        DataError: Another version of the service wrote it.
+        OSError: It cannot be read.
+    """
+    marker = read_contents(store.folder / MARKER)
+    return set(marker.files) if marker else set()
+
+
+def problem_of_completed(
+    store: FolderStore, actors: Sequence[str], number: int
+) -> DataError | str | None:
+    """Check the states of the last complete generation; see `problem_of_states`.
+
+    An actor may have no state in it, because the actor had none at that time. If the marker file
+    says that the actor had one, its missing state is a problem.
+    """
+    had_state = actors_of_completed(store)
+    lost = [actor for actor in actors if actor in had_state and not store.exists(actor, number)]
+    if lost:
+        return f"its state of {', '.join(lost)} is missing"
+    return problem_of_states(store, actors, number)
 
 
 def next_generation(store: FolderStore) -> int:
@@ -156,9 +207,8 @@ class GenerationKeeper:
         """
         self._commander, self._store = commander, store
         self._actors = tuple(reversed(actors))
-        self._completed = 0
-        with suppress(DataError, OSError):  # The start of the service has logged the error.
-            self._completed = completed_generation(store) or 0
+        self._completed = 0  # Last complete generation.
+        self._is_confirmed = False  # True if the disk is certain to have this number.
         self._positions: list[str] = []
         self._failures = 0  # Failed generations since the last complete one.
         self._current_s = time.monotonic()  # Time when the last complete one was up to date.
@@ -207,7 +257,7 @@ class GenerationKeeper:
         if self._failures == FAILURES_TO_LOG:
             # Single failures are normal: an actor may be busy, or a message is between two actors.
             log.warning(
-                "the states cannot be kept as an older generation: %s. A power cut would lose all "
+                "no older generation of the states can be kept: %s. A power cut would lose all "
                 "keyframes since generation %d. If the disk is full, free some space.",
                 problem, self._completed,
             )  # fmt: skip
@@ -217,6 +267,9 @@ class GenerationKeeper:
         positions = await asyncio.to_thread(self._read_positions)
         if positions == self._positions and not is_forced:
             return ""
+        if not self._is_confirmed:
+            self._completed = await asyncio.to_thread(confirm_completed, self._store)
+            self._is_confirmed = True
         number = await asyncio.to_thread(next_generation, self._store)
         for actor in self._actors:
             details = number, self._completed
@@ -228,8 +281,9 @@ class GenerationKeeper:
         )
         if problem:
             return str(problem)
+        self._is_confirmed = False
         await asyncio.to_thread(complete_generation, self._store, number)
-        self._completed, self._positions = number, positions
+        self._completed, self._positions, self._is_confirmed = number, positions, True
         return ""
 
     def close(self) -> None:
@@ -276,4 +330,5 @@ def keep_last(store: FolderStore, actors: Sequence[str]) -> None:
         SavedFiles(store, actor).sync()
     if problem := problem_of_states(store, actors, is_quick=True):
         raise DataError(str(problem))
-    keep_stopped(store, actors, next_generation(store), completed_generation(store) or 0)
+    completed = confirm_completed(store)
+    keep_stopped(store, actors, next_generation(store), completed)

@@ -12,9 +12,12 @@ from pathlib import Path
 from ldo_service.errors import ConfigError, DamagedStateError, DataError, UnavailableError
 from ldo_service.runtime.generations import (
     INTERDEPENDENT_ACTORS,
+    MARKER,
+    actors_of_completed,
     completed_generation,
     keep_stopped,
     next_generation,
+    problem_of_completed,
     problem_of_states,
 )
 from ldo_service.storage.atomic_write import make_folder, sync, write_atomically
@@ -117,13 +120,14 @@ def _check_states(folder: Path, remote_actors: Collection[str]) -> None:
     store = FolderStore(folder / "state")
     _complete_reset(folder, store, remote_actors)
     found = {path.parent.name for path in store.folder.glob("*/*.msgpack")}
-    actors = sorted((found | set(INTERDEPENDENT_ACTORS)) - set(remote_actors))
     try:
         older = completed_generation(store)
+        found |= actors_of_completed(store)
     except DamagedStateError as error:
         log.error("%s. There is no older generation of the states until the next one is kept.",
                   error)  # fmt: skip
         older = None
+    actors = sorted((found | set(INTERDEPENDENT_ACTORS)) - set(remote_actors))
     if (folder / FALL_BACK_MARKER).exists():
         unfinished = "the previous start ended while the actors fell back to an older generation"
         _fall_back(store, actors, DamagedStateError(unfinished), older)
@@ -166,7 +170,7 @@ def _fall_back(
         if isinstance(problem, str):
             raise ConfigError(f"in {store.folder.parent} {problem}. {advice}")
         raise DamagedStateError(f"{problem}. There is no older generation of it. {advice}")
-    if damage := problem_of_states(store, sorted(actors), older):
+    if damage := problem_of_completed(store, sorted(actors), older):
         raise DamagedStateError(
             f"{problem}. The older generation {older} is not usable either: {damage}. {advice}"
         )
@@ -205,6 +209,7 @@ def _complete_reset(folder: Path, store: FolderStore, remote_actors: Collection[
     )
     for state in sorted((folder / "state").glob(f"*/{CONTENTS}")):
         store.delete(state.parent.name)
+    (store.folder / MARKER).unlink(missing_ok=True)  # Its generation is deleted too.
     (folder / FALL_BACK_MARKER).unlink(missing_ok=True)
     if not remote_actors:
         marker.unlink()

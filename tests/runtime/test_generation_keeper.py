@@ -13,9 +13,11 @@ from ldo_service.runtime.generations import (
     FAILURES_TO_LOG,
     GenerationKeeper,
     completed_generation,
+    problem_of_completed,
     problem_of_states,
 )
 from ldo_service.runtime.stage_commands import CommandSender, What
+from ldo_service.storage import atomic_write
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.interface import MemoryPublisher, MemoryTransport
 
@@ -117,6 +119,31 @@ async def test_full_disk_completes_no_generation(
     assert completed_generation(scene.store) is None
     assert await scene.keeper.keep() == ""
     assert completed_generation(scene.store) == 2
+
+
+async def test_marker_whose_sync_fails_loses_neither_generation(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until the marker is written again, a power cut could bring back its old content."""
+    await scene.keeper.keep()
+    scene.handle_message()
+    sync = atomic_write.sync
+
+    def fail(path: Path) -> None:
+        if path == scene.store.folder:
+            raise OSError(5, "Input/output error")
+        sync(path)
+
+    with monkeypatch.context() as bad:
+        bad.setattr(atomic_write, "sync", fail)
+        for _ in range(2):
+            assert "Input/output error" in await scene.keeper.keep()
+    assert completed_generation(scene.store) == 2
+    assert [problem_of_completed(scene.store, ACTORS, number) for number in (1, 2)] == [None] * 2
+    scene.stages.errors["tracker"] = "is busy"
+    assert "is busy" in await scene.keeper.keep()
+    assert problem_of_completed(scene.store, ACTORS, 2) is None
+    assert scene.stages.kept[-1] == ("mapper", 3, 2)
 
 
 async def test_unexpected_error_does_not_end_the_task(

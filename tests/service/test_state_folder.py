@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
-from ldo_service.errors import ConfigError, DataError, UnavailableError
+from ldo_service.errors import ConfigError, DamagedStateError, DataError, UnavailableError
 from ldo_service.runtime.generations import MARKER
 from ldo_service.service.state_folder import (
     FALL_BACK_MARKER,
@@ -21,7 +22,7 @@ from ldo_service.service.state_folder import (
     claim_state,
     state_folder,
 )
-from ldo_service.storage.state_store import CONTENTS, FolderStore
+from ldo_service.storage.state_store import CONTENTS, GENERATION, FolderStore
 
 ACTORS = {"tracker": Tracker, "mapper": Mapper, "optimizer": Optimizer}
 
@@ -199,6 +200,35 @@ def save_generation_and_newer_states(folder: Path) -> None:
             claim(folder)
     file = store._contents["mapper"].files["step"]
     (store.folder / "mapper" / file).write_bytes(b"")
+
+
+@pytest.mark.parametrize("is_folder_lost", [False, True])
+def test_generation_without_the_state_of_an_actor_is_refused(
+    tmp_path: Path, is_folder_lost: bool
+) -> None:
+    folder = tmp_path / "state" / "loop_closer"
+    FolderStore(folder.parent).save(folder.name, {"places": [1]})
+    save_generation_and_newer_states(tmp_path)
+    if is_folder_lost:
+        shutil.rmtree(folder)
+    else:
+        (folder / GENERATION.format(1)).unlink()
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(DamagedStateError, match="its state of loop_closer is missing"):
+        claim(tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_damage_after_a_completed_reset_falls_back_to_the_empty_map(tmp_path: Path) -> None:
+    save_generation_and_newer_states(tmp_path)
+    (tmp_path / RESET_MARKER).touch()
+    claim(tmp_path)
+    save_states(tmp_path, 5, *ACTORS)
+    for path in (tmp_path / "state" / "mapper").iterdir():
+        path.write_bytes(b"")
+    claim(tmp_path)
+    store = FolderStore(tmp_path / "state")
+    assert [store.load(actor) for actor in ACTORS] == [None] * 3
 
 
 @pytest.mark.parametrize("finished", range(4))
