@@ -88,7 +88,7 @@ def serve(
             folder,
             tuple(actor),
             is_router=is_router,
-            is_remote=client,
+            is_remote=client and bool(actor),
             is_state_kept=state is not None,
             metrics_port=metrics_port,
             recording=record,
