@@ -245,7 +245,7 @@ class GenerationKeeper:
         try:
             problem = await self._keep(is_forced=is_forced)
         except (OSError, DataError) as error:
-            problem = str(error)
+            problem = str(error) or repr(error)  # An OSError may have no text.
         except Exception as error:  # If this task ended, no generation would be kept.
             problem = repr(error)
             if self._errors.is_due():
