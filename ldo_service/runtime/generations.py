@@ -36,8 +36,9 @@ MARKER = "generation.msgpack"  # File with the number of the last complete gener
 # time to sync a generation: at two keyframes per second, fewer than five.
 KEEP_EVERY_S = 1.0
 FAILURES_TO_LOG = 5  # Number of failures in a row after which one is logged.
-# Time that an actor has to keep its state, seconds. It includes a step of the actor.
-KEEP_WITHIN_S = 5.0
+# Time that an actor has to keep its state, seconds. It includes a step of the actor. The time
+# doubles after each failure up to the maximum, because a large map on a slow disk takes longer.
+KEEP_WITHIN_S, MAX_KEEP_WITHIN_S = 5.0, 60.0
 # Actors whose states refer to each other. Each one saves a state before the first keyframe arrives.
 INTERDEPENDENT_ACTORS = ("tracker", "mapper", "optimizer")
 
@@ -210,6 +211,7 @@ class GenerationKeeper:
         self._completed = 0  # Last complete generation.
         self._is_confirmed = False  # True if the disk is certain to have this number.
         self._positions: list[str] = []
+        self._within_s = KEEP_WITHIN_S
         self._failures = 0  # Failed generations since the last complete one.
         self._current_s = time.monotonic()  # Time when the last complete one was up to date.
         self._errors = LogLimit(LOG_PERIOD_S)
@@ -273,8 +275,9 @@ class GenerationKeeper:
         number = await asyncio.to_thread(next_generation, self._store)
         for actor in self._actors:
             details = number, self._completed
-            error = await self._commander.order("keep", actor, KEEP_WITHIN_S, details)
+            error = await self._commander.order("keep", actor, self._within_s, details)
             if error:
+                self._within_s = min(2 * self._within_s, MAX_KEEP_WITHIN_S)
                 return f"{actor} {error}"
         problem = await asyncio.to_thread(
             problem_of_states, self._store, self._actors, number, is_quick=True

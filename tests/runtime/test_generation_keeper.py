@@ -32,13 +32,15 @@ class Stages(CommandSender):
         super().__init__(MemoryTransport())
         self._store = store
         self.errors: dict[str, str | Exception] = {}
+        self.limits_s: list[float] = []
         self.kept: list[tuple[str, int, int]] = []
         self.before_keep: Callable[[str], None] = lambda _actor: None
 
     async def order(
         self, what: What, stage: str, timeout_s: float, generation: tuple[int, int] = (0, 0)
     ) -> str:
-        assert (what, timeout_s) == ("keep", generations.KEEP_WITHIN_S)
+        assert what == "keep"
+        self.limits_s.append(timeout_s)
         self.before_keep(stage)
         error = self.errors.get(stage, "")
         if isinstance(error, Exception):
@@ -95,6 +97,16 @@ async def test_actor_that_does_not_answer_leaves_the_older_generation_whole(scen
     scene.stages.errors.clear()
     assert await scene.keeper.keep() == ""
     assert completed_generation(scene.store) == 5, "no number is used again"
+
+
+async def test_actor_that_does_not_answer_has_more_time_from_then_on(scene: Scene) -> None:
+    scene.stages.errors["optimizer"] = "did not answer within 5 s"  # It is asked first.
+    for _ in range(6):
+        await scene.keeper.keep()
+    assert scene.stages.limits_s == [5, 10, 20, 40, 60, 60]
+    scene.stages.errors.clear()
+    assert await scene.keeper.keep() == ""
+    assert scene.stages.limits_s[6:] == [60, 60, 60]
 
 
 async def test_states_that_do_not_fit_do_not_complete_a_generation(scene: Scene) -> None:

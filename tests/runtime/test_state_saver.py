@@ -1,6 +1,7 @@
 """Tests of the generations that a stage writes in the background, also on a bad disk."""
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -8,7 +9,8 @@ from threading import Event
 
 import pytest
 
-from ldo_service.runtime import Out, state_saver
+from ldo_service.runtime import Out, generations, state_saver
+from ldo_service.runtime.generations import GenerationKeeper, completed_generation
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.stage_commands import CommandSender
@@ -43,22 +45,27 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
 
 
 @asynccontextmanager
-async def doubler(folder: Path) -> AsyncIterator[Callable[[int], Awaitable[str]]]:
-    """Run a stage whose outbox on disk has a message, and yield a function that keeps its state."""
+async def running_doubler(store: FolderStore) -> AsyncIterator[CommandSender]:
+    """Run a stage whose outbox on disk has a message, and yield a client that commands it."""
     transport, absent = MemoryTransport(), {DOUBLES.name: frozenset({"absent"})}
-    store = FolderStore(folder)
     stage = Stage(
         Doubler, transport, config=QUICK, store=store, expected=absent, with_backlog=absent
     )
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, {"doubler"})
-    commander = CommandSender(transport)
-
-    async def keep(generation: int) -> str:
-        return await commander.order("keep", "doubler", 60, (generation, 0))
-
     async with running(stage):
         await send(numbers, number(1))
         await eventually(lambda: stage.health().steps == 1)
+        yield CommandSender(transport)
+
+
+@asynccontextmanager
+async def doubler(folder: Path) -> AsyncIterator[Callable[[int], Awaitable[str]]]:
+    """Run a stage whose outbox on disk has a message, and yield a function that keeps its state."""
+    async with running_doubler(FolderStore(folder)) as commander:
+
+        async def keep(generation: int) -> str:
+            return await commander.order("keep", "doubler", 60, (generation, 0))
+
         yield keep
 
 
@@ -88,3 +95,17 @@ async def test_generation_is_not_begun_while_the_one_before_is_written(
         disk.is_free.set()
         assert await first == ""
         assert await keep(4) == ""
+
+
+async def test_write_that_takes_longer_than_the_time_limit_completes_a_generation_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(generations, "KEEP_WITHIN_S", 0.05)
+    monkeypatch.setattr(generations, "KEEP_EVERY_S", 0.01)
+    monkeypatch.setattr(state_saver, "sync_all", lambda _: time.sleep(0.3))
+    store = FolderStore(tmp_path / "state")
+    async with running_doubler(store) as commander:
+        task = asyncio.create_task(GenerationKeeper(commander, store, ["doubler"]).run())
+        await eventually(lambda: completed_generation(store) is not None)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
