@@ -209,7 +209,7 @@ def _complete_reset(folder: Path, store: FolderStore, remote_actors: Collection[
     )
     for state in sorted((folder / "state").glob(f"*/{CONTENTS}")):
         store.delete(state.parent.name)
-    (store.folder / MARKER).unlink(missing_ok=True)  # Its generation is deleted too.
+    (store.folder / MARKER).unlink(missing_ok=True)  # The states of this generation are deleted.
     (folder / FALL_BACK_MARKER).unlink(missing_ok=True)
     if not remote_actors:
         marker.unlink()

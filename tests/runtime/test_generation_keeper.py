@@ -137,7 +137,7 @@ async def test_full_disk_completes_no_generation(
 async def test_marker_whose_sync_fails_loses_neither_generation(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Until the marker is written again, a power cut could bring back its old content."""
+    """A power cut could bring back the old marker until it is written again."""
     await scene.keeper.keep()
     scene.handle_message()
     sync = atomic_write.sync
