@@ -34,6 +34,7 @@ class GenerationFiles:
         if not self.list_name:
             return
         for part, source in self.sources.items():
+            self._refuse_if_given_up()
             body = (self.folder / source).read_bytes()
             if check_of(body) != self.contents.checks[part]:
                 raise DamagedStateError(
@@ -44,7 +45,12 @@ class GenerationFiles:
             copy.write_bytes(body)
             sync(copy)
         write_atomically(self.folder / self.list_name, self.contents.encode(), syncs=True)
-        if self.is_given_up:
-            (self.folder / self.list_name).unlink(missing_ok=True)
-            raise OSError(f"{self.folder / self.list_name} was given up")
+        self._refuse_if_given_up()
         self.is_written = True
+
+    def _refuse_if_given_up(self) -> None:
+        """Remove all written files and raise an OSError if the generation was given up."""
+        if self.is_given_up:
+            for file in (self.list_name, *(self.contents.files[part] for part in self.sources)):
+                (self.folder / file).unlink(missing_ok=True)
+            raise OSError(f"{self.folder / self.list_name} was given up")

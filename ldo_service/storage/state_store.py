@@ -342,14 +342,14 @@ class FolderStore:
             OSError: The disk cannot be written.
         """
         folder = self.folder / actor
-        if actor in self._writing:
-            self._writing[actor].is_given_up = True
-        lists = list(folder.glob(GENERATION.format("*")))
-        for path in lists:
+        if writing := self._writing.get(actor):
+            writing.is_given_up = True
+        for path in folder.glob(GENERATION.format("*")):
             path.unlink(missing_ok=True)
-        if lists:
+        if folder.is_dir():
             sync(folder)  # The actor may now remove files that only the generations need.
         copies = {f for kept in self._kept.get(actor, {}).values() for f in kept.files.values()}
+        copies.update(writing.sources.values() if writing else ())
         for known in (self._copies, self._writing):
             known.pop(actor, None)
         if actor in self._kept:
