@@ -6,20 +6,24 @@ from pathlib import Path
 
 from ldo_service.storage.atomic_write import sync_all, with_folders
 from ldo_service.storage.generation_files import GenerationFiles
-from ldo_service.storage.state_store import State, StateStore
+from ldo_service.storage.saved_files import SavedFiles
+from ldo_service.storage.state_store import FolderStore, State, StateStore
 from ldo_service.transport.flow_control import InletPosition, OutletPosition
 
 from .actor import Actor
 from .delivery_state import DeliveryState, LoggedInput, RestoredState, restore_actor
+from .supervision_policy import LogLimit
 
 log = logging.getLogger(__name__)
 
-# Number of unsynced files above which a save syncs them. Each saved state lists them, and only a
-# generation syncs them earlier: a service has about 20 of them between two generations.
+# Maximum number of files of the map in the list of unsynced files, which each saved state contains.
+# A save with more files syncs them. A service with generations has about 20 at a time.
 MAX_UNSYNCED_FILES = 100
-# Size of the files that only older generations need above which these are deleted, bytes. A service
-# that completes a generation every second retires a few MB in between.
+# Maximum size of the files that only older generations need, bytes. A larger size deletes the
+# generations. A service that completes them retires a few MB in between. More than 1 GB could fill
+# a small disk, such as an SD card of 32 GB.
 MAX_RETIRED_BYTES = 1_000_000_000
+LOG_PERIOD_S = 60.0  # Minimum time between two log lines about generations, seconds.
 
 
 class Checkpointer:
@@ -34,7 +38,8 @@ class Checkpointer:
         self.is_unsaved = False  # True if the last step is not saved.
         self._failed = 0
         self._has_fallen_back = False
-        self._last_kept = 0  # Number of the last generation that this stage has kept.
+        self._last_kept = 0  # Last generation that this stage has kept; 0: none to rely on.
+        self._give_up_failures = LogLimit(LOG_PERIOD_S)
 
     def restore_actor(self, make: Callable[[], Actor]) -> Actor:
         """Create an actor and restore its last saved state, if there is one.
@@ -44,10 +49,21 @@ class Checkpointer:
         """
         fresh = make()
         self.past = RestoredState.of(self._store.load(fresh.name))
+        self._sync_files(fresh.name)
         self._has_fallen_back = self._store.has_fallen_back(fresh.name)
         if self.past.of_actor:
             log.info("%s: restored from its last saved state.", fresh.name)
         return restore_actor(fresh, self.past, make)
+
+    def _sync_files(self, name: str) -> None:
+        """Sync the files of the state, because the new actor does not know which ones need it."""
+        if not isinstance(self._store, FolderStore):
+            return
+        try:
+            SavedFiles(self._store, name).sync_unsynced()
+        except OSError as error:  # Tracking works even if the disk is full.
+            log.error("%s: the files of its state cannot be synced: %s. A power cut may damage "
+                      "them. Check the disk.", name, error)  # fmt: skip
 
     def forget(self, name: str) -> None:
         """Delete the saved state, so that the actor starts empty."""
@@ -118,7 +134,17 @@ class Checkpointer:
     def _bound_retired_files(self, name: str, size_bytes: int) -> None:
         """Delete the generations of the state if they need too many files of the actor."""
         if size_bytes > MAX_RETIRED_BYTES:
-            self._store.give_up(name)
+            try:
+                self._store.give_up(name)
+            except OSError as error:
+                if self._give_up_failures.is_due():
+                    log.error(
+                        "%s: its older generations cannot be deleted: %s. They need %.0f MB of "
+                        "files that are otherwise unused. The next step tries again. Check the "
+                        "disk.",
+                        name, error, 1e-6 * size_bytes,
+                    )  # fmt: skip
+                return
             self._last_kept = 0
             log.error(
                 "%s: no generation of the states was completed while %.0f MB of files became "
@@ -129,7 +155,7 @@ class Checkpointer:
 
     def is_last_kept(self, generation: int) -> bool:
         """Return whether this generation is the last one that this stage has kept."""
-        return generation == self._last_kept
+        return generation != 0 and generation == self._last_kept
 
     def keep(
         self, actor: Actor, generation: int, completed: int

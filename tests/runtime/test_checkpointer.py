@@ -7,6 +7,7 @@ import pytest
 from ldo_service.gaussians.retired_files import RetiredFiles
 from ldo_service.runtime import Actor, checkpointer
 from ldo_service.runtime.checkpointer import MAX_UNSYNCED_FILES, Checkpointer
+from ldo_service.storage import saved_files
 from ldo_service.storage.checksummed_folder import ChecksummedFolder
 from ldo_service.storage.state_contents import read_contents
 from ldo_service.storage.state_store import CONTENTS, FolderStore
@@ -91,3 +92,71 @@ def test_files_that_only_older_generations_need_are_bounded_while_none_is_comple
     assert 1 <= len(errors) <= 6
     names = {path.name for path in (tmp_path / "state" / "writer").iterdir()}
     assert len(names) < 12, "copies of the deleted generations are removed"
+
+
+def test_generation_is_only_the_last_kept_one_if_one_was_kept(tmp_path: Path) -> None:
+    saver = Checkpointer(FolderStore(tmp_path / "state"))
+    assert not saver.is_last_kept(0)
+    actor = Writer(tmp_path / "map")
+    saver.write(actor, {"keyframe": [1]})
+    saver.keep(actor, 3, completed=0)
+    assert saver.is_last_kept(3)
+    saver.forget("writer")
+    assert not saver.is_last_kept(0), "no generation is complete, so none releases files"
+
+
+@pytest.mark.parametrize("is_same_process", [True, False])
+def test_restored_actor_has_synced_the_files_of_the_actor_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_same_process: bool
+) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr(saved_files, "sync_all", synced.extend)
+    saver = Checkpointer(FolderStore(tmp_path / "state"))
+    actor = Writer(tmp_path / "map")
+    actor.files.write(0, b"image")
+    saver.write(actor, {"keyframe": [0]})
+    assert synced == []
+    if not is_same_process:
+        saver = Checkpointer(FolderStore(tmp_path / "state"))
+    restored = saver.restore_actor(lambda: Writer(tmp_path / "map"))
+    assert actor.files.unsynced_files()[0] in synced
+    assert unsynced_of(tmp_path / "state") == ()
+    saver.write(restored, {"keyframe": [1]})
+    assert unsynced_of(tmp_path / "state") == ()
+
+
+def test_files_that_cannot_be_synced_do_not_prevent_a_restore(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    saver = Checkpointer(FolderStore(tmp_path / "state"))
+    actor = Writer(tmp_path / "map")
+    actor.files.write(0, b"image")
+    saver.write(actor, {"keyframe": [0]})
+    monkeypatch.setattr(saved_files, "sync_all", fail)
+    saver.restore_actor(lambda: Writer(tmp_path / "map"))
+    assert "the files of its state cannot be synced" in caplog.text
+
+
+def test_generations_that_cannot_be_deleted_are_logged_once_and_keep_their_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(checkpointer, "MAX_RETIRED_BYTES", 50)
+    actor, store = Writer(tmp_path / "map"), FolderStore(tmp_path / "state")
+    saver = Checkpointer(store)
+    actor.files.write(0, bytes(92))
+    saver.write(actor, {"keyframe": [0]})
+    saver.keep(actor, 1, completed=0)
+    actor.files.retired.add(0)
+    actor.files.retired.on_snapshot()
+    monkeypatch.setattr(store, "give_up", fail)
+    for _ in range(2):
+        saver.notify(actor)
+    (error,) = (r for r in caplog.records if r.levelname == "ERROR")
+    assert "its older generations cannot be deleted" in error.getMessage()
+    assert 0 in actor.files.sizes
