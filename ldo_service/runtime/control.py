@@ -23,11 +23,13 @@ from typing import Any
 import msgspec
 
 from ldo_service.schemas import ControlAnswer, ControlRequest, decode, encode
-from ldo_service.storage.atomic_write import write_atomically
+from ldo_service.storage.atomic_write import sync, write_atomically
 from ldo_service.transport.interface import Transport
 
-from .generations import GenerationKeeper
+from .generations import KEEP_WITHIN_S, GenerationKeeper
+from .restoring import LOG_PERIOD_S
 from .stage_commands import CommandSender, What
+from .supervision_policy import LogLimit
 
 log = logging.getLogger(__name__)
 
@@ -36,9 +38,9 @@ log = logging.getLogger(__name__)
 MIN_S = 2.0
 # Time between two attempts to complete a reset that the previous process began, seconds.
 COMPLETE_AGAIN_S = 2.0
-# Attempts to keep the empty states after a reset, and the time between two of them, seconds. A
-# stage may still be writing the generation before.
-KEEP_ATTEMPTS, KEEP_AGAIN_S = 3, 1.0
+# Time for all attempts to keep the empty states after a reset, and between two of them, seconds.
+# A stage that is still writing the generation before refuses to begin another one.
+KEEP_FOR_S, KEEP_AGAIN_S = 2 * KEEP_WITHIN_S, 1.0
 
 
 class ControlError(Exception):
@@ -145,11 +147,17 @@ class Control:
                 "`ldo control reset`."
             )
         self._is_paused = False
-        if self._pause_marker is not None:
-            with suppress(OSError):  # A restart then pauses the service again.
+        note = ""
+        try:
+            if self._pause_marker is not None:
                 self._pause_marker.unlink(missing_ok=True)
+        except OSError as error:
+            note = (
+                f" A restart pauses the service again, because {self._pause_marker} cannot be "
+                f"removed: {error.strerror}."
+            )
         await self._each("resume", self._sources)
-        return "frames are processed again."
+        return f"frames are processed again.{note}"
 
     async def _save(self) -> str:
         await self._each("save", self._actors)
@@ -164,9 +172,10 @@ class Control:
     async def _reset_actors(self) -> str:
         try:
             await self._each("pause", self._actors)
-            self._mark_reset()
+            await asyncio.to_thread(self._mark_reset)
             await self._each("reset", self._actors)
             await self._replace_generations()
+            await asyncio.to_thread(self._remove_reset_marker)
         except ControlError as error:
             with suppress(ControlError):
                 await self._resume_actors()
@@ -177,9 +186,6 @@ class Control:
                 "completes it too."
             ) from error
         self._is_reset_pending = False
-        if self._reset_marker is not None:
-            with suppress(OSError):  # The next start then repeats the reset.
-                self._reset_marker.unlink(missing_ok=True)
         await self._resume_actors()
         still = " Frames stay paused." if self._is_paused else ""
         return f"{', '.join(self._actors)} restarted with an empty state.{still}"
@@ -192,13 +198,13 @@ class Control:
         """
         if self._generations is None:
             return
-        problem = ""
-        for attempt in range(KEEP_ATTEMPTS):
-            if attempt:
-                await asyncio.sleep(KEEP_AGAIN_S)
-            problem = await self._generations.keep(is_forced=True)
-            if not problem:
-                return
+        until_s = time.monotonic() + KEEP_FOR_S
+        while problem := await self._generations.keep(is_forced=True):
+            if time.monotonic() >= until_s:
+                break
+            await asyncio.sleep(KEEP_AGAIN_S)
+        else:
+            return
         raise ControlError(
             f"all actors are empty, but their states cannot be kept as an older generation: "
             f"{problem}. A power cut could bring back the old map. If the disk is full, free some "
@@ -226,15 +232,40 @@ class Control:
                 ) from error
         self._is_reset_pending = True
 
+    def _remove_reset_marker(self) -> None:
+        """Remove the marker, because the next start would otherwise delete the new map.
+
+        Raises:
+            ControlError: The disk cannot be written.
+        """
+        if self._reset_marker is None:
+            return
+        try:
+            self._reset_marker.unlink(missing_ok=True)
+            sync(self._reset_marker.parent)
+        except OSError as error:
+            raise ControlError(
+                f"all actors are empty, but {self._reset_marker} cannot be removed: "
+                f"{error.strerror or error}. Check the disk, then repeat the command."
+            ) from error
+
     async def _complete_reset(self) -> None:
         """Complete the reset that the previous process began, when all actors are running."""
         log.warning("completing the reset that the previous process of the service began; frames "
                     "are dropped until all actors have started.")  # fmt: skip
+        failures = LogLimit(LOG_PERIOD_S)
         while self._is_reset_pending:
             async with self._one_at_a_time:
-                with suppress(ControlError):
+                try:
                     if self._is_reset_pending:
                         log.info("reset: %s", await self._reset())
+                except ControlError as error:
+                    if failures.is_due():
+                        log.error("reset: %s The service tries again.", error)
+                except Exception:  # If this task ended, frames would be dropped for good.
+                    if failures.is_due():
+                        log.exception("reset: an unexpected error; the service tries again. Please "
+                                      "report the traceback.")  # fmt: skip
             await asyncio.sleep(COMPLETE_AGAIN_S)
 
     async def _each(self, what: What, actors: Sequence[str]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ldo_service.runtime import Actor, In, Latest, Out, control
-from ldo_service.runtime.control import KEEP_ATTEMPTS, Control
+from ldo_service.runtime.control import Control, ControlError
 from ldo_service.runtime.generations import GenerationKeeper
 from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import ControlAnswer, ControlRequest, Health, Message, decode, encode
@@ -206,11 +206,13 @@ async def test_marker_that_cannot_be_removed_pauses_no_restarted_source(
     async with scene.started():
         assert (await scene.request("pause")).ok
         monkeypatch.setattr(Path, "unlink", fail)
-        assert (await scene.request("resume")).ok
+        answer = await scene.request("resume")
+        assert answer.ok
+        assert "A restart pauses the service again" in answer.message
         assert scene.has_marker()
-    restarted = Stage(Source, scene.transport, config=QUICK, starts_paused=scene.has_marker)
-    async with running(restarted):
-        await eventually(lambda: not restarted.health().paused)
+        restarted = Stage(Source, scene.transport, config=QUICK, starts_paused=scene.has_marker)
+        async with running(restarted):
+            await eventually(lambda: not restarted.health().paused)
 
 
 async def test_pause_that_cannot_be_written_says_that_a_restart_resumes(tmp_path: Path) -> None:
@@ -263,18 +265,45 @@ async def test_reset_of_the_previous_process_is_completed(tmp_path: Path) -> Non
         await eventually(lambda: not scene.health()[0].paused)
 
 
-async def test_marker_that_cannot_be_removed_does_not_hold_the_actors_after_a_reset(
+async def test_reset_marker_that_cannot_be_removed_holds_the_sources(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The next start would delete a map that is made while the marker exists."""
+
     def fail(*_: object, **__: object) -> None:
         raise OSError(30, "Read-only file system")
 
     scene = Scene(reset_marker=tmp_path / "reset")
     async with scene.started():
-        with monkeypatch.context() as read_only:
-            read_only.setattr(Path, "unlink", fail)
-            assert (await scene.request("reset")).ok
+        for method in ("unlink", "sync"):
+            with monkeypatch.context() as read_only:
+                read_only.setattr(Path if method == "unlink" else control, method, fail)
+                answer = await scene.request("reset")
+            assert "cannot be removed: Read-only" in answer.message
+            assert [health.paused for health in scene.health()] == [True, False]
+        assert (await scene.request("reset")).ok
         assert not any(health.paused for health in scene.health())
+
+
+async def test_reset_of_the_previous_process_is_completed_after_any_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(control, "COMPLETE_AGAIN_S", 0.001)
+    errors: list[Exception] = [ControlError("source is busy"), RuntimeError("no thread")]
+    reset = Control._reset
+
+    async def fail_at_first(own: Control) -> str:
+        if errors:
+            raise errors.pop(0)
+        return await reset(own)
+
+    monkeypatch.setattr(Control, "_reset", fail_at_first)
+    marker = tmp_path / "reset"
+    marker.touch()
+    scene = Scene(reset_marker=marker)
+    async with scene.started():
+        await eventually(lambda: not marker.exists())
+    assert "reset: source is busy The service tries again." in caplog.text
 
 
 async def test_reset_without_a_marker_on_the_disk_is_refused(tmp_path: Path) -> None:
@@ -300,20 +329,22 @@ class Generations(GenerationKeeper):
         return "disk full" if self.attempts <= self.failures else ""
 
 
-@pytest.mark.parametrize("failures", [0, KEEP_ATTEMPTS - 1, KEEP_ATTEMPTS])
+@pytest.mark.parametrize(("failures", "is_kept"), [(0, True), (20, True), (10**9, False)])
 async def test_reset_is_complete_when_the_empty_states_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failures: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failures: int, is_kept: bool
 ) -> None:
     monkeypatch.setattr(control, "KEEP_AGAIN_S", 0.001)
+    if not is_kept:
+        monkeypatch.setattr(control, "KEEP_FOR_S", 0.01)
     generations, marker = Generations(failures), tmp_path / "reset"
     scene = Scene(reset_marker=marker, generations=generations)
     async with scene.started():
         answer = await scene.request("reset")
-        is_kept = failures < KEEP_ATTEMPTS
         assert answer.ok is is_kept
         assert marker.exists() is not is_kept, "the next start has to complete the reset"
         assert scene.source.health().paused is not is_kept
         if not is_kept:
             assert "A power cut could bring back the old map" in answer.message
+            generations.failures = 0
             assert (await scene.request("reset")).ok
             assert not marker.exists()
