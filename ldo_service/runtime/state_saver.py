@@ -178,6 +178,9 @@ class StateSaver:
                 await asyncio.to_thread(files.write)
         except (OSError, DataError) as error:
             report(order, f"cannot keep its state: {error}")
+        except Exception as error:  # The service waits for a reply.
+            log.exception("keeping a state failed. Please report the traceback.")
+            report(order, f"cannot keep its state: {error!r}")
         else:
             report(order, "")
 

@@ -82,6 +82,18 @@ async def test_files_of_outboxes_are_synced_again_after_a_failed_sync(
     assert disk.synced == [log, log, log, set()]
 
 
+async def test_unexpected_error_of_a_write_is_reported_and_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(_: object) -> None:
+        raise RuntimeError("no thread")
+
+    monkeypatch.setattr(state_saver, "sync_all", fail)
+    async with doubler(tmp_path) as keep:
+        assert "RuntimeError('no thread')" in await keep(1)
+    assert "Please report the traceback" in caplog.text
+
+
 async def test_generation_is_not_begun_while_the_one_before_is_written(
     tmp_path: Path, disk: Disk
 ) -> None:
