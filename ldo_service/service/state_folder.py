@@ -32,7 +32,8 @@ RESET_MARKER = "reset"
 FALL_BACK_MARKER = "falling_back"
 PAUSE_MARKER = "paused"  # File that exists while the service is paused.
 # Errors of a path that cannot become a folder. After any other error, such as a file system that is
-# read-only, full or not mounted yet, a later attempt may succeed.
+# read-only, full or not mounted yet, a later attempt may succeed. Wrong permissions count as such
+# too, because a mount or a deployment may still set them; see decision 0113.
 _OF_PATH = (errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
 
 
@@ -161,6 +162,7 @@ def _fall_back(
     Raises:
         ConfigError: The states do not match, and there is no older generation.
         DamagedStateError: A state is damaged, and there is no undamaged older generation.
+        UnavailableError: The disk cannot be written now; the next start tries again.
     """
     advice = (
         "Restore the whole folder from one copy, choose another folder with --state, or delete "
@@ -187,9 +189,11 @@ def _fall_back(
         marker.unlink()
         sync(marker.parent)  # Otherwise a power cut could bring the marker back.
     except OSError as error:
-        raise DataError(
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        advice = "Free some disk space" if is_full else "Make the folder writable"
+        raise UnavailableError(
             f"{store.folder.parent} cannot fall back to generation {older} of the states: {error}. "
-            "Free some disk space; the next start tries again."
+            f"{advice}; the next start tries again."
         ) from error
 
 
@@ -213,3 +217,4 @@ def _complete_reset(folder: Path, store: FolderStore, remote_actors: Collection[
     (folder / FALL_BACK_MARKER).unlink(missing_ok=True)
     if not remote_actors:
         marker.unlink()
+        sync(folder)  # Otherwise a power cut could bring the marker back.

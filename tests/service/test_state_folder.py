@@ -16,6 +16,7 @@ from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
 from ldo_service.errors import ConfigError, DamagedStateError, DataError, UnavailableError
 from ldo_service.runtime.generations import MARKER
+from ldo_service.service import state_folder as module
 from ldo_service.service.state_folder import (
     FALL_BACK_MARKER,
     RESET_MARKER,
@@ -253,23 +254,44 @@ def test_interrupted_fall_back_is_finished_at_the_next_start(
     assert not (tmp_path / FALL_BACK_MARKER).exists()
 
 
+@pytest.mark.parametrize(
+    ("number", "advice"), [(errno.ENOSPC, "Free some"), (errno.EROFS, "Make the folder writable")]
+)
 def test_fall_back_that_the_disk_interrupts_is_finished_at_the_next_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, advice: str
 ) -> None:
     save_generation_and_newer_states(tmp_path)
     fall_back = FolderStore.fall_back
 
     def fail(store: FolderStore, actor: str, generation: int) -> None:
         if actor == "tracker":
-            raise OSError(28, "No space left on device")
+            raise OSError(number, os.strerror(number))
         fall_back(store, actor, generation)
 
     with monkeypatch.context() as full:
         full.setattr(FolderStore, "fall_back", fail)
-        with pytest.raises(DataError, match="the next start tries again"):
+        with pytest.raises(UnavailableError, match=f"{advice}.*; the next start tries again"):
             claim(tmp_path)
     claim(tmp_path)
     assert steps_of(tmp_path) == [1, 1, 1]
+
+
+def test_removal_of_the_reset_marker_is_on_the_disk_before_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A power cut that brought the marker back would delete the new map."""
+    (tmp_path / RESET_MARKER).touch()
+    was_marked: list[bool] = []
+    sync = module.sync
+
+    def record(path: Path) -> None:
+        sync(path)
+        if path == tmp_path:
+            was_marked.append((tmp_path / RESET_MARKER).exists())
+
+    monkeypatch.setattr(module, "sync", record)
+    claim(tmp_path)
+    assert was_marked == [False]
 
 
 def test_completed_reset_leaves_no_fall_back_to_finish(tmp_path: Path) -> None:
