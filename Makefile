@@ -3,9 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 SOURCES := pyproject.toml CMakeLists.txt $(wildcard ldo_service/kernels/*.cpp ldo_service/kernels/*.hpp)
 
-.PHONY: help demo test check slow bench docs clean
+.PHONY: help demo test check slow bench gpu-check docs clean
 help:  ## list the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
 demo: .venv/installed  ## run SLAM on a built-in synthetic room: a table and three pictures
 	$(BIN)/ldo demo --out build/demo --overwrite
@@ -22,6 +22,12 @@ check: .venv/dev  ## check format, lint, types and pages
 bench: .venv/tests  ## run the benchmarks; docs/benchmarks has a page per question
 	@for program in $(basename $(notdir $(wildcard tests/bench/bench_*.py))); do \
 		echo "== $$program"; $(BIN)/python -m tests.bench.$$program || exit 1; done
+
+gpu-check: .venv/tests  ## interpret and compile the GPU kernels; it needs no GPU and no torch
+	$(BIN)/python -m pip install --quiet --group gpu-check
+	LDO_ISA=baseline TRITON_INTERPRET=1 $(BIN)/python -m pytest -q -n auto --dist worksteal \
+		tests/kernels/gpu $(ARGS)
+	$(BIN)/python -m tests.kernels.gpu.cubins
 
 docs: .venv/docs  ## build the documentation site in build/site
 	$(BIN)/python docs/generate.py

@@ -1,0 +1,195 @@
+"""Blending of splats front to back, and its derivative; see `kernels/blend.hpp`.
+
+A program of one warp blends a tile of 16x16 pixels. The pixels have the shape [16 pixels, 16
+blocks], because the 4x4 pixels of a block finish together. In this order, a thread holds eight
+pixels of one block, so that sums over pixels stay in its registers except for one exchange between
+threads. In the other order, each sum takes 32 shuffle instructions instead of 5.
+"""
+
+import triton
+import triton.language as tl
+
+from .arithmetic import PINNED, exp2
+from .projection import LOG2_MIN_ALPHA, ROW, TILE
+
+ONE_WARP = {"num_warps": 1, **PINNED}
+# The compiler would stop at 128 registers without `maxnreg`, and spill eight bytes for sm_100.
+BACKWARD = {**ONE_WARP, "maxnreg": 144}
+
+LOG2_MAX_ALPHA = tl.constexpr(-0.0144995697)  # log2(0.99)
+CAPPED = tl.constexpr(0.98999)  # A larger alpha was capped at 0.99, up to rounding.
+STOP = tl.constexpr(1e-4)  # A pixel of less transmittance is finished.
+BATCH = tl.constexpr(256)  # Each block checks its transmittance after this number of pairs.
+CHUNK = tl.constexpr(16)  # The tile checks after this number of pairs whether all blocks finished.
+
+
+@triton.jit
+def pixels_of(tile, columns):
+    """Return columns and rows [16, 16] of the pixels of a tile, and of its blocks [1, 16].
+
+    The masks 3 and 12 replace remainders. If the compiler sees that four pixels are neighbors in
+    memory, it gives them to four threads, and the sums over pixels become shuffles.
+    """
+    pixel, block = tl.arange(0, 16)[:, None], tl.arange(0, 16)[None, :]
+    block_x = tile % columns * TILE + (block & 3) * 4
+    block_y = tile // columns * TILE + (block & 12)
+    return block_x + (pixel & 3), block_y + ((pixel & 12) >> 2), block_x, block_y
+
+
+@triton.jit
+def alpha_of(splat, px, py):
+    """Return the capped alpha of a splat at pixels, and the offsets from its center."""
+    dx, dy = px - tl.load(splat), py - tl.load(splat + 1)
+    a, b, c = tl.load(splat + 2), tl.load(splat + 3), tl.load(splat + 4)
+    log2_alpha = dx * (dx * a + dy * b) + (dy * dy * c + tl.load(splat + 5))
+    alpha = exp2(tl.minimum(tl.maximum(log2_alpha, -126.0), LOG2_MAX_ALPHA))
+    return tl.where(log2_alpha >= LOG2_MIN_ALPHA, alpha, 0.0), dx, dy
+
+
+@triton.jit
+def largest_of_block(T):
+    return tl.max(T, 0, keep_dims=True)
+
+
+@triton.jit
+def blend_forward(splats, listed, reached, starts, columns, width, height, planes, ends):
+    """Blend the splats of each tile.
+
+    A block checks its transmittance after each fourth splat that reaches it, counted from the start
+    of a batch, and at the end of a batch, like the C++ kernel.
+
+    Args:
+        splats: [N, 16].
+        listed: Splat of each pair, [P]: tile by tile, front to back.
+        reached: Blocks that each pair reaches, [P].
+        starts: First pair of each tile, [tiles + 1].
+        columns: Tiles in a row of the image.
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
+        planes: Output, [5, height, width]: red, green, blue, weighted depth, opacity.
+        ends: Output, [tiles, 16]: pair after the last one that each block blends.
+    """
+    tile = tl.program_id(0)
+    x, y, block_x, block_y = pixels_of(tile, columns)
+    px, py = x.to(tl.float32), y.to(tl.float32)
+    T = tl.full([16, 16], 1.0, tl.float32)
+    red, green, blue = T * 0.0, T * 0.0, T * 0.0
+    depth = T * 0.0
+    start, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    is_open = ((block_x < width) & (block_y < height)).to(tl.int32)
+    count = is_open * 0
+    block_end = tl.where(is_open != 0, end, start)
+    block = tl.arange(0, 16)[None, :]
+    i = start
+    any_open = tl.max(tl.max(is_open, 1), 0)
+    while (i < end) & (any_open != 0):
+        chunk_end = tl.minimum(i + CHUNK, end)
+        for j in range(i, chunk_end):
+            bits = tl.load(reached + j)
+            if bits != 0:
+                splat = splats + tl.load(listed + j).to(tl.int64) * ROW
+                alpha, _dx, _dy = alpha_of(splat, px, py)
+                weight = tl.where(is_open != 0, alpha * T, 0.0)
+                red += weight * tl.load(splat + 8)
+                green += weight * tl.load(splat + 9)
+                blue += weight * tl.load(splat + 10)
+                depth += weight * tl.load(splat + 11)
+                T = T - weight
+                takes = (bits >> block) & is_open
+                count += takes
+                is_dark = (takes != 0) & (count % 4 == 0) & (largest_of_block(T) < STOP)
+                block_end = tl.where(is_dark, j + 1, block_end)
+                is_open = tl.where(is_dark, 0, is_open)
+            if (j + 1 - start) % BATCH == 0:
+                is_dark = (is_open != 0) & (largest_of_block(T) < STOP)
+                block_end = tl.where(is_dark, j + 1, block_end)
+                is_open = tl.where(is_dark, 0, is_open)
+                count = count * 0
+        i = chunk_end
+        any_open = tl.max(tl.max(is_open, 1), 0)
+    tl.store(ends + tile * 16 + block, block_end)
+    is_inside = (x < width) & (y < height)
+    size = width * height
+    at = planes + y * width + x
+    tl.store(at, red, is_inside)
+    tl.store(at + size, green, is_inside)
+    tl.store(at + 2 * size, blue, is_inside)
+    tl.store(at + 3 * size, depth, is_inside)
+    tl.store(at + 4 * size, 1.0 - T, is_inside)
+
+
+@triton.jit
+def over_pixels(values):
+    return tl.sum(tl.sum(values, 0), 0)
+
+
+@triton.jit
+def blend_backward(
+    splats, listed, reached, origins, starts, ends, columns, width, height, planes, by_planes, sums
+):
+    """Sum the derivatives of each pair over the pixels of its tile.
+
+    Each pair writes its own row of `sums`. No two programs write the same row, so that no atomic
+    operation is needed, and the bits do not depend on the order of the programs. With
+    v = dL/d ln(alpha), d = pixel - (u, v) and the blending weight w, a row holds the sums of v,
+    v dx, v dy, v dx^2, v dx dy, v dy^2, w dL/dcolor (3), w dL/ddepth and w.
+    `kernels/blend_gradient.hpp` derives v = w (q - m).
+
+    Args:
+        splats: [N, 16].
+        listed: Splat of each pair, [P]: tile by tile, front to back.
+        reached: Blocks that each pair reaches, [P].
+        origins: Row of `sums` that each pair writes, [P]; those of a splat are contiguous.
+        starts: First pair of each tile, [tiles + 1].
+        ends: Pair after the last one that each block blended, [tiles, 16].
+        columns: Tiles in a row of the image.
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
+        planes: Planes of the rendering, [5, height, width].
+        by_planes: Derivatives of the loss by the planes, [5, height, width].
+        sums: Output, [P, 16], which holds zeros before.
+    """
+    tile = tl.program_id(0)
+    x, y, _block_x, _block_y = pixels_of(tile, columns)
+    px, py = x.to(tl.float32), y.to(tl.float32)
+    is_inside = (x < width) & (y < height)
+    size = width * height
+    at = y * width + x
+    by_red = tl.load(by_planes + at, is_inside, 0.0)
+    by_green = tl.load(by_planes + at + size, is_inside, 0.0)
+    by_blue = tl.load(by_planes + at + 2 * size, is_inside, 0.0)
+    by_depth = tl.load(by_planes + at + 3 * size, is_inside, 0.0)
+    by_opacity = tl.load(by_planes + at + 4 * size, is_inside, 0.0)
+    behind = by_red * tl.load(planes + at, is_inside, 0.0)
+    behind += by_green * tl.load(planes + at + size, is_inside, 0.0)
+    behind += by_blue * tl.load(planes + at + 2 * size, is_inside, 0.0)
+    behind += by_depth * tl.load(planes + at + 3 * size, is_inside, 0.0)
+    behind += by_opacity * tl.load(planes + at + 4 * size, is_inside, 0.0)
+    T = tl.where(is_inside, 1.0, 0.0)
+    block_end = tl.load(ends + tile * 16 + tl.arange(0, 16)[None, :])
+    lane = tl.arange(0, 16)
+    for j in range(tl.load(starts + tile), tl.max(tl.max(block_end, 1), 0)):
+        if tl.load(reached + j) != 0:
+            splat = splats + tl.load(listed + j).to(tl.int64) * ROW
+            alpha, dx, dy = alpha_of(splat, px, py)
+            alpha = tl.where(j < block_end, alpha, 0.0)
+            q = by_blue * tl.load(splat + 10) + (by_depth * tl.load(splat + 11) + by_opacity)
+            q = by_red * tl.load(splat + 8) + (by_green * tl.load(splat + 9) + q)
+            weight = alpha * T
+            T = T - weight
+            behind = behind - weight * q
+            mean = tl.div_rn(behind, tl.maximum(T, 1e-30))
+            v = tl.where(alpha < CAPPED, weight * (q - mean), 0.0)
+            vx, vy = v * dx, v * dy
+            out = tl.where(lane == 0, over_pixels(v), 0.0)
+            out = tl.where(lane == 1, over_pixels(vx), out)
+            out = tl.where(lane == 2, over_pixels(vy), out)
+            out = tl.where(lane == 3, over_pixels(vx * dx), out)
+            out = tl.where(lane == 4, over_pixels(vx * dy), out)
+            out = tl.where(lane == 5, over_pixels(vy * dy), out)
+            out = tl.where(lane == 6, over_pixels(weight * by_red), out)
+            out = tl.where(lane == 7, over_pixels(weight * by_green), out)
+            out = tl.where(lane == 8, over_pixels(weight * by_blue), out)
+            out = tl.where(lane == 9, over_pixels(weight * by_depth), out)
+            out = tl.where(lane == 10, over_pixels(weight), out)
+            tl.store(sums + tl.load(origins + j).to(tl.int64) * 16 + lane, out)

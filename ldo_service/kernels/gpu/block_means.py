@@ -1,0 +1,29 @@
+"""Means of the rendered planes over square blocks, from which the exposure is estimated."""
+
+import triton
+import triton.language as tl
+
+
+@triton.jit
+def block_means(planes, width, height, side, across, down, out, LANES: tl.constexpr):
+    """Average color and opacity over blocks of side x side pixels, one program per mean.
+
+    Args:
+        planes: Rendering, [5, height, width].
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
+        side: Side of a block, pixels.
+        across: Number of complete blocks in a row of the image.
+        down: Number of complete blocks in a column of the image.
+        out: Output, [4, down, across]: means of red, green, blue and opacity.
+        LANES: A power of two that is at least side * side.
+    """
+    number = tl.program_id(0)
+    blocks = across * down
+    channel, block = number // blocks, number % blocks
+    plane = tl.where(channel == 3, 4, channel)
+    lane = tl.arange(0, LANES)
+    x, y = block % across * side + lane % side, block // across * side + lane // side
+    at = planes + plane * width * height + y * width + x
+    total = tl.sum(tl.load(at, lane < side * side, 0.0), 0)
+    tl.store(out + number, tl.div_rn(total, (side * side).to(tl.float32)))

@@ -1,0 +1,233 @@
+"""Image loss of a rendering and its derivatives: L1, SSIM and depth; see `kernels/loss.cpp`.
+
+The window of SSIM is applied along rows, then along columns, first to the images and then to the
+derivatives of SSIM by the windowed means. One lane computes one value of [3, H, W].
+"""
+
+import triton
+import triton.language as tl
+
+from .arithmetic import sign
+
+# exp(-k^2 / (2 1.5^2)) / sum, for k = 0 .. 5, as in `kernels/gaussian_window.hpp`.
+TAP0 = tl.constexpr(0.26601171)
+TAP1 = tl.constexpr(0.21300553)
+TAP2 = tl.constexpr(0.10936069)
+TAP3 = tl.constexpr(0.03600077)
+TAP4 = tl.constexpr(0.00759876)
+TAP5 = tl.constexpr(0.00102838)
+C1 = tl.constexpr(0.01 * 0.01)  # Constants of SSIM, for values in 0..1.
+C2 = tl.constexpr(0.03 * 0.03)
+
+
+@triton.jit
+def tap(k: tl.constexpr):
+    """Return the weight of the window k places from its middle."""
+    if k == 0:  # noqa: SIM116
+        return TAP0
+    elif k == 1:  # noqa: RET505
+        return TAP1
+    elif k == 2:
+        return TAP2
+    elif k == 3:
+        return TAP3
+    elif k == 4:
+        return TAP4
+    else:
+        return TAP5
+
+
+@triton.jit
+def place_of(width, height, BLOCK: tl.constexpr):
+    """Return place in [3, H, W], channel, place in [H, W], row, column, and whether lanes exist."""
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    size = width * height
+    pixel = at % size
+    return at, at // size, pixel, pixel // width, pixel % width, at < 3 * size
+
+
+@triton.jit
+def exposed_at(planes, color, mask, exposure, at, channel, pixel, is_live):
+    """Return the exposed rendering and the frame in 0..1, both 0 where the mask is 0."""
+    counts = is_live & (tl.load(mask + pixel, is_live, 0) != 0)
+    gain = tl.load(exposure + channel, is_live, 0.0)
+    bias = tl.load(exposure + 3 + channel, is_live, 0.0)
+    x = gain * tl.load(planes + at, counts, 0.0) + bias
+    y = tl.load(color + at, counts, 0).to(tl.float32) * (1.0 / 255.0)
+    return tl.where(counts, x, 0.0), tl.where(counts, y, 0.0), counts, gain
+
+
+@triton.jit
+def products_at(planes, color, mask, exposure, at, channel, pixel, is_live):
+    x, y, _, _ = exposed_at(planes, color, mask, exposure, at, channel, pixel, is_live)
+    return x, y, x * x + y * y, x * y
+
+
+@triton.jit
+def means_along_rows(planes, color, mask, exposure, width, height, out, BLOCK: tl.constexpr):
+    """Apply the window along rows to x, y, x^2 + y^2 and x y.
+
+    Args:
+        planes: Rendering, [5, H, W].
+        color: Frame, [3, H, W] uint8.
+        mask: Pixels that count, [H, W] uint8.
+        exposure: Gains of the three channels, then biases, [2, 3].
+        width: W.
+        height: H.
+        out: Output, [4, 3, H, W].
+        BLOCK: Lanes of a program.
+    """
+    at, channel, pixel, _row, column, is_live = place_of(width, height, BLOCK)
+    x, y, squares, product = products_at(planes, color, mask, exposure, at, channel, pixel, is_live)
+    x, y, squares, product = x * TAP0, y * TAP0, squares * TAP0, product * TAP0
+    for k in tl.static_range(1, 6):
+        has_right = is_live & (column + k < width)
+        x1, y1, squares1, product1 = products_at(
+            planes, color, mask, exposure, at + k, channel, pixel + k, has_right
+        )
+        has_left = is_live & (column - k >= 0)
+        x2, y2, squares2, product2 = products_at(
+            planes, color, mask, exposure, at - k, channel, pixel - k, has_left
+        )
+        x += (x1 + x2) * tap(k)
+        y += (y1 + y2) * tap(k)
+        squares += (squares1 + squares2) * tap(k)
+        product += (product1 + product2) * tap(k)
+    size = 3 * width * height
+    tl.store(out + at, x, is_live)
+    tl.store(out + size + at, y, is_live)
+    tl.store(out + 2 * size + at, squares, is_live)
+    tl.store(out + 3 * size + at, product, is_live)
+
+
+@triton.jit
+def window_along_columns(images, at, row, width, height, is_live):
+    """Return the windowed sums of an image at places `at`, along its columns."""
+    out = tl.load(images + at, is_live, 0.0) * TAP0
+    for k in tl.static_range(1, 6):
+        below = tl.load(images + at + k * width, is_live & (row + k < height), 0.0)
+        above = tl.load(images + at - k * width, is_live & (row - k >= 0), 0.0)
+        out += (below + above) * tap(k)
+    return out
+
+
+@triton.jit
+def ssim_derivatives(along_rows, width, height, out, ssims, BLOCK: tl.constexpr):
+    """Apply the window along columns, and compute SSIM and its derivatives.
+
+    Args:
+        along_rows: Output of `means_along_rows`, [4, 3, H, W].
+        width: W.
+        height: H.
+        out: Output, [3, 3, H, W]: derivatives of SSIM by the windowed x, x^2 + y^2 and x y.
+        ssims: Output, [programs]: sum of SSIM over the values of each program.
+        BLOCK: Lanes of a program.
+    """
+    at, _channel, _pixel, row, _column, is_live = place_of(width, height, BLOCK)
+    size = 3 * width * height
+    mx = window_along_columns(along_rows, at, row, width, height, is_live)
+    my = window_along_columns(along_rows + size, at, row, width, height, is_live)
+    squares = window_along_columns(along_rows + 2 * size, at, row, width, height, is_live)
+    product = window_along_columns(along_rows + 3 * size, at, row, width, height, is_live)
+    mean_squares = mx * mx + my * my
+    a1, a2 = mx * my * 2.0 + C1, (product - mx * my) * 2.0 + C2
+    b1, b2 = mean_squares + C1, squares - mean_squares + C2
+    inverse = tl.div_rn(1.0, b1 * b2)
+    ssim = a1 * a2 * inverse
+    by_b1, by_b2 = ssim * inverse * b2, ssim * inverse * b1
+    by_product = a1 * inverse * 2.0
+    by_x = my * (a2 * inverse * 2.0 - by_product) - mx * (by_b1 - by_b2) * 2.0
+    tl.store(out + at, by_x, is_live)
+    tl.store(out + size + at, 0.0 - by_b2, is_live)
+    tl.store(out + 2 * size + at, by_product, is_live)
+    tl.store(ssims + tl.program_id(0), tl.sum(tl.where(is_live, ssim, 0.0), 0))
+
+
+@triton.jit
+def derivatives_along_rows(derivatives, width, height, out, BLOCK: tl.constexpr):
+    """Apply the window along rows to the output [3, 3, H, W] of `ssim_derivatives`."""
+    at, _channel, _pixel, _row, column, is_live = place_of(width, height, BLOCK)
+    size = 3 * width * height
+    for image in tl.static_range(3):
+        here = derivatives + image * size + at
+        value = tl.load(here, is_live, 0.0) * TAP0
+        for k in tl.static_range(1, 6):
+            right = tl.load(here + k, is_live & (column + k < width), 0.0)
+            left = tl.load(here - k, is_live & (column - k >= 0), 0.0)
+            value += (right + left) * tap(k)
+        tl.store(out + image * size + at, value, is_live)
+
+
+@triton.jit
+def color_gradient(
+    planes,
+    color,
+    mask,
+    exposure,
+    along_rows,
+    width,
+    height,
+    l1,
+    d_ssim,
+    by_planes,
+    l1s,
+    squares,
+    BLOCK: tl.constexpr,
+):
+    """Compute the derivatives by the color planes, and the sums of L1 and of the squared error.
+
+    Args:
+        planes: Rendering, [5, H, W].
+        color: Frame, [3, H, W] uint8.
+        mask: Pixels that count, [H, W] uint8.
+        exposure: Gains of the three channels, then biases, [2, 3].
+        along_rows: Output of `derivatives_along_rows`, [3, 3, H, W].
+        width: W.
+        height: H.
+        l1: Weight of L1 over the number of values.
+        d_ssim: Weight of D-SSIM over the number of values, with the sign of SSIM: negative.
+        by_planes: Output, [5, H, W], of which the color planes are written.
+        l1s: Output, [programs]: sum of the absolute errors of each program.
+        squares: Output, [programs]: sum of the squared errors of each program.
+        BLOCK: Lanes of a program.
+    """
+    at, channel, pixel, row, _column, is_live = place_of(width, height, BLOCK)
+    size = 3 * width * height
+    by_x = window_along_columns(along_rows, at, row, width, height, is_live)
+    by_squares = window_along_columns(along_rows + size, at, row, width, height, is_live)
+    by_product = window_along_columns(along_rows + 2 * size, at, row, width, height, is_live)
+    x, y, counts, gain = exposed_at(planes, color, mask, exposure, at, channel, pixel, is_live)
+    difference = x - y
+    by_ssim = by_x + x * 2.0 * by_squares + y * by_product
+    gradient = (sign(difference) * l1 + by_ssim * d_ssim) * gain
+    tl.store(by_planes + at, tl.where(counts, gradient, 0.0), is_live)
+    tl.store(l1s + tl.program_id(0), tl.sum(tl.abs(difference), 0))
+    tl.store(squares + tl.program_id(0), tl.sum(difference * difference, 0))
+
+
+@triton.jit
+def depth_gradient(
+    planes, depth_m, mask, width, height, step, by_planes, errors, BLOCK: tl.constexpr
+):
+    """Compute the derivatives by the planes of depth and opacity, and the sum of the errors.
+
+    Args:
+        planes: Rendering, [5, H, W].
+        depth_m: Depth of the frame, [H, W]; 0 where not measured.
+        mask: Pixels that count, [H, W] uint8.
+        width: W.
+        height: H.
+        step: Weight of the depth over the number of depths that count.
+        by_planes: Output, [5, H, W], of which the last two planes are written.
+        errors: Output, [programs]: sum of the depth errors of each program.
+        BLOCK: Lanes of a program.
+    """
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    size = width * height
+    is_live = at < size
+    depth = tl.load(depth_m + at, is_live, 0.0)
+    counts = is_live & (depth > 0.0) & (tl.load(mask + at, is_live, 0) != 0)
+    error = tl.where(counts, tl.load(planes + 3 * size + at, is_live, 0.0) - depth, 0.0)
+    tl.store(by_planes + 3 * size + at, sign(error) * step, is_live)
+    tl.store(by_planes + 4 * size + at, tl.zeros([BLOCK], tl.float32), is_live)
+    tl.store(errors + tl.program_id(0), tl.sum(tl.abs(error), 0))

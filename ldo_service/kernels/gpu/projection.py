@@ -1,0 +1,267 @@
+"""Projection of Gaussians to splats, and pairs of splats and tiles; see `kernels/projection.hpp`.
+
+A row of a Gaussian has 16 floats: mean 0-2, log scale 3-5, quaternion wxyz 6-9, opacity logit 10,
+color 11-13, two unused. A splat has 16 floats: u v | a b c log2_opacity | x_slope y_slope |
+red green blue | z | four unused. A view has 18 floats: T_camera_map row by row (12), fx fy cx cy,
+low_pass, box.
+"""
+
+import triton
+import triton.language as tl
+
+from .arithmetic import LOG2_E, clamp, dot, exp, log2
+
+ROW = tl.constexpr(16)
+NEAR = tl.constexpr(0.05)  # Near plane, meters.
+LOG2_MIN_ALPHA = tl.constexpr(-7.99435344)  # log2(1 / 255); weaker contributions are dropped.
+TILE = tl.constexpr(16)  # Pixels.
+
+
+@triton.jit
+def camera_of(view, width, height):
+    """Return the rows of the rotation, the translation, the lens, the limits and the filter.
+
+    The lens is (fx, fy, cx, cy). The limits bound x / z and y / z where the projection is
+    linearized. The filter is (low_pass, box), in px^2.
+    """
+    R0 = (tl.load(view), tl.load(view + 1), tl.load(view + 2))
+    R1 = (tl.load(view + 4), tl.load(view + 5), tl.load(view + 6))
+    R2 = (tl.load(view + 8), tl.load(view + 9), tl.load(view + 10))
+    t = (tl.load(view + 3), tl.load(view + 7), tl.load(view + 11))
+    fx, fy, cx, cy = tl.load(view + 12), tl.load(view + 13), tl.load(view + 14), tl.load(view + 15)
+    w, h = width.to(tl.float32), height.to(tl.float32)
+    margin_x, margin_y = tl.div_rn(0.15 * w, fx), tl.div_rn(0.15 * h, fy)
+    limits = (
+        tl.div_rn(0.0 - cx, fx) - margin_x,
+        tl.div_rn(w - cx, fx) + margin_x,
+        tl.div_rn(0.0 - cy, fy) - margin_y,
+        tl.div_rn(h - cy, fy) + margin_y,
+    )
+    return R0, R1, R2, t, (fx, fy, cx, cy), limits, (tl.load(view + 16), tl.load(view + 17))
+
+
+@triton.jit
+def to_camera(mean, R0, R1, R2, t):
+    return dot(mean, R0) + t[0], dot(mean, R1) + t[1], dot(mean, R2) + t[2]
+
+
+@triton.jit
+def jacobian(p, R0, R1, R2, lens, limits):
+    """Return the derivatives of u and v by a point of the map, and the values that they share.
+
+    These values are 1 / z, x / z, y / z, and the entries (ju, jv, ku, kv) of the derivative of the
+    perspective. The viewing direction is clamped to `limits`, because the affine model fails
+    farther outside.
+    """
+    inverse_z = tl.div_rn(1.0, tl.maximum(p[2], NEAR))
+    x, y = p[0] * inverse_z, p[1] * inverse_z
+    ju, jv = inverse_z * lens[0], inverse_z * lens[1]
+    ku, kv = ju * clamp(x, limits[0], limits[1]), jv * clamp(y, limits[2], limits[3])
+    du = (ju * R0[0] - ku * R2[0], ju * R0[1] - ku * R2[1], ju * R0[2] - ku * R2[2])
+    dv = (jv * R1[0] - kv * R2[0], jv * R1[1] - kv * R2[1], jv * R1[2] - kv * R2[2])
+    return du, dv, inverse_z, x, y, (ju, jv, ku, kv)
+
+
+@triton.jit
+def principal_axes(q, sigmas):
+    """Return the columns of the rotation of a quaternion of any length, scaled by `sigmas`."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    s = tl.div_rn(2.0, w * w + x * x + y * y + z * z)
+    sx, sy, sz = s * x, s * y, s * z
+    xx, yy, zz = sx * x, sy * y, sz * z
+    xy, xz, yz = sx * y, sx * z, sy * z
+    wx, wy, wz = sx * w, sy * w, sz * w
+    a0 = ((1.0 - yy - zz) * sigmas[0], (xy + wz) * sigmas[0], (xz - wy) * sigmas[0])
+    a1 = ((xy - wz) * sigmas[1], (1.0 - xx - zz) * sigmas[1], (yz + wx) * sigmas[1])
+    a2 = ((xz + wy) * sigmas[2], (yz - wx) * sigmas[2], (1.0 - xx - yy) * sigmas[2])
+    return a0, a1, a2
+
+
+@triton.jit
+def image_covariance(along_u, along_v, low_pass):
+    """Return uu, uv and vv of the covariance in px^2, from the axes along u and v."""
+    uu = low_pass + along_u[0] * along_u[0] + along_u[1] * along_u[1] + along_u[2] * along_u[2]
+    uv = along_u[0] * along_v[0] + along_u[1] * along_v[1] + along_u[2] * along_v[2]
+    vv = low_pass + along_v[0] * along_v[0] + along_v[1] * along_v[1] + along_v[2] * along_v[2]
+    return uu, uv, vv
+
+
+@triton.jit
+def load_row(rows, i, is_live):
+    """Return mean, log scales, quaternion, opacity logit and color of the Gaussians i.
+
+    Lanes that are not live get the quaternion of no rotation and zeros.
+    """
+    at = rows + i.to(tl.int64) * ROW
+    mean = (tl.load(at, is_live, 0.0), tl.load(at + 1, is_live, 0.0), tl.load(at + 2, is_live, 0.0))
+    scale = (
+        tl.load(at + 3, is_live, 0.0),
+        tl.load(at + 4, is_live, 0.0),
+        tl.load(at + 5, is_live, 0.0),
+    )
+    q = (
+        tl.load(at + 6, is_live, 1.0),
+        tl.load(at + 7, is_live, 0.0),
+        tl.load(at + 8, is_live, 0.0),
+        tl.load(at + 9, is_live, 0.0),
+    )
+    opacity = tl.load(at + 10, is_live, 0.0)
+    color = (
+        tl.load(at + 11, is_live, 0.0),
+        tl.load(at + 12, is_live, 0.0),
+        tl.load(at + 13, is_live, 0.0),
+    )
+    return mean, scale, q, opacity, color
+
+
+@triton.jit
+def pixels_within(center, radius, size):
+    """Return the first and last pixel of [0, size) within `radius`, and whether one exists."""
+    low = tl.maximum(center - radius, 0.0)
+    high = tl.minimum(center + radius, size.to(tl.float32) - 1.0)
+    is_near = low <= high  # NaN compares as false.
+    low, high = tl.where(is_near, low, 0.0), tl.where(is_near, high, 0.0)
+    first, last = low.to(tl.int32), high.to(tl.int32)
+    first += (first.to(tl.float32) < low).to(tl.int32)
+    return first, last, is_near & (first <= last)
+
+
+@triton.jit
+def project_and_cull(rows, n, view, width, height, splats, ranges, pairs, BLOCK: tl.constexpr):
+    """Compute the splat of each Gaussian, one lane per Gaussian.
+
+    Args:
+        rows: Gaussians, [n, 16].
+        n: Number of Gaussians.
+        view: View, [18].
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
+        splats: Output, [n, 16].
+        ranges: Output, [n, 4]: tiles x0 y0 x1 y1 of the box that holds each pixel with
+            alpha >= 1/255.
+        pairs: Output, [n]: number of tiles of the box; 0 if the Gaussian is not drawn.
+        BLOCK: Lanes of a program.
+    """
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_live = i < n
+    mean, scale, q, opacity, color = load_row(rows, i, is_live)
+    R0, R1, R2, t, lens, limits, filters = camera_of(view, width, height)
+    p = to_camera(mean, R0, R1, R2, t)
+    du, dv, _inverse_z, x, y, _perspective = jacobian(p, R0, R1, R2, lens, limits)
+    a0, a1, a2 = principal_axes(q, (exp(scale[0]), exp(scale[1]), exp(scale[2])))
+    along_u = (dot(du, a0), dot(du, a1), dot(du, a2))
+    along_v = (dot(dv, a0), dot(dv, a1), dot(dv, a2))
+    low_pass, box = filters
+    uu, uv, vv = image_covariance(along_u, along_v, low_pass)
+    determinant = uu * vv - uv * uv
+    per_log2 = tl.div_rn(-0.5 * LOG2_E, determinant)
+    # Averaging over the wider pixels of a binned image lowers the peak of the splat. Without
+    # binning, the box is 0 and both logarithms are equal.
+    narrow = (uu - box) * (vv - box) - uv * uv
+    log2_opacity = 0.0 - log2(1.0 + exp(0.0 - opacity))
+    log2_opacity = log2_opacity + (log2(narrow) - log2(determinant)) * 0.5
+    # Largest q = d' S^-1 d at which alpha >= 1/255.
+    reach = (log2_opacity - LOG2_MIN_ALPHA) * (2.0 / LOG2_E)
+    u, v = x * lens[0] + lens[2], y * lens[1] + lens[3]
+
+    # NaN and infinity times zero are NaN, which fails every comparison.
+    total = mean[0] + mean[1] + mean[2] + scale[0] + scale[1] + scale[2] + q[0] + q[1] + q[2]
+    total = total + q[3] + opacity + color[0] + color[1] + color[2]
+    is_drawn = is_live & (p[2] >= NEAR) & (reach >= 0.0) & (total * 0.0 >= 0.0)
+    radius_u = tl.sqrt_rn(tl.maximum(reach * uu, 0.0))
+    radius_v = tl.sqrt_rn(tl.maximum(reach * vv, 0.0))
+    left, right, is_across = pixels_within(u, radius_u, width)
+    top, bottom, is_down = pixels_within(v, radius_v, height)
+    is_drawn = is_drawn & is_across & is_down
+    x0, x1 = tl.where(is_drawn, left, 0) // TILE, tl.where(is_drawn, right, 0) // TILE
+    y0, y1 = tl.where(is_drawn, top, 0) // TILE, tl.where(is_drawn, bottom, 0) // TILE
+
+    out = splats + i.to(tl.int64) * ROW
+    tl.store(out, u, is_live)
+    tl.store(out + 1, v, is_live)
+    tl.store(out + 2, vv * per_log2, is_live)
+    tl.store(out + 3, uv * per_log2 * -2.0, is_live)
+    tl.store(out + 4, uu * per_log2, is_live)
+    tl.store(out + 5, log2_opacity, is_live)
+    tl.store(out + 6, tl.div_rn(uv, vv), is_live)
+    tl.store(out + 7, tl.div_rn(uv, uu), is_live)
+    tl.store(out + 8, color[0], is_live)
+    tl.store(out + 9, color[1], is_live)
+    tl.store(out + 10, color[2], is_live)
+    tl.store(out + 11, p[2], is_live)
+    tl.store(ranges + i * 4, x0, is_live)
+    tl.store(ranges + i * 4 + 1, y0, is_live)
+    tl.store(ranges + i * 4 + 2, x1, is_live)
+    tl.store(ranges + i * 4 + 3, y1, is_live)
+    tl.store(pairs + i, tl.where(is_drawn, (x1 - x0 + 1) * (y1 - y0 + 1), 0), is_live)
+
+
+@triton.jit
+def depth_keys(splats, visible, n, keys, BLOCK: tl.constexpr):
+    """Write the bits of the depth of each visible splat, whose order is that of the depths.
+
+    Args:
+        splats: [N, 16].
+        visible: Rows that are drawn, [n].
+        n: Number of these rows.
+        keys: Output, [n] int32. Depths are positive, so the bits are too.
+        BLOCK: Lanes of a program.
+    """
+    lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_live = lane < n
+    i = tl.load(visible + lane, is_live, 0)
+    z = tl.load(splats + i.to(tl.int64) * ROW + 11, is_live, 0.0)
+    tl.store(keys + lane, z.to(tl.int32, bitcast=True), is_live)
+
+
+@triton.jit
+def exponent_at(dx, dy, a, b, c):
+    return dx * (dx * a + dy * b) + dy * dy * c
+
+
+@triton.jit
+def list_pairs(
+    splats, ranges, owners, firsts, n_pairs, columns, tiles, reached, BLOCK: tl.constexpr
+):
+    """Compute the tile of each pair, and the blocks of 4x4 pixels that its splat reaches.
+
+    Args:
+        splats: [N, 16].
+        ranges: Tiles of each splat, [N, 4].
+        owners: Splat of each pair, [n_pairs]; the tiles of a splat are taken row by row.
+        firsts: First pair of each splat, [N].
+        n_pairs: Number of pairs.
+        columns: Tiles in a row of the image.
+        tiles: Output, [n_pairs]: the tile.
+        reached: Output, [n_pairs]: bit i is set if the ellipse alpha >= 1/255 reaches block i.
+        BLOCK: Lanes of a program.
+    """
+    pair = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_live = pair < n_pairs
+    s = tl.load(owners + pair, is_live, 0)
+    x0 = tl.load(ranges + s * 4, is_live, 0)
+    y0 = tl.load(ranges + s * 4 + 1, is_live, 0)
+    across = tl.load(ranges + s * 4 + 2, is_live, 0) - x0 + 1
+    k = tl.where(is_live, pair - tl.load(firsts + s, is_live, 0), 0)
+    tile_x, tile_y = x0 + k % across, y0 + k // across
+    tl.store(tiles + pair, tile_y * columns + tile_x, is_live)
+
+    at = splats + s.to(tl.int64) * ROW
+    u, v = tl.load(at, is_live, 0.0), tl.load(at + 1, is_live, 0.0)
+    a, b = tl.load(at + 2, is_live, 0.0), tl.load(at + 3, is_live, 0.0)
+    c = tl.load(at + 4, is_live, 0.0)
+    # The margin of 1e-3 ensures that rounding drops no pixel that the blending would count.
+    least = LOG2_MIN_ALPHA - tl.load(at + 5, is_live, 0.0) - 1e-3
+    x_slope, y_slope = tl.load(at + 6, is_live, 0.0), tl.load(at + 7, is_live, 0.0)
+    bits = tl.zeros([BLOCK], tl.int32)
+    for block in tl.static_range(16):
+        left = (tile_x * TILE).to(tl.float32) - u + (block % 4 * 4)
+        top = (tile_y * TILE).to(tl.float32) - v + (block // 4 * 4)
+        # Alpha is largest on a ridge line, on one of the two sides nearest to the center.
+        side_x, side_y = clamp(0.0, left, left + 3.0), clamp(0.0, top, top + 3.0)
+        best_y = clamp(side_x * y_slope, top, top + 3.0)
+        best_x = clamp(side_y * x_slope, left, left + 3.0)
+        on_x = exponent_at(side_x, best_y, a, b, c)
+        on_y = exponent_at(best_x, side_y, a, b, c)
+        bits = bits | tl.where(tl.maximum(on_x, on_y) >= least, 1 << block, 0)
+    tl.store(reached + pair, bits, is_live)

@@ -1,0 +1,268 @@
+"""Derivative of the projection with a fused step of Adam; see `kernels/projection_gradient.hpp`."""
+
+import triton
+import triton.language as tl
+
+from .arithmetic import add_scaled, cross, dot, exp, log
+from .projection import (
+    NEAR,
+    ROW,
+    camera_of,
+    image_covariance,
+    jacobian,
+    load_row,
+    principal_axes,
+    to_camera,
+)
+
+
+@triton.jit
+def quaternion_gradient(q, g0, g1, g2):
+    """Return the derivatives by a quaternion of any length, from those by the rotation's columns.
+
+    The length of the quaternion has no effect, so the radial part of the gradient is removed.
+    """
+    shorten = tl.div_rn(1.0, tl.sqrt_rn(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
+    w, x, y, z = q[0] * shorten, q[1] * shorten, q[2] * shorten, q[3] * shorten
+    by_w = x * (g1[2] - g2[1]) + y * (g2[0] - g0[2]) + z * (g0[1] - g1[0])
+    by_x = w * (g1[2] - g2[1]) + y * (g1[0] + g0[1]) + z * (g2[0] + g0[2])
+    by_x = by_x - x * 2.0 * (g1[1] + g2[2])
+    by_y = w * (g2[0] - g0[2]) + x * (g1[0] + g0[1]) + z * (g2[1] + g1[2])
+    by_y = by_y - y * 2.0 * (g0[0] + g2[2])
+    by_z = w * (g0[1] - g1[0]) + x * (g2[0] + g0[2]) + y * (g2[1] + g1[2])
+    by_z = by_z - z * 2.0 * (g0[0] + g1[1])
+    radial = w * by_w + x * by_x + y * by_y + z * by_z
+    twice = shorten * 2.0
+    return (
+        (by_w - w * radial) * twice,
+        (by_x - x * radial) * twice,
+        (by_y - y * radial) * twice,
+        (by_z - z * radial) * twice,
+    )
+
+
+@triton.jit
+def needle_gradient(scale, push, log_ratio):
+    """Return the derivatives of the needle penalty by the log scales.
+
+    The penalty applies if log(longest / middle axis) is at least `log_ratio`.
+    """
+    longest = tl.maximum(scale[0], tl.maximum(scale[1], scale[2]))
+    low, high = tl.minimum(scale[0], scale[1]), tl.maximum(scale[0], scale[1])
+    middle = tl.maximum(low, tl.minimum(high, scale[2]))
+    push = tl.where(longest - middle >= log_ratio, push, 0.0)
+    return (
+        tl.where(scale[0] >= longest, push, 0.0) - tl.where(scale[0] == middle, push, 0.0),
+        tl.where(scale[1] >= longest, push, 0.0) - tl.where(scale[1] == middle, push, 0.0),
+        tl.where(scale[2] >= longest, push, 0.0) - tl.where(scale[2] == middle, push, 0.0),
+    )
+
+
+@triton.jit
+def only_at(numbers, number, value):
+    """Return `value` where `numbers` equals `number`, and 0 elsewhere."""
+    return tl.where(numbers == number, value, 0.0)
+
+
+@triton.jit
+def project_backward(
+    rows,
+    view,
+    width,
+    height,
+    visible,
+    n_visible,
+    firsts,
+    pairs,
+    sums,
+    by_rows,
+    moments,
+    squares,
+    steps,
+    rates,
+    corrections,
+    beta1,
+    beta2,
+    epsilon,
+    needle_weight,
+    needle_log_ratio,
+    max_sigma_per_depth,
+    weights,
+    by_pose,
+    LAST_STEP: tl.constexpr,
+    ADAM: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Add the sums of each splat over its tiles, differentiate the projection, and step.
+
+    Args:
+        rows: Gaussians, [N, 16]; changed with ADAM.
+        view: View, [18].
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
+        visible: Rows that are drawn, [n_visible], ascending; one lane computes one of them.
+        n_visible: Number of these rows.
+        firsts: First pair of each splat, [N].
+        pairs: Number of pairs of each splat, [N].
+        sums: Output of `blend_backward`, [P, 16].
+        by_rows: Output without ADAM, [n_visible, 16]: derivatives by the rows. Column 14 is the
+            blending weight summed over the pixels.
+        moments: First moments, [N, 16]; changed with ADAM.
+        squares: Second moments, [N, 16]; changed with ADAM.
+        steps: Number of steps of each row, [N]; changed with ADAM.
+        rates: Learning rates of the columns, [16].
+        corrections: 1 / (1 - beta^steps) of both moments, [LAST_STEP + 1, 2].
+        beta1: Decay of the first moments.
+        beta2: Decay of the second moments.
+        epsilon: Positive term that keeps the denominator from zero.
+        needle_weight: Weight of the penalty on needles.
+        needle_log_ratio: Logarithm of the axis ratio above which the penalty applies.
+        max_sigma_per_depth: Maximum standard deviation per meter of depth after the step.
+        weights: Output, [n_visible]: blending weight of each row summed over the pixels.
+        by_pose: Output, [programs, 8]: derivatives by xi of T_map_camera exp(xi), rotation first.
+        LAST_STEP: Number of steps after which the correction stays constant.
+        ADAM: Take a step of Adam, instead of writing the derivatives.
+        BLOCK: Lanes of a program.
+    """
+    lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_live = lane < n_visible
+    i = tl.load(visible + lane, is_live, 0)
+    first, count = tl.load(firsts + i, is_live, 0), tl.load(pairs + i, is_live, 0)
+    zero = tl.zeros([BLOCK], tl.float32)
+    V, Vx, Vy, Vxx, Vxy, Vyy = zero, zero, zero, zero, zero, zero
+    red, green, blue, depth, weight = zero, zero, zero, zero, zero
+    for k in range(tl.max(count)):
+        has_pair = k < count
+        at = sums + (first + k).to(tl.int64) * 16
+        V += tl.load(at, has_pair, 0.0)
+        Vx += tl.load(at + 1, has_pair, 0.0)
+        Vy += tl.load(at + 2, has_pair, 0.0)
+        Vxx += tl.load(at + 3, has_pair, 0.0)
+        Vxy += tl.load(at + 4, has_pair, 0.0)
+        Vyy += tl.load(at + 5, has_pair, 0.0)
+        red += tl.load(at + 6, has_pair, 0.0)
+        green += tl.load(at + 7, has_pair, 0.0)
+        blue += tl.load(at + 8, has_pair, 0.0)
+        depth += tl.load(at + 9, has_pair, 0.0)
+        weight += tl.load(at + 10, has_pair, 0.0)
+
+    mean, scale, q, opacity, _color = load_row(rows, i, is_live)
+    R0, R1, R2, t, lens, limits, filters = camera_of(view, width, height)
+    p = to_camera(mean, R0, R1, R2, t)
+    du, dv, inverse_z, x, y, perspective = jacobian(p, R0, R1, R2, lens, limits)
+    ju, jv, ku, kv = perspective
+    sigmas = exp(scale[0]), exp(scale[1]), exp(scale[2])
+    a0, a1, a2 = principal_axes(q, sigmas)
+    along_u = (dot(du, a0), dot(du, a1), dot(du, a2))
+    along_v = (dot(dv, a0), dot(dv, a1), dot(dv, a2))
+    low_pass, box = filters
+    uu, uv, vv = image_covariance(along_u, along_v, low_pass)
+
+    # K is the inverse of the image covariance S. From ln alpha = ln o - d' K d / 2 follow
+    # dL/dmean = K sum(v d) and 2 dL/dS = K sum(v d d') K.
+    inverse = tl.div_rn(1.0, uu * vv - uv * uv)
+    Kuu, Kuv, Kvv = vv * inverse, 0.0 - uv * inverse, uu * inverse
+    by_u, by_v = Kuu * Vx + Kuv * Vy, Kuv * Vx + Kvv * Vy
+    left_uu, left_uv = Kuu * Vxx + Kuv * Vxy, Kuu * Vxy + Kuv * Vyy
+    left_vu, left_vv = Kuv * Vxx + Kvv * Vxy, Kuv * Vxy + Kvv * Vyy
+    Suu, Suv = left_uu * Kuu + left_uv * Kuv, left_uu * Kuv + left_uv * Kvv
+    Svv = left_vu * Kuv + left_vv * Kvv
+    # Binning adds the term ln(|S - box I| / |S|) / 2 to ln alpha.
+    is_binned = box > 0.0
+    nn, mm = uu - box, vv - box
+    narrow = tl.div_rn(V, nn * mm - uv * uv)
+    Suu = tl.where(is_binned, Suu + mm * narrow - V * Kuu, Suu)
+    Suv = tl.where(is_binned, Suv - uv * narrow - V * Kuv, Suv)
+    Svv = tl.where(is_binned, Svv + nn * narrow - V * Kvv, Svv)
+
+    # S is the low pass plus the sum over axes a of (du.a, dv.a) (du.a, dv.a)'.
+    m0 = Suu * along_u[0] + Suv * along_v[0]
+    m1 = Suu * along_u[1] + Suv * along_v[1]
+    m2 = Suu * along_u[2] + Suv * along_v[2]
+    n0 = Suv * along_u[0] + Svv * along_v[0]
+    n1 = Suv * along_u[1] + Svv * along_v[1]
+    n2 = Suv * along_u[2] + Svv * along_v[2]
+    none = (zero, zero, zero)
+    by_du = add_scaled(add_scaled(add_scaled(none, a0, m0), a1, m1), a2, m2)
+    by_dv = add_scaled(add_scaled(add_scaled(none, a0, n0), a1, n1), a2, n2)
+    g0 = add_scaled(add_scaled(none, du, m0 * sigmas[0]), dv, n0 * sigmas[0])
+    g1 = add_scaled(add_scaled(none, du, m1 * sigmas[1]), dv, n1 * sigmas[1])
+    g2 = add_scaled(add_scaled(none, du, m2 * sigmas[2]), dv, n2 * sigmas[2])
+    by_q = quaternion_gradient(q, g0, g1, g2)
+    size = width.to(tl.float32) * height.to(tl.float32)
+    push = weight * tl.div_rn(needle_weight, size)
+    needle = needle_gradient(scale, push, needle_log_ratio)
+
+    # The derivative passes the Jacobian and the perspective to the point in the camera frame.
+    row_u = (dot(R0, by_du), dot(R1, by_du), dot(R2, by_du))
+    row_v = (dot(R0, by_dv), dot(R1, by_dv), dot(R2, by_dv))
+    moves_u = tl.where((x >= limits[0]) & (x <= limits[1]), 1.0, 0.0)
+    moves_v = tl.where((y >= limits[2]) & (y <= limits[3]), 1.0, 0.0)
+    pull = by_u * ju * p[0] + by_v * jv * p[1] + ju * row_u[0] + jv * row_v[1]
+    pull = pull - (moves_u + 1.0) * ku * row_u[2] - (moves_v + 1.0) * kv * row_v[2]
+    g = (
+        ju * (by_u - moves_u * inverse_z * row_u[2]),
+        jv * (by_v - moves_v * inverse_z * row_v[2]),
+        depth - inverse_z * pull,
+    )
+    gradient = (
+        g[0] * R0[0] + g[1] * R1[0] + g[2] * R2[0],
+        g[0] * R0[1] + g[1] * R1[1] + g[2] * R2[1],
+        g[0] * R0[2] + g[1] * R1[2] + g[2] * R2[2],
+        m0 * along_u[0] + n0 * along_v[0] + needle[0],
+        m1 * along_u[1] + n1 * along_v[1] + needle[1],
+        m2 * along_u[2] + n2 * along_v[2] + needle[2],
+        by_q[0],
+        by_q[1],
+        by_q[2],
+        by_q[3],
+        tl.div_rn(V, 1.0 + exp(opacity)),
+        red,
+        green,
+        blue,
+        weight,
+        zero,
+    )
+
+    # T_camera_map' = exp(-xi) T_camera_map rotates and moves the point and the rows of J R.
+    turn = cross(p, g)
+    turn_u, turn_v = cross(row_u, (ju, zero, 0.0 - ku)), cross(row_v, (zero, jv, 0.0 - kv))
+    number = tl.arange(0, 8)
+    pose = tl.zeros([8], tl.float32)
+    for j in tl.static_range(3):
+        rotation = tl.where(is_live, 0.0 - turn[j] - turn_u[j] - turn_v[j], 0.0)
+        pose += only_at(number, j, tl.sum(rotation, 0))
+        pose += only_at(number, j + 3, tl.sum(tl.where(is_live, 0.0 - g[j], 0.0), 0))
+    tl.store(by_pose + tl.program_id(0) * 8 + number, pose)
+    tl.store(weights + lane, weight, is_live)
+
+    at = i.to(tl.int64) * ROW
+    if ADAM:
+        # A row whose gradient is zero is hidden; it keeps its values, moments and step count.
+        is_moved = is_live & (lane < 0)
+        for j in tl.static_range(16):
+            is_moved = is_moved | (is_live & (tl.abs(gradient[j]) > 0.0))
+        step = tl.load(steps + i, is_moved, 0) + 1
+        tl.store(steps + i, step, is_moved)
+        step = tl.minimum(step, LAST_STEP)
+        of_mean = tl.load(corrections + step * 2, is_moved, 1.0)
+        of_square = tl.load(corrections + step * 2 + 1, is_moved, 1.0)
+        z = zero
+        for j in tl.static_range(16):
+            m, s = moments + at + j, squares + at + j
+            value, rate = tl.load(rows + at + j, is_moved, 0.0), tl.load(rates + j)
+            new_m = tl.load(m, is_moved, 0.0) * beta1 + gradient[j] * (1.0 - beta1)
+            new_s = tl.load(s, is_moved, 0.0) * beta2 + gradient[j] * gradient[j] * (1.0 - beta2)
+            tl.store(m, new_m, is_moved)
+            tl.store(s, new_s, is_moved)
+            root = tl.sqrt_rn(new_s * of_square) + epsilon
+            value = value - tl.div_rn(rate * of_mean * new_m, root)
+            if j < 3:
+                z += value * R2[j]
+            if (j >= 3) & (j < 6):
+                limit = max_sigma_per_depth * tl.maximum(z + t[2], NEAR)
+                value = tl.minimum(value, log(limit))
+            tl.store(rows + at + j, value, is_moved)
+    else:
+        for j in tl.static_range(16):
+            tl.store(by_rows + lane.to(tl.int64) * ROW + j, gradient[j], is_live)

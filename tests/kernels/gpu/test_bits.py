@@ -1,0 +1,89 @@
+"""The results are bitwise equal in each run, in any order of the programs, and for any memory."""
+
+import numpy as np
+import pytest
+from triton.runtime.interpreter import interpreter_builder
+
+from ldo_service.kernels.gpu.arrays import Arrays, HostArray, HostArrays, TorchArrays
+from tests.kernels.gpu.scenes import ARRAYS, SCENES, launch
+from tests.kernels.gpu.test_gradients import BETAS, EPSILON, PENALTY, state_of
+from tests.kernels.gpu.test_loss import IMAGES, WEIGHTS
+
+
+class OtherwiseFilledArrays(HostArrays):
+    """Arrays whose undefined values are 3."""
+
+    def empty(self, shape: tuple[int, ...], dtype: type) -> HostArray:
+        return HostArray(np.full(shape, 3, dtype))
+
+
+def everything(arrays: Arrays, names: tuple[str, ...] = ("turned",)) -> list[np.ndarray]:
+    """Return all results of the kernels on some scenes."""
+    out = []
+    for name in names:
+        scene = SCENES[name]
+        camera, n = scene.camera, len(scene.rows)
+        rows, by_planes = arrays.upload(scene.rows), arrays.upload(scene.by_planes())
+        rendering = launch.render(arrays, rows, n, scene.view, camera.width, camera.height)
+        given = launch.backpropagate(arrays, rows, rendering, by_planes)
+        state = state_of(n)
+        moments = (arrays.upload(x) for x in (state.mean, state.square, state.steps))
+        corrections = arrays.upload(launch.bias_corrections(*BETAS))
+        adam = launch.AdamState(*moments, corrections, *BETAS, EPSILON)
+        made = launch.backpropagate(
+            arrays, rows, rendering, by_planes, adam=adam, rates=state.rates, **PENALTY
+        )
+        lists = rendering.lists
+        out += [rendering.planes, rendering.ends, lists.listed, lists.origins, given.rows]
+        out += [made.weights, rows, adam.moments, adam.squares, adam.steps]
+        out += [arrays.upload(x) for x in (given.xi, made.xi)]
+        out.append(arrays.upload(launch.mean_blocks(arrays, rendering, 8)))
+        _, color, depth_m, mask, exposure = IMAGES["wide"]
+        crop = slice(0, camera.height), slice(0, camera.width)
+        if camera.height <= 18:
+            images = (np.ascontiguousarray(x[..., *crop]) for x in (color, depth_m, mask))
+            frame = launch.Frame(*map(arrays.upload, images), 100)
+            weights = WEIGHTS.l1, WEIGHTS.d_ssim, WEIGHTS.depth
+            by_loss, means = launch.image_loss(arrays, rendering, frame, exposure, weights)
+            out += [by_loss, arrays.upload(means)]
+    return [arrays.download(x) for x in out]
+
+
+def assert_same_bits(first: list[np.ndarray], second: list[np.ndarray]) -> None:
+    assert len(first) == len(second)
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+NAMED = ("beyond the edges", "ties")  # Scenes of 16x16 pixels, so that the loss takes part.
+
+
+def test_second_run_has_the_same_bits() -> None:
+    assert_same_bits(everything(ARRAYS, NAMED), everything(ARRAYS, NAMED))
+
+
+def test_undefined_memory_has_no_effect() -> None:
+    assert_same_bits(everything(ARRAYS, NAMED), everything(OtherwiseFilledArrays(), NAMED))
+
+
+def test_order_of_the_programs_has_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program reads nothing that another one writes, and no two programs write the same place."""
+    monkeypatch.setattr(launch, "LANES", 32)  # More programs.
+    monkeypatch.setattr(launch, "PIXEL_LANES", 128)
+    names = ("turned", *NAMED)
+    forward = everything(ARRAYS, names)
+    set_place, is_moved = interpreter_builder.set_grid_idx, []
+
+    def set_reversed(x: int, y: int, z: int) -> None:
+        last = interpreter_builder.grid_dim[0] - 1
+        is_moved.append(last > 0)
+        set_place(last - x, y, z)
+
+    monkeypatch.setattr(interpreter_builder, "set_grid_idx", set_reversed)
+    assert_same_bits(forward, everything(ARRAYS, names))
+    assert sum(is_moved) > 100
+
+
+def test_torch_arrays_give_the_same_bits() -> None:
+    pytest.importorskip("torch", reason="install torch to test the arrays of a GPU on the CPU")
+    assert_same_bits(everything(ARRAYS, NAMED), everything(TorchArrays("cpu"), NAMED))

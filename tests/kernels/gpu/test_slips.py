@@ -1,0 +1,118 @@
+"""Planted errors in the kernels, each of which a test must detect."""
+
+import importlib.util
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from tests.kernels.gpu import agreement, scenes, test_gradients
+from tests.kernels.gpu.scenes import launch
+from tests.kernels.gpu.test_blending import test_planes_equal_those_of_the_cpu as judge_planes
+from tests.kernels.gpu.test_gradients import test_derivatives_equal_those_of_the_cpu as judge_rows
+from tests.kernels.gpu.test_gradients import test_step_equals_the_step_of_the_cpu as judge_step
+from tests.kernels.gpu.test_loss import test_loss_equals_that_of_the_cpu as judge_loss
+from tests.kernels.gpu.test_projection import test_splats_equal_the_reference as judge_splats
+
+pytestmark = pytest.mark.slow
+KERNELS = Path(launch.__file__).parent
+# Module, correct text, wrong text, and the test that must fail.
+SLIPS = {
+    "row that is not finite": (
+        "projection",
+        "& (total * 0.0 >= 0.0)",
+        "",
+        partial(judge_splats, "broken rows"),
+    ),
+    "wrong slope of a ridge": (
+        "projection",
+        "clamp(side_x * y_slope",
+        "clamp(side_x * x_slope",
+        partial(judge_planes, "turned"),
+    ),
+    "late early stop": (
+        "blending",
+        "STOP = tl.constexpr(1e-4)",
+        "STOP = tl.constexpr(5e-5)",
+        partial(judge_planes, "dark"),
+    ),
+    "inexact mean behind a splat": (
+        "blending",
+        "weight * (q - mean)",
+        "weight * (q - mean * 1.0001)",
+        partial(judge_rows, "cloud"),
+    ),
+    "missing derivative of binning": (
+        "projection_gradient",
+        "tl.where(is_binned, Suv - uv * narrow - V * Kuv, Suv)",
+        "Suv",
+        partial(judge_rows, "binned"),
+    ),
+    "wrong bias correction": (
+        "projection_gradient",
+        "corrections + step * 2 + 1",
+        "corrections + step * 2",
+        partial(judge_step, "turned"),
+    ),
+    "half a derivative of SSIM": (
+        "loss",
+        "x * 2.0 * by_squares",
+        "x * by_squares",
+        partial(judge_loss, "wide"),
+    ),
+}
+
+
+@pytest.fixture(autouse=True)
+def _fresh_results(monkeypatch: pytest.MonkeyPatch):
+    """Keep results of other tests, and differences that slips cause, out of each other."""
+    monkeypatch.setattr(agreement, "measured", {})
+    scenes.of_kernel.cache_clear()
+    test_gradients.gradients_of.cache_clear()
+    yield
+    scenes.of_kernel.cache_clear()
+    test_gradients.gradients_of.cache_clear()
+
+
+def changed_module(name: str, text: str, folder: Path) -> ModuleType:
+    """Return a module of kernels with another text, which imports the others unchanged."""
+    path = folder / f"changed_{name}.py"
+    path.write_text(text)
+    full_name = f"ldo_service.kernels.gpu.changed_{name}"
+    spec = importlib.util.spec_from_file_location(full_name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_planted_error_is_detected(
+    slip: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, correct, wrong, judge = SLIPS[slip]
+    text = (KERNELS / f"{name}.py").read_text()
+    assert text.count(correct) == 1
+    for content, is_wrong in ((text, False), (text.replace(correct, wrong), True)):
+        folder = tmp_path / str(is_wrong)
+        folder.mkdir()
+        module = changed_module(name, content, folder)
+        if name == "projection_gradient":
+            monkeypatch.setattr(launch, "project_backward", module.project_backward)
+        else:
+            monkeypatch.setattr(launch, name, module)
+        scenes.of_kernel.cache_clear()
+        test_gradients.gradients_of.cache_clear()
+        judge_must(judge, fail=is_wrong)
+
+
+def judge_must(judge: Callable[[], None], *, fail: bool) -> None:
+    """Run a test, which must pass or must fail by an assertion."""
+    if not fail:
+        judge()
+        return
+    with pytest.raises(AssertionError):
+        judge()
