@@ -58,6 +58,9 @@ class Adam:
     """Adam optimizer of a map, with moments and a step count for each Gaussian.
 
     A Gaussian that is invisible in an iteration does not change, and its moments do not decay.
+
+    Attributes:
+        matches: Counter that increases when the moments are matched to other rows of the map.
     """
 
     def __init__(self, config: AdamConfig | None = None) -> None:
@@ -66,6 +69,7 @@ class Adam:
         self._ids = np.zeros(0, np.int64)
         self._moments = [aligned_rows(0), aligned_rows(0)]  # First, second; may have spare rows.
         self._steps = np.zeros(0, np.int32)
+        self.matches = 0
         # The map that `_ids` was last matched to, with its `membership` counter at that time.
         self._followed: tuple[ref[GaussianMap], int] | None = None
 
@@ -91,7 +95,7 @@ class Adam:
             rate: Factor on the configured learning rates.
             threads: Threads of the kernel.
         """
-        step = self._step(gaussians, rate)
+        step = self.arguments(gaussians, rate)
         _adam.adam_step(
             step.rows,
             step.mean,
@@ -138,7 +142,7 @@ class Adam:
         """
         reached = rasterizer.descend(
             by_planes,
-            self._step(gaussians, rate),
+            self.arguments(gaussians, rate),
             needle_weight=needle_weight,
             needle_ratio=needle_ratio,
             max_sigma_px=max_sigma_px,
@@ -146,7 +150,13 @@ class Adam:
         gaussians.touch(reached.indices)
         return reached
 
-    def _step(self, gaussians: GaussianMap, rate: float) -> AdamStep:
+    def arguments(self, gaussians: GaussianMap, rate: float = 1.0) -> AdamStep:
+        """Return rows and state of a map for one step, without copies of the state.
+
+        Args:
+            gaussians: The map.
+            rate: Factor on the configured learning rates.
+        """
         self._follow(gaussians)
         config, n = self.config, len(gaussians)
         mean, square = (moment[:n] for moment in self._moments)
@@ -195,6 +205,7 @@ class Adam:
             self._sort_out(ids)
         elif len(ids) == n:
             return
+        self.matches += 1
         self._reserve(len(ids))
         grown = np.zeros(len(ids) - len(self._steps), np.int32)
         self._steps = np.concatenate([self._steps, grown])

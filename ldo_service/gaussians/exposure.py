@@ -105,11 +105,41 @@ def estimate_exposure(
         comparable, the gain is implausible, or the residual is too large.
     """
     x = np.stack([_averaged(plane) for plane in rendered])
-    y = np.stack([_averaged(plane) for plane in seen]) * np.float32(1 / 255)
-    usable = (_averaged(opacity) > 0.95) & np.isfinite(x).all(axis=0)
-    usable &= _averaged(seen.max(axis=0) >= 255 * SATURATED) == 0
-    if mask is not None:
-        usable &= _averaged(mask > 0) > 0.99
+    return fit_blocks(x, _averaged(opacity), ImageBlocks.of(seen, mask))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ImageBlocks:
+    """Mean colors of the pixel blocks of a camera image.
+
+    Attributes:
+        color: [3, B, C] float32, 0..1.
+        usable: Blocks without saturated or ignored pixels, [B, C] bool.
+    """
+
+    color: np.ndarray
+    usable: np.ndarray
+
+    @classmethod
+    def of(cls, seen: np.ndarray, mask: np.ndarray | None = None) -> "ImageBlocks":
+        """Average an image of the camera; `estimate_exposure` describes the arguments."""
+        color = np.stack([_averaged(plane) for plane in seen]) * np.float32(1 / 255)
+        usable = _averaged(seen.max(axis=0) >= 255 * SATURATED) == 0
+        if mask is not None:
+            usable &= _averaged(mask > 0) > 0.99
+        return cls(color, usable)
+
+
+def fit_blocks(rendered: np.ndarray, opacity: np.ndarray, seen: ImageBlocks) -> Exposure | None:
+    """Estimate an exposure from mean colors of pixel blocks; see `estimate_exposure`.
+
+    Args:
+        rendered: Mean rendered colors, [3, B, C], 0..1.
+        opacity: Mean rendered opacities, [B, C].
+        seen: Blocks of the camera image.
+    """
+    x, y = rendered, seen.color
+    usable = seen.usable & (opacity > 0.95) & np.isfinite(x).all(axis=0)
     if np.count_nonzero(usable) < max(MIN_BLOCKS, MIN_SHARE * usable.size):
         return None
     lines = [_robust_line(x[c, usable], y[c, usable]) for c in range(3)]
@@ -119,9 +149,14 @@ def estimate_exposure(
     return Exposure.of(np.array(lines).T[:2]) if is_plausible else None
 
 
+def block_side(width: int) -> int:
+    """Return the side in pixels of the blocks that an image of this width is averaged over."""
+    return max(MIN_BLOCK_PX, width // BLOCKS_ACROSS)
+
+
 def _averaged(plane: np.ndarray) -> np.ndarray:
     """Return the mean of each square block of an image [H, W]; incomplete blocks are omitted."""
-    block = max(MIN_BLOCK_PX, plane.shape[1] // BLOCKS_ACROSS)
+    block = block_side(plane.shape[1])
     height, width = (n // block for n in plane.shape)
     plane = np.ascontiguousarray(plane[: height * block, : width * block], np.float32)
     return cv2.resize(plane, (width, height), interpolation=cv2.INTER_AREA)

@@ -10,11 +10,12 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
-from .adam import Adam, AdamConfig
-from .exposure import Exposure, estimate_exposure
-from .loss import ImageLoss, LossWeights, image_loss
+from .adam import AdamConfig
+from .exposure import Exposure
+from .loss import ImageLoss, LossWeights
 from .model import GaussianMap
-from .renderer import Rasterizer, VisibleGaussians
+from .optimizer_backend import CpuBackend, OptimizerBackend, ShapeLimits
+from .renderer import VisibleGaussians
 from .training_views import TrainingView
 
 # Constants of Adam for keyframe poses. A pose gets few steps, so its moments average over more
@@ -133,6 +134,11 @@ class GaussianOptimizerConfig:
             raise ConfigError(named(self, "max_needle_ratio") + " must be at least 1.")
 
     @property
+    def limits(self) -> ShapeLimits:
+        """Limits on the shape of the Gaussians."""
+        return ShapeLimits(self.needle_weight, self.max_needle_ratio, self.max_sigma_px)
+
+    @property
     def refines_poses(self) -> bool:
         """True if keyframe poses are optimized too: one of their learning rates is above 0."""
         return self.rotation_rate_rad > 0 or self.translation_rate_m > 0
@@ -167,23 +173,33 @@ class GaussianOptimizer:
 
     The same map, training views and plan give bitwise equal results for any number of threads. Not
     thread-safe.
+
+    Args:
+        config: Settings.
+        threads: Number of threads.
+        backend: Computation of the iterations; None for the C++ kernels.
     """
 
-    def __init__(self, config: GaussianOptimizerConfig | None = None, *, threads: int = 1) -> None:
-        self.config = config or GaussianOptimizerConfig()
-        self._adam = Adam(self.config.adam)
+    def __init__(
+        self,
+        config: GaussianOptimizerConfig | None = None,
+        *,
+        threads: int = 1,
+        backend: OptimizerBackend | None = None,
+    ) -> None:
+        self.config = config = config or GaussianOptimizerConfig()
+        self._backend = backend or CpuBackend(config.adam, config.loss, config.limits)
+        self._backend.threads = threads
         self._poses = PoseAdam()
-        self._rasterizer = Rasterizer(threads=threads)
-        self._by_planes = np.empty((5, 0, 0), np.float32)
 
     @property
     def threads(self) -> int:
         """Number of threads; it may change between calls."""
-        return self._rasterizer.threads
+        return self._backend.threads
 
     @threads.setter
     def threads(self, count: int) -> None:
-        self._rasterizer.threads = count
+        self._backend.threads = count
 
     def optimize(
         self,
@@ -223,6 +239,23 @@ class GaussianOptimizer:
         Returns:
             Loss before each step, for the iterations that were run.
         """
+        self._backend.begin(gaussians)
+        try:
+            return self._run(views, plan, rates, fixed, effort, starts_half, observe, is_usable)
+        finally:
+            self._backend.end()
+
+    def _run(
+        self,
+        views: Views,
+        plan: Sequence[int],
+        rates: tuple[float, float],
+        fixed: int | None,
+        effort: float,
+        starts_half: bool,
+        observe: Observer | None,
+        is_usable: Callable[[int], bool],
+    ) -> list[ImageLoss]:
         losses, spent = [], 0.0
         half_effort = self.config.half_share * effort if starts_half else 0.0
         for rate, keyframe in zip(np.geomspace(*rates, len(plan)), plan, strict=True):
@@ -233,9 +266,7 @@ class GaussianOptimizer:
             view = views[keyframe]
             side_px = min(view.camera.width, view.camera.height)
             is_half = spent < half_effort and side_px >= MIN_HALVED_PX
-            step = self.step(
-                gaussians, view, rate=rate, is_fixed=keyframe == fixed, is_half=is_half
-            )
+            step = self._iterate(view, rate, keyframe == fixed, is_half)
             if step.view is not view:
                 views[keyframe] = step.view
             if observe is not None:
@@ -263,53 +294,29 @@ class GaussianOptimizer:
             is_fixed: Keep the exposure and the pose of the view constant.
             is_half: Render and compare the view at half resolution.
         """
-        config, binning = self.config, 2 if is_half else 1
-        image = view.halved() if is_half else view
-        # Render and compute the loss.
-        T_camera_map = se3.inverse(view.T_map_camera)
-        planes = self._rasterizer.render(
-            gaussians.rows, image.camera, T_camera_map, bounds=gaussians.bounds, binning=binning
-        )
+        self._backend.begin(gaussians)
+        try:
+            return self._iterate(view, rate, is_fixed, is_half)
+        finally:
+            self._backend.end()
+
+    def _iterate(
+        self, view: TrainingView, rate: float, is_fixed: bool, is_half: bool
+    ) -> IterationResult:
+        self._backend.render(view, is_half=is_half)
         if not is_fixed:
-            view = self._exposed(view, image, planes)
-        by_planes = self._room_for(planes)
-        loss = image_loss(
-            planes,
-            image.color,
-            image.depth_m,
-            view.exposure,
-            config.loss,
-            by_planes,
-            mask=image.mask,
-            threads=self.threads,
-        )
-        # Compute the gradients and take a step.
-        visible = self._adam.step_fused(
-            gaussians,
-            self._rasterizer,
-            by_planes,
-            rate=rate,
-            needle_weight=config.needle_weight,
-            needle_ratio=config.max_needle_ratio,
-            max_sigma_px=config.max_sigma_px / binning,
-        )
-        if is_half:  # The weights are in pixels of the full image.
-            visible = replace(visible, weights=visible.weights * binning**2)
+            view = self._exposed(view)
+        loss, visible = self._backend.descend(view.exposure, rate=rate)
         if not is_fixed:
             view = self._placed(view, visible.xi, rate)
         return IterationResult(loss, view, visible)
 
-    def _room_for(self, planes: np.ndarray) -> np.ndarray:
-        if self._by_planes.shape != planes.shape:
-            self._by_planes = np.empty_like(planes)
-        return self._by_planes
-
-    def _exposed(self, view: TrainingView, image: TrainingView, planes: np.ndarray) -> TrainingView:
+    def _exposed(self, view: TrainingView) -> TrainingView:
         """Return the view with its exposure moved to that of the image that was rendered."""
         share = self.config.exposure_share
         if share == 0:
             return view
-        found = estimate_exposure(planes[:3], planes[4], image.color, image.mask)
+        found = self._backend.estimate_exposure()
         if found is None:
             return view
         before = view.exposure.matrix
@@ -329,7 +336,7 @@ class GaussianOptimizer:
 
         The number increases whenever the optimizer changes the Gaussian.
         """
-        return self._adam.steps(gaussians)
+        return self._backend.steps(gaussians)
 
     def forget_view(self, keyframe: int) -> None:
         """Drop the moments of a keyframe that will not be optimized again."""
@@ -337,9 +344,9 @@ class GaussianOptimizer:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return a copy of all moments as named arrays."""
-        return self._adam.snapshot() | self._poses.snapshot()
+        return self._backend.snapshot() | self._poses.snapshot()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore the exact state of a `snapshot`."""
-        self._adam.restore(state)
+        self._backend.restore(state)
         self._poses.restore(state)

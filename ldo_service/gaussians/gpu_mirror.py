@@ -1,0 +1,125 @@
+"""Copy of a map on a GPU: rows, moments and step counts, in the order of the map."""
+
+from typing import Any
+from weakref import ref
+
+import numpy as np
+
+from ldo_service.kernels.gpu.arrays import Arrays
+
+from .adam import Adam
+from .model import GaussianMap
+from .renderer import AdamStep
+from .rows import ROW
+
+
+class GaussianMirror:
+    """Rows, moments and step counts of a map on a device, 196 bytes for each Gaussian.
+
+    The map and its `Adam` on the CPU stay the originals. `update` uploads what changed there since
+    the last call, and `write_back` downloads what the device changed. Between the two calls, the
+    map must not change.
+
+    Attributes:
+        rows: Gaussians, [capacity, 16].
+        moments: First moments, [capacity, 16].
+        squares: Second moments, [capacity, 16].
+        steps: Number of steps of each row, [capacity] int32.
+        uploaded: Number of rows that the last `update` uploaded.
+        downloaded: Number of rows that the last `write_back` downloaded.
+    """
+
+    def __init__(self, arrays: Arrays) -> None:
+        self._arrays = arrays
+        self._map: ref[GaussianMap] | None = None
+        self._matches = 0
+        self._ids = np.zeros(0, np.int64)
+        self._known = np.zeros((0, ROW), np.float32)  # Rows on the device.
+        self._capacity = 0
+        self.rows, self.moments, self.squares, self.steps = self._zeros(0)
+        self.uploaded = self.downloaded = 0
+
+    def forget(self) -> None:
+        """Forget the content, so that the next `update` uploads all rows and moments."""
+        self._map = None
+
+    def update(self, gaussians: GaussianMap, adam: Adam) -> None:
+        """Upload all rows that the map has changed, and follow additions and removals.
+
+        If the moments were matched to other rows more than once since the last call, the moments
+        are uploaded too, because the path of each row is then unknown.
+        """
+        state = adam.arguments(gaussians)
+        is_known = self._map is not None and self._map() is gaussians
+        if is_known and adam.matches - self._matches <= 1:
+            self._follow(gaussians.ids)
+        else:
+            self._replace(gaussians, state)
+        self._map, self._matches = ref(gaussians), adam.matches
+        self._ids = gaussians.ids.copy()
+        is_changed = (self._known.view(np.int32) != gaussians.rows.view(np.int32)).any(axis=1)
+        changed = np.flatnonzero(is_changed)
+        self.uploaded = len(changed)
+        if len(changed):
+            self._known[changed] = gaussians.rows[changed]
+            self._put(self.rows, changed, gaussians.rows[changed])
+
+    def write_back(self, gaussians: GaussianMap, adam: Adam) -> None:
+        """Download the rows, moments and step counts that steps on the device changed."""
+        state = adam.arguments(gaussians)
+        n = len(gaussians)
+        steps = self._arrays.download(self.steps)[:n]
+        touched = np.flatnonzero(steps != state.steps)
+        self.downloaded = len(touched)
+        if len(touched) == 0:
+            return
+        places = self._arrays.upload(touched.astype(np.int32))
+        rows, moments, squares = (
+            self._arrays.download(self._arrays.take(array, places))
+            for array in (self.rows, self.moments, self.squares)
+        )
+        gaussians.rows[touched] = self._known[touched] = rows
+        state.mean[touched], state.square[touched] = moments, squares
+        state.steps[touched] = steps[touched]
+        gaussians.touch(touched.astype(np.uint32))
+
+    def _zeros(self, capacity: int) -> tuple[Any, Any, Any, Any]:
+        rows, moments, squares = (self._arrays.zeros((capacity, ROW), np.float32) for _ in range(3))
+        return rows, moments, squares, self._arrays.zeros((capacity,), np.int32)
+
+    def _put(self, array: Any, places: np.ndarray, values: np.ndarray) -> None:
+        on_device = self._arrays.upload(places.astype(np.int32))
+        self._arrays.put(array, on_device, self._arrays.upload(values))
+
+    def _follow(self, ids: np.ndarray) -> None:
+        """Move rows and state of the remaining Gaussians to their new places.
+
+        The state of all other places becomes zero, as in `Adam`.
+        """
+        if np.array_equal(ids, self._ids):
+            return
+        old_places = np.searchsorted(self._ids, ids)
+        stays = np.append(self._ids, -1)[old_places] == ids
+        old_places, places = old_places[stays], np.flatnonzero(stays)
+        if len(ids) > self._capacity:
+            self._capacity = max(len(ids), 2 * self._capacity)
+        kept, moved_to = (self._arrays.upload(x.astype(np.int32)) for x in (old_places, places))
+        new = self._zeros(self._capacity)
+        for array, old in zip(
+            new, (self.rows, self.moments, self.squares, self.steps), strict=True
+        ):
+            self._arrays.put(array, moved_to, self._arrays.take(old, kept))
+        self.rows, self.moments, self.squares, self.steps = new
+        known = np.zeros((len(ids), ROW), np.float32)
+        known[places] = self._known[old_places]
+        self._known = known
+
+    def _replace(self, gaussians: GaussianMap, state: AdamStep) -> None:
+        """Upload moments and step counts of all Gaussians; `update` then uploads their rows."""
+        n = len(gaussians)
+        self._capacity = n
+        self.rows = self._arrays.zeros((n, ROW), np.float32)
+        self._known = np.zeros((n, ROW), np.float32)
+        self.moments, self.squares, self.steps = (
+            self._arrays.upload(x) for x in (state.mean, state.square, state.steps)
+        )

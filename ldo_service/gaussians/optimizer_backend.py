@@ -1,0 +1,177 @@
+"""Backends of the Gaussian optimizer: the computation of its iterations."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from ldo_service.geometry import se3
+
+from .adam import Adam, AdamConfig
+from .exposure import Exposure, estimate_exposure
+from .loss import ImageLoss, LossWeights, image_loss
+from .model import GaussianMap
+from .renderer import Rasterizer, VisibleGaussians
+from .training_views import TrainingView
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeLimits:
+    """Limits on the shape of the Gaussians during the optimization.
+
+    Attributes:
+        needle_weight: Weight of the penalty on needle-shaped Gaussians; see `Rasterizer.gradients`.
+        max_needle_ratio: Ratio of the longest to the middle axis above which the penalty applies.
+        max_sigma_px: Longest standard deviation after a step, in pixels of the full image.
+    """
+
+    needle_weight: float
+    max_needle_ratio: float
+    max_sigma_px: float
+
+
+class OptimizerBackend(Protocol):
+    """Interface of the computation of iterations.
+
+    The optimizer calls `begin`, then `render`, `estimate_exposure` and `descend` for each
+    iteration, and then `end`. In between, only the backend reads or writes the rows of the map.
+
+    Attributes:
+        threads: Number of threads; it may change between calls and does not change the results.
+    """
+
+    threads: int
+
+    def begin(self, gaussians: GaussianMap) -> None:
+        """Prepare iterations on a map."""
+
+    def end(self) -> None:
+        """Write the results of the iterations to the map, if they are not there yet."""
+
+    def render(self, view: TrainingView, *, is_half: bool) -> None:
+        """Render the map at the pose of a view, with `is_half` at half resolution."""
+
+    def estimate_exposure(self) -> Exposure | None:
+        """Estimate the exposure of the last rendered view; see `exposure.estimate_exposure`."""
+
+    def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+        """Compare the last rendering with its view, and take a step of Adam.
+
+        The map changes at the latest in `end`.
+
+        Args:
+            exposure: Exposure of the view.
+            rate: Factor on all learning rates.
+
+        Returns:
+            Loss before the step, and the visible Gaussians, with weights in pixels of the full
+            image. They are valid until the next rendering.
+        """
+
+    def steps(self, gaussians: GaussianMap) -> np.ndarray:
+        """Return the number of Adam steps of each Gaussian, [N] int32, after `end`."""
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Return a copy of the moments as named arrays; they do not depend on the backend."""
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Restore the exact state of a `snapshot`."""
+
+
+class CpuBackend:
+    """Iterations in C++.
+
+    The results are bitwise equal for any number of threads.
+
+    Args:
+        adam: Settings of Adam.
+        weights: Weights of the image loss.
+        limits: Limits on the shape of the Gaussians.
+        threads: Number of threads.
+    """
+
+    def __init__(
+        self, adam: AdamConfig, weights: LossWeights, limits: ShapeLimits, *, threads: int = 1
+    ) -> None:
+        self._adam, self._weights, self._limits = Adam(adam), weights, limits
+        self._rasterizer = Rasterizer(threads=threads)
+        self._by_planes = np.empty((5, 0, 0), np.float32)
+        self._gaussians: GaussianMap | None = None  # Map between `begin` and `end`.
+        # View of the last rendering in the resolution of the rendering, its planes and its binning.
+        self._rendered: tuple[TrainingView, np.ndarray, int] | None = None
+
+    @property
+    def threads(self) -> int:
+        return self._rasterizer.threads
+
+    @threads.setter
+    def threads(self, count: int) -> None:
+        self._rasterizer.threads = count
+
+    def begin(self, gaussians: GaussianMap) -> None:
+        self._gaussians = gaussians
+
+    def end(self) -> None:
+        self._gaussians = self._rendered = None
+
+    def render(self, view: TrainingView, *, is_half: bool) -> None:
+        image = view.halved() if is_half else view
+        binning = 2 if is_half else 1
+        gaussians = self._map()
+        planes = self._rasterizer.render(
+            gaussians.rows,
+            image.camera,
+            se3.inverse(view.T_map_camera),
+            bounds=gaussians.bounds,
+            binning=binning,
+        )
+        self._rendered = image, planes, binning
+
+    def estimate_exposure(self) -> Exposure | None:
+        image, planes, _ = self._last()
+        return estimate_exposure(planes[:3], planes[4], image.color, image.mask)
+
+    def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+        image, planes, binning = self._last()
+        if self._by_planes.shape != planes.shape:
+            self._by_planes = np.empty_like(planes)
+        loss = image_loss(
+            planes,
+            image.color,
+            image.depth_m,
+            exposure,
+            self._weights,
+            self._by_planes,
+            mask=image.mask,
+            threads=self.threads,
+        )
+        visible = self._adam.step_fused(
+            self._map(),
+            self._rasterizer,
+            self._by_planes,
+            rate=rate,
+            needle_weight=self._limits.needle_weight,
+            needle_ratio=self._limits.max_needle_ratio,
+            max_sigma_px=self._limits.max_sigma_px / binning,
+        )
+        if binning > 1:  # The weights are in pixels of the full image.
+            visible = replace(visible, weights=visible.weights * binning**2)
+        return loss, visible
+
+    def _map(self) -> GaussianMap:
+        assert self._gaussians is not None, "begin comes first"
+        return self._gaussians
+
+    def _last(self) -> tuple[TrainingView, np.ndarray, int]:
+        assert self._rendered is not None, "render comes first"
+        return self._rendered
+
+    def steps(self, gaussians: GaussianMap) -> np.ndarray:
+        return self._adam.steps(gaussians)
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        return self._adam.snapshot()
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        self._adam.restore(state)
