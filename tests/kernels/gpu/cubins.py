@@ -84,7 +84,7 @@ KERNELS = (
         (FLOATS, INTS, INT, INTS),
         {"BLOCK": LANES},
         FOUR_WARPS,
-        (16, 16, 16, 16, 16, 16, 16),
+        (10, 12, 12, 12, 12, 12, 10),
     ),
     Kernel(
         projection.list_pairs,
@@ -105,7 +105,7 @@ KERNELS = (
         (FLOATS, INT, INT, INT, INT, INT, FLOATS),
         {"LANES": 256},
         blending.ONE_WARP,
-        (32, 32, 32, 32, 32, 32, 32),
+        (36, 39, 42, 41, 40, 39, 39),
     ),
     Kernel(
         loss.means_along_rows,
@@ -178,7 +178,7 @@ KERNELS = (
         ),
         {"LAST_STEP": CORRECTIONS - 1, "ADAM": True, "BLOCK": LANES},
         FOUR_WARPS,
-        (96, 116, 108, 108, 106, 120, 112),
+        (110, 113, 113, 113, 113, 116, 115),
     ),
 )
 

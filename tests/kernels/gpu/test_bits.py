@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from triton.runtime.interpreter import interpreter_builder
 
 from ldo_service.kernels.gpu.arrays import Arrays, HostArray, HostArrays, TorchArrays
 from tests.kernels.gpu.scenes import ARRAYS, SCENES, launch
@@ -68,6 +67,8 @@ def test_undefined_memory_has_no_effect() -> None:
 
 def test_order_of_the_programs_has_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     """A program reads nothing that another one writes, and no two programs write the same place."""
+    from triton.runtime.interpreter import interpreter_builder
+
     monkeypatch.setattr(launch, "LANES", 32)  # More programs.
     monkeypatch.setattr(launch, "PIXEL_LANES", 128)
     names = ("turned", *NAMED)
