@@ -54,6 +54,7 @@ class OptimizerBackend(Protocol):
 
     def estimate_exposure(self) -> Exposure | None:
         """Estimate the exposure of the last rendered view; see `exposure.estimate_exposure`."""
+        ...
 
     def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
         """Compare the last rendering with its view, and take a step of Adam.
@@ -68,12 +69,15 @@ class OptimizerBackend(Protocol):
             Loss before the step, and the visible Gaussians, with weights in pixels of the full
             image. They are valid until the next rendering.
         """
+        ...
 
     def steps(self, gaussians: GaussianMap) -> np.ndarray:
         """Return the number of Adam steps of each Gaussian, [N] int32, after `end`."""
+        ...
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return a copy of the moments as named arrays; they do not depend on the backend."""
+        ...
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore the exact state of a `snapshot`."""

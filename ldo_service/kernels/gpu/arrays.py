@@ -5,6 +5,7 @@ runs on a CPU too. Both give equal results, because they sort stably and add no 
 numbers.
 """
 
+from importlib import import_module
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ class Arrays(Protocol):
 
     def download(self, array: Any) -> np.ndarray:
         """Return a copy of an array on the host."""
+        ...
 
     def empty(self, shape: tuple[int, ...], dtype: type) -> Any:
         """Return an array with undefined values, which a kernel writes before anything reads it."""
@@ -41,6 +43,7 @@ class Arrays(Protocol):
 
     def offsets(self, counts: Any) -> tuple[Any, int]:
         """Return the sums [M] int32 of all counts before each one, and the sum of all counts."""
+        ...
 
     def repeat(self, values: Any, counts: Any, total: int) -> Any:
         """Return each value as often as its count says; `total` is the sum of the counts."""
@@ -147,7 +150,7 @@ class TorchArrays:
 
     def __init__(self, device: str) -> None:
         try:
-            import torch  # The library is optional.
+            torch = import_module("torch")  # The library is optional.
         except ImportError as error:
             raise ConfigError(
                 f"arrays on the device {device} need torch. Run {install_command('cuda')}."

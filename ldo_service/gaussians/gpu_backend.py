@@ -1,0 +1,189 @@
+"""GPU backend of the Gaussian optimizer; experimental, and no setting selects it yet."""
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import log10
+from weakref import ref
+
+import numpy as np
+
+from ldo_service.geometry import se3
+from ldo_service.kernels.gpu import launch
+from ldo_service.kernels.gpu.arrays import Arrays
+
+from .adam import Adam, AdamConfig
+from .exposure import Exposure, ImageBlocks, block_side, fit_blocks
+from .gpu_mirror import GaussianMirror
+from .loss import ImageLoss, LossWeights
+from .model import GaussianMap
+from .optimizer_backend import ShapeLimits
+from .renderer import VisibleGaussians
+from .training_views import TrainingView
+
+# Number of images that stay on the device, at 8 bytes a pixel. A keyframe counts twice if it is
+# used at full and at half resolution.
+MAX_FRAMES = 64
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ResidentFrame:
+    """Images of a view on the device.
+
+    Attributes:
+        color: Color image of the view on the host, while it exists.
+        mask: Mask of the view on the host, while it exists; None if the view has no mask.
+        image: Images on the device.
+        size: Width and height.
+        intrinsics: fx, fy, cx, cy.
+        blocks: Mean colors of blocks, for the estimate of the exposure.
+    """
+
+    color: ref[np.ndarray]
+    mask: ref[np.ndarray] | None
+    image: launch.Frame
+    size: tuple[int, int]
+    intrinsics: tuple[float, float, float, float]
+    blocks: ImageBlocks
+
+    def shows(self, view: TrainingView) -> bool:
+        """Return whether the images are those of a view."""
+        mask = self.mask and self.mask()
+        return self.color() is view.color and (
+            view.mask is None if self.mask is None else mask is view.mask
+        )
+
+
+class GpuBackend:
+    """Iterations by the kernels of `kernels.gpu`.
+
+    The map and the moments on the CPU stay the originals. `begin` uploads changed rows, and `end`
+    downloads the rows that the iterations changed. An iteration downloads the weights of the
+    visible Gaussians, the terms of the loss, and mean colors for the exposure.
+
+    The results are bitwise equal on one GPU model and one version of Triton. They differ from those
+    of the CPU in the last bits of each iteration.
+
+    Args:
+        arrays: Arrays of the device.
+        adam: Settings of Adam.
+        weights: Weights of the image loss.
+        limits: Limits on the shape of the Gaussians.
+    """
+
+    def __init__(
+        self, arrays: Arrays, adam: AdamConfig, weights: LossWeights, limits: ShapeLimits
+    ) -> None:
+        self.threads = 1
+        self._arrays, self._config = arrays, adam
+        self._adam, self._weights, self._limits = Adam(adam), weights, limits
+        self._corrections = arrays.upload(launch.bias_corrections(adam.beta1, adam.beta2))
+        self._frames: OrderedDict[tuple[int, bool], ResidentFrame] = OrderedDict()
+        self._gaussians: GaussianMap | None = None  # Map between `begin` and `end`.
+        self._rendered: tuple[ResidentFrame, launch.PlaneRendering, int] | None = None
+        self.mirror = GaussianMirror(arrays)
+
+    def begin(self, gaussians: GaussianMap) -> None:
+        self._gaussians = gaussians
+        self.mirror.update(gaussians, self._adam)
+
+    def end(self) -> None:
+        gaussians, self._gaussians, self._rendered = self._gaussians, None, None
+        if gaussians is not None:
+            self.mirror.write_back(gaussians, self._adam)
+
+    def render(self, view: TrainingView, *, is_half: bool) -> None:
+        assert self._gaussians is not None, "begin comes first"
+        frame = self._frame(view, is_half)
+        binning = 2 if is_half else 1
+        T_camera_map = se3.inverse(view.T_map_camera)
+        values = launch.view_of(T_camera_map, frame.intrinsics, binning)
+        rendering = launch.render(
+            self._arrays, self.mirror.rows, len(self._gaussians), values, *frame.size
+        )
+        self._rendered = frame, rendering, binning
+
+    def estimate_exposure(self) -> Exposure | None:
+        frame, rendering, _ = self._last()
+        means = launch.mean_blocks(self._arrays, rendering, block_side(rendering.width))
+        return fit_blocks(means[:3], means[3], frame.blocks)
+
+    def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+        frame, rendering, binning = self._last()
+        weights = self._weights
+        by_planes, (l1, d_ssim, depth, squared) = launch.image_loss(
+            self._arrays,
+            rendering,
+            frame.image,
+            exposure.matrix,
+            (weights.l1, weights.d_ssim, weights.depth),
+        )
+        mirror, config = self.mirror, self._config
+        adam = launch.AdamState(
+            mirror.moments,
+            mirror.squares,
+            mirror.steps,
+            self._corrections,
+            config.beta1,
+            config.beta2,
+            config.epsilon,
+        )
+        made = launch.backpropagate(
+            self._arrays,
+            mirror.rows,
+            rendering,
+            by_planes,
+            adam=adam,
+            rates=config.rates() * np.float32(rate),
+            needle_weight=self._limits.needle_weight,
+            needle_ratio=self._limits.max_needle_ratio,
+            max_sigma_px=self._limits.max_sigma_px / binning,
+        )
+        visible = VisibleGaussians(
+            self._arrays.download(rendering.lists.visible).astype(np.uint32),
+            self._arrays.download(made.weights) * np.float32(binning**2),
+            made.xi,
+        )
+        total = weights.l1 * l1 + weights.d_ssim * d_ssim + weights.depth * depth
+        psnr_db = -10 * log10(max(squared, 1e-20))
+        return ImageLoss(total, l1, d_ssim, depth, psnr_db), visible
+
+    def _last(self) -> tuple[ResidentFrame, launch.PlaneRendering, int]:
+        assert self._rendered is not None, "render comes first"
+        return self._rendered
+
+    def _frame(self, view: TrainingView, is_half: bool) -> ResidentFrame:
+        """Return the images of a view on the device; upload them if they are not there."""
+        key = (view.keyframe, is_half)
+        frame = self._frames.get(key)
+        if frame is None or not frame.shows(view):
+            frame = self._uploaded(view, view.halved() if is_half else view)
+            self._frames[key] = frame
+        self._frames.move_to_end(key)
+        if len(self._frames) > MAX_FRAMES:
+            self._frames.popitem(last=False)
+        return frame
+
+    def _uploaded(self, view: TrainingView, image: TrainingView) -> ResidentFrame:
+        mask = np.ones_like(image.color[0]) if image.mask is None else image.mask
+        measured = int(np.count_nonzero((image.depth_m > 0) & (mask > 0)))
+        color, depth_m, mask = map(self._arrays.upload, (image.color, image.depth_m, mask))
+        camera = image.camera
+        return ResidentFrame(
+            ref(view.color),
+            None if view.mask is None else ref(view.mask),
+            launch.Frame(color, depth_m, mask, measured),
+            (camera.width, camera.height),
+            (camera.fx, camera.fy, camera.cx, camera.cy),
+            ImageBlocks.of(image.color, image.mask),
+        )
+
+    def steps(self, gaussians: GaussianMap) -> np.ndarray:
+        return self._adam.steps(gaussians)
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        return self._adam.snapshot()
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        self._adam.restore(state)
+        self.mirror.forget()

@@ -1,0 +1,164 @@
+"""Optimization through the GPU backend in the interpreter of Triton, compared with the C++."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ldo_service.datasets import Sequence
+from ldo_service.gaussians import (
+    GaussianMap,
+    GaussianOptimizer,
+    GaussianOptimizerConfig,
+    TrainingView,
+    densify,
+)
+from ldo_service.gaussians.densification import DensificationConfig
+from ldo_service.geometry import Camera, RgbdFrame, se3
+from tests.gaussians.conftest import halved
+from tests.kernels.gpu.agreement import check
+from tests.kernels.gpu.scenes import ARRAYS, launch
+
+CONFIG = GaussianOptimizerConfig(half_share=0.2, usual_reach=500)
+# Few large Gaussians, because the interpreter takes some milliseconds for each pair with a tile.
+FEW = DensificationConfig(coarsest_px=8, max_contrast=9.0, max_depth_step=9.0)
+
+
+@pytest.fixture(autouse=True)
+def _setting(monkeypatch: pytest.MonkeyPatch):
+    """Halve small images, launch few large programs, and compute without warnings."""
+    monkeypatch.setattr("ldo_service.gaussians.optimizer.MIN_HALVED_PX", 32)
+    monkeypatch.setattr("ldo_service.gaussians.exposure.MIN_BLOCK_PX", 4)
+    monkeypatch.setattr(launch, "LANES", 1024)
+    monkeypatch.setattr(launch, "PIXEL_LANES", 4096)
+    with np.errstate(all="ignore"):
+        yield
+
+
+def window(frame: RgbdFrame, size: int) -> RgbdFrame:
+    """Return the middle of a frame, size x size pixels."""
+    camera = frame.camera
+    x, y = (camera.width - size) // 2, (camera.height - size) // 2
+    inside = slice(y, y + size), slice(x, x + size)
+    return RgbdFrame(
+        np.ascontiguousarray(frame.color[inside]),
+        np.ascontiguousarray(frame.depth_m[inside]),
+        Camera(size, size, camera.fx, camera.fy, camera.cx - x, camera.cy - y),
+    )
+
+
+class Mapping:
+    """A map of the room, which grows and shrinks between plans of the optimizer."""
+
+    def __init__(self, room: Sequence, size: int, *, on_gpu: bool) -> None:
+        self.room, self.size, self.on_gpu = room, size, on_gpu
+        self.gaussians, self.views = GaussianMap(), {}
+        self.optimizer = self.new_optimizer()
+        self.losses: list[float] = []
+        self.weights: list[float] = []
+
+    def new_optimizer(self) -> GaussianOptimizer:
+        if not self.on_gpu:
+            return GaussianOptimizer(CONFIG)
+        from ldo_service.gaussians.gpu_backend import GpuBackend  # It imports Triton.
+
+        self.backend = GpuBackend(ARRAYS, CONFIG.adam, CONFIG.loss, CONFIG.limits)
+        return GaussianOptimizer(CONFIG, backend=self.backend)
+
+    def insert(self, index: int) -> None:
+        frame = window(halved(self.room[index]), self.size)
+        T_map_camera = self.room.truth().T_world_camera[index]
+        densify(self.gaussians, frame, T_map_camera, index, FEW)
+        view = TrainingView.of(frame, T_map_camera, index)
+        if index:  # The camera sees later frames darker.
+            view = replace(view, color=(view.color * 0.9).astype(np.uint8))
+        self.views[index] = view
+
+    def fit(self, plan: list[int]) -> None:
+        effort = 0.6 * len(plan)  # Enough for all iterations; the first ones are halved.
+        losses = self.optimizer.optimize(
+            self.gaussians,
+            self.views,
+            plan,
+            fixed=0,
+            effort=effort,
+            starts_half=True,
+            observe=lambda _, visible: self.weights.append(float(visible.weights.sum())),
+        )
+        assert len(losses) == len(plan)
+        self.losses += [loss.total for loss in losses]
+
+    def restart(self) -> None:
+        """Continue with the state of a snapshot."""
+        saved, moments = self.gaussians.snapshot(), self.optimizer.snapshot()
+        self.gaussians, self.optimizer = GaussianMap.restore(saved), self.new_optimizer()
+        self.optimizer.restore(moments)
+
+    def run(self, plans: list[list[int]]) -> None:
+        """Run three plans, with insertion, pruning, offloading and a snapshot in between."""
+        first, second, third = plans
+        self.insert(0)
+        self.insert(4)
+        self.fit(first)
+        self.gaussians.remove(self.gaussians.ids % 17 == 3)
+        offloaded = self.gaussians.extract(self.gaussians.ids % 11 == 5)
+        self.insert(8)
+        self.fit(second)
+        self.restart()
+        self.gaussians.reinsert(*offloaded)
+        self.gaussians.move_anchors({4: se3.exp(np.array([0, 0.002, 0, 0.001, 0, 0]))})
+        self.fit(third)
+
+
+def compare(room: Sequence, size: int, plans: list[list[int]]) -> Mapping:
+    """Compare map, exposures, moments and losses of both backends, and return the GPU's mapping."""
+    cpu, gpu = (Mapping(room, size, on_gpu=on_gpu) for on_gpu in (False, True))
+    cpu.run(plans)
+    gpu.run(plans)
+    name = f"{size}x{size}"
+    assert len(gpu.losses) == len(cpu.losses)
+    losses = np.array(gpu.losses) / cpu.losses - 1
+    check("loss in ten iterations", np.abs(losses).max(), name)
+    np.testing.assert_allclose(gpu.weights, cpu.weights, rtol=1e-3)
+    np.testing.assert_array_equal(gpu.gaussians.ids, cpu.gaussians.ids)
+    np.testing.assert_array_equal(gpu.gaussians.anchors, cpu.gaussians.anchors)
+    gains = np.array([view.exposure.gain for view in cpu.views.values()])
+    assert np.abs(gains[1:] - 1).max() > 0.01
+    for index, view in cpu.views.items():
+        error = np.abs(gpu.views[index].exposure.matrix - view.exposure.matrix).max()
+        check("exposure after ten iterations", error, f"{name}, keyframe {index}")
+    difference = np.abs(gpu.gaussians.rows - cpu.gaussians.rows)
+    spread = cpu.gaussians.rows[:, :14].std(axis=0)
+    check("rows after ten iterations", (difference[:, :14] / spread).mean(), name)
+    check("median of rows after ten iterations", np.median(difference[:, :14] / spread), name)
+    saved, wanted = gpu.optimizer.snapshot(), cpu.optimizer.snapshot()
+    assert saved.keys() == wanted.keys()
+    np.testing.assert_array_equal(saved["ids"], wanted["ids"])
+    assert np.mean(saved["steps"] != wanted["steps"]) < 0.01
+    assert gpu.gaussians.version > 0
+    return gpu
+
+
+def test_iterations_on_a_small_window_agree_with_the_cpu(room: Sequence) -> None:
+    gpu = compare(room, 32, [[4], [8], [4, 0, 4]])
+    mirror = gpu.backend.mirror
+    assert 0 < mirror.downloaded <= len(gpu.gaussians)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)  # It takes seven minutes of CPU time.
+def test_ten_iterations_through_the_mirror_agree_with_the_cpu(room: Sequence) -> None:
+    gpu = compare(room, 64, [[4, 0, 4, 4], [8, 0, 8], [8, 4, 8]])
+    assert len(gpu.losses) == 10
+
+
+def test_images_are_uploaded_again_if_they_changed(room: Sequence) -> None:
+    mapping = Mapping(room, 32, on_gpu=True)
+    mapping.insert(0)
+    view, backend = mapping.views[0], mapping.backend
+    first = backend._frame(view, is_half=False)
+    assert backend._frame(replace(view, T_map_camera=np.eye(4)), is_half=False) is first
+    assert backend._frame(view, is_half=True) is not first
+    masked = replace(view, mask=np.zeros((32, 32), np.uint8))
+    assert backend._frame(masked, is_half=False).image.measured == 0
+    assert backend._frame(view, is_half=False) is not first
