@@ -1,12 +1,12 @@
 """Compilation of the GPU kernels for seven architectures, without a GPU.
 
-    python -m tests.kernels.gpu.cubins
+    python -m tests.kernels.gpu.cubins [CAPABILITY...]
 
 The program prints registers, stack and shared memory of each kernel as a table. It exits with
 status 1 if a kernel uses a stack or spills registers, needs more registers than its limit, or
 contains an instruction whose result differs between GPUs: an approximation, a flush of denormal
 numbers, TF32, or a fused product and sum. At first it compiles two kernels with such faults, and
-checks that it detects them.
+checks that it detects them. Without arguments, it compiles for all of CAPABILITIES.
 """
 
 import os
@@ -278,24 +278,25 @@ def undetected_faults() -> list[str]:
     return missed + ([] if fused.differing else ["fused products were not detected"])
 
 
-def main() -> int:
+def main(arguments: list[str]) -> int:
     """Compile all kernels, print the table, and return the exit status."""
     faults, rows = undetected_faults(), []
+    chosen = [c for c in CAPABILITIES if not arguments or str(c) in arguments]
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         for i, kernel in enumerate(KERNELS):
-            made = list(pool.map(partial(compiled, i), CAPABILITIES))
-            for capability, result in zip(CAPABILITIES, made, strict=True):
+            made = list(pool.map(partial(compiled, i), chosen))
+            for capability, result in zip(chosen, made, strict=True):
                 faults += faults_of(kernel, capability, result)
             cells = " | ".join(result.cell for result in made)
             rows.append(f"| {kernel.name} | {kernel.options['num_warps']} | {cells} |")
             print(f"{kernel.name}: compiled, {made[0].shuffles} shuffles", file=sys.stderr)
     print("registers / stack and spills / bytes of shared memory")
-    print("| kernel | warps | " + " | ".join(f"sm_{c}" for c in CAPABILITIES) + " |")
-    print("|---|---|" + "---|" * len(CAPABILITIES))
+    print("| kernel | warps | " + " | ".join(f"sm_{c}" for c in chosen) + " |")
+    print("|---|---|" + "---|" * len(chosen))
     print("\n".join(rows))
     print("\n".join(faults) or "no stack, no spill, no instruction that differs between GPUs")
     return int(bool(faults))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

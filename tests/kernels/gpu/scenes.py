@@ -127,6 +127,14 @@ def wide() -> np.ndarray:
     return rows
 
 
+def needles() -> np.ndarray:
+    """Return long thin Gaussians at any angle, whose ridge lines have unequal slopes."""
+    rows = cloud(30, 13, depth_m=(1.0, 3.0), logit=(-1, 3))
+    rows[:, :2] *= 0.5
+    rows[:, 3:6] = np.log(rows[:, 2:3] * [0.2, 0.02, 0.01])
+    return rows
+
+
 def faint_wall() -> np.ndarray:
     """Return 250 faint Gaussians in front of 60 opaque ones, so that a batch of 256 ends between.
 
@@ -149,6 +157,7 @@ SCENES = {
     "capped": Scene(cloud(50, 3, logit=(6, 9)), camera_of(20, 20), np.eye(4)),
     "dark": Scene(wall(140, 5, (-1.5, 1.0)), camera_of(16, 16), np.eye(4)),
     "ties": Scene(ties(), camera_of(16, 16), np.eye(4)),
+    "needles": Scene(needles(), camera_of(28, 20), np.eye(4)),
     "broken rows": Scene(broken(), camera_of(20, 20), np.eye(4)),
     "one pixel": Scene(cloud(60, 5, sigma=(0.1, 0.3)), camera_of(1, 1), np.eye(4)),
     "binned": Scene(cloud(90, 1), camera_of(28, 20), TURNED, binning=2),

@@ -26,11 +26,11 @@ SLIPS = {
         "",
         partial(judge_splats, "broken rows"),
     ),
-    "wrong slope of a ridge": (
+    "ridge without its slope": (
         "projection",
-        "clamp(side_x * y_slope",
-        "clamp(side_x * x_slope",
-        partial(judge_planes, "turned"),
+        "clamp(side_y * x_slope",
+        "clamp(0.0 * x_slope",
+        partial(judge_planes, "needles"),
     ),
     "late early stop": (
         "blending",
