@@ -52,7 +52,10 @@ EXTRAS = {  # Optional extra of the package: modules that it installs.
     "phones": ("av", "liblzfse"),
     "s3": ("s3fs",),
     "cluster": ("ray", "s3fs"),
+    "cuda": ("torch", "triton"),
 }
+# Extras that have no use for users yet.
+EXPERIMENTAL = {"cuda": "Its GPU kernels are experimental, and the service does not use them yet"}
 REINSTALL = "`.venv/bin/pip install -e .` in the clone of LDO-SLAM installs all libraries."
 LISTEN_S = 1.5  # Three heartbeats.
 Check = Annotated[
@@ -138,11 +141,12 @@ def extras() -> Iterator[Finding]:
     """Check which optional extras are installed."""
     for extra, packages in EXTRAS.items():
         missing = [p for p in packages if importlib.util.find_spec(p) is None]
+        note = f". {EXPERIMENTAL[extra]}" if extra in EXPERIMENTAL else ""
         if missing:
-            advice = f"to use it, run {install_command(extra)}"
+            advice = f"to use it, run {install_command(extra)}{note}"
             yield Finding("absent", f"extra {extra} (missing: {', '.join(missing)}): {advice}")
         else:
-            yield Finding("ok", f"extra {extra}")
+            yield Finding("ok", f"extra {extra}{note}")
 
 
 def networks() -> Iterator[Finding]:

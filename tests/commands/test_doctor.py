@@ -59,6 +59,16 @@ def test_every_extra_of_the_package_is_checked() -> None:
     assert set(doctor.EXTRAS) == set(pyproject["project"]["optional-dependencies"])
 
 
+@pytest.mark.parametrize(("found", "mark"), [(object(), "ok"), (None, "absent")])
+def test_extra_for_a_gpu_is_called_experimental(
+    monkeypatch: pytest.MonkeyPatch, found: object, mark: str
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: found)
+    (finding,) = [finding for finding in doctor.extras() if "extra cuda" in finding.text]
+    assert finding.mark == mark
+    assert "experimental, and the service does not use them" in finding.text
+
+
 @pytest.mark.parametrize(("days", "mark"), [(40, "ok"), (10, "warn")])
 def test_certificates_that_expire_within_30_days_are_warnings(
     tmp_path: Path, days: int, mark: str
