@@ -117,9 +117,11 @@ def load_row(rows, i, is_live):
 @triton.jit
 def pixels_within(center, radius, size):
     """Return the first and last pixel of [0, size) within `radius`, and whether one exists."""
-    low = tl.maximum(center - radius, 0.0)
-    high = tl.minimum(center + radius, size.to(tl.float32) - 1.0)
-    is_near = low <= high  # NaN compares as false.
+    edge = size.to(tl.float32) - 1.0
+    low, high = center - radius, center + radius
+    # NaN fails this comparison. It must come first, because the maximum of NaN and 0 is 0 on a GPU.
+    is_near = (low <= edge) & (high >= 0.0)
+    low, high = tl.maximum(low, 0.0), tl.minimum(high, edge)
     low, high = tl.where(is_near, low, 0.0), tl.where(is_near, high, 0.0)
     first, last = low.to(tl.int32), high.to(tl.int32)
     first += (first.to(tl.float32) < low).to(tl.int32)
@@ -168,10 +170,9 @@ def project_and_cull(rows, n, view, width, height, splats, ranges, pairs, BLOCK:
     total = mean[0] + mean[1] + mean[2] + scale[0] + scale[1] + scale[2] + q[0] + q[1] + q[2]
     total = total + q[3] + opacity + color[0] + color[1] + color[2]
     is_drawn = is_live & (p[2] >= NEAR) & (reach >= 0.0) & (total * 0.0 >= 0.0)
-    radius_u = tl.sqrt_rn(tl.maximum(reach * uu, 0.0))
-    radius_v = tl.sqrt_rn(tl.maximum(reach * vv, 0.0))
-    left, right, is_across = pixels_within(u, radius_u, width)
-    top, bottom, is_down = pixels_within(v, radius_v, height)
+    # A covariance of NaN, such as that of a quaternion of zeros, makes the radii NaN.
+    left, right, is_across = pixels_within(u, tl.sqrt_rn(reach * uu), width)
+    top, bottom, is_down = pixels_within(v, tl.sqrt_rn(reach * vv), height)
     is_drawn = is_drawn & is_across & is_down
     x0, x1 = tl.where(is_drawn, left, 0) // TILE, tl.where(is_drawn, right, 0) // TILE
     y0, y1 = tl.where(is_drawn, top, 0) // TILE, tl.where(is_drawn, bottom, 0) // TILE

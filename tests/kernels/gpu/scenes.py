@@ -117,6 +117,8 @@ def broken() -> np.ndarray:
     rows = cloud(40, 9)
     rows[3, 0], rows[7, 4], rows[11, 12] = np.nan, np.inf, -np.inf
     rows[15, 6:10], rows[19, 2], rows[23, 10] = 0, -1.0, -8.0
+    # This row has no rotation either. Its center is the center of a pixel, (9, 11).
+    rows[27, :3], rows[27, 6:10], rows[27, 10] = (0, 0, 1), 0, 5
     return rows
 
 
