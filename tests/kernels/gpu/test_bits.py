@@ -16,7 +16,7 @@ class OtherwiseFilledArrays(HostArrays):
         return HostArray(np.full(shape, 3, dtype))
 
 
-def everything(arrays: Arrays, names: tuple[str, ...] = ("turned",)) -> list[np.ndarray]:
+def results_of(arrays: Arrays, names: tuple[str, ...] = ("turned",)) -> list[np.ndarray]:
     """Return all results of the kernels on some scenes."""
     out = []
     for name in names:
@@ -24,18 +24,18 @@ def everything(arrays: Arrays, names: tuple[str, ...] = ("turned",)) -> list[np.
         camera, n = scene.camera, len(scene.rows)
         rows, by_planes = arrays.upload(scene.rows), arrays.upload(scene.by_planes())
         rendering = launch.render(arrays, rows, n, scene.view, camera.width, camera.height)
-        given = launch.backpropagate(arrays, rows, rendering, by_planes)
+        derivatives = launch.backpropagate(arrays, rows, rendering, by_planes)
         state = state_of(n)
         moments = (arrays.upload(x) for x in (state.mean, state.square, state.steps))
         corrections = arrays.upload(launch.bias_corrections(*BETAS))
         adam = launch.AdamState(*moments, corrections, *BETAS, EPSILON)
-        made = launch.backpropagate(
+        stepped = launch.backpropagate(
             arrays, rows, rendering, by_planes, adam=adam, rates=state.rates, **PENALTY
         )
         lists = rendering.lists
-        out += [rendering.planes, rendering.ends, lists.listed, lists.origins, given.rows]
-        out += [made.weights, rows, adam.moments, adam.squares, adam.steps]
-        out += [arrays.upload(x) for x in (given.xi, made.xi)]
+        out += [rendering.planes, rendering.ends, lists.listed, lists.origins, derivatives.rows]
+        out += [stepped.weights, rows, adam.moments, adam.squares, adam.steps]
+        out += [arrays.upload(x) for x in (derivatives.xi, stepped.xi)]
         out.append(arrays.upload(launch.mean_blocks(arrays, rendering, 8)))
         _, color, depth_m, mask, exposure = IMAGES["wide"]
         crop = slice(0, camera.height), slice(0, camera.width)
@@ -54,15 +54,15 @@ def assert_same_bits(first: list[np.ndarray], second: list[np.ndarray]) -> None:
         np.testing.assert_array_equal(one, other)
 
 
-NAMED = ("beyond the edges", "ties")  # Scenes of 16x16 pixels, so that the loss takes part.
+SQUARE_SCENES = ("beyond the edges", "ties")  # Scenes of 16x16 pixels, so that the loss takes part.
 
 
 def test_second_run_has_the_same_bits() -> None:
-    assert_same_bits(everything(ARRAYS, NAMED), everything(ARRAYS, NAMED))
+    assert_same_bits(results_of(ARRAYS, SQUARE_SCENES), results_of(ARRAYS, SQUARE_SCENES))
 
 
 def test_undefined_memory_has_no_effect() -> None:
-    assert_same_bits(everything(ARRAYS, NAMED), everything(OtherwiseFilledArrays(), NAMED))
+    assert_same_bits(results_of(ARRAYS, SQUARE_SCENES), results_of(OtherwiseFilledArrays(), SQUARE_SCENES))
 
 
 def test_order_of_the_programs_has_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,8 +71,8 @@ def test_order_of_the_programs_has_no_effect(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(launch, "LANES", 32)  # More programs.
     monkeypatch.setattr(launch, "PIXEL_LANES", 128)
-    names = ("turned", *NAMED)
-    forward = everything(ARRAYS, names)
+    names = ("turned", *SQUARE_SCENES)
+    forward = results_of(ARRAYS, names)
     set_place, is_moved = interpreter_builder.set_grid_idx, []
 
     def set_reversed(x: int, y: int, z: int) -> None:
@@ -81,10 +81,10 @@ def test_order_of_the_programs_has_no_effect(monkeypatch: pytest.MonkeyPatch) ->
         set_place(last - x, y, z)
 
     monkeypatch.setattr(interpreter_builder, "set_grid_idx", set_reversed)
-    assert_same_bits(forward, everything(ARRAYS, names))
+    assert_same_bits(forward, results_of(ARRAYS, names))
     assert sum(is_moved) > 100
 
 
 def test_torch_arrays_give_the_same_bits() -> None:
     pytest.importorskip("torch", reason="install torch to test the arrays of a GPU on the CPU")
-    assert_same_bits(everything(ARRAYS, NAMED), everything(TorchArrays("cpu"), NAMED))
+    assert_same_bits(results_of(ARRAYS, SQUARE_SCENES), results_of(TorchArrays("cpu"), SQUARE_SCENES))

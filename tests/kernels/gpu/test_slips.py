@@ -16,7 +16,7 @@ from tests.kernels.gpu.test_gradients import test_step_equals_the_step_of_the_cp
 from tests.kernels.gpu.test_loss import test_loss_equals_that_of_the_cpu as judge_loss
 from tests.kernels.gpu.test_projection import test_splats_equal_the_reference as judge_splats
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]  # Minutes, on a busy machine.
 KERNELS = Path(launch.__file__).parent
 # Module, correct text, wrong text, and the test that must fail.
 SLIPS = {
@@ -67,7 +67,7 @@ SLIPS = {
 
 @pytest.fixture(autouse=True)
 def _fresh_results(monkeypatch: pytest.MonkeyPatch):
-    """Keep results of other tests, and differences that slips cause, out of each other."""
+    """Compute all results again, and leave the planted differences out of the summary."""
     monkeypatch.setattr(agreement, "measured", {})
     scenes.of_kernel.cache_clear()
     test_gradients.gradients_of.cache_clear()
