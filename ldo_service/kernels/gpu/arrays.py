@@ -12,6 +12,8 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, install_command
 
+MAX_PAIRS = 2**31 - 1  # The kernels count pairs of a Gaussian and a tile in int32.
+
 
 class Arrays(Protocol):
     """Operations on arrays of one device. `Any` is an array of this device."""
@@ -42,7 +44,11 @@ class Arrays(Protocol):
         """Write rows of an array at some places, in place."""
 
     def offsets(self, counts: Any) -> tuple[Any, int]:
-        """Return the sums [M] int32 of all counts before each one, and the sum of all counts."""
+        """Return the sums [M] int32 of all counts before each one, and the sum of all counts.
+
+        Raises:
+            ConfigError: The sum of all counts does not fit into int32.
+        """
         ...
 
     def repeat(self, values: Any, counts: Any, total: int) -> Any:
@@ -50,6 +56,20 @@ class Arrays(Protocol):
 
     def starts(self, ascending: Any, n: int) -> Any:
         """Return the first places [n + 1] int32 of the values 0 to n in an ascending array."""
+
+
+def checked_total(total: int) -> int:
+    """Return the number of pairs of a Gaussian and a tile, if each pair has a place in int32.
+
+    Raises:
+        ConfigError: There are more pairs.
+    """
+    if total > MAX_PAIRS:
+        raise ConfigError(
+            f"the rendering has {total} pairs of a Gaussian and a tile, at most {MAX_PAIRS} are "
+            "possible. Use smaller images, or reduce mapper.offload.max_resident_gaussians."
+        )
+    return total
 
 
 class HostArray:
@@ -126,7 +146,7 @@ class HostArrays:
 
     def offsets(self, counts: HostArray) -> tuple[HostArray, int]:
         sums = np.cumsum(counts.values, dtype=np.int64)
-        total = int(sums[-1]) if len(sums) else 0
+        total = checked_total(int(sums[-1]) if len(sums) else 0)
         return HostArray((sums - counts.values).astype(np.int32)), total
 
     def repeat(self, values: HostArray, counts: HostArray, total: int) -> HostArray:
@@ -182,8 +202,8 @@ class TorchArrays:
         array[places.long()] = values
 
     def offsets(self, counts: Any) -> tuple[Any, int]:
-        sums = self._torch.cumsum(counts, 0)
-        total = int(sums[-1]) if len(sums) else 0
+        sums = self._torch.cumsum(counts, 0)  # The result is int64.
+        total = checked_total(int(sums[-1]) if len(sums) else 0)
         return (sums - counts).to(self._torch.int32), total
 
     def repeat(self, values: Any, counts: Any, total: int) -> Any:

@@ -70,6 +70,15 @@ def test_offsets_are_the_sums_before_each_count(arrays: Arrays) -> None:
     assert arrays.offsets(placed(arrays))[1] == 0
 
 
+def test_sum_of_counts_beyond_int32_raises_an_error(arrays: Arrays) -> None:
+    half = 2**30
+    assert arrays.offsets(placed(arrays, half, half - 1))[1] == 2**31 - 1
+    with pytest.raises(
+        ConfigError, match=r"2147483648 pairs .* at most 2147483647 .*max_resident"
+    ):
+        arrays.offsets(placed(arrays, half, half))
+
+
 def test_repeat_gives_each_value_as_often_as_its_count(arrays: Arrays) -> None:
     values, counts = placed(arrays, 7, 8, 9), placed(arrays, 2, 0, 3)
     got = arrays.download(arrays.repeat(values, counts, 5))

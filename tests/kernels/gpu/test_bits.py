@@ -62,7 +62,9 @@ def test_second_run_has_the_same_bits() -> None:
 
 
 def test_undefined_memory_has_no_effect() -> None:
-    assert_same_bits(results_of(ARRAYS, SQUARE_SCENES), results_of(OtherwiseFilledArrays(), SQUARE_SCENES))
+    assert_same_bits(
+        results_of(ARRAYS, SQUARE_SCENES), results_of(OtherwiseFilledArrays(), SQUARE_SCENES)
+    )
 
 
 def test_order_of_the_programs_has_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,4 +89,6 @@ def test_order_of_the_programs_has_no_effect(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_torch_arrays_give_the_same_bits() -> None:
     pytest.importorskip("torch", reason="install torch to test the arrays of a GPU on the CPU")
-    assert_same_bits(results_of(ARRAYS, SQUARE_SCENES), results_of(TorchArrays("cpu"), SQUARE_SCENES))
+    assert_same_bits(
+        results_of(ARRAYS, SQUARE_SCENES), results_of(TorchArrays("cpu"), SQUARE_SCENES)
+    )
