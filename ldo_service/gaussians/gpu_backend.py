@@ -9,7 +9,7 @@ from weakref import ref
 import numpy as np
 
 from ldo_service.geometry import se3
-from ldo_service.kernels.gpu import launch
+from ldo_service.kernels.gpu import descent, frame_loss, plane_rendering
 from ldo_service.kernels.gpu.arrays import Arrays
 
 from .adam import Adam, AdamConfig
@@ -41,7 +41,7 @@ class ResidentFrame:
 
     color: ref[np.ndarray]
     mask: ref[np.ndarray] | None
-    image: launch.Frame
+    image: frame_loss.Frame
     size: tuple[int, int]
     intrinsics: tuple[float, float, float, float]
     blocks: ImageBlocks
@@ -77,10 +77,10 @@ class GpuBackend:
         self.threads = 1
         self._arrays, self._config = arrays, adam
         self._adam, self._weights, self._limits = Adam(adam), weights, limits
-        self._corrections = arrays.upload(launch.bias_corrections(adam.beta1, adam.beta2))
+        self._corrections = arrays.upload(descent.bias_corrections(adam.beta1, adam.beta2))
         self._frames: OrderedDict[tuple[int, bool], ResidentFrame] = OrderedDict()
         self._gaussians: GaussianMap | None = None  # Map between `begin` and `end`.
-        self._rendered: tuple[ResidentFrame, launch.PlaneRendering, int] | None = None
+        self._rendered: tuple[ResidentFrame, plane_rendering.PlaneRendering, int] | None = None
         self.mirror = GaussianMirror(arrays)
 
     def begin(self, gaussians: GaussianMap) -> None:
@@ -97,21 +97,21 @@ class GpuBackend:
         frame = self._frame(view, is_half)
         binning = 2 if is_half else 1
         T_camera_map = se3.inverse(view.T_map_camera)
-        values = launch.view_of(T_camera_map, frame.intrinsics, binning)
-        rendering = launch.render(
+        values = plane_rendering.view_of(T_camera_map, frame.intrinsics, binning)
+        rendering = plane_rendering.render(
             self._arrays, self.mirror.rows, len(self._gaussians), values, *frame.size
         )
         self._rendered = frame, rendering, binning
 
     def estimate_exposure(self) -> Exposure | None:
         frame, rendering, _ = self._last()
-        means = launch.mean_blocks(self._arrays, rendering, block_side(rendering.width))
+        means = plane_rendering.mean_blocks(self._arrays, rendering, block_side(rendering.width))
         return fit_blocks(means[:3], means[3], frame.blocks)
 
     def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
         frame, rendering, binning = self._last()
         weights = self._weights
-        by_planes, (l1, d_ssim, depth, squared) = launch.image_loss(
+        by_planes, (l1, d_ssim, depth, squared) = frame_loss.image_loss(
             self._arrays,
             rendering,
             frame.image,
@@ -119,7 +119,7 @@ class GpuBackend:
             (weights.l1, weights.d_ssim, weights.depth),
         )
         mirror, config = self.mirror, self._config
-        adam = launch.AdamState(
+        adam = descent.AdamState(
             mirror.moments,
             mirror.squares,
             mirror.steps,
@@ -128,7 +128,7 @@ class GpuBackend:
             config.beta2,
             config.epsilon,
         )
-        made = launch.backpropagate(
+        made = descent.backpropagate(
             self._arrays,
             mirror.rows,
             rendering,
@@ -148,7 +148,7 @@ class GpuBackend:
         psnr_db = -10 * log10(max(squared, 1e-20))
         return ImageLoss(total, l1, d_ssim, depth, psnr_db), visible
 
-    def _last(self) -> tuple[ResidentFrame, launch.PlaneRendering, int]:
+    def _last(self) -> tuple[ResidentFrame, plane_rendering.PlaneRendering, int]:
         assert self._rendered is not None, "render comes first"
         return self._rendered
 
@@ -172,7 +172,7 @@ class GpuBackend:
         return ResidentFrame(
             ref(view.color),
             None if view.mask is None else ref(view.mask),
-            launch.Frame(color, depth_m, mask, measured),
+            frame_loss.Frame(color, depth_m, mask, measured),
             (camera.width, camera.height),
             (camera.fx, camera.fy, camera.cx, camera.cy),
             ImageBlocks.of(image.color, image.mask),

@@ -17,7 +17,7 @@ from ldo_service.gaussians.densification import DensificationConfig
 from ldo_service.geometry import Camera, RgbdFrame, se3
 from tests.gaussians.conftest import halved
 from tests.kernels.gpu.agreement import check
-from tests.kernels.gpu.scenes import ARRAYS, launch
+from tests.kernels.gpu.scenes import ARRAYS, descent, frame_loss, plane_rendering
 
 CONFIG = GaussianOptimizerConfig(half_share=0.2, usual_reach=500)
 # Few large Gaussians, because the interpreter takes some milliseconds for each pair with a tile.
@@ -29,8 +29,9 @@ def _setting(monkeypatch: pytest.MonkeyPatch):
     """Halve small images, launch few large programs, and compute without warnings."""
     monkeypatch.setattr("ldo_service.gaussians.optimizer.MIN_HALVED_PX", 32)
     monkeypatch.setattr("ldo_service.gaussians.exposure.MIN_BLOCK_PX", 4)
-    monkeypatch.setattr(launch, "LANES", 1024)
-    monkeypatch.setattr(launch, "PIXEL_LANES", 4096)
+    monkeypatch.setattr(plane_rendering, "LANES", 1024)
+    monkeypatch.setattr(descent, "LANES", 1024)
+    monkeypatch.setattr(frame_loss, "PIXEL_LANES", 4096)
     with np.errstate(all="ignore"):
         yield
 

@@ -10,5 +10,5 @@ does.
 - `loss`, `block_means`: image loss with its derivatives, and the block means for the exposure.
 - `projection_gradient`: derivatives by the Gaussians, and a step of Adam.
 - `arrays`: memory, sorting and sums, in NumPy for the interpreter and in torch for a GPU.
-- `launch`: functions that launch the kernels of one iteration.
+- `plane_rendering`, `frame_loss`, `descent`: functions that launch the kernels of one iteration.
 """

@@ -37,7 +37,9 @@ from ldo_service.kernels.gpu import (
     projection_gradient,
 )
 from ldo_service.kernels.gpu.arithmetic import PINNED
-from ldo_service.kernels.gpu.launch import CORRECTIONS, FOUR_WARPS, LANES, PIXEL_LANES
+from ldo_service.kernels.gpu.descent import CORRECTIONS
+from ldo_service.kernels.gpu.frame_loss import PIXEL_LANES
+from ldo_service.kernels.gpu.plane_rendering import FOUR_WARPS, LANES
 
 # Compute capabilities: Turing, A100, RTX 30, RTX 40, H100, B200, RTX 50. The Jetson Orin, 87, uses
 # the same code as 86.
@@ -50,7 +52,7 @@ DIFFERING = re.compile(r"\b(fma\.|mad\.f|\S*\.approx|\S*\.ftz|div\.full|\S*tf32)
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel as `launch` starts it.
+    """A kernel as an iteration launches it.
 
     Attributes:
         function: The kernel.

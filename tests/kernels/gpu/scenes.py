@@ -24,7 +24,7 @@ if os.environ.get("LDO_ISA") != "baseline":
     # Wider instruction sets fuse products with sums, which the kernels do not.
     pytest.skip(REASON + ", and LDO_ISA=baseline", allow_module_level=True)
 
-from ldo_service.kernels.gpu import launch  # noqa: E402
+from ldo_service.kernels.gpu import descent, frame_loss, plane_rendering  # noqa: E402, F401
 
 MAX_PAIRS = 150
 TURNED = se3.exp(np.array([0.15, -0.2, 0.1, 0.1, -0.15, 0.2]))
@@ -54,7 +54,7 @@ class Scene:
     def view(self) -> np.ndarray:
         camera = self.camera
         intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
-        return launch.view_of(self.T_camera_map, intrinsics, self.binning)
+        return plane_rendering.view_of(self.T_camera_map, intrinsics, self.binning)
 
     @property
     def T_rounded(self) -> np.ndarray:
@@ -171,13 +171,15 @@ NAMES = [name for name in SCENES if name != "no Gaussians"]
 SEAM = Scene(faint_wall(), camera_of(16, 16), np.eye(4))
 
 
-def rendered(scene: Scene) -> launch.PlaneRendering:
+def rendered(scene: Scene) -> plane_rendering.PlaneRendering:
     rows, camera = ARRAYS.upload(scene.rows), scene.camera
-    return launch.render(ARRAYS, rows, len(scene.rows), scene.view, camera.width, camera.height)
+    return plane_rendering.render(
+        ARRAYS, rows, len(scene.rows), scene.view, camera.width, camera.height
+    )
 
 
 @cache
-def of_kernel(name: str) -> launch.PlaneRendering:
+def of_kernel(name: str) -> plane_rendering.PlaneRendering:
     """Return the rendering of a scene by the GPU kernels."""
     return rendered(SCENES[name])
 

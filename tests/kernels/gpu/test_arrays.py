@@ -73,9 +73,7 @@ def test_offsets_are_the_sums_before_each_count(arrays: Arrays) -> None:
 def test_sum_of_counts_beyond_int32_raises_an_error(arrays: Arrays) -> None:
     half = 2**30
     assert arrays.offsets(placed(arrays, half, half - 1))[1] == 2**31 - 1
-    with pytest.raises(
-        ConfigError, match=r"2147483648 pairs .* at most 2147483647 .*max_resident"
-    ):
+    with pytest.raises(ConfigError, match=r"2147483648 pairs .* at most 2147483647 .*max_resident"):
         arrays.offsets(placed(arrays, half, half))
 
 

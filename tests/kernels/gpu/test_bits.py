@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ldo_service.kernels.gpu.arrays import Arrays, HostArray, HostArrays, TorchArrays
-from tests.kernels.gpu.scenes import ARRAYS, SCENES, launch
+from tests.kernels.gpu.scenes import ARRAYS, SCENES, descent, frame_loss, plane_rendering
 from tests.kernels.gpu.test_gradients import BETAS, EPSILON, PENALTY, state_of
 from tests.kernels.gpu.test_loss import IMAGES, WEIGHTS
 
@@ -23,27 +23,27 @@ def results_of(arrays: Arrays, names: tuple[str, ...] = ("turned",)) -> list[np.
         scene = SCENES[name]
         camera, n = scene.camera, len(scene.rows)
         rows, by_planes = arrays.upload(scene.rows), arrays.upload(scene.by_planes())
-        rendering = launch.render(arrays, rows, n, scene.view, camera.width, camera.height)
-        derivatives = launch.backpropagate(arrays, rows, rendering, by_planes)
+        rendering = plane_rendering.render(arrays, rows, n, scene.view, camera.width, camera.height)
+        derivatives = descent.backpropagate(arrays, rows, rendering, by_planes)
         state = state_of(n)
         moments = (arrays.upload(x) for x in (state.mean, state.square, state.steps))
-        corrections = arrays.upload(launch.bias_corrections(*BETAS))
-        adam = launch.AdamState(*moments, corrections, *BETAS, EPSILON)
-        stepped = launch.backpropagate(
+        corrections = arrays.upload(descent.bias_corrections(*BETAS))
+        adam = descent.AdamState(*moments, corrections, *BETAS, EPSILON)
+        stepped = descent.backpropagate(
             arrays, rows, rendering, by_planes, adam=adam, rates=state.rates, **PENALTY
         )
         lists = rendering.lists
         out += [rendering.planes, rendering.ends, lists.listed, lists.origins, derivatives.rows]
         out += [stepped.weights, rows, adam.moments, adam.squares, adam.steps]
         out += [arrays.upload(x) for x in (derivatives.xi, stepped.xi)]
-        out.append(arrays.upload(launch.mean_blocks(arrays, rendering, 8)))
+        out.append(arrays.upload(plane_rendering.mean_blocks(arrays, rendering, 8)))
         _, color, depth_m, mask, exposure = IMAGES["wide"]
         crop = slice(0, camera.height), slice(0, camera.width)
         if camera.height <= 18:
             images = (np.ascontiguousarray(x[..., *crop]) for x in (color, depth_m, mask))
-            frame = launch.Frame(*map(arrays.upload, images), 100)
+            frame = frame_loss.Frame(*map(arrays.upload, images), 100)
             weights = WEIGHTS.l1, WEIGHTS.d_ssim, WEIGHTS.depth
-            by_loss, means = launch.image_loss(arrays, rendering, frame, exposure, weights)
+            by_loss, means = frame_loss.image_loss(arrays, rendering, frame, exposure, weights)
             out += [by_loss, arrays.upload(means)]
     return [arrays.download(x) for x in out]
 
@@ -71,8 +71,9 @@ def test_order_of_the_programs_has_no_effect(monkeypatch: pytest.MonkeyPatch) ->
     """A program reads nothing that another one writes, and no two programs write the same place."""
     from triton.runtime.interpreter import interpreter_builder
 
-    monkeypatch.setattr(launch, "LANES", 32)  # More programs.
-    monkeypatch.setattr(launch, "PIXEL_LANES", 128)
+    monkeypatch.setattr(plane_rendering, "LANES", 32)  # More programs.
+    monkeypatch.setattr(descent, "LANES", 32)
+    monkeypatch.setattr(frame_loss, "PIXEL_LANES", 128)
     names = ("turned", *SQUARE_SCENES)
     forward = results_of(ARRAYS, names)
     set_place, is_moved = interpreter_builder.set_grid_idx, []

@@ -8,7 +8,7 @@ from autograd import grad
 from ldo_service.gaussians.renderer import AdamStep
 from ldo_service.kernels import _adam
 from tests.kernels.gpu.agreement import check, peak, relative
-from tests.kernels.gpu.scenes import ARRAYS, NAMES, SCENES, Scene, host, launch, of_cpu, of_kernel
+from tests.kernels.gpu.scenes import ARRAYS, NAMES, SCENES, Scene, descent, host, of_cpu, of_kernel
 from tests.reference.render import render_reference
 
 FIELDS = {
@@ -24,16 +24,16 @@ PENALTY = {"needle_weight": 30.0, "needle_ratio": 1.5}
 MAX_SIGMA_PX = 1.2
 
 
-def differentiated(name: str, **options: float) -> launch.Derivatives:
+def differentiated(name: str, **options: float) -> descent.Derivatives:
     scene = SCENES[name]
     by_planes = ARRAYS.upload(scene.by_planes())
-    return launch.backpropagate(
+    return descent.backpropagate(
         ARRAYS, ARRAYS.upload(scene.rows), of_kernel(name), by_planes, **options
     )
 
 
 @cache
-def gradients_of(name: str) -> launch.Derivatives:
+def gradients_of(name: str) -> descent.Derivatives:
     return differentiated(name)
 
 
@@ -90,10 +90,10 @@ def state_of(n: int) -> AdamStep:
     return AdamStep(np.empty(0), mean, square, steps, np.array(rates, np.float32), *BETAS, EPSILON)
 
 
-def on_device(state: AdamStep) -> launch.AdamState:
+def on_device(state: AdamStep) -> descent.AdamState:
     arrays = (ARRAYS.upload(x) for x in (state.mean, state.square, state.steps))
-    corrections = ARRAYS.upload(launch.bias_corrections(*BETAS))
-    return launch.AdamState(*arrays, corrections, *BETAS, EPSILON)
+    corrections = ARRAYS.upload(descent.bias_corrections(*BETAS))
+    return descent.AdamState(*arrays, corrections, *BETAS, EPSILON)
 
 
 @pytest.mark.parametrize("name", ["turned", "capped", "broken rows", "binned"])
@@ -102,7 +102,7 @@ def test_step_equals_the_step_of_the_cpu(name: str) -> None:
     by_planes, n = scene.by_planes(), len(scene.rows)
     gradients = host(differentiated(name, **PENALTY).rows)
     adam, rows = on_device(state_of(n)), ARRAYS.upload(scene.rows)
-    made = launch.backpropagate(
+    made = descent.backpropagate(
         ARRAYS,
         rows,
         of_kernel(name),
@@ -131,7 +131,7 @@ def test_step_equals_the_step_of_the_cpu(name: str) -> None:
 
 
 def stepped_by_cpu(
-    name: str, scene: Scene, gradients: np.ndarray, adam: launch.AdamState, rows: np.ndarray
+    name: str, scene: Scene, gradients: np.ndarray, adam: descent.AdamState, rows: np.ndarray
 ) -> None:
     """Compare the step with that of the C++ kernel for the same gradients."""
     cpu, wanted = state_of(len(scene.rows)), scene.rows.copy()

@@ -9,7 +9,7 @@ from autograd import grad
 from ldo_service.gaussians.exposure import Exposure
 from ldo_service.gaussians.loss import LossWeights, image_loss
 from tests.kernels.gpu.agreement import check, peak, relative
-from tests.kernels.gpu.scenes import ARRAYS, host, launch, of_kernel
+from tests.kernels.gpu.scenes import ARRAYS, frame_loss, host, of_kernel, plane_rendering
 from tests.reference.loss import loss_reference
 
 WEIGHTS = LossWeights(0.8, 0.2, 0.5)
@@ -38,11 +38,11 @@ IMAGES = {
 }
 
 
-def rendering_of(planes: np.ndarray) -> launch.PlaneRendering:
+def rendering_of(planes: np.ndarray) -> plane_rendering.PlaneRendering:
     """Return a rendering with given planes; the loss reads nothing else of it."""
     none = of_kernel("no Gaussians")
     height, width = planes.shape[1:]
-    return launch.PlaneRendering(
+    return plane_rendering.PlaneRendering(
         none.view, 1.0, width, height, none.splats, none.lists, ARRAYS.upload(planes), none.ends
     )
 
@@ -50,9 +50,9 @@ def rendering_of(planes: np.ndarray) -> launch.PlaneRendering:
 def loss_of_kernel(given: Images) -> tuple[np.ndarray, np.ndarray]:
     planes, color, depth_m, mask, exposure = given
     measured = int(np.count_nonzero((depth_m > 0) & (mask > 0)))
-    frame = launch.Frame(*map(ARRAYS.upload, (color, depth_m, mask)), measured)
+    frame = frame_loss.Frame(*map(ARRAYS.upload, (color, depth_m, mask)), measured)
     weights = WEIGHTS.l1, WEIGHTS.d_ssim, WEIGHTS.depth
-    by_planes, means = launch.image_loss(ARRAYS, rendering_of(planes), frame, exposure, weights)
+    by_planes, means = frame_loss.image_loss(ARRAYS, rendering_of(planes), frame, exposure, weights)
     return host(by_planes), means
 
 
@@ -100,7 +100,7 @@ def test_loss_without_measured_depth_has_no_depth_term() -> None:
 @pytest.mark.parametrize("side", [3, 8])
 def test_block_means_equal_those_of_opencv(side: int) -> None:
     planes = IMAGES["wide"][0]
-    got = launch.mean_blocks(ARRAYS, rendering_of(planes), side)
+    got = plane_rendering.mean_blocks(ARRAYS, rendering_of(planes), side)
     down, across = 18 // side, 37 // side
     assert got.shape == (4, down, across)
     for k, plane in enumerate((0, 1, 2, 4)):
@@ -110,5 +110,5 @@ def test_block_means_equal_those_of_opencv(side: int) -> None:
 
 
 def test_image_smaller_than_a_block_has_no_block_means() -> None:
-    got = launch.mean_blocks(ARRAYS, rendering_of(IMAGES["smaller than the window"][0]), 8)
+    got = plane_rendering.mean_blocks(ARRAYS, rendering_of(IMAGES["smaller than the window"][0]), 8)
     assert got.shape == (4, 1, 0)

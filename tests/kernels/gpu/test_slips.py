@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 
 from tests.kernels.gpu import agreement, scenes, test_gradients
-from tests.kernels.gpu.scenes import launch
+from tests.kernels.gpu.scenes import descent, frame_loss, plane_rendering
 from tests.kernels.gpu.test_blending import test_planes_equal_those_of_the_cpu as judge_planes
 from tests.kernels.gpu.test_gradients import test_derivatives_equal_those_of_the_cpu as judge_rows
 from tests.kernels.gpu.test_gradients import test_step_equals_the_step_of_the_cpu as judge_step
@@ -17,7 +17,7 @@ from tests.kernels.gpu.test_loss import test_loss_equals_that_of_the_cpu as judg
 from tests.kernels.gpu.test_projection import test_splats_equal_the_reference as judge_splats
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]  # Minutes, on a busy machine.
-KERNELS = Path(launch.__file__).parent
+KERNELS = Path(descent.__file__).parent
 # Module, correct text, wrong text, and the test that must fail.
 SLIPS = {
     "row that is not finite": (
@@ -100,10 +100,9 @@ def test_planted_error_is_detected(
         folder = tmp_path / str(is_wrong)
         folder.mkdir()
         module = changed_module(name, content, folder)
-        if name == "projection_gradient":
-            monkeypatch.setattr(launch, "project_backward", module.project_backward)
-        else:
-            monkeypatch.setattr(launch, name, module)
+        for user in (plane_rendering, frame_loss, descent):
+            if hasattr(user, name):
+                monkeypatch.setattr(user, name, module)
         scenes.of_kernel.cache_clear()
         test_gradients.gradients_of.cache_clear()
         judge_must(judge, fail=is_wrong)
