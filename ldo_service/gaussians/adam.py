@@ -54,6 +54,18 @@ class AdamConfig:
         return np.array(out, np.float32)
 
 
+def places_of_remaining(old_ids: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the old places [M] and the new places [M] of the Gaussians that are in both maps.
+
+    Args:
+        old_ids: Identifiers before a change of the map, [K], ascending.
+        ids: Identifiers after it, [N].
+    """
+    old_places = np.searchsorted(old_ids, ids)
+    stays = np.append(old_ids, -1)[old_places] == ids
+    return old_places[stays], np.flatnonzero(stays)
+
+
 class Adam:
     """Adam optimizer of a map, with moments and a step count for each Gaussian.
 
@@ -61,6 +73,7 @@ class Adam:
 
     Attributes:
         matches: Counter that increases when the moments are matched to other rows of the map.
+        restores: Counter that increases when `restore` replaces the moments.
     """
 
     def __init__(self, config: AdamConfig | None = None) -> None:
@@ -69,7 +82,7 @@ class Adam:
         self._ids = np.zeros(0, np.int64)
         self._moments = [aligned_rows(0), aligned_rows(0)]  # First, second; may have spare rows.
         self._steps = np.zeros(0, np.int32)
-        self.matches = 0
+        self.matches = self.restores = 0
         # The map that `_ids` was last matched to, with its `membership` counter at that time.
         self._followed: tuple[ref[GaussianMap], int] | None = None
 
@@ -182,6 +195,7 @@ class Adam:
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore the exact state of a `snapshot`."""
         self._followed = None
+        self.restores += 1
         self._ids, self._steps = state["ids"].copy(), state["steps"].copy()
         self._reserve(len(self._ids))
         for moment, saved in zip(self._moments, (state["mean"], state["square"]), strict=True):
@@ -217,9 +231,7 @@ class Adam:
         All other rows become zero.
         """
         n = len(self._ids)
-        old_places = np.searchsorted(self._ids, ids)
-        stays = np.append(self._ids, -1)[old_places] == ids
-        old_places, places = old_places[stays], np.flatnonzero(stays)
+        old_places, places = places_of_remaining(self._ids, ids)
         steps, self._steps = self._steps, np.zeros(len(ids), np.int32)
         self._steps[places] = steps[old_places]
         self._reserve(len(ids))

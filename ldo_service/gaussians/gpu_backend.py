@@ -186,4 +186,3 @@ class GpuBackend:
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self._adam.restore(state)
-        self.mirror.forget()

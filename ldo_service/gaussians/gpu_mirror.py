@@ -7,14 +7,18 @@ import numpy as np
 
 from ldo_service.kernels.gpu.arrays import Arrays
 
-from .adam import Adam
+from .adam import Adam, places_of_remaining
 from .model import GaussianMap
 from .renderer import AdamStep
 from .rows import ROW
 
 
 class GaussianMirror:
-    """Rows, moments and step counts of a map on a device, 196 bytes for each Gaussian.
+    """Rows, moments and step counts of a map on a device.
+
+    A Gaussian takes 196 bytes. If the map grows, the capacity is at least doubled, so that the
+    mirror takes up to 392 bytes for each Gaussian. While a change of the map moves Gaussians, the
+    array that is moved takes up to 192 bytes more.
 
     The map and its `Adam` on the CPU stay the originals. `update` uploads what changed there since
     the last call, and `write_back` downloads what the device changed. Between the two calls, the
@@ -32,30 +36,27 @@ class GaussianMirror:
     def __init__(self, arrays: Arrays) -> None:
         self._arrays = arrays
         self._map: ref[GaussianMap] | None = None
-        self._matches = 0
+        self._matches = self._restores = 0
         self._ids = np.zeros(0, np.int64)
         self._known = np.zeros((0, ROW), np.float32)  # Rows on the device.
         self._capacity = 0
         self.rows, self.moments, self.squares, self.steps = self._zeros(0)
         self.uploaded = self.downloaded = 0
 
-    def forget(self) -> None:
-        """Forget the content, so that the next `update` uploads all rows and moments."""
-        self._map = None
-
     def update(self, gaussians: GaussianMap, adam: Adam) -> None:
         """Upload all rows that the map has changed, and follow additions and removals.
 
-        If the moments were matched to other rows more than once since the last call, the moments
-        are uploaded too, because the path of each row is then unknown.
+        If the moments were restored since the last call, or were matched to other rows more than
+        once, the moments are uploaded too, because the path of each row is then unknown.
         """
         state = adam.arguments(gaussians)
         is_known = self._map is not None and self._map() is gaussians
-        if is_known and adam.matches - self._matches <= 1:
+        if is_known and adam.restores == self._restores and adam.matches - self._matches <= 1:
             self._follow(gaussians.ids)
         else:
             self._replace(gaussians, state)
-        self._map, self._matches = ref(gaussians), adam.matches
+        self._map = ref(gaussians)
+        self._matches, self._restores = adam.matches, adam.restores
         self._ids = gaussians.ids.copy()
         is_changed = (self._known.view(np.int32) != gaussians.rows.view(np.int32)).any(axis=1)
         changed = np.flatnonzero(is_changed)
@@ -94,22 +95,31 @@ class GaussianMirror:
     def _follow(self, ids: np.ndarray) -> None:
         """Move rows and state of the remaining Gaussians to their new places.
 
-        The state of all other places becomes zero, as in `Adam`.
+        The state of all other places becomes zero, as in `Adam`. Additions at the end of the map
+        move nothing while the capacity suffices.
         """
-        if np.array_equal(ids, self._ids):
+        n = len(self._ids)
+        is_extended = np.array_equal(ids[:n], self._ids)
+        if is_extended and len(ids) <= self._capacity:
+            if len(ids) > n:
+                added = np.zeros((len(ids) - n, ROW), np.float32)
+                self._known = np.concatenate([self._known, added])
             return
-        old_places = np.searchsorted(self._ids, ids)
-        stays = np.append(self._ids, -1)[old_places] == ids
-        old_places, places = old_places[stays], np.flatnonzero(stays)
+        old_places, places = places_of_remaining(self._ids, ids)
         if len(ids) > self._capacity:
             self._capacity = max(len(ids), 2 * self._capacity)
         kept, moved_to = (self._arrays.upload(x.astype(np.int32)) for x in (old_places, places))
-        new = self._zeros(self._capacity)
-        for array, old in zip(
-            new, (self.rows, self.moments, self.squares, self.steps), strict=True
-        ):
-            self._arrays.put(array, moved_to, self._arrays.take(old, kept))
-        self.rows, self.moments, self.squares, self.steps = new
+
+        def moved(old: Any, shape: tuple[int, ...], dtype: type) -> Any:
+            new = self._arrays.zeros((self._capacity, *shape), dtype)
+            self._arrays.put(new, moved_to, self._arrays.take(old, kept))
+            return new
+
+        # The arrays are moved one after the other, so that only one of them exists twice.
+        self.rows = moved(self.rows, (ROW,), np.float32)
+        self.moments = moved(self.moments, (ROW,), np.float32)
+        self.squares = moved(self.squares, (ROW,), np.float32)
+        self.steps = moved(self.steps, (), np.int32)
         known = np.zeros((len(ids), ROW), np.float32)
         known[places] = self._known[old_places]
         self._known = known

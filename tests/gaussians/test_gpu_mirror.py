@@ -114,11 +114,36 @@ def test_restored_map_and_moments_are_uploaded_whole(followed: tuple) -> None:
     mirror.write_back(gaussians, adam)
     gaussians = GaussianMap.restore(saved)
     adam.restore(moments)
-    mirror.forget()
     mirror.update(gaussians, adam)
     assert mirror.uploaded == 40
     assert_equals_original(mirror, gaussians, adam)
     assert adam.arguments(gaussians).steps.max() == 1
+
+
+def test_restored_moments_of_the_same_map_are_uploaded(followed: tuple) -> None:
+    gaussians, adam, mirror = followed
+    saved = adam.snapshot()
+    step_on_device(mirror, np.arange(40))
+    mirror.write_back(gaussians, adam)
+    adam.restore(saved)
+    mirror.update(gaussians, adam)
+    assert_equals_original(mirror, gaussians, adam)
+
+
+def test_additions_within_the_capacity_move_no_rows(followed: tuple) -> None:
+    gaussians, adam, mirror = followed
+    gaussians.add(rows_of(10, 7), 7)  # The capacity of 40 becomes 80.
+    mirror.update(gaussians, adam)
+    arrays = mirror.rows, mirror.moments, mirror.squares, mirror.steps
+    gaussians.add(rows_of(30, 8), 8)
+    mirror.update(gaussians, adam)
+    assert (mirror.rows, mirror.moments, mirror.squares, mirror.steps) == arrays
+    assert len(mirror.rows) == 80
+    assert_equals_original(mirror, gaussians, adam)
+    gaussians.add(rows_of(1, 9), 9)
+    mirror.update(gaussians, adam)
+    assert mirror.rows is not arrays[0]
+    assert_equals_original(mirror, gaussians, adam)
 
 
 def test_another_map_is_uploaded_whole(followed: tuple) -> None:
