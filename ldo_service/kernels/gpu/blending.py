@@ -9,7 +9,7 @@ threads. In the other order, each sum takes 32 shuffle instructions instead of 5
 import triton
 import triton.language as tl
 
-from .arithmetic import PINNED, exp2
+from .arithmetic import PINNED, exp2, kernel
 from .projection import LOG2_MIN_ALPHA, ROW, TILE
 
 ONE_WARP = {"num_warps": 1, **PINNED}
@@ -51,7 +51,7 @@ def largest_of_block(T):
     return tl.max(T, 0, keep_dims=True)
 
 
-@triton.jit
+@kernel
 def blend_forward(splats, listed, reached, starts, columns, width, height, planes, ends):
     """Blend the splats of each tile.
 
@@ -123,7 +123,7 @@ def over_pixels(values):
     return tl.sum(tl.sum(values, 0), 0)
 
 
-@triton.jit
+@kernel
 def blend_backward(
     splats, listed, reached, origins, starts, ends, columns, width, height, planes, by_planes, sums
 ):

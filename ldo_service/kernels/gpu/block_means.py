@@ -1,10 +1,11 @@
 """Means of the rendered planes over square blocks, from which the exposure is estimated."""
 
-import triton
 import triton.language as tl
 
+from .arithmetic import kernel
 
-@triton.jit
+
+@kernel
 def block_means(planes, width, height, side, across, down, out, LANES: tl.constexpr):
     """Average color and opacity over blocks of side x side pixels, one program per mean.
 

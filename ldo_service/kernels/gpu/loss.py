@@ -7,7 +7,7 @@ derivatives of SSIM by the windowed means. One lane computes one value of [3, H,
 import triton
 import triton.language as tl
 
-from .arithmetic import sign
+from .arithmetic import kernel, sign
 
 # exp(-k^2 / (2 1.5^2)) / sum, for k = 0 .. 5, as in `kernels/gaussian_window.hpp`.
 TAP0 = tl.constexpr(0.26601171)
@@ -57,7 +57,7 @@ def exposed_at(planes, color, mask, exposure, at, channel, pixel, is_live):
     return tl.where(counts, x, 0.0), tl.where(counts, y, 0.0), counts, gain
 
 
-@triton.jit
+@kernel
 def means_along_rows(planes, color, mask, exposure, width, height, out, BLOCK: tl.constexpr):
     """Apply the window along rows to x, y, x^2 + y^2 and x y.
 
@@ -100,7 +100,7 @@ def window_along_columns(images, at, row, width, height, is_live):
     return out
 
 
-@triton.jit
+@kernel
 def ssim_derivatives(along_rows, width, height, out, ssims, BLOCK: tl.constexpr):
     """Apply the window along columns, and compute SSIM and its derivatives.
 
@@ -132,7 +132,7 @@ def ssim_derivatives(along_rows, width, height, out, ssims, BLOCK: tl.constexpr)
     tl.store(ssims + tl.program_id(0), tl.sum(tl.where(is_live, ssim, 0.0), 0))
 
 
-@triton.jit
+@kernel
 def derivatives_along_rows(derivatives, width, height, out, BLOCK: tl.constexpr):
     """Apply the window along rows to the output [3, 3, H, W] of `ssim_derivatives`."""
     at, _channel, _pixel, _row, column, is_live = place_of(width, height, BLOCK)
@@ -146,7 +146,7 @@ def derivatives_along_rows(derivatives, width, height, out, BLOCK: tl.constexpr)
         tl.store(out + image * size + at, value, is_live)
 
 
-@triton.jit
+@kernel
 def color_gradient(
     planes,
     color,
@@ -199,7 +199,7 @@ def color_gradient(
     tl.store(squares + tl.program_id(0), tl.sum(difference * difference, 0))
 
 
-@triton.jit
+@kernel
 def depth_gradient(
     planes, depth_m, mask, width, height, step, by_planes, errors, BLOCK: tl.constexpr
 ):

@@ -9,7 +9,7 @@ low_pass, box.
 import triton
 import triton.language as tl
 
-from .arithmetic import LOG2_E, clamp, dot, exp, log2
+from .arithmetic import LOG2_E, clamp, dot, exp, kernel, log2
 
 ROW = tl.constexpr(16)
 NEAR = tl.constexpr(0.05)  # Near plane, meters.
@@ -128,7 +128,7 @@ def pixels_within(center, radius, size):
     return first, last, is_near & (first <= last)
 
 
-@triton.jit
+@kernel
 def project_and_cull(rows, n, view, width, height, splats, ranges, pairs, BLOCK: tl.constexpr):
     """Compute the splat of each Gaussian, one lane per Gaussian.
 
@@ -197,7 +197,7 @@ def project_and_cull(rows, n, view, width, height, splats, ranges, pairs, BLOCK:
     tl.store(pairs + i, tl.where(is_drawn, (x1 - x0 + 1) * (y1 - y0 + 1), 0), is_live)
 
 
-@triton.jit
+@kernel
 def depth_keys(splats, visible, n, keys, BLOCK: tl.constexpr):
     """Write the bits of the depth of each visible splat, whose order is that of the depths.
 
@@ -220,7 +220,7 @@ def exponent_at(dx, dy, a, b, c):
     return dx * (dx * a + dy * b) + dy * dy * c
 
 
-@triton.jit
+@kernel
 def list_pairs(
     splats, ranges, owners, firsts, n_pairs, columns, tiles, reached, BLOCK: tl.constexpr
 ):

@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from .arithmetic import add_scaled, cross, dot, exp, log
+from .arithmetic import add_scaled, cross, dot, exp, kernel, log
 from .projection import (
     NEAR,
     ROW,
@@ -64,7 +64,7 @@ def only_at(numbers, number, value):
     return tl.where(numbers == number, value, 0.0)
 
 
-@triton.jit
+@kernel
 def project_backward(
     rows,
     view,

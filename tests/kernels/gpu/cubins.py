@@ -5,8 +5,10 @@
 The program prints registers, stack and shared memory of each kernel as a table. It exits with
 status 1 if a kernel uses a stack or spills registers, needs more registers than its limit, or
 contains an instruction whose result differs between GPUs: an approximation, a flush of denormal
-numbers, TF32, or a fused product and sum. At first it compiles two kernels with such faults, and
-checks that it detects them. Without arguments, it compiles for all of CAPABILITIES.
+numbers, TF32, or a fused product and sum. A kernel must not depend on the values of its integers
+either, because a launch would then compile other code than this program. At first the program
+compiles two kernels with such faults, and checks that it detects them. Without arguments, it
+compiles for all of CAPABILITIES.
 """
 
 import os
@@ -16,7 +18,7 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -270,19 +272,37 @@ def faults_of(kernel: Kernel, capability: int, made: Compiled) -> list[str]:
     return faults
 
 
+def specialized_integers(kernel: Kernel) -> list[str]:
+    """Return a fault for each integer argument for whose value Triton would compile again."""
+    parameters = zip(kernel.function.params, kernel.types, strict=False)
+    return [
+        f"{kernel.name}: {parameter.name} is missing in SIZES of arithmetic.py"
+        for parameter, kind in parameters
+        if kind == INT and not parameter.do_not_specialize
+    ]
+
+
 def undetected_faults() -> list[str]:
-    """Compile a kernel with too few registers and one with fused products, for sm_86."""
+    """Return a fault for each planted fault that is not detected.
+
+    The planted faults are a kernel with too few registers and one with fused products, compiled for
+    sm_86, and one whose integers are specialized.
+    """
     by_name = {kernel.name: i for i, kernel in enumerate(KERNELS)}
     spilling = compiled(by_name["blend_backward"], 86, {"maxnreg": 64})
     fused = compiled(by_name["blend_forward"], 86, {"enable_fp_fusion": True})
     assert PINNED["enable_fp_fusion"] is False
+    forward = KERNELS[by_name["blend_forward"]]
+    specialized = specialized_integers(replace(forward, function=triton.jit(forward.function.fn)))
     missed = [] if spilling.stack else ["spilled registers were not detected"]
-    return missed + ([] if fused.differing else ["fused products were not detected"])
+    missed += [] if fused.differing else ["fused products were not detected"]
+    return missed + ([] if len(specialized) == 3 else ["specialized integers were not detected"])
 
 
 def main(arguments: list[str]) -> int:
     """Compile all kernels, print the table, and return the exit status."""
     faults, rows = undetected_faults(), []
+    faults += [fault for kernel in KERNELS for fault in specialized_integers(kernel)]
     chosen = [c for c in CAPABILITIES if not arguments or str(c) in arguments]
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         for i, kernel in enumerate(KERNELS):
