@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.kernels.gpu.agreement import summary
+from tests.kernels.gpu import agreement
 
 
 @pytest.fixture(autouse=True)
@@ -32,8 +32,27 @@ def _arithmetic_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Send the differences of a worker of pytest-xdist to the main process."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["differences"] = agreement.measured
+
+
+class Collector:
+    """Collector of the differences that the workers of pytest-xdist measured."""
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node: Any) -> None:
+        for kind, errors in getattr(node, "workeroutput", {}).get("differences", {}).items():
+            agreement.measured.setdefault(kind, []).extend(map(tuple, errors))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(Collector())
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    lines = summary()
+    lines = agreement.summary()
     if lines:
         terminalreporter.section("largest differences")
         terminalreporter.write_line("\n".join(lines))
