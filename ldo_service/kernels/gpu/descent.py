@@ -12,7 +12,6 @@ from .plane_rendering import FOUR_WARPS, ROW, TILE, PlaneRendering, programs_for
 
 LANES = 128  # Lanes of the programs, each of which computes one Gaussian.
 CORRECTIONS = 1024  # Number of steps after which 1 - beta^steps is 1 in practice.
-MAX_LIMIT = 1e30  # A limit on sizes that no Gaussian reaches; infinity would become NaN.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -136,7 +135,7 @@ def backpropagate(
             *state,
             needle_weight,
             float(np.log(needle_ratio)),
-            min(max_sigma_px / rendering.focal_px, MAX_LIMIT),
+            max_sigma_px / rendering.focal_px,
             weights,
             by_pose,
             LAST_STEP=CORRECTIONS - 1,
