@@ -64,6 +64,103 @@ def only_at(numbers, number, value):
     return tl.where(numbers == number, value, 0.0)
 
 
+@triton.jit
+def sums_of_pairs(sums, first, count, BLOCK: tl.constexpr):
+    """Return the eleven sums of each splat, added over its `count` pairs from `first` on."""
+    zero = tl.zeros([BLOCK], tl.float32)
+    V, Vx, Vy, Vxx, Vxy, Vyy = zero, zero, zero, zero, zero, zero
+    red, green, blue, depth, weight = zero, zero, zero, zero, zero
+    for k in range(tl.max(count)):
+        has_pair = k < count
+        at = sums + (first + k).to(tl.int64) * 16
+        V += tl.load(at, has_pair, 0.0)
+        Vx += tl.load(at + 1, has_pair, 0.0)
+        Vy += tl.load(at + 2, has_pair, 0.0)
+        Vxx += tl.load(at + 3, has_pair, 0.0)
+        Vxy += tl.load(at + 4, has_pair, 0.0)
+        Vyy += tl.load(at + 5, has_pair, 0.0)
+        red += tl.load(at + 6, has_pair, 0.0)
+        green += tl.load(at + 7, has_pair, 0.0)
+        blue += tl.load(at + 8, has_pair, 0.0)
+        depth += tl.load(at + 9, has_pair, 0.0)
+        weight += tl.load(at + 10, has_pair, 0.0)
+    return V, Vx, Vy, Vxx, Vxy, Vyy, red, green, blue, depth, weight
+
+
+@triton.jit
+def store_pose(by_pose, p, g, perspective, row_u, row_v, is_live):
+    """Store the sum of the derivatives by the pose over the lanes, as the row of the program.
+
+    Args:
+        by_pose: Output, [programs, 8].
+        p: Point in the camera frame.
+        g: Derivative by this point.
+        perspective: Entries (ju, jv, ku, kv) of the derivative of the perspective.
+        row_u: Derivative by the row of u of the Jacobian, in the camera frame.
+        row_v: Derivative by the row of v.
+        is_live: Whether lanes exist.
+    """
+    ju, jv, ku, kv = perspective
+    # T_camera_map' = exp(-xi) T_camera_map rotates and moves the point and the rows of J R.
+    turn = cross(p, g)
+    turn_u, turn_v = cross(row_u, (ju, 0.0, 0.0 - ku)), cross(row_v, (0.0, jv, 0.0 - kv))
+    number = tl.arange(0, 8)
+    pose = tl.zeros([8], tl.float32)
+    for j in tl.static_range(3):
+        rotation = tl.where(is_live, 0.0 - turn[j] - turn_u[j] - turn_v[j], 0.0)
+        pose += only_at(number, j, tl.sum(rotation, 0))
+        pose += only_at(number, j + 3, tl.sum(tl.where(is_live, 0.0 - g[j], 0.0), 0))
+    tl.store(by_pose + tl.program_id(0) * 8 + number, pose)
+
+
+@triton.jit
+def take_step(
+    rows, i, gradient, is_live, camera, state, adam, max_sigma_per_depth, LAST_STEP: tl.constexpr
+):
+    """Take a step of Adam, in place, and limit the sizes.
+
+    Args:
+        rows: Gaussians, [N, 16].
+        i: Row of each lane.
+        gradient: Derivatives by the columns; the last one is 0.
+        is_live: Whether lanes exist.
+        camera: Third row of the rotation of T_camera_map, and its translation.
+        state: Moments, squares and steps; see `project_backward`.
+        adam: Rates, corrections, beta1, beta2 and epsilon; see `project_backward`.
+        max_sigma_per_depth: Maximum standard deviation per meter of depth after the step.
+        LAST_STEP: Number of steps after which the correction stays constant.
+    """
+    R2, t = camera
+    moments, squares, steps = state
+    rates, corrections, beta1, beta2, epsilon = adam
+    at = i.to(tl.int64) * ROW
+    # A row whose gradient is zero is hidden; it keeps its values, moments and step count.
+    is_moved = is_live & (i < 0)
+    for j in tl.static_range(16):
+        is_moved = is_moved | (is_live & (tl.abs(gradient[j]) > 0.0))
+    step = tl.load(steps + i, is_moved, 0) + 1
+    tl.store(steps + i, step, is_moved)
+    step = tl.minimum(step, LAST_STEP)
+    of_mean = tl.load(corrections + step * 2, is_moved, 1.0)
+    of_square = tl.load(corrections + step * 2 + 1, is_moved, 1.0)
+    z = gradient[15]
+    for j in tl.static_range(16):
+        m, s = moments + at + j, squares + at + j
+        value, rate = tl.load(rows + at + j, is_moved, 0.0), tl.load(rates + j)
+        new_m = tl.load(m, is_moved, 0.0) * beta1 + gradient[j] * (1.0 - beta1)
+        new_s = tl.load(s, is_moved, 0.0) * beta2 + gradient[j] * gradient[j] * (1.0 - beta2)
+        tl.store(m, new_m, is_moved)
+        tl.store(s, new_s, is_moved)
+        root = tl.sqrt_rn(new_s * of_square) + epsilon
+        value = value - tl.div_rn(rate * of_mean * new_m, root)
+        if j < 3:
+            z += value * R2[j]
+        if (j >= 3) & (j < 6):
+            limit = max_sigma_per_depth * tl.maximum(z + t[2], NEAR)
+            value = tl.minimum(value, log(limit))
+        tl.store(rows + at + j, value, is_moved)
+
+
 @kernel
 def project_backward(
     rows,
@@ -128,23 +225,10 @@ def project_backward(
     is_live = lane < n_visible
     i = tl.load(visible + lane, is_live, 0)
     first, count = tl.load(firsts + i, is_live, 0), tl.load(pairs + i, is_live, 0)
+    V, Vx, Vy, Vxx, Vxy, Vyy, red, green, blue, depth, weight = sums_of_pairs(
+        sums, first, count, BLOCK
+    )
     zero = tl.zeros([BLOCK], tl.float32)
-    V, Vx, Vy, Vxx, Vxy, Vyy = zero, zero, zero, zero, zero, zero
-    red, green, blue, depth, weight = zero, zero, zero, zero, zero
-    for k in range(tl.max(count)):
-        has_pair = k < count
-        at = sums + (first + k).to(tl.int64) * 16
-        V += tl.load(at, has_pair, 0.0)
-        Vx += tl.load(at + 1, has_pair, 0.0)
-        Vy += tl.load(at + 2, has_pair, 0.0)
-        Vxx += tl.load(at + 3, has_pair, 0.0)
-        Vxy += tl.load(at + 4, has_pair, 0.0)
-        Vyy += tl.load(at + 5, has_pair, 0.0)
-        red += tl.load(at + 6, has_pair, 0.0)
-        green += tl.load(at + 7, has_pair, 0.0)
-        blue += tl.load(at + 8, has_pair, 0.0)
-        depth += tl.load(at + 9, has_pair, 0.0)
-        weight += tl.load(at + 10, has_pair, 0.0)
 
     mean, scale, q, opacity, _color = load_row(rows, i, is_live)
     R0, R1, R2, t, lens, limits, filters = camera_of(view, width, height)
@@ -224,45 +308,21 @@ def project_backward(
         zero,
     )
 
-    # T_camera_map' = exp(-xi) T_camera_map rotates and moves the point and the rows of J R.
-    turn = cross(p, g)
-    turn_u, turn_v = cross(row_u, (ju, zero, 0.0 - ku)), cross(row_v, (zero, jv, 0.0 - kv))
-    number = tl.arange(0, 8)
-    pose = tl.zeros([8], tl.float32)
-    for j in tl.static_range(3):
-        rotation = tl.where(is_live, 0.0 - turn[j] - turn_u[j] - turn_v[j], 0.0)
-        pose += only_at(number, j, tl.sum(rotation, 0))
-        pose += only_at(number, j + 3, tl.sum(tl.where(is_live, 0.0 - g[j], 0.0), 0))
-    tl.store(by_pose + tl.program_id(0) * 8 + number, pose)
+    store_pose(by_pose, p, g, perspective, row_u, row_v, is_live)
     tl.store(weights + lane, weight, is_live)
 
-    at = i.to(tl.int64) * ROW
     if ADAM:
-        # A row whose gradient is zero is hidden; it keeps its values, moments and step count.
-        is_moved = is_live & (lane < 0)
-        for j in tl.static_range(16):
-            is_moved = is_moved | (is_live & (tl.abs(gradient[j]) > 0.0))
-        step = tl.load(steps + i, is_moved, 0) + 1
-        tl.store(steps + i, step, is_moved)
-        step = tl.minimum(step, LAST_STEP)
-        of_mean = tl.load(corrections + step * 2, is_moved, 1.0)
-        of_square = tl.load(corrections + step * 2 + 1, is_moved, 1.0)
-        z = zero
-        for j in tl.static_range(16):
-            m, s = moments + at + j, squares + at + j
-            value, rate = tl.load(rows + at + j, is_moved, 0.0), tl.load(rates + j)
-            new_m = tl.load(m, is_moved, 0.0) * beta1 + gradient[j] * (1.0 - beta1)
-            new_s = tl.load(s, is_moved, 0.0) * beta2 + gradient[j] * gradient[j] * (1.0 - beta2)
-            tl.store(m, new_m, is_moved)
-            tl.store(s, new_s, is_moved)
-            root = tl.sqrt_rn(new_s * of_square) + epsilon
-            value = value - tl.div_rn(rate * of_mean * new_m, root)
-            if j < 3:
-                z += value * R2[j]
-            if (j >= 3) & (j < 6):
-                limit = max_sigma_per_depth * tl.maximum(z + t[2], NEAR)
-                value = tl.minimum(value, log(limit))
-            tl.store(rows + at + j, value, is_moved)
+        take_step(
+            rows,
+            i,
+            gradient,
+            is_live,
+            (R2, t),
+            (moments, squares, steps),
+            (rates, corrections, beta1, beta2, epsilon),
+            max_sigma_per_depth,
+            LAST_STEP,
+        )
     else:
         for j in tl.static_range(16):
             tl.store(by_rows + lane.to(tl.int64) * ROW + j, gradient[j], is_live)
