@@ -9,7 +9,15 @@ from collections.abc import Iterator
 import numpy as np
 from furnishing import Builder, furnish
 
-from ldo_service.synthetic.flat.building import DOOR_HEIGHT_M, DOOR_WIDTH_M, HEIGHT_M, WALL_M, Panel
+from ldo_service.synthetic.flat.building import (
+    DOOR_HEIGHT_M,
+    DOOR_WIDTH_M,
+    HEIGHT_M,
+    SHELL,
+    WALL_M,
+    Panel,
+    lamp_centers_m,
+)
 from ldo_service.synthetic.flat.paint import Materials, materials
 from ldo_service.synthetic.flat.scene import Flat
 from ldo_service.synthetic.flat.scene_object import CEILING, FLOOR, WALL
@@ -33,7 +41,14 @@ def room(seed: int) -> Flat:
     furnish(builder)
     panels = tuple(_panels(rng, size_m, door_m))
     things = tuple(builder.things)
-    return Flat(panels, things, (LAMP,) * len(things), materials(FIRST_SEED + seed))
+    return Flat(
+        panels=panels,
+        things=things,
+        rooms=(LAMP,) * len(things),
+        textures=materials(FIRST_SEED + seed),
+        lamps_m=lamp_centers_m(),
+        shell=SHELL,
+    )
 
 
 def inside_m(flat: Flat) -> tuple[float, float]:
