@@ -61,12 +61,14 @@ def test_second_run_has_the_same_bits() -> None:
     assert_same_bits(results_of(ARRAYS, SQUARE_SCENES), results_of(ARRAYS, SQUARE_SCENES))
 
 
+@pytest.mark.slow
 def test_undefined_memory_has_no_effect() -> None:
     assert_same_bits(
         results_of(ARRAYS, SQUARE_SCENES), results_of(OtherwiseFilledArrays(), SQUARE_SCENES)
     )
 
 
+@pytest.mark.slow
 def test_order_of_the_programs_has_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     """A program reads nothing that another one writes, and no two programs write the same place."""
     from triton.runtime.interpreter import interpreter_builder
