@@ -51,12 +51,12 @@ def _room(placed: Placement, room: int, paint: str, floor: str) -> list[Panel]:
     width, depth = ROOM_SIZE_M
     slabs = [
         *((slab, 3) for slab in _door_wall(width, -WALL_M / 2, DOOR_X_M, paint)),
-        (_slab((0, depth + WALL_M / 2), (width, WALL_M), paint), 2),
-        (_slab((-(width + WALL_M) / 2, depth / 2), (WALL_M, depth), paint), 1),
-        (_slab(((width + WALL_M) / 2, depth / 2), (WALL_M, depth), paint), 0),
+        (wall_slab((0, depth + WALL_M / 2), (width, WALL_M), paint), 2),
+        (wall_slab((-(width + WALL_M) / 2, depth / 2), (WALL_M, depth), paint), 1),
+        (wall_slab(((width + WALL_M) / 2, depth / 2), (WALL_M, depth), paint), 0),
     ]
     walls = [Panel(placed(slab), WALL, face, room) for slab, face in slabs]
-    return [*walls, *_level(placed, room, (0, depth / 2), (width, depth), floor)]
+    return [*walls, *level(placed, room, (0, depth / 2), _outer(width, depth), floor)]
 
 
 def _corridor() -> list[Panel]:
@@ -69,11 +69,11 @@ def _corridor() -> list[Panel]:
     door_m = ROOM_A.origin_m[0] + DOOR_X_M
     slabs = [
         *((slab, 2) for slab in _door_wall(length, (width + WALL_M) / 2, door_m, "wall_c")),
-        (_slab(((length + WALL_M) / 2, 0), (WALL_M, width), "wall_c"), 0),
+        (wall_slab(((length + WALL_M) / 2, 0), (WALL_M, width), "wall_c"), 0),
     ]
     turned = Placement((0.0, 0.0, 0.0), (-1.0, 0.0))
     walls = [Panel(put(slab), WALL, face, 2) for put in (CORRIDOR, turned) for slab, face in slabs]
-    return [*walls, *_level(CORRIDOR, 2, (0, 0), CORRIDOR_SIZE_M, "floor_c")]
+    return [*walls, *level(CORRIDOR, 2, (0, 0), _outer(*CORRIDOR_SIZE_M), "floor_c")]
 
 
 def _door_wall(length_m: float, y_m: float, door_m: float, paint: str) -> list[Solid]:
@@ -82,17 +82,23 @@ def _door_wall(length_m: float, y_m: float, door_m: float, paint: str) -> list[S
     lintel_m = HEIGHT_M - DOOR_HEIGHT_M
     above_m = (door_m, y_m, HEIGHT_M - lintel_m / 2)
     return [
-        _slab(((left - end) / 2, y_m), (left + end, WALL_M), paint),
-        _slab(((right + end) / 2, y_m), (end - right, WALL_M), paint),
+        wall_slab(((left - end) / 2, y_m), (left + end, WALL_M), paint),
+        wall_slab(((right + end) / 2, y_m), (end - right, WALL_M), paint),
         Solid("box", above_m, (DOOR_WIDTH_M, WALL_M, lintel_m), paint),
     ]
 
 
-def _slab(center_m: tuple[float, float], size_m: tuple[float, float], paint: str) -> Solid:
+def _outer(width_m: float, depth_m: float) -> tuple[float, float]:
+    """Return the size of a room up to the outer faces of its walls."""
+    return width_m + 2 * WALL_M, depth_m + 2 * WALL_M
+
+
+def wall_slab(center_m: tuple[float, float], size_m: tuple[float, float], paint: str) -> Solid:
+    """Return a wall from the floor to the ceiling."""
     return Solid("box", (*center_m, HEIGHT_M / 2), (*size_m, HEIGHT_M), paint)
 
 
-def _level(
+def level(
     placed: Placement,
     room: int,
     center_m: tuple[float, float],
@@ -101,9 +107,8 @@ def _level(
 ) -> list[Panel]:
     """Return the floor and the ceiling of a room.
 
-    Both extend to the outer faces of the walls, so that the floor also covers the doorways.
+    If `size_m` reaches the outer faces of the walls, the floor also covers the doorways.
     """
-    extent = (size_m[0] + 2 * WALL_M, size_m[1] + 2 * WALL_M, 0.1)
-    below = placed(Solid("box", (*center_m, -0.05), extent, floor))
-    above = placed(Solid("box", (*center_m, HEIGHT_M + 0.05), extent, "ceiling"))
+    below = placed(Solid("box", (*center_m, -0.05), (*size_m, 0.1), floor))
+    above = placed(Solid("box", (*center_m, HEIGHT_M + 0.05), (*size_m, 0.1), "ceiling"))
     return [Panel(below, FLOOR, 5, room), Panel(above, CEILING, 4, room)]

@@ -13,11 +13,11 @@ import numpy as np
 
 from ldo_service.synthetic.solids import Solid
 
-from .building import HEIGHT_M, WALL_M, Panel
+from .building import HEIGHT_M, WALL_M, Panel, level, wall_slab
 from .furnishing import ASKEW, BACK, DOOR, LEFT, RIGHT, TURNED, Row, built, placed_in
 from .paint import Materials, materials
 from .scene import Flat
-from .scene_object import CEILING, FLOOR, WALL, Placement, SceneObject
+from .scene_object import WALL, Placement, SceneObject
 
 OFFICES = 4
 PITCH_M = 2.4  # Distance between the centers of two neighboring offices.
@@ -133,25 +133,25 @@ def _panels(number: int) -> list[Panel]:
     width_m, depth_m = OFFICE_SIZE_M
     office = [
         *((slab, 3) for slab in _door_wall(width_m, -WALL_M / 2, "wall_a")),
-        (_slab((0, depth_m + WALL_M / 2), (width_m, WALL_M), "wall_a"), 2),
-        (_slab((-(width_m + WALL_M) / 2, depth_m / 2), (WALL_M, depth_m), "wall_a"), 1),
-        (_slab(((width_m + WALL_M) / 2, depth_m / 2), (WALL_M, depth_m), "wall_a"), 0),
+        (wall_slab((0, depth_m + WALL_M / 2), (width_m, WALL_M), "wall_a"), 2),
+        (wall_slab((-(width_m + WALL_M) / 2, depth_m / 2), (WALL_M, depth_m), "wall_a"), 1),
+        (wall_slab(((width_m + WALL_M) / 2, depth_m / 2), (WALL_M, depth_m), "wall_a"), 0),
     ]
     half_m = CORRIDOR_WIDTH_M / 2
     section = [
         *((slab, 2) for slab in _door_wall(PITCH_M, half_m + WALL_M / 2, "wall_c")),
-        (_slab((0, -half_m - WALL_M / 2), (PITCH_M, WALL_M), "wall_c"), 3),
+        (wall_slab((0, -half_m - WALL_M / 2), (PITCH_M, WALL_M), "wall_c"), 3),
     ]
     end_m = (PITCH_M + WALL_M) / 2
     if number == 0:
-        section.append((_slab((-end_m, 0), (WALL_M, CORRIDOR_WIDTH_M), "wall_b"), 1))
+        section.append((wall_slab((-end_m, 0), (WALL_M, CORRIDOR_WIDTH_M), "wall_b"), 1))
     if number == OFFICES - 1:
-        section.append((_slab((end_m, 0), (WALL_M, CORRIDOR_WIDTH_M), "wall_b"), 0))
+        section.append((wall_slab((end_m, 0), (WALL_M, CORRIDOR_WIDTH_M), "wall_b"), 0))
     return [
         *(Panel(inside(slab), WALL, face, number) for slab, face in office),
-        *_level(inside, number, (0, depth_m / 2), (PITCH_M, depth_m + 2 * WALL_M), "floor_a"),
+        *level(inside, number, (0, depth_m / 2), (PITCH_M, depth_m + 2 * WALL_M), "floor_a"),
         *(Panel(outside(slab), WALL, face, OFFICES + number) for slab, face in section),
-        *_level(outside, OFFICES + number, (0, 0), (PITCH_M, 2 * half_m + 2 * WALL_M), "floor_c"),
+        *level(outside, OFFICES + number, (0, 0), (PITCH_M, 2 * half_m + 2 * WALL_M), "floor_c"),
     ]
 
 
@@ -161,24 +161,7 @@ def _door_wall(length_m: float, y_m: float, paint: str) -> list[Solid]:
     at_m = (DOORWAY_M + side_m) / 2
     above_m = HEIGHT_M - LINTEL_M
     return [
-        _slab((-at_m, y_m), (side_m, WALL_M), paint),
-        _slab((at_m, y_m), (side_m, WALL_M), paint),
+        wall_slab((-at_m, y_m), (side_m, WALL_M), paint),
+        wall_slab((at_m, y_m), (side_m, WALL_M), paint),
         Solid("box", (0.0, y_m, HEIGHT_M - above_m / 2), (DOORWAY_M, WALL_M, above_m), paint),
     ]
-
-
-def _slab(center_m: tuple[float, float], size_m: tuple[float, float], paint: str) -> Solid:
-    return Solid("box", (*center_m, HEIGHT_M / 2), (*size_m, HEIGHT_M), paint)
-
-
-def _level(
-    placed: Placement,
-    room: int,
-    center_m: tuple[float, float],
-    size_m: tuple[float, float],
-    floor: str,
-) -> list[Panel]:
-    """Return the floor and the ceiling of an office or a section, up to the outer wall faces."""
-    below = placed(Solid("box", (*center_m, -0.05), (*size_m, 0.1), floor))
-    above = placed(Solid("box", (*center_m, HEIGHT_M + 0.05), (*size_m, 0.1), "ceiling"))
-    return [Panel(below, FLOOR, 5, room), Panel(above, CEILING, 4, room)]
