@@ -195,8 +195,9 @@ def read_baseline(path: Path) -> MapMeasurement:
     try:
         return msgspec.json.decode(path.expanduser().read_bytes(), type=MapMeasurement)
     except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
+        problem = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(
-            f"--baseline {path} cannot be read: {error}. Give a file that `ldo bench map --save` "
+            f"--baseline {path} cannot be read: {problem}. Give a file that `ldo bench map --save` "
             "has written."
         ) from error
 
