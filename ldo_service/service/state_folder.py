@@ -76,7 +76,7 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
 
 
 def _folder_error(folder: Path, error: OSError) -> ConfigError:
-    """Return the error of a folder that cannot be used, whose exit code tells if it is lasting."""
+    """Return the error of a folder that cannot be used; its type tells if a retry can help."""
     problem = f"{folder} cannot be used for state: {error.strerror or error}"
     if error.errno in _OF_PATH:
         return ConfigError(f"{problem}. Choose another folder with --state.")
