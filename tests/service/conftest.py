@@ -212,8 +212,9 @@ class LiveService:
 def _end(program: subprocess.Popen[Any]) -> None:
     program.kill()
     program.wait()
-    if program.stdout is not None:
-        program.stdout.close()
+    for pipe in (program.stdin, program.stdout):
+        if pipe is not None:
+            pipe.close()
 
 
 @contextmanager
