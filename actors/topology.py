@@ -128,7 +128,7 @@ def producer_of(topic: t.Topic) -> str:
 def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
     """Return the name and the delivery policy of each consumer of a topic."""
     if topic is t.CONTROL:
-        return [("the service", "one at a time")]
+        return [("the service", "(one request at a time)")]
     return [
         (box.name, str(port.policy)) for box in GRAPH for port in box.inputs if port.topic is topic
     ]

@@ -13,7 +13,7 @@ from ldo_service.schemas.objects import (
 )
 from ldo_service.schemas.pose import QUATERNION_TOLERANCE
 
-Pair = tuple[int, int]  # Ids of two keyframes.
+Pair = tuple[int, int]  # Ids of two keyframes, or numbers of two submaps.
 
 
 class GraphLandmark(msgspec.Struct, frozen=True, kw_only=True):
@@ -42,11 +42,11 @@ class GraphCorrection(Message, frozen=True, kw_only=True):
     keyframes: Array  # Keyframe ids, i8 [K], ascending.
     T_map_keyframe: Array  # Translation in meters and quaternion wxyz, f8 [K, 7].
     last_refinement: int = 0  # Number of the last keyframe/refinement that the poses include.
-    # Each merged submap, with the older submap that it is merged into.
+    # Numbers of each merged submap, and of the oldest submap that it is merged with.
     merged_submaps: tuple[Pair, ...] = ()
-    # Accepted loop closures as pairs of reference and keyframe.
+    # Accepted loop closures: ids of the old keyframe (`reference`) and of the new one.
     accepted_closures: tuple[Pair, ...] = ()
-    # Loop closures that were rejected or removed; the newest 512.
+    # Loop closures that were rejected or removed, as in `accepted_closures`; the newest 512.
     rejected_closures: tuple[Pair, ...] = ()
     landmarks: tuple[GraphLandmark, ...] = ()  # Ascending by object id.
 

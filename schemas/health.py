@@ -46,9 +46,12 @@ class Health(Message, frozen=True, kw_only=True):
     """
 
     actor: str
+    # busy: in a step. draining: handling its last messages before it stops.
     state: Literal["starting", "ready", "busy", "draining"]
     pid: int
-    epoch: int  # Number that changes when the process restarts or the actor is reset.
+    # Number of this process of the actor; it changes with each restart and reset. In the
+    # attachments of other topics, the epoch stays the same if the actor continues from its state.
+    epoch: int
     steps: int  # Handled messages.
     failures: int  # Exceptions in the handler.
     restarts: int  # Number of times that the actor was rebuilt from its last state.

@@ -30,6 +30,7 @@ class MeasuredPose(msgspec.Struct, frozen=True, kw_only=True):
             )
 
 
+# Three coefficients of a polynomial, as in `CameraCorrection`.
 Terms = tuple[float, float, float]
 NO_TERMS: Terms = (0.0, 0.0, 0.0)
 
@@ -88,7 +89,9 @@ class Keyframe(Message, frozen=True, kw_only=True):
     window_measurements: tuple[MeasuredPose, ...] = ()
     # Mask u1 [H, W]; 1 where pixels move and are not mapped. Shape [0, 0] if nothing moves.
     dynamic_mask: Array = NO_MASK
-    submap: int = 0  # Number of the submap; each loss of tracking starts a new one.
+    # Number of the submap. If relocalization fails for many LOST frames, the tracker starts a new
+    # submap.
+    submap: int = 0
     # Poses of this keyframe in keyframes of other submaps; they connect the submaps.
     submap_measurements: tuple[MeasuredPose, ...] = ()
     # Correction that `color` and `depth_m` already contain.

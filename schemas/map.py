@@ -32,13 +32,14 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
 
     bytes  0..19  five weights of labels (f4), the largest first
     bytes 20..23  sum of the weights of all observations; the weights of older ones decay (f4)
-    bytes 24..25  extent in mm of the object that the Gaussian was last observed to belong to (u2)
+    bytes 24..25  size of the object in mm at the last observation of a label, see below (u2)
     byte  26      number of keyframes since then that show the Gaussian in no object (u1)
     bytes 27..31  labels of the five weights, indices into `label_names` (u1)
 
     The five weights are probabilities, whose sum is at most 1. The difference from 1 is the weight
     of background, which is label 0. If the first weight is larger than that of background, the
-    likeliest label is byte 27; otherwise it is 0.
+    likeliest label is byte 27; otherwise it is 0. The size of an object is the side of the square
+    that has the area of its 2D box, at the depth of the Gaussian.
     """
 
     ids: Array  # Ids, i8 [N], unique, ascending.

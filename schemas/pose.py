@@ -67,19 +67,23 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     # Covariance of T_reference_camera for a perturbation on the right: rotation in rad,
     # translation in m. Zeros if unknown: while LOST, and in the first frame of a submap.
     covariance: Matrix6 = (0.0,) * 36
-    inlier_fraction: float = 0.0  # Fraction of the residuals that are inliers.
+    inlier_fraction: float = 0.0  # Fraction of the residuals within three times their noise.
     residual_color: float = 0.0  # Robust sigma of the color residuals, gray levels 0..255.
-    residual_depth: float = 0.0  # Robust sigma of the depth residuals, in sigmas of the sensor.
+    # Robust sigma of the depth residuals, as a multiple of the expected depth noise.
+    residual_depth: float = 0.0
     overlap: float = 0.0  # Fraction of the reference keyframe's surface that this frame sees.
-    iterations: int = 0
-    # Initial guess that led to the pose: "direct", "prior", "features", "gicp", "relocalized" or
-    # "reused"; "first" for the first frame; "none" without a pose.
+    iterations: int = 0  # Iterations of alignment.
+    # Initial guess that led to the pose. "direct": the last pose, moved on with its velocity or
+    # left as it is; "prior": other odometry; "features": ORB features; "gicp": registration of
+    # point clouds; "relocalized": features of an earlier keyframe; "reused": the pose in the map.
+    # "first": first frame of a submap; "none": no pose.
     pose_source: str = ""
-    # Spread of the poses from several initial guesses, rad of image motion.
+    # Largest distance to a pose that alignment found from another initial guess and that the images
+    # support: angle between the poses plus their translation divided by the median depth, rad.
     hypothesis_spread_rad: float = 0.0
     T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera).
-    # Submap whose frame is `map` in T_map_odom. 0 is the map itself; any other submap is not
-    # merged with the map yet.
+    # 0: T_map_odom leads to the frame of the map. Otherwise, it leads to the frame of the submap
+    # with this number, which is not merged with the map yet.
     submap: int = 0
 
     def check(self) -> None:
