@@ -45,7 +45,8 @@ class AddKeys:
 
     Copy this folder to the machine of the program, and pass it to the program with --keys. The
     command also updates the access control list `access.yaml` in the folder of each service. Copy
-    the new list to each service, and restart the service.
+    the new list into the key folder of each running service, which uses it within seconds. Restart
+    only a service under systemd or with --client.
 
       ldo keys add DIR service mule --robot mule --host mule.local
       ldo keys add DIR camera front --robot mule
@@ -89,8 +90,9 @@ class ListKeys:
 class RevokeKeys:
     """Revoke keys, and delete their folder on this machine.
 
-    The revocation takes effect at a service after you have copied the new `access.yaml` to it and
-    restarted it. A separate router needs a new configuration of `ldo keys router` and a restart.
+    Copy the new `access.yaml` into the key folder of each running service, which then rejects the
+    keys within seconds. Restart only a service under systemd or with --client. A separate router
+    needs a new configuration of `ldo keys router` and a restart.
     """
 
     folder: Folder
@@ -154,8 +156,9 @@ def keys(verb: Verb) -> None:
         case RevokeKeys():
             CertificateAuthority(verb.folder).remove(verb.name)
             print(
-                f"{verb.name} is revoked. Copy the new {ACCESS} to every service and restart the "
-                "service: until then the keys remain valid there."
+                f"{verb.name} is revoked. Copy the new {ACCESS} into the key folder of every "
+                "service: until then the keys remain valid there. Restart only a service under "
+                "systemd or with --client."
             )
 
 

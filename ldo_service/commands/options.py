@@ -44,8 +44,8 @@ Preset = Annotated[
     str,
     argument(
         metavar="NAME",
-        help="preset whose settings --config and --set then change: "
-        + "; ".join(f"{name} ({about})" for name, about in known_presets().items()),
+        help="replace default settings by those of the preset NAME, before --config and --set; "
+        + "; ".join(f"{name}: {about}" for name, about in known_presets().items()),
     ),
 ]
 Source = Annotated[

@@ -79,9 +79,11 @@ def publish(
 
     `realsense` is a camera on USB. `ros2` reads topics of ROS 2 that a Zenoh bridge forwards.
 
-    Frames keep the stamps of the source unless --restamp is given. Stamps must ascend: the service
-    rejects a frame that is not later than the frame before. To send a data set again, use
-    --restamp: the age of a pose is then the clock of a subscriber minus the stamp of the pose.
+    Frames keep the stamps of the source. Stamps must ascend: the service rejects a frame that is
+    not later than the frame before, unless it is earlier by more than a second, as after a restart
+    of the camera. --restamp replaces each stamp by the time of sending, so that you can send a data
+    set again. A subscriber on this machine can then compute the delay of a pose: its clock minus
+    the stamp of the pose.
 
       ldo publish ~/data/rgbd_dataset_freiburg1_desk --rate 15
       ldo publish ~/data/rgbd_dataset_freiburg1_desk --restamp

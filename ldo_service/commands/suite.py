@@ -36,7 +36,7 @@ def suite(
     ] = 1,
     overwrite: Overwrite = False,
 ) -> None:
-    """Run and evaluate several sequences and variants; print tables with mean and spread.
+    """Run and evaluate sequences and variants; print tables with mean and standard deviation.
 
     The command prints the tables in Markdown and writes them to DIR/table.md. If you repeat an
     interrupted command, finished runs are not repeated. A sequence without data is skipped and

@@ -35,7 +35,7 @@ def view(
     config: ConfigFile = None,
     set: Settings = (),
 ) -> None:
-    """Show a map in a browser: Gaussians, paths, keyframes, objects, loops, and a search box.
+    """Show a map in a browser: Gaussians, paths, keyframes, objects, loop closures, search.
 
     For a run in progress, the window shows the files written so far, and adds others when they
     appear. By default only browsers on this machine can open the window; see docs/viewer.md.

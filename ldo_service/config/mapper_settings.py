@@ -184,8 +184,9 @@ class RefitSettings:
 class MapperSettings:
     """Map of Gaussians and of objects."""
 
-    # Effort of the optimizer for each keyframe, in iterations at full resolution; most iterations
-    # have half the resolution. The default gives 12 frames per second on two cores at 640x480.
+    # Computing time of the Gaussian optimizer for each keyframe, in units of one iteration at full
+    # resolution. Most iterations use images of half the resolution and take less time, so about 35
+    # iterations run with the default. It gives 12 frames per second on two cores at 640x480.
     iterations: NonNegativeInt = 12
     # Threads of the renderer. 0 uses all cores but one, which is left for the tracker.
     threads: NonNegativeInt = 0

@@ -36,7 +36,8 @@ A: held-out frames, which are tracked and never mapped, without the black rim of
 rendering gets the vignetting and the rolling shutter that the run has estimated for the camera, and
 a gain and bias per channel, interpolated between the keyframes before and after. A, exposure
 fitted: gain and bias are fitted to the evaluated frame by least squares. A, no exposure: neither.
-B: as in the literature, every fifth training frame; pixels without depth are black in both images.
+B: as in the literature, every fifth frame that is not held out, rendered as in A; pixels without
+depth are black in both images.
 LOST frames have no pose and are only counted; WEAK frames are evaluated."""
 
 
