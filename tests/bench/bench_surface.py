@@ -138,7 +138,9 @@ def summary(errors_m: np.ndarray) -> str:
 
 def main() -> None:
     """Print accuracy and completeness of the mesh of a run."""
-    parser = argparse.ArgumentParser(description="Measure the mesh of a run against the true surface.")
+    parser = argparse.ArgumentParser(
+        description="Measure the mesh of a run against the true surface."
+    )
     parser.add_argument("run", type=Path, help="folder of a finished `ldo run`")
     parser.add_argument("source", help="the source of the run")
     parser.add_argument("--voxel", type=float, default=0.02, help="side of a voxel, meters")
