@@ -1,7 +1,8 @@
 """Comparison of two calibration views: depth, features and colors as linearized equations.
 
-The equations of depth and features have the shared unknowns of `BIAS` and `TIMES`, and the relative
-pose of the pair as their own unknowns. Points move with the velocity of the camera between the
+The equations of depth and features have two kinds of unknowns. All pairs share the coefficients of
+the depth bias (columns `BIAS`) and the times of the shutter (columns `TIMES`). Each pair has a
+relative pose of its own. Points move with the velocity of the camera between the
 times at which the rows of color and depth are recorded. Conventions: `ldo_service.geometry`.
 """
 
@@ -52,18 +53,21 @@ COLUMNS = TIMES.stop + 7  # Shared unknowns, relative pose and residual.
 
 @dataclass(frozen=True, slots=True)
 class CommonPoints:
-    """Surface points that both views of a pair show, as indices into their blocks."""
+    """Surface points that both views of a pair show.
 
-    there: np.ndarray  # [N] in the first view.
-    here: np.ndarray  # [N] in the second one.
+    A point is given by its block in each view. The blocks of a view are numbered row by row.
+    """
+
+    in_first: np.ndarray  # [N] int64, blocks of the first view.
+    in_second: np.ndarray  # [N] int64, blocks of the second view.
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedPair:
     """Pair of views with the shared coefficients at which it is linearized."""
 
-    first: CalibrationView
-    second: CalibrationView
+    first: CalibrationView  # View `pair.first`, whose depth is used.
+    second: CalibrationView  # View `pair.second`.
     pair: ViewPair
     shared: np.ndarray  # [6] coefficients of the bias, then times of the shutter.
 
@@ -81,7 +85,15 @@ def block_grid(camera: Camera, block: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def view_surface(view: CalibrationView, coefficients: np.ndarray) -> np.ndarray:
-    """Return points and normals [h w, 6] of a view; see `_surfaces.surfaces`."""
+    """Return a surface point and a unit normal for each block of a view, [h w, 6].
+
+    Both are in the camera frame, the point in meters. The normal is 0 where the block and its four
+    neighbors do not belong to one surface.
+
+    Args:
+        view: The view.
+        coefficients: Coefficients of the depth bias, which is removed from the depth, [3].
+    """
     rays, basis, _ = block_grid(view.camera, view.block)
     bias = (basis @ coefficients).reshape(view.depth_m.shape)
     depth_m = unbiased_depth(view.depth_m.astype(np.float64), bias)
@@ -91,16 +103,28 @@ def view_surface(view: CalibrationView, coefficients: np.ndarray) -> np.ndarray:
 
 
 def depth_block(
-    compared: ComparedPair, there: np.ndarray, here: np.ndarray
+    compared: ComparedPair, surface_first: np.ndarray, surface_second: np.ndarray
 ) -> tuple[Block, CommonPoints]:
-    """Compare the surfaces of both views of a pair; see `_surfaces.compare`."""
+    """Compare the surfaces of both views of a pair.
+
+    A residual is the distance in meters of a point of the first view, moved into the second view,
+    from the tangent plane of the surface there.
+
+    Args:
+        compared: The pair.
+        surface_first: Surface of the first view, see `view_surface`, [h w, 6].
+        surface_second: Surface of the second view, [h w, 6].
+
+    Returns:
+        The linearized residuals, and the points that both views show.
+    """
     view, (_, depth_readout_s, delay_s) = compared.first, compared.shared[TIMES].tolist()
     height, width = view.depth_m.shape
     most = -(-height // BLOCK_STRIDE) * -(-width // BLOCK_STRIDE)
     rows, depths, indices = np.empty((most, COLUMNS)), np.empty(most), np.empty((most, 2), np.int64)
     count = _surfaces.compare(
-        there,
-        here,
+        surface_first,
+        surface_second,
         block_grid(view.camera, view.block)[1],
         compared.pair.T_second_first,
         view.velocity,
@@ -129,12 +153,13 @@ def _cells(blocks: np.ndarray, width: int) -> np.ndarray:
     return (row * CELLS // width) * CELLS + column * CELLS // width
 
 
-def feature_block(compared: ComparedPair, there: np.ndarray) -> Block:
+def feature_block(compared: ComparedPair, surface_first: np.ndarray) -> Block:
     """Return the linearized reprojection errors of the features in pixels; u and v alternate.
 
     Args:
         compared: The pair.
-        there: Points and normals of the first view, [h w, 6].
+        surface_first: Surface of the first view in its own camera frame, see `view_surface`,
+            [h w, 6].
     """
     view, pair, camera = compared.first, compared.pair, compared.first.camera
     (readout_s, depth_readout_s, delay_s), T = compared.shared[TIMES], pair.T_second_first
@@ -147,7 +172,7 @@ def feature_block(compared: ComparedPair, there: np.ndarray) -> Block:
     # First, the depth is corrected to the time at which the color row of the first view was
     # recorded. The point is then moved to the time of the middle row, transformed to the second
     # view, and moved to the time of the color row in that view.
-    z_per_s = _depth_speed(view, there, rays, measured_m, pair.pixels_first)
+    z_per_s = _depth_speed(view, surface_first, rays, measured_m, pair.pixels_first)
     z = measured_m + z_per_s * (delay_s + (depth_readout_s - readout_s) * row_there)
     points = rays * z[:, None]
     speed_there = _speed(points, view.velocity)
@@ -223,12 +248,14 @@ def color_block(
     """Compare the colors of two views at their common points.
 
     Returns:
-        A block of the three channels, whose weights are 1. Its own unknowns are gain and offset.
+        The measurements of the three channels, whose weights are 1. The pair's own unknowns are
+        gain and offset of the exposure.
         None if there are fewer than MIN_COMMON points.
     """
-    is_exposed = first.is_exposed.reshape(-1)[points.there]
-    is_exposed &= second.is_exposed.reshape(-1)[points.here]
-    a, b = points.there[is_exposed][::COLOR_STRIDE], points.here[is_exposed][::COLOR_STRIDE]
+    is_exposed = first.is_exposed.reshape(-1)[points.in_first]
+    is_exposed &= second.is_exposed.reshape(-1)[points.in_second]
+    a = points.in_first[is_exposed][::COLOR_STRIDE]
+    b = points.in_second[is_exposed][::COLOR_STRIDE]
     if len(a) < MIN_COMMON:
         return None
     there = first.color.reshape(-1, 3)[a].T.astype(np.float64)

@@ -120,8 +120,8 @@ class CameraCorrection:
 class CorrectionHistory:
     """Camera corrections with which the keyframes of a run were made, in order of time."""
 
-    stamps_ns: tuple[int, ...] = ()
-    corrections: tuple[CameraCorrection, ...] = ()
+    stamps_ns: tuple[int, ...] = ()  # Stamps of the keyframes.
+    corrections: tuple[CameraCorrection, ...] = ()  # Corrections, one per keyframe.
 
     def at(self, stamp_ns: int) -> CameraCorrection:
         """Return the correction of the last keyframe up to a stamp.

@@ -1,8 +1,12 @@
 """Least squares of shared coefficients, with the unknowns of each block eliminated.
 
-A block contains the measurements of one pair of views. The unknowns of a block, such as the
-relative pose, occur in no other block. The coefficients are shared by all blocks. Leading
-dimensions [...] are independent systems, such as the color channels, at the same pixels.
+A block contains the measurements of one pair of views. Its own unknowns, such as the relative pose
+of the pair, occur in no other block. All blocks share the coefficients, such as those of the depth
+bias.
+
+Several independent systems are solved at once if the arrays have leading dimensions, written
+[...]. The color channels are such systems: each has its own coefficients and residuals, and all
+have the same pixels.
 """
 
 from collections.abc import Generator, Sequence, Set
@@ -22,12 +26,18 @@ class Block:
     """Linearized measurements of one pair of views: residual + J_shared dc + J_own dx.
 
     dc is the step of the K shared coefficients, dx that of the M unknowns of this block. J_shared
-    [..., N, K] and J_own [..., N, M] are the Jacobians of the residuals for these two.
+    [..., N, K] and J_own [..., N, M] are the Jacobians of the N residuals for these two.
+
+    Attributes:
+        rows: J_shared, J_own and the residual side by side, [..., N, K + M + 1].
+        weight: Weight of each squared residual, [..., N].
+        cells: Number of the image cell in which each residual lies, [N] int. Cells are squares
+            with an eighth of the image width. Empty for features, which are not checked by cells.
     """
 
-    rows: np.ndarray  # [..., N, K + M + 1]: J_shared, J_own and the residual.
-    weight: np.ndarray  # [..., N]
-    cells: np.ndarray  # [N] int: cell of the image of each residual.
+    rows: np.ndarray
+    weight: np.ndarray
+    cells: np.ndarray
 
     @property
     def products(self) -> np.ndarray:
@@ -37,9 +47,10 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Reduced:
-    """Normal equations of a block without its own unknowns.
+    """Normal equations of a block after its own unknowns are eliminated (Schur complement).
 
-    The step of the block's own unknowns is -own [dc; 1].
+    The remaining equations are H dc = -g for the step dc of the K shared coefficients. The step of
+    the block's own unknowns follows from it: dx = -own [dc; 1].
     """
 
     H: np.ndarray  # [..., K, K]
@@ -70,15 +81,15 @@ class Reduced:
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
-    """Root mean square of the cells' mean residuals in held-out blocks.
+class HeldOutResiduals:
+    """Residuals of held-out pairs of views, with and without the estimated coefficients.
 
-    `rms_without` is computed with all shared coefficients at 0, `rms_with` with the coefficients
-    estimated from the blocks that were not held out. Within a cell, noise averages out.
+    Both values have the unit of the residuals: meters for depth, gray levels for color. They are
+    root mean squares of the mean residuals of image cells, because noise averages out in a cell.
     """
 
-    rms_without: float
-    rms_with: float
+    rms_without: float  # Value with all shared coefficients at 0.
+    rms_with: float  # Value with the coefficients estimated from the pairs not held out.
 
     @property
     def residual_ratio(self) -> float:
@@ -116,6 +127,11 @@ def held_out(
     """Return groups of successive blocks, each with a step [..., K] of the shared coefficients.
 
     The step is computed from all blocks outside the group.
+
+    Args:
+        blocks: Reduced normal equations.
+        prior: Weight of the coefficients, the same for all.
+        now: Coefficients at which the blocks are linearized, [..., K].
     """
     groups = np.array_split(np.arange(len(blocks)), min(GROUPS, len(blocks)))
     ranges = [range(int(group[0]), int(group[-1]) + 1) for group in groups]
@@ -160,11 +176,22 @@ def _weights(prior: np.ndarray | float, now: np.ndarray) -> np.ndarray:
 
 def check(
     blocks: Sequence[Block], reduced: Sequence[Reduced], prior: float, now: np.ndarray
-) -> Generator[float, None, list[Check]]:
-    """Evaluate the coefficients on held-out blocks; yield the amount of work after each block.
+) -> Generator[float, None, list[HeldOutResiduals]]:
+    """Compute the residuals of held-out blocks; yield the amount of work after each block.
+
+    Each group of blocks is held out once, and the coefficients are estimated from the other blocks.
+
+    Args:
+        blocks: Blocks.
+        reduced: Their reduced normal equations.
+        prior: Weight of the coefficients, the same for all.
+        now: Coefficients at which the blocks are linearized, [..., K].
+
+    Yields:
+        The work in the unit of `estimation.estimate`, about 1 ms.
 
     Returns:
-        A check of each independent system.
+        The residuals of each independent system, such as a color channel.
     """
     without: list[list[np.ndarray]] = []
     with_: list[list[np.ndarray]] = []
@@ -175,7 +202,8 @@ def check(
             yield CHECK_WORK
     systems = range(len(without[0]))
     return [
-        Check(*(_rms([means[i] for means in each]) for each in (without, with_))) for i in systems
+        HeldOutResiduals(*(_rms([means[i] for means in each]) for each in (without, with_)))
+        for i in systems
     ]
 
 

@@ -36,7 +36,15 @@ from .comparison import (
     view_surface,
 )
 from .correction import BIAS_TERMS, VIGNETTING_TERMS, CameraCorrection
-from .elimination import Block, Check, Reduced, check, covariance, solve, student_weight
+from .elimination import (
+    Block,
+    HeldOutResiduals,
+    Reduced,
+    check,
+    covariance,
+    solve,
+    student_weight,
+)
 from .outlines import Extrinsics, extrinsics
 from .views import CalibrationView, ViewPair
 
@@ -69,16 +77,16 @@ SURFACE_WORK, PAIR_WORK, COLOR_PAIR_WORK, COLOR_ROUND_WORK = 0.3, 0.5, 0.3, 0.3
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Depth bias and vignetting, with the relative poses of the views, estimated together."""
+    """Result of an estimation: the errors of the camera, and the relative poses of the views."""
 
-    depth_bias: np.ndarray  # [3] 1/m
+    depth_bias: np.ndarray  # [3] 1/m, see `CameraCorrection`.
     depth_bias_covariance: np.ndarray  # [3, 3] 1/m^2
-    times_s: np.ndarray  # [3] in the order of `ShutterTiming`.
+    times_s: np.ndarray  # [3], times of the shutter in the order of `ShutterTiming`.
     times_covariance: np.ndarray  # [3, 3] s^2
-    vignetting: np.ndarray  # [3, 3] channel by term
+    vignetting: np.ndarray  # [3, 3] color channel by term, see `CameraCorrection`.
     pairs: list[ViewPair]  # Pairs with their relative poses, estimated jointly with the bias.
-    depth_check: Check  # Held-out residuals of the dense depth alone, without features.
-    color_checks: list[Check]  # One per channel; empty if too few colors were compared.
+    depth_check: HeldOutResiduals  # Residuals of the dense depth alone, without features.
+    color_checks: list[HeldOutResiduals]  # One per channel; empty if too few colors were compared.
     # Error of the pose between depth and color; None if it was not asked for, or not visible.
     extrinsics: Extrinsics | None
 
@@ -102,17 +110,19 @@ class Estimate:
     def confirmed(
         self, before: CameraCorrection, max_ratios: tuple[float, float], *, is_known: bool
     ) -> CameraCorrection:
-        """Return a correction with the confirmed parts of this estimate; other parts are 0.
+        """Return the correction to use after this estimate.
 
-        The parts are the depth bias and the vignetting. A part takes its new estimate if held-out
-        pairs of views confirm it. A part that was confirmed before stays in use, unless its
-        held-out residual exceeds `MAX_KEPT_RATIO`. It then takes its new estimate too, or keeps its
-        value if it comes from an earlier run.
+        Depth bias and vignetting are decided separately, by the residual of held-out pairs of views
+        relative to the residual without correction:
+
+        - up to the limit in `max_ratios`, the new estimate is used;
+        - up to `MAX_KEPT_RATIO`, a correction in use stays in use, with the value of the new
+          estimate or, if it comes from an earlier run, with its own;
+        - otherwise, the camera is not corrected: the coefficients are 0.
 
         Args:
             before: Correction in use.
-            max_ratios: Maximum held-out residuals that confirm a depth bias and vignetting,
-                relative to those without correction.
+            max_ratios: Limits of the depth bias and of the vignetting.
             is_known: True if the correction in use comes from an earlier run.
         """
         depth_bias, vignetting = CameraCorrection().depth_bias, CameraCorrection().vignetting
@@ -241,7 +251,7 @@ def _vignetting(
     pairs: Sequence[ViewPair],
     common: Sequence[CommonPoints],
     start: np.ndarray,
-) -> Generator[float, None, tuple[np.ndarray, list[Check]]]:
+) -> Generator[float, None, tuple[np.ndarray, list[HeldOutResiduals]]]:
     """Estimate the coefficients of the vignetting, [3, 3], and check each channel."""
     compared: list[Block] = []
     for p, points in zip(pairs, common, strict=True):

@@ -1,12 +1,15 @@
 """Pose between depth and color camera, from outlines of near surfaces and gradients of color.
 
-Depth is registered to color with a pose of the depth camera. If that pose is wrong by the small
-increment xi = (rotation, translation), a surface point X of the depth image is at X + rotation x X
-+ translation in the color camera. An outline, where depth jumps from a near surface to a far one,
-then lies some pixels beside the edge in the color image. The shift along the normal n of the
-outline is n J (xi + v t) + w. J is the derivative of the pixel, w is the width by which the depth
-camera widens all near surfaces, v is the velocity of the camera, and t is the error of the delay of
-depth.
+Depth is registered to color with a pose of the depth camera. That pose may be wrong by the small
+increment xi = (r, s), a rotation vector r and a translation s. A surface point X of the depth image
+is then at X + cross(r, X) + s in the color camera. An outline, where depth jumps from a near
+surface to a far one, lies some pixels beside the edge in the color image. The shift along the
+normal n of the outline is n J (xi + v t) + w:
+
+- J [2, 6] is the derivative of the pixel by xi;
+- v [6] is the velocity of the camera in its own frame, rad/s and m/s;
+- t is the error of the delay of depth, seconds;
+- w is the width by which the depth camera widens all near surfaces, pixels.
 
 Each point of an outline has a profile: the gradient of color along n, at the pixels around the
 point. The estimate maximizes the sum over all points of the profile at the shift, blurred by a
@@ -85,13 +88,16 @@ ITERATION_WORK = 1.2
 
 @dataclass(frozen=True, slots=True)
 class Extrinsics:
-    """Error of the pose with which depth is registered to color."""
+    """Error of the pose with which depth was registered to color.
 
-    xi: np.ndarray  # [6] rotation in rad, then translation in m: T_color_depth = exp(xi).
-    covariance: np.ndarray  # [6, 6]
+    The true pose is exp(xi) T_color_depth if depth was registered with T_color_depth.
+    """
+
+    xi: np.ndarray  # [6] rotation in rad, then translation in m, in the color camera.
+    covariance: np.ndarray  # [6, 6] of xi.
 
     def metrics(self) -> dict[str, float]:
-        """Return the components with their standard deviations, by name."""
+        """Return rotation, translation and shift with their standard deviations, by name."""
         sigmas = np.sqrt(np.diag(COMPONENTS @ self.covariance @ COMPONENTS.T)).tolist()
         values = (COMPONENTS @ self.xi).tolist()
         return dict(zip((*NAMES, *SIGMA_NAMES), (*values, *sigmas), strict=True))
@@ -186,7 +192,7 @@ def extrinsics(
 
     Args:
         points: Outline points of each view, in order of time; see `outline_points`.
-        velocities: Velocity of the camera in each view, [6] per second.
+        velocities: Velocity of the camera in each view, [6] rad/s and m/s, in the camera frame.
         times_s: Readout of color, readout of depth and delay of depth, [3]. The motion of the
             camera during these times shifts the outlines too.
 

@@ -51,9 +51,9 @@ VIEW_WORK = 6.0  # Work of making a view, in the same unit.
 class SelfCalibrationConfig:
     """Settings of the self-calibration.
 
-    The two maximum ratios were chosen on seven recordings and simulations. The depth ratio was at
-    most 0.85 with a strong bias, and above 0.94 otherwise. The color ratio was at most 0.15 with
-    strong vignetting, and above 0.45 otherwise.
+    `max_depth_ratio` and `max_color_ratio` were chosen on seven recordings and simulations. The
+    ratio of depth was at most 0.85 with a strong bias, and above 0.94 otherwise. That of color was
+    at most 0.15 with strong vignetting, and above 0.45 otherwise.
     """
 
     # Numbers of views at which an estimate starts. The estimate at the last number ends the
@@ -64,8 +64,8 @@ class SelfCalibrationConfig:
     lost_frames: int = 3  # Frames from one view to the next while tracking is LOST.
     min_pairs: int = 3  # An estimate from fewer pairs of views is skipped.
     # A correction is used if it reduces the residual of held-out pairs to at most this fraction.
-    max_depth_ratio: float = 0.86
-    max_color_ratio: float = 0.3
+    max_depth_ratio: float = 0.86  # Limit for the depth bias.
+    max_color_ratio: float = 0.3  # Limit for the vignetting.
 
     def __post_init__(self) -> None:
         if any(n < 2 for n in self.views) or list(self.views) != sorted(set(self.views)):
@@ -313,7 +313,7 @@ class SelfCalibration:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, dict[str, Any]]:
-        """Return the state as named parts; the part of a view never changes."""
+        """Return the state as named parts; a part that did not change is the same object."""
         now = {
             **self.correction.pack(),
             "ratios": list(self.ratios),

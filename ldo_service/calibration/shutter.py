@@ -27,7 +27,7 @@ MAX_RAD_PER_S, MAX_M_PER_S = 10.0, 10.0
 
 @dataclass(frozen=True, slots=True)
 class ShutterTiming:
-    """Times at which a camera records the parts of a frame."""
+    """Durations and delay with which a camera records the rows of color and depth."""
 
     readout_s: float = 0.0  # Time from the first to the last row of the color image.
     depth_readout_s: float = 0.0  # Time from the first to the last row of depth; 0: simultaneous.
@@ -68,7 +68,7 @@ class FrameMotion:
     # [6] rotation in rad/s, then translation in m/s, in the camera frame: the camera is at
     # T_camera * exp(velocity * t) after the time t.
     velocity: np.ndarray
-    timing: ShutterTiming
+    timing: ShutterTiming  # Timing of the camera's shutter.
 
     @staticmethod
     def between(

@@ -50,11 +50,14 @@ class CalibrationView:
 
     number: int  # Running number of the view.
     camera: Camera  # Camera of the full image.
-    block: int  # Side of a block, pixels. One pixel of the images below averages one block.
-    depth_m: np.ndarray  # [h, w] float32; 0 where unknown or not on one surface.
-    color: np.ndarray  # [h, w, 3] float32, blurred.
+    # Side of a block of pixels of the full image. The images below have one pixel per block.
+    block: int
+    depth_m: np.ndarray  # [h, w] float32, mean depth; 0 where unknown or not on one surface.
+    color: np.ndarray  # [h, w, 3] float32, 0..255, blurred.
     is_exposed: np.ndarray  # [h, w] bool: no pixel nearby is clipped.
-    tracks: np.ndarray  # [N] int64: numbers of the corners, ascending; the same in all views.
+    # Numbers of the N tracked corners, [N] int64, ascending. A corner has the same number in all
+    # views.
+    tracks: np.ndarray
     corners: np.ndarray  # [N, 2] pixels of the full image.
     corner_depth_m: np.ndarray  # [N]; 0 where unknown.
     T_odom_camera: np.ndarray | None = None  # Pose by the tracker, [4, 4]; None if LOST.
@@ -126,7 +129,7 @@ class ViewMaker:
             frame: The frame.
             T_odom_camera: Its pose, [4, 4], by which the motion of the corners is predicted; None
                 while tracking is LOST.
-            velocity: Velocity of the camera, [6]; None if unknown.
+            velocity: Velocity of the camera, see `CalibrationView.velocity`; None if unknown.
         """
         camera = frame.camera
         block = max(1, camera.width // VIEW_WIDTH)
@@ -253,8 +256,9 @@ class ViewPair:
     """Two views that show the same surface, with the corners that both show."""
 
     first: int  # Number of the view whose depth is used.
-    second: int
+    second: int  # Number of the other view.
     T_second_first: np.ndarray  # [4, 4]
+    # The M common corners: pixels of the full images, and depth in the first view.
     pixels_first: np.ndarray  # [M, 2]
     depth_first_m: np.ndarray  # [M]
     pixels_second: np.ndarray  # [M, 2]
