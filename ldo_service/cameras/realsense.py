@@ -19,7 +19,7 @@ class RealSenseStream:
     """Stream settings of a RealSense; color and depth have the same size and rate."""
 
     serial: str = ""  # Serial number of the device; empty if there is only one.
-    width: int = 640
+    width: int = 640  # Pixels, as the height.
     height: int = 480
     rate_hz: int = 30
 

@@ -45,8 +45,8 @@ Notify = Callable[[str], None]
 class RosTopics:
     """ROS names of the topics of a camera, and properties of its images."""
 
-    color: str
-    depth: str
+    color: str  # Topic of the color images.
+    depth: str  # Topic of the depth images.
     info: str = ""  # Camera info of color; empty: `camera_info` in the namespace of `color`.
     # Maximum difference between the stamps of color and depth: less than half a period at 30 Hz.
     max_skew_s: float = 0.015

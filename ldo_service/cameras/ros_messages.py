@@ -46,7 +46,8 @@ class RosImage:
     stamp_ns: int
     frame_id: str  # ROS name of the camera frame.
     image: Image
-    depth_scale: float = 1.0  # Units of a depth image per meter.
+    # Number of units of the depth image in a meter: 1000 for millimeters.
+    depth_scale: float = 1.0
 
 
 def is_compressed(topic: str) -> bool:

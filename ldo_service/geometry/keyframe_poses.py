@@ -207,4 +207,6 @@ class RelativePose:
     a: int  # Keyframe that the pose is relative to.
     b: int  # Measured keyframe.
     T_a_b: np.ndarray  # [4, 4]
-    information: np.ndarray  # [6, 6] for T_a_b * exp(xi): rotation, then translation.
+    # Information matrix [6, 6] of the error xi in T_a_b * exp(xi): rotation in rad, then
+    # translation in m.
+    information: np.ndarray

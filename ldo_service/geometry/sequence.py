@@ -90,7 +90,7 @@ class Sequence(ABC):
         """Return the ground-truth `T_world_camera` in the data set's world frame, or None."""
 
     def odometry(self) -> Trajectory | None:
-        """Return `T_odom_camera` of another odometry that was recorded with the frames, or None.
+        """Return the odometry that was recorded with the frames, `T_odom_camera`, or None.
 
         It is an estimate, such as that of a phone or of wheels, and no ground truth. Its stamps are
         of the clock of the frames, and the camera is that of the color images.
@@ -147,7 +147,7 @@ class Cached(Sequence):
         return self._sequence.truth()
 
     def odometry(self) -> Trajectory | None:
-        """Return the recorded poses of another odometry, or None."""
+        """Return the odometry that was recorded with the frames, or None."""
         return self._sequence.odometry()
 
     def true_labels(self) -> TrueLabels | None:
@@ -170,7 +170,7 @@ class OdometryAsTruth(Sequence):
         return self._sequence.read(index)
 
     def truth(self) -> Trajectory | None:
-        """Return the recorded poses of another odometry, or None."""
+        """Return the odometry that was recorded with the frames, or None."""
         return self._sequence.odometry()
 
     def true_labels(self) -> TrueLabels | None:

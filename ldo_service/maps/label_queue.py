@@ -17,10 +17,10 @@ MAX_REGIONS = 4096
 
 
 class WaitingRequest(NamedTuple):
-    """Label request, and the area of the region's surface that its view shows, square meters."""
+    """Label request that waits for the labeller."""
 
     request: LabelRequest
-    surface_m2: float
+    surface_m2: float  # Area of the region's surface that the view of the request shows.
 
 
 class LabelRequestQueue:

@@ -19,7 +19,8 @@ class ObjectMatch:
     center: tuple[float, float, float]  # Center of the object's box.
     size: tuple[float, float, float]  # Size along the axes of the box.
     T_map_object: Pose  # Center and axes of the box.
-    # Distance to the camera or, after a run, to its last position; None if no pose is known.
+    # Distance of the center from the camera or, after a run, from its last position; None if no
+    # camera position is known.
     distance: float | None
 
 
