@@ -143,7 +143,8 @@ class Adam:
         Args:
             gaussians: The map; its rows change.
             rasterizer: The rasterizer that last rendered this map.
-            by_planes: Derivatives of the loss by the rendered planes, [5, H, W].
+            by_planes: Derivatives of the loss by the planes that `Rasterizer.render` returns,
+                [5, H, W].
             rate: Factor on the configured learning rates.
             needle_weight: Weight of the penalty on needle-shaped Gaussians; see
                 `Rasterizer.gradients`.
@@ -164,7 +165,7 @@ class Adam:
         return reached
 
     def arguments(self, gaussians: GaussianMap, rate: float = 1.0) -> AdamStep:
-        """Return rows and state of a map for one step, without copies of the state.
+        """Return the arguments of one Adam step on all rows of a map; no array is copied.
 
         Args:
             gaussians: The map.

@@ -15,7 +15,7 @@ class ChunkEntry:
     whose ids go from `first_id` to `last_id`, with gaps if `count` is smaller than this range.
     """
 
-    anchor: int
+    anchor: int  # Id of the anchor keyframe.
     first_id: int
     last_id: int
     count: int

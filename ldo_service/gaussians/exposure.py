@@ -56,11 +56,11 @@ class Exposure:
         return np.array([self.gain, self.bias])
 
     def applied(self, color: np.ndarray) -> np.ndarray:
-        """Convert an image [H, W, 3] from the exposure of the map to this exposure, in 0..1."""
+        """Convert colors [H, W, 3] in 0..1 from the exposure of the map to this one, and clip."""
         return (self.gain * color + self.bias).clip(0, 1)
 
     def removed(self, color: np.ndarray) -> np.ndarray:
-        """Convert an image [H, W, 3] from this exposure to the exposure of the map, in 0..1."""
+        """Convert colors [H, W, 3] in 0..1 from this exposure to that of the map, and clip."""
         return ((color - self.bias) / np.maximum(self.gain, MIN_GAIN)).clip(0, 1)
 
 
@@ -110,7 +110,7 @@ def estimate_exposure(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ImageBlocks:
-    """Mean colors of the pixel blocks of a camera image.
+    """Mean colors of the blocks of a camera image: B rows of C square blocks of pixels.
 
     Attributes:
         color: [3, B, C] float32, 0..1.
@@ -134,9 +134,12 @@ def fit_blocks(rendered: np.ndarray, opacity: np.ndarray, seen: ImageBlocks) -> 
     """Estimate an exposure from mean colors of pixel blocks; see `estimate_exposure`.
 
     Args:
-        rendered: Mean rendered colors, [3, B, C], 0..1.
+        rendered: Mean rendered colors of B rows of C blocks, [3, B, C], 0..1.
         opacity: Mean rendered opacities, [B, C].
-        seen: Blocks of the camera image.
+        seen: The same blocks of the camera image.
+
+    Returns:
+        The exposure; None if the two images probably show different surfaces.
     """
     x, y = rendered, seen.color
     usable = seen.usable & (opacity > 0.95) & np.isfinite(x).all(axis=0)

@@ -59,7 +59,7 @@ class Fitting:
 
     Args:
         config: Settings of the Gaussian optimizer.
-        window: Settings of the choice after a new keyframe.
+        sampling: Settings of the choice of keyframes after a new keyframe.
         views: Keyframes to fit the map to.
         is_resident: Function that returns whether all Gaussians that may be visible in a keyframe
             are in memory. Keyframes with the result False are skipped: the Gaussians in memory
@@ -71,7 +71,7 @@ class Fitting:
     def __init__(
         self,
         config: GaussianOptimizerConfig,
-        window: ViewSamplingConfig,
+        sampling: ViewSamplingConfig,
         views: KeyframeViews,
         is_resident: Callable[[int], bool],
         *,
@@ -79,7 +79,7 @@ class Fitting:
         threads: int,
     ) -> None:
         self._optimizer = GaussianOptimizer(config, threads=threads)
-        self._window, self._views, self._is_resident = window, views, is_resident
+        self._sampling, self._views, self._is_resident = sampling, views, is_resident
         self._seed = seed
         self.iterations = 0
         self.unusable = 0  # Number of keyframes that were chosen but skipped.
@@ -108,7 +108,7 @@ class Fitting:
         Returns:
             Ids of the keyframes, one per iteration.
         """
-        window, rng = self._window, random_for(self._seed, newest.keyframe)
+        sampling, rng = self._sampling, random_for(self._seed, newest.keyframe)
         older = [k for k in self._views.store.keyframes() if k != newest.keyframe]
         plan = sample_training_views(
             newest.keyframe,
@@ -116,8 +116,8 @@ class Fitting:
             older,
             iterations,
             rng,
-            newest_share=window.newest_share,
-            covisible_share=window.covisible_share,
+            newest_share=sampling.newest_share,
+            covisible_share=sampling.covisible_share,
         )
         return [*plan[:1], *checked, *plan[1:]][:iterations]
 
@@ -130,14 +130,14 @@ class Fitting:
         keyframe measured. Only the last `recent` keyframes and `earlier` random ones before them
         are checked.
         """
-        window = self._window
-        split = max(0, len(older) - window.recent)
+        sampling = self._sampling
+        split = max(0, len(older) - sampling.recent)
         earlier, recent = older[:split], older[split:]
-        if len(earlier) > window.earlier:
-            chosen = rng.choice(len(earlier), window.earlier, replace=False)
+        if len(earlier) > sampling.earlier:
+            chosen = rng.choice(len(earlier), sampling.earlier, replace=False)
             earlier = [earlier[i] for i in np.sort(chosen)]
         surface = sampled_surface(newest)
-        return [k for k in (*earlier, *recent) if self._shared(surface, k) >= window.min_shared]
+        return [k for k in (*earlier, *recent) if self._shared(surface, k) >= sampling.min_shared]
 
     def _shared(self, p_map: np.ndarray, keyframe: int) -> float:
         return covisibility_ratio(p_map, self._views.cameras[keyframe], self._views.poses[keyframe])

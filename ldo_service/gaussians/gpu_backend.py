@@ -55,11 +55,11 @@ class ResidentFrame:
 
 
 class GpuBackend:
-    """Iterations by the kernels of `kernels.gpu`.
+    """Iterations of the Gaussian optimizer by the kernels of `kernels.gpu`.
 
-    The map and the moments on the CPU stay the originals. `begin` uploads changed rows, and `end`
-    downloads the rows that the iterations changed. An iteration downloads the weights of the
-    visible Gaussians, the terms of the loss, and mean colors for the exposure.
+    The device works on a copy of the map and of the moments of Adam. `begin` uploads changed rows,
+    and `end` downloads the rows that the iterations changed. An iteration downloads the weights of
+    the visible Gaussians, the terms of the loss, and mean colors for the exposure.
 
     The results are bitwise equal on one GPU model and one version of Triton. They differ from those
     of the CPU in the last bits of each iteration.

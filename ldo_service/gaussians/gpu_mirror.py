@@ -17,12 +17,12 @@ class GaussianMirror:
     """Rows, moments and step counts of a map on a device.
 
     A Gaussian takes 196 bytes. If the map grows, the capacity is at least doubled, so that the
-    mirror takes up to 392 bytes for each Gaussian. While a change of the map moves Gaussians, the
-    array that is moved takes up to 192 bytes more.
+    mirror takes up to 392 bytes for each Gaussian. A change of the map may move Gaussians. The
+    mirror then moves one array after the other, which takes up to 192 bytes more per Gaussian.
 
-    The map and its `Adam` on the CPU stay the originals. `update` uploads what changed there since
-    the last call, and `write_back` downloads what the device changed. Between the two calls, the
-    map must not change.
+    The mirror is a copy: the map and its `Adam` are on the CPU. `update` uploads what changed there
+    since the last call, and `write_back` downloads what the device changed. Between the two calls,
+    the map must not change.
 
     Attributes:
         rows: Gaussians, [capacity, 16].
@@ -46,8 +46,8 @@ class GaussianMirror:
     def update(self, gaussians: GaussianMap, adam: Adam) -> None:
         """Upload all rows that the map has changed, and follow additions and removals.
 
-        If the moments were restored since the last call, or were matched to other rows more than
-        once, the moments are uploaded too, because the path of each row is then unknown.
+        The moments are uploaded too if `adam` was restored since the last call, or if it adapted
+        its moments to a changed map more than once. The mirror cannot follow their rows then.
         """
         state = adam.arguments(gaussians)
         is_known = self._map is not None and self._map() is gaussians

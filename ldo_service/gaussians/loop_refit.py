@@ -134,7 +134,7 @@ class LoopRefit:
 
     @property
     def deduplication_iterations(self) -> int:
-        """Number of iterations after the deduplication that the next new keyframe triggers."""
+        """Number of optimizer iterations that follow the deduplication of the next new keyframe."""
         config = self.config
         return config.deduplication_iterations * min(
             config.deduplicated_per_keyframe, len(self._to_deduplicate)

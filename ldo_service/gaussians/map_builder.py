@@ -64,7 +64,7 @@ class MapBuilder:
         self._confirmation = Confirmation(self.views.store, self.config.pruning, self.config.seed)
         self.fitting = Fitting(
             self.config.optimizer,
-            self.config.window,
+            self.config.sampling,
             self.views,
             self.is_resident,
             seed=self.config.seed,

@@ -18,7 +18,7 @@ class MapBuilderConfig:
 
     insertion: DensificationConfig = field(default_factory=DensificationConfig)
     optimizer: GaussianOptimizerConfig = field(default_factory=GaussianOptimizerConfig)
-    window: ViewSamplingConfig = field(default_factory=ViewSamplingConfig)
+    sampling: ViewSamplingConfig = field(default_factory=ViewSamplingConfig)
     pruning: PruningConfig = field(default_factory=PruningConfig)
     merging: DeduplicationConfig = field(default_factory=DeduplicationConfig)
     store: KeyframeStoreConfig = field(default_factory=KeyframeStoreConfig)

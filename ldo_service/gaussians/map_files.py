@@ -7,7 +7,11 @@ from .offloading import OffloadedGaussians
 
 
 class MapFiles:
-    """Files of a map, which the owner of its saved state notifies of each save."""
+    """Files of a map, which are removed only when no saved state of the map needs them.
+
+    The checkpointer calls `saved` or `kept` after it has saved the state, and the other methods
+    while it writes the files to the disk.
+    """
 
     def __init__(self, offloaded: OffloadedGaussians, images: KeyframeStore) -> None:
         self._offloaded = offloaded
@@ -18,7 +22,11 @@ class MapFiles:
         self._offloaded.retired.saved()
 
     def kept(self, *, is_previous_complete: bool) -> None:
-        """Remove files that no kept generation of the state needs; see `RetiredFiles.kept`."""
+        """Remove files that no kept generation of the state needs.
+
+        Args:
+            is_previous_complete: See `RetiredFiles.kept`.
+        """
         self._offloaded.retired.kept(is_previous_complete=is_previous_complete)
 
     def retired_bytes(self) -> int:
@@ -30,11 +38,11 @@ class MapFiles:
         return [path for folder in self._folders for path in folder.unsynced_files()]
 
     def begin_sync(self) -> None:
-        """Note that the caller begins to sync `unsynced_files`."""
+        """Record that the caller begins to sync `unsynced_files`."""
         for folder in self._folders:
             folder.begin_sync()
 
     def end_sync(self) -> None:
-        """Note that the files of the last `begin_sync` are on the disk."""
+        """Record that the files of the last `begin_sync` are on the disk."""
         for folder in self._folders:
             folder.end_sync()

@@ -151,8 +151,8 @@ class IterationResult:
     Attributes:
         loss: Loss before the step.
         view: The training view with exposure and pose after the step.
-        visible: Gaussians that may touch the image, with weights in pixels of the full image; valid
-            until the next rendering.
+        visible: Gaussians that may touch the image; valid until the next rendering. Their weights
+            are sums over the pixels of the full image, also after a step at half resolution.
     """
 
     loss: ImageLoss

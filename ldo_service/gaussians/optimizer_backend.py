@@ -57,17 +57,17 @@ class OptimizerBackend(Protocol):
         ...
 
     def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
-        """Compare the last rendering with its view, and take a step of Adam.
+        """Compare the result of the last `render` with its view, and take a step of Adam.
 
-        The map changes at the latest in `end`.
+        A backend may change the map now or only in `end`.
 
         Args:
             exposure: Exposure of the view.
             rate: Factor on all learning rates.
 
         Returns:
-            Loss before the step, and the visible Gaussians, with weights in pixels of the full
-            image. They are valid until the next rendering.
+            Loss before the step, and the visible Gaussians. Their weights are sums over the pixels
+            of the full image, also at half resolution. They are valid until the next rendering.
         """
         ...
 

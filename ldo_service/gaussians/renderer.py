@@ -157,7 +157,7 @@ class Rasterizer:
         have changed since the rendering. The result is bitwise equal for any number of threads.
 
         Args:
-            by_planes: dL/dplanes without the additional term, [5, H, W].
+            by_planes: dL/dplanes without the additional term, [5, H, W] as `render` returns them.
             needle_weight: Weight of the additional term.
             needle_ratio: Ratio of the longest to the middle axis above which the term is positive.
         """
@@ -194,7 +194,8 @@ class Rasterizer:
         in place.
 
         Args:
-            by_planes: dL/dplanes without the penalty on needles, [5, H, W].
+            by_planes: dL/dplanes without the penalty on needles, [5, H, W] as `render` returns
+                them.
             step: Parameters, moments and rates.
             needle_weight: Weight of the penalty on needles; see `gradients`.
             needle_ratio: Ratio of the longest to the middle axis above which the penalty applies.

@@ -4,10 +4,11 @@ from ldo_service.storage.checksummed_folder import ChecksummedFolder
 
 
 class RetiredFiles:
-    """Numbers of files that the current state does not need.
+    """Files that the current state does not need any more, but that a saved state may need.
 
-    A process restored from the last saved state may still need them. If the saved states are also
-    kept as older generations, the service may fall back to these.
+    These are the last saved state and, if they are kept, its older generations. The service falls
+    back to an older generation if the last state is damaged. A file is given by its number in the
+    folder.
     """
 
     def __init__(self, files: ChecksummedFolder) -> None:
@@ -17,18 +18,25 @@ class RetiredFiles:
         self._kept: list[int] = []  # The newest kept generation does not need them.
 
     def add(self, number: int) -> None:
-        """Retire a file, or remove it if a restored process cannot use the folder."""
+        """Remove a file as soon as no saved state needs it.
+
+        A file in a temporary folder is removed at once, because no restored process uses it.
+        """
         if self._files.is_temporary:
             self._files.remove(number)
         else:
             self._new.append(number)
 
     def on_snapshot(self) -> None:
-        """Note that a snapshot of the state is taken, which needs none of the files."""
+        """Record that a snapshot was taken, which needs none of the files added before it."""
         self._unsaved, self._new = [*self._unsaved, *self._new], []
 
     def restart(self, numbers: list[int]) -> None:
-        """Replace all retired files by those that a restored state does not need."""
+        """Forget all files, and start with those that a restored state does not need.
+
+        Args:
+            numbers: Numbers of these files.
+        """
         self._new, self._unsaved, self._kept = [], numbers, []
 
     @property
@@ -45,13 +53,14 @@ class RetiredFiles:
         self._remove(self._unsaved)
 
     def kept(self, *, is_previous_complete: bool) -> None:
-        """Remove the files that the kept generations do not need.
+        """Remove the files that no kept generation of the state needs.
 
-        Call this method instead of `saved` after each kept generation of the saved state.
+        If older generations are kept, call this method, instead of `saved`, after the state was
+        saved as a new generation.
 
         Args:
-            is_previous_complete: Whether the generation kept before this one is complete, so that
-                no older one is needed.
+            is_previous_complete: True if the generation before the new one is complete, so that no
+                older one is needed.
         """
         if is_previous_complete:
             self._remove(self._kept)

@@ -337,5 +337,6 @@ def _expanded(data: bytes, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
     with zstandard.ZstdDecompressor().stream_reader(data) as stream:
         filled = stream.readinto(out.reshape(-1).view(np.uint8).data)
         if filled < out.nbytes or stream.read(1):
-            raise ValueError(f"an image must have the shape {shape} after decompression")
+            size = f"only {filled}" if filled < out.nbytes else "more"
+            raise ValueError(f"an image {shape} has {out.nbytes} bytes, but the data has {size}")
     return out
