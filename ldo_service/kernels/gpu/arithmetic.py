@@ -44,7 +44,8 @@ def exp2(x):
 def log2(x):
     """Return log2 of a normal x > 0, with an absolute error below 1e-6.
 
-    The exponent is added to the series of atanh of the mantissa in [sqrt(1/2), sqrt(2)).
+    The result is the exponent plus log2 of the mantissa m in [sqrt(1/2), sqrt(2)). A polynomial
+    approximates the latter, as ln m = 2 atanh(s) with s = (m - 1) / (m + 1).
     """
     bits = x.to(tl.int32, bitcast=True)
     e = (bits - 0x3F3504F3) >> 23

@@ -1,7 +1,9 @@
 """Blending of splats front to back, and its derivative; see `kernels/blend.hpp`.
 
-A program of one warp blends a tile of 16x16 pixels. The pixels have the shape [16 pixels, 16
-blocks], because the 4x4 pixels of a block finish together. In this order, a thread holds eight
+A tile has 16x16 pixels, in 16 blocks of 4x4 pixels. A pair is a splat and a tile that it may reach;
+`projection` describes both and the layout of a splat. A program of one warp blends a tile. The
+pixels have the shape [16 pixels, 16 blocks], because the pixels of a block finish together. In this
+order, a thread holds eight
 pixels of one block, so that sums over pixels stay in its registers except for one exchange between
 threads. In the other order, each sum takes 32 shuffle instructions instead of 5.
 """
@@ -25,11 +27,14 @@ CHUNK = tl.constexpr(16)  # The tile checks after this number of pairs whether a
 
 @triton.jit
 def pixels_of(tile, columns):
-    """Return columns and rows [16, 16] of the pixels of a tile, and of its blocks [1, 16].
+    """Return the positions of the pixels and blocks of a tile, given by its number.
 
-    The masks 3 and 12 replace remainders. If the compiler sees that four pixels are neighbors in
-    memory, it gives them to four threads, and the sums over pixels become shuffles.
+    Returns:
+        Column and row of each pixel in the image, [16 pixels, 16 blocks] each. Then column and row
+        of the first pixel of each block, [1, 16] each.
     """
+    # The masks 3 and 12 replace remainders. If the compiler sees that four pixels are neighbors in
+    # memory, it gives them to four threads, and the sums over pixels become shuffles.
     pixel, block = tl.arange(0, 16)[:, None], tl.arange(0, 16)[None, :]
     block_x = tile % columns * TILE + (block & 3) * 4
     block_y = tile // columns * TILE + (block & 12)
@@ -61,13 +66,13 @@ def blend_forward(splats, listed, reached, starts, columns, width, height, plane
     Args:
         splats: [N, 16].
         listed: Splat of each pair, [P]: tile by tile, front to back.
-        reached: Blocks that each pair reaches, [P].
+        reached: Bit mask of the blocks of the tile that each pair reaches, [P].
         starts: First pair of each tile, [tiles + 1].
         columns: Tiles in a row of the image.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         planes: Output, [5, height, width]: red, green, blue, weighted depth, opacity.
-        ends: Output, [tiles, 16]: pair after the last one that each block blends.
+        ends: Output, [tiles, 16]: number of the pair after the last one that each block blends.
     """
     tile = tl.program_id(0)
     x, y, block_x, block_y = pixels_of(tile, columns)
@@ -133,19 +138,21 @@ def blend_backward(
     operation is needed, and the bits do not depend on the order of the programs. With
     v = dL/d ln(alpha), d = pixel - (u, v) and the blending weight w, a row holds the sums of v,
     v dx, v dy, v dx^2, v dx dy, v dy^2, w dL/dcolor (3), w dL/ddepth and w.
-    `kernels/blend_gradient.hpp` derives v = w (q - m).
+
+    With q = dL/dcolor . color + dL/ddepth z + dL/dopacity of the splat, v is w (q - m). There, m is
+    the mean of q over the splats behind it; see `kernels/blend_gradient.hpp`.
 
     Args:
         splats: [N, 16].
         listed: Splat of each pair, [P]: tile by tile, front to back.
-        reached: Blocks that each pair reaches, [P].
+        reached: Bit mask of the blocks of the tile that each pair reaches, [P].
         origins: Row of `sums` that each pair writes, [P]; those of a splat are contiguous.
         starts: First pair of each tile, [tiles + 1].
-        ends: Pair after the last one that each block blended, [tiles, 16].
+        ends: Output of `blend_forward`, [tiles, 16].
         columns: Tiles in a row of the image.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
-        planes: Planes of the rendering, [5, height, width].
+        planes: Output of `blend_forward`, [5, height, width].
         by_planes: Derivatives of the loss by the planes, [5, height, width].
         sums: Output, [P, 16], which holds zeros before.
     """

@@ -1,7 +1,11 @@
 """Image loss of a rendering and its derivatives: L1, SSIM and depth; see `kernels/loss.cpp`.
 
-The window of SSIM is applied along rows, then along columns, first to the images and then to the
-derivatives of SSIM by the windowed means. One lane computes one value of [3, H, W].
+The loss compares x with y: x is the rendering with the exposure of the frame applied, y is the
+frame, both in 0..1. The window of SSIM, a Gaussian, is applied along rows, then along columns,
+first to the images and then to the derivatives of SSIM by the windowed means.
+
+One lane computes one value of [3, H, W]. Its index there is `at`, and `pixel` is its index in
+[H, W]. `is_live` is false for lanes of the last program that have no value.
 """
 
 import triton
@@ -22,7 +26,7 @@ C2 = tl.constexpr(0.03 * 0.03)
 
 @triton.jit
 def tap(k: tl.constexpr):
-    """Return the weight of the window k places from its middle."""
+    """Return the factor of the window for the pixel at k from its middle; all add up to 1."""
     if k == 0:
         return TAP0
     elif (k == 1) | (k == -1):  # noqa: RET505
@@ -39,7 +43,7 @@ def tap(k: tl.constexpr):
 
 @triton.jit
 def place_of(width, height, BLOCK: tl.constexpr):
-    """Return place in [3, H, W], channel, place in [H, W], row, column, and whether lanes exist."""
+    """Return `at`, channel, `pixel`, row, column and `is_live` of each lane; see the module."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     size = width * height
     pixel = at % size
@@ -48,7 +52,7 @@ def place_of(width, height, BLOCK: tl.constexpr):
 
 @triton.jit
 def exposed_at(planes, color, mask, exposure, at, channel, pixel, is_live):
-    """Return the exposed rendering and the frame in 0..1, both 0 where the mask is 0."""
+    """Return x, y, where they count, and the gain; x and y are 0 where the mask is 0."""
     counts = is_live & (tl.load(mask + pixel, is_live, 0) != 0)
     gain = tl.load(exposure + channel, is_live, 0.0)
     bias = tl.load(exposure + 3 + channel, is_live, 0.0)
@@ -59,7 +63,7 @@ def exposed_at(planes, color, mask, exposure, at, channel, pixel, is_live):
 
 @kernel
 def means_along_rows(planes, color, mask, exposure, width, height, out, BLOCK: tl.constexpr):
-    """Apply the window along rows to x, y, x^2 + y^2 and x y.
+    """Apply the window along rows to x, y, x^2 + y^2 and x y; the module defines x and y.
 
     Args:
         planes: Rendering, [5, H, W].
@@ -92,7 +96,7 @@ def means_along_rows(planes, color, mask, exposure, width, height, out, BLOCK: t
 
 @triton.jit
 def window_along_columns(images, at, row, width, height, is_live):
-    """Return the windowed sums of an image at places `at`, along its columns."""
+    """Apply the window along columns to images [3, H, W], at the index `at` of each lane."""
     out = tl.zeros_like(row).to(tl.float32)
     for k in tl.static_range(-5, 6):
         is_inside = is_live & (row + k >= 0) & (row + k < height)
@@ -108,7 +112,8 @@ def ssim_derivatives(along_rows, width, height, out, ssims, BLOCK: tl.constexpr)
         along_rows: Output of `means_along_rows`, [4, 3, H, W].
         width: W.
         height: H.
-        out: Output, [3, 3, H, W]: derivatives of SSIM by the windowed x, x^2 + y^2 and x y.
+        out: Output, [3, 3, H, W]: derivatives of SSIM by the windowed x, x^2 + y^2 and x y; the
+            module defines x and y.
         ssims: Output, [programs]: sum of SSIM over the values of each program.
         BLOCK: Lanes of a program.
     """
@@ -172,8 +177,8 @@ def color_gradient(
         along_rows: Output of `derivatives_along_rows`, [3, 3, H, W].
         width: W.
         height: H.
-        l1: Weight of L1 over the number of values.
-        d_ssim: Weight of D-SSIM over the number of values, with the sign of SSIM: negative.
+        l1: Weight of L1, divided by the number of values 3 H W.
+        d_ssim: Negative weight of D-SSIM, divided by the number of values; D-SSIM is 1 - SSIM.
         by_planes: Output, [5, H, W], of which the color planes are written.
         l1s: Output, [programs]: sum of the absolute errors of each program.
         squares: Output, [programs]: sum of the squared errors of each program.
@@ -211,7 +216,7 @@ def depth_gradient(
         mask: Pixels that count, [H, W] uint8.
         width: W.
         height: H.
-        step: Weight of the depth over the number of depths that count.
+        step: Weight of the depth error, divided by the number of depths that count.
         by_planes: Output, [5, H, W], of which the last two planes are written.
         errors: Output, [programs]: sum of the depth errors of each program.
         BLOCK: Lanes of a program.

@@ -26,7 +26,7 @@ LOW_PASS = np.float32(0.3)  # Variance that the image adds to each splat, px^2.
 def view_of(
     T_camera_map: np.ndarray, intrinsics: tuple[float, float, float, float], binning: int = 1
 ) -> np.ndarray:
-    """Return the values [18] float32 that kernels need of a view.
+    """Return the 18 float32 values of a view; `projection` describes their layout.
 
     Args:
         T_camera_map: [4, 4] or [3, 4].
@@ -49,8 +49,8 @@ class Splats:
     """Projection of N Gaussians.
 
     Attributes:
-        splats: [N, 16].
-        ranges: Tiles x0 y0 x1 y1 of each splat, [N, 4].
+        splats: [N, 16]; `projection` describes the layout.
+        ranges: Tiles x0 y0 x1 y1 of each splat, both ends included, [N, 4].
         pairs: Number of tiles of each splat, [N]; 0 if it is not drawn.
     """
 
@@ -61,15 +61,18 @@ class Splats:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TileLists:
-    """Pairs of a splat and a tile, sorted by (tile, depth, row).
+    """Pairs of a splat and a tile that it may reach, sorted by tile, then depth, then row.
+
+    A row is the index of a Gaussian, and of its splat. Before the sort by tile, the pairs of a
+    splat are contiguous.
 
     Attributes:
         visible: Rows that are drawn, [V], ascending.
-        firsts: First pair of each row in the order before the sort by tile, [N]; undefined for rows
+        firsts: Index of the first pair of each row before the sort by tile, [N]; undefined for rows
             that are not drawn.
-        listed: Splat of each pair, [P].
-        reached: Blocks that each pair reaches, [P].
-        origins: Place of each pair before the sort by tile, [P].
+        listed: Row of each pair, [P].
+        reached: Bit mask of the blocks of 4x4 pixels of the tile that each pair reaches, [P].
+        origins: Index of each pair before the sort by tile, [P].
         starts: First pair of each tile, [tiles + 1].
     """
 
@@ -86,14 +89,15 @@ class PlaneRendering:
     """Rendered planes, and everything that their derivatives need.
 
     Attributes:
-        view: View, [18].
-        focal_px: Larger focal length.
+        view: Output of `view_of`, on the device.
+        focal_px: Larger one of fx and fy, pixels.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         splats: Projected Gaussians.
         lists: Pairs of splats and tiles.
         planes: [5, height, width].
-        ends: Pair after the last one that each block blended, [tiles, 16].
+        ends: For the 16 blocks of each tile, the index of the pair after the last blended one,
+            [tiles, 16].
     """
 
     view: Any
@@ -111,7 +115,16 @@ def programs_for(count: int, lanes: int) -> tuple[int]:
 
 
 def project(arrays: Arrays, rows: Any, n: int, view: Any, width: int, height: int) -> Splats:
-    """Project the first n rows."""
+    """Project the first n Gaussians.
+
+    Args:
+        arrays: Arrays of the device.
+        rows: Gaussians on the device, [N, 16].
+        n: Number of Gaussians, at most N.
+        view: Output of `view_of`, on the device.
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
+    """
     out = Splats(
         arrays.empty((n, ROW), np.float32),
         arrays.empty((n, 4), np.int32),
@@ -176,7 +189,7 @@ def list_tiles(arrays: Arrays, splats: Splats, width: int, height: int) -> TileL
 def render(
     arrays: Arrays, rows: Any, n: int, view: np.ndarray, width: int, height: int
 ) -> PlaneRendering:
-    """Render the first n rows.
+    """Render the first n Gaussians.
 
     Args:
         arrays: Arrays of the device.

@@ -1,9 +1,18 @@
 """Projection of Gaussians to splats, and pairs of splats and tiles; see `kernels/projection.hpp`.
 
 A row of a Gaussian has 16 floats: mean 0-2, log scale 3-5, quaternion wxyz 6-9, opacity logit 10,
-color 11-13, two unused. A splat has 16 floats: u v | a b c log2_opacity | x_slope y_slope |
-red green blue | z | four unused. A view has 18 floats: T_camera_map row by row (12), fx fy cx cy,
-low_pass, box.
+color 11-13, two unused.
+
+A splat, the projection of a Gaussian, has 16 floats: u v | a b c log2_opacity | x_slope y_slope |
+red green blue | z | four unused. At the offset (x, y) from its center (u, v) in pixels, log2 of
+alpha is a x^2 + b x y + c y^2 + log2_opacity. Alpha is largest at x = x_slope y for a given y, and
+at y = y_slope x for a given x.
+
+A view has 18 floats: T_camera_map row by row (12), fx fy cx cy, low_pass, box. The last two are
+variances in px^2: low_pass is added to the covariance of each splat, and box is the part of it that
+stands for the average over the pixels of a binned image.
+
+A pair is a splat and a tile of 16x16 pixels that it may reach. A tile has 16 blocks of 4x4 pixels.
 """
 
 import triton
@@ -49,9 +58,10 @@ def to_camera(mean, R0, R1, R2, t):
 def jacobian(p, R0, R1, R2, lens, limits):
     """Return the derivatives of u and v by a point of the map, and the values that they share.
 
-    These values are 1 / z, x / z, y / z, and the entries (ju, jv, ku, kv) of the derivative of the
-    perspective. The viewing direction is clamped to `limits`, because the affine model fails
-    farther outside.
+    The point p is in the camera frame; `camera_of` describes the other arguments. The shared values
+    are 1 / z, x / z, y / z and (ju, jv, ku, kv). By the point in the camera frame, the derivative
+    of u is (ju, 0, -ku), and that of v is (0, jv, -kv). The viewing direction is clamped to
+    `limits`, because the affine model fails farther outside.
     """
     inverse_z = tl.div_rn(1.0, tl.maximum(p[2], NEAR))
     x, y = p[0] * inverse_z, p[1] * inverse_z
@@ -79,7 +89,11 @@ def principal_axes(q, sigmas):
 
 @triton.jit
 def image_covariance(along_u, along_v, low_pass):
-    """Return uu, uv and vv of the covariance in px^2, from the axes along u and v."""
+    """Return uu, uv and vv of the covariance of a splat, px^2.
+
+    The three axes of the Gaussian, each one standard deviation long, appear in the image with the
+    lengths `along_u` and `along_v`, px. `low_pass` is the variance that is added, px^2.
+    """
     uu = low_pass + along_u[0] * along_u[0] + along_u[1] * along_u[1] + along_u[2] * along_u[2]
     uv = along_u[0] * along_v[0] + along_u[1] * along_v[1] + along_u[2] * along_v[2]
     vv = low_pass + along_v[0] * along_v[0] + along_v[1] * along_v[1] + along_v[2] * along_v[2]
@@ -135,10 +149,10 @@ def project_and_cull(rows, n, view, width, height, splats, ranges, pairs, BLOCK:
     Args:
         rows: Gaussians, [n, 16].
         n: Number of Gaussians.
-        view: View, [18].
+        view: View, [18]; the module describes the layout.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
-        splats: Output, [n, 16].
+        splats: Output, [n, 16]; the module describes the layout.
         ranges: Output, [n, 4]: tiles x0 y0 x1 y1 of the box that holds each pixel with
             alpha >= 1/255.
         pairs: Output, [n]: number of tiles of the box; 0 if the Gaussian is not drawn.
@@ -199,13 +213,13 @@ def project_and_cull(rows, n, view, width, height, splats, ranges, pairs, BLOCK:
 
 @kernel
 def depth_keys(splats, visible, n, keys, BLOCK: tl.constexpr):
-    """Write the bits of the depth of each visible splat, whose order is that of the depths.
+    """Write a key for each visible splat, by which integers sort like the depths.
 
     Args:
         splats: [N, 16].
         visible: Rows that are drawn, [n].
         n: Number of these rows.
-        keys: Output, [n] int32. Depths are positive, so the bits are too.
+        keys: Output, [n] int32: bits of the depth. They sort like it, because depths are positive.
         BLOCK: Lanes of a program.
     """
     lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -234,7 +248,8 @@ def list_pairs(
         n_pairs: Number of pairs.
         columns: Tiles in a row of the image.
         tiles: Output, [n_pairs]: the tile.
-        reached: Output, [n_pairs]: bit i is set if the ellipse alpha >= 1/255 reaches block i.
+        reached: Output, [n_pairs]: bit i is set if the ellipse alpha >= 1/255 reaches block i of
+            the tile; blocks are numbered row by row.
         BLOCK: Lanes of a program.
     """
     pair = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

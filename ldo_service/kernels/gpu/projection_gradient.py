@@ -45,7 +45,8 @@ def quaternion_gradient(q, g0, g1, g2):
 def needle_gradient(scale, push, log_ratio):
     """Return the derivatives of the needle penalty by the log scales.
 
-    The penalty applies if log(longest / middle axis) is at least `log_ratio`.
+    The penalty is push max(0, log(longest / middle axis) - log_ratio). `push` is the weight of the
+    penalty times the mean blending weight of the Gaussian over the pixels.
     """
     longest = tl.maximum(scale[0], tl.maximum(scale[1], scale[2]))
     low, high = tl.minimum(scale[0], scale[1]), tl.maximum(scale[0], scale[1])
@@ -66,7 +67,10 @@ def only_at(numbers, number, value):
 
 @triton.jit
 def sums_of_pairs(sums, first, count, BLOCK: tl.constexpr):
-    """Return the eleven sums of each splat, added over its `count` pairs from `first` on."""
+    """Return the eleven sums that `blend_backward` lists, for each splat instead of each pair.
+
+    A splat has `count` pairs: the rows of `sums` from `first` on.
+    """
     zero = tl.zeros([BLOCK], tl.float32)
     V, Vx, Vy, Vxx, Vxy, Vyy = zero, zero, zero, zero, zero, zero
     red, green, blue, depth, weight = zero, zero, zero, zero, zero
@@ -89,16 +93,16 @@ def sums_of_pairs(sums, first, count, BLOCK: tl.constexpr):
 
 @triton.jit
 def store_pose(by_pose, p, g, perspective, row_u, row_v, is_live):
-    """Store the sum of the derivatives by the pose over the lanes, as the row of the program.
+    """Store the derivatives by the pose, summed over all Gaussians of the program.
 
     Args:
-        by_pose: Output, [programs, 8].
+        by_pose: Output, [programs, 8]: by rotation (3), by translation (3), and two zeros.
         p: Point in the camera frame.
         g: Derivative by this point.
-        perspective: Entries (ju, jv, ku, kv) of the derivative of the perspective.
+        perspective: (ju, jv, ku, kv); see `projection.jacobian`.
         row_u: Derivative by the row of u of the Jacobian, in the camera frame.
         row_v: Derivative by the row of v.
-        is_live: Whether lanes exist.
+        is_live: True for lanes that have a Gaussian.
     """
     ju, jv, ku, kv = perspective
     # T_camera_map' = exp(-xi) T_camera_map rotates and moves the point and the rows of J R.
@@ -123,7 +127,7 @@ def take_step(
         rows: Gaussians, [N, 16].
         i: Row of each lane.
         gradient: Derivatives by the columns; the last one is 0.
-        is_live: Whether lanes exist.
+        is_live: True for lanes that have a Gaussian.
         camera: Third row of the rotation of T_camera_map, and its translation.
         state: Moments, squares and steps; see `project_backward`.
         adam: Rates, corrections, beta1, beta2 and epsilon; see `project_backward`.
@@ -194,13 +198,13 @@ def project_backward(
 
     Args:
         rows: Gaussians, [N, 16]; changed with ADAM.
-        view: View, [18].
+        view: View, [18]; `projection` describes the layout.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         visible: Rows that are drawn, [n_visible], ascending; one lane computes one of them.
         n_visible: Number of these rows.
-        firsts: First pair of each splat, [N].
-        pairs: Number of pairs of each splat, [N].
+        firsts: First row of `sums` of each splat, [N].
+        pairs: Number of rows of `sums` of each splat, one for each of its tiles, [N].
         sums: Output of `blend_backward`, [P, 16].
         by_rows: Output without ADAM, [n_visible, 16]: derivatives by the rows. Column 14 is the
             blending weight summed over the pixels.
@@ -216,7 +220,8 @@ def project_backward(
         needle_log_ratio: Logarithm of the axis ratio above which the penalty applies.
         max_sigma_per_depth: Maximum standard deviation per meter of depth after the step.
         weights: Output, [n_visible]: blending weight of each row summed over the pixels.
-        by_pose: Output, [programs, 8]: derivatives by xi of T_map_camera exp(xi), rotation first.
+        by_pose: Output, [programs, 8]: derivatives by xi of T_map_camera exp(xi), rotation first,
+            then two zeros; to be summed over the programs.
         LAST_STEP: Number of steps after which the correction stays constant.
         ADAM: Take a step of Adam, instead of writing the derivatives.
         BLOCK: Lanes of a program.
