@@ -101,8 +101,8 @@ class NormalEquations:
     visible: float  # Number of points inside the image and not hidden.
     photometric: ResidualStatistics
     geometric: ResidualStatistics
-    # Gradients of the photometric and of the geometric residuals by cell, [C, 2, 8]; empty if the
-    # equations were computed without cells.
+    # Gradients of the photometric and of the geometric residuals, summed over each image cell,
+    # [C, 2, 8]; empty if the equations were computed without cells.
     cells: np.ndarray
 
 
@@ -124,8 +124,8 @@ def normal_equations(
         T_camera_reference: Pose at which the residuals are linearized, [4, 4].
         appearance: Brightness change and noise.
         config: Settings of the residuals.
-        cells: Number of the cell of each point, [N] uint8 below 64; None computes no gradients by
-            cell.
+        cells: Image cell of each point, [N] uint8 below 64; see `ReferencePoints.cells`. None if
+            the gradients of each cell are not needed.
 
     Raises:
         ValueError: An array has a wrong shape, or the transform is not rigid.
@@ -185,11 +185,11 @@ class AlignConfig:
     biased_covariance_scale: float = 10.0
 
     def with_bias(self, relative_sigma: float) -> "AlignConfig":
-        """Return the settings for depth with a bias that is not exactly known.
+        """Return the settings for a camera whose depth bias is uncertain.
 
         Args:
-            relative_sigma: Standard deviation of the bias, as a multiple of that of an unknown
-                camera.
+            relative_sigma: Standard deviation of the bias: 0 without a bias, and 1 for a camera
+                that is not calibrated yet; see `CameraKnowledge`.
         """
         if not relative_sigma:
             return self
@@ -226,7 +226,7 @@ class Alignment:
     depth_noise_scale: float  # Geometric noise as a multiple of `DepthNoise`.
     overlap: float  # Visible fraction of the reference points.
     paired: float  # Fraction of the reference points that are paired with a measured depth.
-    gain: float
+    gain: float  # Gray level of the frame divided by that of the keyframe.
     bias: float  # Gray levels.
     iterations: int  # Sum over all levels.
     converged: bool  # The last step on the finest level was below stop_px.

@@ -76,9 +76,10 @@ class FrameCompensator:
     ) -> tuple[PoseHypothesis, ShutterState]:
         """Measure the motion of the camera during a frame, and return the pose for this motion.
 
-        If the motion is not as expected, the frame is compensated with the measured motion and
-        aligned again. After a small difference, only the pose of an OK frame is corrected, to first
-        order, unless the frame becomes a keyframe.
+        The frame was compensated for the expected motion. If the measured motion differs from it by
+        more than `ShutterConfig.realign_ratio`, the frame is compensated again and aligned again.
+        Up to `max_linear_ratio`, this is saved for OK frames that become no keyframe: their pose is
+        corrected to first order instead.
 
         Args:
             frame: The frame of the last call of `expect`.

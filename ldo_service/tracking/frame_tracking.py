@@ -359,7 +359,7 @@ class FrameTracker:
             self.config.align.residuals.noise,
         )
         self.state = replace(
-            self.state, dynamic_mask=seen.dynamic_mask, motion_evidence=seen.suspicion
+            self.state, dynamic_mask=seen.dynamic_mask, motion_evidence=seen.evidence
         )
         if seen.has_large_change(keyframe.moved_mask, config):
             renewed = keyframe.with_moved(seen.moved_mask, config)

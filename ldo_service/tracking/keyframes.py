@@ -25,8 +25,10 @@ class KeyframeConfig:
 
     # Minimum overlap with the reference keyframe; below it, the frame shows new surface to map.
     min_overlap: float = 0.85
+    # Maximum rotation and translation from the reference keyframe; the translation is a fraction of
+    # the median depth.
     max_rotation_rad: float = radians(15.0)
-    max_translation: float = 0.08  # Fraction of the median depth.
+    max_translation: float = 0.08
     # Minimum number of frames between reference keyframes. A camera that turns by 10 degrees per
     # frame needs a new one at every frame.
     min_frames: int = 1
@@ -91,11 +93,14 @@ class Relay:
     def pose_of(
         self, T_relay_camera: np.ndarray, information: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pose of a camera in the keyframe, [4, 4], and its information, [6, 6].
+        """Convert a pose relative to the relay into a pose relative to its keyframe.
 
         Args:
-            T_relay_camera: Pose of the camera in the relay, [4, 4].
+            T_relay_camera: Pose of the camera relative to the relay, [4, 4].
             information: Information of that pose, [6, 6]; zero if the pose is unknown.
+
+        Returns:
+            T_keyframe_camera, [4, 4], and its information, [6, 6].
         """
         T_keyframe_camera = self.T_keyframe_relay @ T_relay_camera
         if not information.any():

@@ -26,7 +26,7 @@ RECENT_KEYFRAMES = 32
 class MapCorrection:
     """Keyframe poses of one version of the pose graph, decoded on demand."""
 
-    version: int
+    version: int  # Version of the pose graph.
     roots: Mapping[int, int]  # Oldest submap that each submap is merged with, by submap.
     # Function that returns T_map_keyframe [4, 4] by id. Its argument lists the ids to return,
     # or is None for all keyframes. The newest keyframe is always returned too.
@@ -93,8 +93,8 @@ class MapFrame:
         Args:
             keyframe: Id of the new keyframe.
             tracked: The frame.
-            next_reference: Id of the keyframe that the next frame is aligned to, or None. Only
-                recent poses are stored. The pose of this keyframe is not removed.
+            next_reference: Id of the keyframe that the next frame is aligned to, or None. Its pose
+                stays stored even if it is not recent.
         """
         self._poses.add(
             keyframe,

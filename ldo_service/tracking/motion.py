@@ -11,7 +11,7 @@ MAX_STEPS = 4.0  # Maximum extrapolation, in multiples of the last frame interva
 
 @dataclass(frozen=True, slots=True)
 class ConstantVelocity:
-    """Constant-velocity motion model: the last accepted pose and the motion before it."""
+    """Constant-velocity motion model: the last accepted pose, and the motion that led to it."""
 
     T_odom_camera: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4]
     # Motion from the second-last pose to the last pose, [6]: rotation rad, then translation m.

@@ -106,11 +106,13 @@ class MotionEvidence:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MotionMasks:
-    """Result of motion segmentation, at working resolution."""
+    """Result of motion segmentation, at working resolution: that of the finest pyramid level."""
 
-    dynamic_mask: np.ndarray  # Dynamic pixels of the frame, [H, W] bool.
-    moved_mask: np.ndarray  # Pixels of the keyframe that have moved, [H, W] bool.
-    suspicion: MotionEvidence  # State for the next frame.
+    # Pixels of the frame that show moving objects, [H, W] bool.
+    dynamic_mask: np.ndarray
+    # Pixels of the keyframe whose surface is no longer there, [H, W] bool.
+    moved_mask: np.ndarray
+    evidence: MotionEvidence  # State for the next frame.
 
     def has_large_change(self, known: np.ndarray | None, config: MotionSegmentationConfig) -> bool:
         """Return whether `moved_mask` has many pixels that a known mask lacks.
@@ -237,8 +239,8 @@ def foreground_mask(
         dynamic_mask: Dynamic pixels of the frame, [H, W] bool at working resolution.
 
     Returns:
-        [H, W] bool at working resolution; None if too few of the other pixels agree with the
-        keyframe, because its pose is wrong or it shows another surface.
+        [H, W] bool at working resolution. None if too few of the pixels that are not dynamic agree
+        with the keyframe, because T_keyframe_camera is wrong or the keyframe shows another surface.
     """
     now, then = _level(view, config), _level(keyframe, config)
     pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)

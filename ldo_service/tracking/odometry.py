@@ -194,7 +194,7 @@ class Odometry:
         return None if keyframe is None else keyframe.id
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state that the next results depend on, except for the last correction.
+        """Return the state that the next results depend on, without the last `MapCorrection`.
 
         Returns:
             Arrays and plain values. A keyframe or record that has not changed since the last
@@ -318,10 +318,10 @@ class Odometry:
             window = self._measure_window(tracked)
             if known is not None:
                 others = (measured for measured in window if measured.a != known.record.id)
-                window = [known.measures(keyframe), *others]
+                window = [known.measurement_of(keyframe), *others]
         self._map.add_keyframe(keyframe, tracked, self.reference)
         merge = tracked.submap_measurement
-        measurement = None if merge is None else merge.measures(keyframe)
+        measurement = None if merge is None else merge.measurement_of(keyframe)
         return NewKeyframe(keyframe, kind, tracked.submap, tuple(window), measurement)
 
     def _add_reference(

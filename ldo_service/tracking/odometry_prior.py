@@ -77,7 +77,7 @@ class PriorCheck(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StampedPose:
-    """Pose of the robot's base in the coordinate frame of the other odometry, at one time."""
+    """Pose of the robot's base in the coordinate frame of the odometry prior, at one time."""
 
     stamp_ns: int
     T_prior_base: np.ndarray  # [4, 4]
@@ -85,7 +85,7 @@ class StampedPose:
 
 @dataclass(frozen=True, slots=True)
 class PriorPose:
-    """Camera pose in the coordinate frame of the other odometry, at one time."""
+    """Camera pose in the coordinate frame of the odometry prior, at one time."""
 
     stamp_ns: int
     T_prior_camera: np.ndarray  # [4, 4]
@@ -94,7 +94,7 @@ class PriorPose:
 
 @dataclass(frozen=True, slots=True)
 class OdometryPriorBuffer:
-    """Last poses of another odometry in its current session."""
+    """Last poses of the odometry prior, all after the last restart or jump of their source."""
 
     poses: tuple[StampedPose, ...] = ()  # Ascending by stamp.
     session: int = 0  # Number of the session; restarts and jumps increase it.
@@ -197,7 +197,7 @@ def interpolated(a: StampedPose, b: StampedPose, stamp_ns: int) -> np.ndarray:
         stamp_ns: Time of the result. If it is after b, the motion is extrapolated.
 
     Returns:
-        Pose [4, 4] of the robot's base in the coordinate frame of the other odometry.
+        Pose [4, 4] of the robot's base in the coordinate frame of the odometry prior.
     """
     share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
     T = se3.interpolate(a.T_prior_base[None], b.T_prior_base[None], np.array([share]))

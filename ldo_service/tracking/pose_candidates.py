@@ -44,7 +44,10 @@ class PoseHypothesisConfig:
 
 @dataclass(frozen=True, slots=True)
 class PoseHypothesis:
-    """Alignment of a frame from one initial guess, and the evidence for it."""
+    """Alignment of a frame from one initial guess, and the evidence for it.
+
+    Distances between poses are rotation plus parallax in rad; see `motion.image_motion_rad`.
+    """
 
     alignment: Alignment
     # Initial guess: "direct" from constant velocity or rest, "prior" from another odometry,
@@ -55,7 +58,7 @@ class PoseHypothesis:
     # True if an independent estimate of the pose, by features or GICP, agrees; False if it
     # disagrees. None if there is no such estimate, or if the images refute the estimate.
     is_confirmed: bool | None = None
-    # Distance to the farthest other hypothesis that the images support.
+    # Distance to the farthest other hypothesis of the frame that the images support.
     hypothesis_spread_rad: float = 0.0
     agrees_with_prior: bool = False  # True if the odometry prior predicts this pose.
     # Distance to the pose by features alone; infinite if unknown.
@@ -166,13 +169,14 @@ def hypothesis_distance_rad(candidate: PoseHypothesis, T_keyframe_camera: np.nda
 
 @dataclass(frozen=True, slots=True)
 class InitialGuessAligner:
-    """Direct alignment of a frame from one or several initial guesses, without state."""
+    """Direct alignment of a frame from one or several initial guesses."""
 
     align: AlignConfig
     features: FeatureConfig
     shape: GicpConfig
     candidates: PoseHypothesisConfig
-    large_motion: float  # Image widths per frame.
+    # Image motion above which all initial guesses are tried, image widths per frame.
+    large_motion: float
 
     def align_from_guess(
         self,

@@ -4,7 +4,8 @@ Relocalization. A lost frame is compared with the keyframe records whose thumbna
 to that of the frame. It is also compared with a few further records, which change from search to
 search. The time per frame is thus independent of the size of the database, and every record is
 tried eventually. If ORB features find no match, SIFT features are tried on the newest records and a
-few others. SIFT matches at half and twice the distance and takes ten times as long.
+few others. SIFT also matches a surface that is half or twice as far away, but takes ten times as
+long.
 
 A record is accepted if features and direct alignment agree on the pose. The criteria are stricter
 than in tracking, since no predicted pose supports the result. A match is ambiguous and rejected if
@@ -125,7 +126,7 @@ class RelocalizationConfig:
 
 @dataclass(frozen=True, slots=True)
 class Relocalizer:
-    """Relocalization of a frame in a keyframe database, without state."""
+    """Relocalization of a frame in a keyframe database."""
 
     pyramid: PyramidConfig
     align: AlignConfig
@@ -316,15 +317,15 @@ class ReusedKeyframe:
     keyframe: ReferenceKeyframe  # The keyframe, rebuilt from the record.
     candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
-    def measures(self, keyframe: int) -> RelativePose:
-        """Return the pose in this keyframe that the aligned frame has as the new `keyframe`."""
+    def measurement_of(self, keyframe: int) -> RelativePose:
+        """Return the pose of the aligned frame, the new `keyframe`, relative to this keyframe."""
         seen = self.candidate.alignment
         return RelativePose(self.record.id, keyframe, seen.T_reference_camera, seen.information)
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeReuse:
-    """Search for a known keyframe to reuse as the reference, without state."""
+    """Search for a known keyframe that can be the reference instead of a new one."""
 
     pyramid: PyramidConfig
     align: AlignConfig

@@ -26,7 +26,7 @@ EARLIER_WEIGHT = 0.25
 class ShutterConfig:
     """Settings of the estimation and compensation of the shutter's timing."""
 
-    is_on: bool = True
+    is_on: bool = True  # False: neither estimation nor compensation.
     # Timing to start with, such as that of the map in which the camera is localized.
     initial: ShutterTiming = field(default_factory=ShutterTiming)
     # Maximum interval between two frames whose mean velocity is used. A hand shakes with periods of
@@ -70,24 +70,29 @@ class ShutterConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ShutterState:
-    """State of the compensation between frames."""
+    """State of the shutter compensation that is kept from frame to frame.
 
-    timing: ShutterTiming = field(default_factory=ShutterTiming)
+    Velocities are those of `FrameMotion`: rotation in rad/s, then translation in m/s.
+    """
+
+    timing: ShutterTiming = field(default_factory=ShutterTiming)  # Timing that is compensated.
     evidence: TimingEvidence = field(default_factory=TimingEvidence)
-    # Mean velocity between the last two frames that have a pose, [6] per second; None if unknown.
+    # Mean velocity between the last two frames that have a pose, [6]; None if unknown.
     mean_velocity: np.ndarray | None = None
-    # Velocity at the reference keyframe, [6] per second: the mean of the velocities before
-    # and after it. None if unknown, and at the frame after a new reference.
+    # Velocity at the reference keyframe, [6]: the mean of the velocities before and after it. None
+    # if unknown, and at the frame after a new reference.
     reference_velocity: np.ndarray | None = None
     has_new_reference: bool = False  # True if the last frame became the reference.
-    # Equations of the last frame. They are evaluated once the next frame shows its velocity.
+    # Equations of the last frame. They wait for the next frame, which shows the velocity at the
+    # last one.
     pending: BandEquations | None = None
 
     def informed(self, equations: np.ndarray | None, config: ShutterConfig) -> "ShutterState":
         """Return the state with the self-calibration's estimate as the prior of the times.
 
         Args:
-            equations: Information and right side of the times, [3, 4]; None if unknown.
+            equations: Normal equations of the times of the shutter, [3, 4]; see
+                `CameraKnowledge.timing`. None if unknown.
             config: Settings.
         """
         known = self.evidence.prior
@@ -130,7 +135,8 @@ class ShutterState:
     def moved(self, motion: FrameMotion, config: ShutterConfig) -> "ShutterState":
         """Return the state after a frame with a known motion.
 
-        The pending equations of the last frame are evaluated.
+        The motion also shows the velocity at the frame before. With it, the pending equations of
+        that frame are added to the evidence.
         """
         mean, earlier, state = motion.velocity, self.mean_velocity, self
         if earlier is not None:

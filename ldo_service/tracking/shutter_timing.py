@@ -47,11 +47,16 @@ MIN_GROUPS, MAX_GROUPS = 12, 24  # Groups of the jackknife; two are merged beyon
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BandEquations:
-    """Normal equations of a frame at its pose, for color and for depth of each band of rows."""
+    """Normal equations of a frame at its pose, for each of B bands of rows.
 
-    hessian: np.ndarray  # [B, 2, 8, 8] for color and depth.
+    The unknowns are those of `NormalEquations`: pose increment, gain and bias. Velocities are those
+    of `FrameMotion`: rotation in rad/s, then translation in m/s.
+    """
+
+    hessian: np.ndarray  # [B, 2, 8, 8]: color, then depth.
     gradient: np.ndarray  # [B, 2, 8]
-    rows: np.ndarray  # [B, 2] mean row in the reference and in the frame, -0.5..0.5.
+    # Mean row of each band in the reference and in the frame, [B, 2], from -0.5 (top) to 0.5.
+    rows: np.ndarray
     T_camera_reference: np.ndarray  # [4, 4]
     at_reference: FrameMotion  # Motion that is compensated in the reference.
     at_frame: FrameMotion  # Motion that is compensated in the frame.
@@ -76,12 +81,12 @@ class BandEquations:
         return BandEquations(**{**kept, **motions})
 
     def pose_change(self, velocity: np.ndarray) -> np.ndarray:
-        """Return the change of the pose if the frame is compensated with another velocity.
+        """Return the change of the pose if the shutter is compensated with another velocity.
 
         The change is a first-order approximation.
 
         Args:
-            velocity: Velocity of the frame, [6] per second.
+            velocity: Velocity that replaces `at_frame.velocity`, [6].
 
         Returns:
             The increment xi [6], which changes the pose to T_reference_camera * exp(xi).
@@ -93,14 +98,14 @@ class BandEquations:
         return -np.linalg.solve(A, b)[POSE]
 
     def timing_equations(self, velocity: np.ndarray) -> np.ndarray:
-        """Return the normal equations for the times.
+        """Return the normal equations for the times of the shutter.
 
         Args:
-            velocity: Best estimate of the velocity at the frame, [6] per second.
+            velocity: Best estimate of the velocity at the frame, [6].
 
         Returns:
             Information and right side, [3, 4], of the times in the order of `ShutterTiming`. Their
-            solution includes the times that are already compensated.
+            solution is the times themselves, not a change of those that are already compensated.
         """
         # Velocities of the reference in the camera frame. All twists change T_reference_camera.
         to_camera = se3.adjoint(self.T_camera_reference)
@@ -143,7 +148,7 @@ def band_equations(
         config: Settings of the residuals.
         at_reference: Motion that is compensated in the reference.
         at_frame: Motion that is compensated in the frame.
-        reference_velocity: Best estimate of the velocity at the reference, [6] per second.
+        reference_velocity: Best estimate of the velocity at the reference, [6].
     """
     index = min(LEVEL, len(frame.levels) - 1, len(reference.points) - 1)
     points, level = reference.points[index], frame.levels[index]
@@ -186,15 +191,15 @@ class TimingEvidence:
     """Sums of the timing equations of many frames, in groups with equal numbers of frames."""
 
     groups: tuple[np.ndarray, ...] = ()  # [3, 4] each: information | right side, in order of time.
-    size: int = 1  # Measurements per complete group.
-    in_last: int = 0  # Measurements in the last group.
-    count: int = 0
+    size: int = 1  # Frames per complete group.
+    in_last: int = 0  # Frames in the last group.
+    count: int = 0  # Frames in all groups.
     # Prior of the times as information and right side, [3, 4]: an estimate from other evidence, or
     # `PRIOR`.
     prior: np.ndarray = field(default_factory=PRIOR.copy)
 
     def extended(self, measurement: np.ndarray) -> "TimingEvidence":
-        """Return the evidence with the equations [3, 4] of one more frame, as in `groups`."""
+        """Return the evidence with the timing equations [3, 4] of one more frame."""
         groups, size, in_last = list(self.groups), self.size, self.in_last
         if groups and in_last < size:
             groups[-1] = groups[-1] + measurement
@@ -234,7 +239,7 @@ class TimingEvidence:
         return np.linalg.solve(total[:, :3], total[:, 3])
 
     def scaled(self, weight: float) -> "TimingEvidence":
-        """Return the evidence with another weight."""
+        """Return the evidence with the equations of all frames multiplied by a weight."""
         return replace(self, groups=tuple(weight * group for group in self.groups))
 
     def pack(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from .tracking_result import KeyframeKind, TrackedFrame
 
 
 class KeyframeOrigin(StrEnum):
-    """Origin of the reference keyframe; keyframe reuse depends on it."""
+    """Relation of the reference keyframe to known keyframes; keyframe reuse depends on it."""
 
     NEW = "new"  # New, without a measured pose relative to a known keyframe.
     MEASURED = "tied"  # New, with a measured pose relative to a known keyframe.

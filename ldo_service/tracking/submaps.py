@@ -80,11 +80,11 @@ class SubmapMeasurement:
             keyframe.id, keyframe.submap, T_keyframe_camera, alignment.information
         )
 
-    def measures(self, keyframe: int) -> RelativePose:
-        """Return the measured pose of a new keyframe relative to the keyframe of the other submap.
+    def measurement_of(self, keyframe: int) -> RelativePose:
+        """Return the measured pose of a new keyframe relative to the keyframe `self.keyframe`.
 
         Args:
-            keyframe: Id of the new keyframe, which is made of the measured frame.
+            keyframe: Id of the new keyframe, which is made of the frame of this measurement.
         """
         return RelativePose(self.keyframe, keyframe, self.T_keyframe_camera, self.information)
 
@@ -142,9 +142,9 @@ class Submaps:
     lost_views: int = 0  # Number of these frames that differ from the last counted one.
     # Thumbnail of the last counted view, [300] int8; None without LOST frames.
     lost_thumbnail: np.ndarray | None = None
-    frames_since_search: int = 0
-    pending_match: SubmapMatch | None = None  # Match that awaits confirmation.
-    missed: int = 0  # Searches in a row without a match.
+    frames_since_search: int = 0  # Frames since the last search of the other submaps.
+    pending_match: SubmapMatch | None = None  # First match, which a second one must confirm.
+    missed: int = 0  # Searches of the other submaps in a row without a match.
 
     def started(self) -> "Submaps":
         """Return the state with one more submap, which is not merged with any other."""
@@ -210,7 +210,8 @@ class Submaps:
     def with_search_result(self, found: SubmapMatch | None, config: SubmapConfig) -> "Submaps":
         """Return the state after a search of the other submaps.
 
-        A match that is inconsistent with the pending match becomes the pending match.
+        The pending match stays if the new match is consistent with it; `is_confirmed_by` says
+        whether the two merge the submaps. Otherwise, the new match becomes the pending match.
 
         Args:
             found: The match, or None if the search found none. More than `config.misses` searches
@@ -236,7 +237,7 @@ class Submaps:
         )
 
     def with_merge(self, submap: int, other: int) -> "Submaps":
-        """Return the state with two submaps merged."""
+        """Return the state with two submaps merged; the older one becomes the root of both."""
         older, younger = sorted((self.roots[submap], self.roots[other]))
         roots = tuple(older if root == younger else root for root in self.roots)
         return replace(self, roots=roots, pending_match=None)

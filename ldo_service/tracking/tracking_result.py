@@ -46,7 +46,9 @@ class TrackedFrame:
     intensity_sigma: float = 0.0  # Photometric noise, gray levels.
     depth_noise_scale: float = 0.0  # Geometric noise as a multiple of `DepthNoise`.
     iterations: int = 0  # Iterations of alignment over all pyramid levels.
-    hypothesis_spread_rad: float = 0.0  # Spread of the supported hypotheses; 0 for a single one.
+    # Distance to the farthest other pose that the images support; 0 if there is none. See
+    # `PoseHypothesis`.
+    hypothesis_spread_rad: float = 0.0
     is_contradictory: bool = False  # True if color and depth contradict each other.
     # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
     dynamic_mask: np.ndarray | None = None
@@ -76,7 +78,7 @@ class TrackedFrame:
             status: Tracking status of the frame.
             pose_source: Name of the initial guess that the alignment started from.
             needed_keyframe: The kind of keyframe that the frame should become; None if none.
-            hypothesis_spread_rad: Spread of the supported hypotheses.
+            hypothesis_spread_rad: Distance to the farthest other pose that the images support.
             dynamic_mask: Dynamic pixels, [H, W] bool at working resolution; None if unknown.
         """
         T_reference_camera, information = alignment.T_reference_camera, alignment.information

@@ -72,7 +72,7 @@ class PersonWalk:
                 CONFIG,
                 DepthNoise(),
             )
-            evidence, moved_mask = masks.suspicion, masks.moved_mask
+            evidence, moved_mask = masks.evidence, masks.moved_mask
         assert masks is not None
         return masks
 
