@@ -55,7 +55,7 @@ class AdamConfig:
 
 
 def places_of_remaining(old_ids: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the old places [M] and the new places [M] of the Gaussians that are in both maps.
+    """Return the old indices [M] and the new indices [M] of the Gaussians that are in both maps.
 
     Args:
         old_ids: Identifiers before a change of the map, [K], ascending.
@@ -72,7 +72,7 @@ class Adam:
     A Gaussian that is invisible in an iteration does not change, and its moments do not decay.
 
     Attributes:
-        matches: Counter that increases when the moments are matched to other rows of the map.
+        matches: Counter that increases when the moments follow added or removed rows of the map.
         restores: Counter that increases when `restore` replaces the moments.
     """
 

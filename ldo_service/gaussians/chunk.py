@@ -37,7 +37,7 @@ class Chunk:
         """Id of the anchor keyframe for each Gaussian, [M] int32, as in `GaussianMap.anchors`."""
         return np.full(len(self.ids), self.anchor, np.int32)
 
-    def piece(self) -> GaussianBatch:
+    def batch(self) -> GaussianBatch:
         """Return the chunk as a batch."""
         return GaussianBatch(self.ids, self.rows, self.anchors, self.labels)
 

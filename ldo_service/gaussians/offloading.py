@@ -36,15 +36,15 @@ class OffloadedGaussians:
     the motions that are not yet applied to its file. If `folder` is None, a temporary folder is
     used and removed at the end. Not thread-safe.
 
-    The folder contains the chunks of one map only. `restore` removes all files that are newer than
-    the snapshot, and retires the others that are not in it. Without `restore`, the first `put`
-    removes all earlier files. When a chunk is loaded, its file is retired. It stays, since a
-    process restored from the last snapshot would need the file. It is removed once a later
-    snapshot, which does not contain the chunk, has been saved.
+    The folder contains the chunks of one map only. When a chunk is loaded, its file is retired: it
+    stays, since a process restored from the last snapshot would need it. It is removed once a later
+    snapshot, which does not contain the chunk, has been saved. `restore` removes all files that are
+    newer than the snapshot, and retires the others that are not in it. Without `restore`, the first
+    `put` removes all earlier files.
 
     Attributes:
         files: The folder of the chunks.
-        retired: Files of chunks that were loaded after the last snapshot.
+        retired: The retired files.
 
     Raises:
         ConfigError: The folder cannot be used.
@@ -152,7 +152,7 @@ class OffloadedGaussians:
         chunks = [self.load(number) for number in sorted(numbers)]
         if not chunks:
             return np.zeros(0, np.int64)
-        loaded = _joined([chunk.piece() for chunk in chunks])
+        loaded = _joined([chunk.batch() for chunk in chunks])
         gaussians.reinsert(*loaded)
         return np.sort(loaded.ids)
 
@@ -195,7 +195,7 @@ class OffloadedGaussians:
         for number in sorted(self._entries, key=lambda n: self._entries[n].first_id):
             by_anchor.setdefault(self._entries[number].anchor, []).append(number)
         for anchor, numbers in by_anchor.items():
-            parts = _joined([self._read(number).piece() for number in numbers])
+            parts = _joined([self._read(number).batch() for number in numbers])
             if len(parts.ids):
                 ids, rows, _, labels = _in_order(parts)
                 yield Chunk(anchor, ids, rows, labels)
@@ -352,12 +352,12 @@ def _members(labels: np.ndarray) -> list[np.ndarray]:
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(labels) else []
 
 
-def _joined(pieces: list[GaussianBatch]) -> GaussianBatch:
-    return GaussianBatch(*map(np.concatenate, zip(*pieces, strict=True)))
+def _joined(batches: list[GaussianBatch]) -> GaussianBatch:
+    return GaussianBatch(*map(np.concatenate, zip(*batches, strict=True)))
 
 
-def _in_order(piece: GaussianBatch) -> GaussianBatch:
-    return piece.at(np.argsort(piece.ids, kind="stable"))
+def _in_order(batch: GaussianBatch) -> GaussianBatch:
+    return batch.at(np.argsort(batch.ids, kind="stable"))
 
 
 def iter_all_gaussians(
@@ -372,6 +372,6 @@ def iter_all_gaussians(
     for chunk in offloaded.chunks():
         first, last = map(int, np.searchsorted(resident.ids, chunk.ids[[0, -1]]))
         yield resident.at(slice(start, first))
-        yield _in_order(_joined([resident.at(slice(first, last)), chunk.piece()]))
+        yield _in_order(_joined([resident.at(slice(first, last)), chunk.batch()]))
         start = last
     yield resident.at(slice(start, None))

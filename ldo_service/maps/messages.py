@@ -18,13 +18,13 @@ NOTHING = GaussianBatch(
 )
 
 
-def gaussians_message(piece: GaussianBatch) -> Gaussians:
+def gaussians_message(batch: GaussianBatch) -> Gaussians:
     """Convert a batch to a message; `labels` is empty if no Gaussian has an observed class."""
-    labels = piece.labels if piece.labels.any() else new_labels(0)
+    labels = batch.labels if batch.labels.any() else new_labels(0)
     return Gaussians(
-        ids=Array.of(piece.ids),
-        params=Array.of(piece.rows),
-        anchors=Array.of(piece.anchors),
+        ids=Array.of(batch.ids),
+        params=Array.of(batch.rows),
+        anchors=Array.of(batch.anchors),
         labels=Array.of(labels),
     )
 
@@ -32,7 +32,7 @@ def gaussians_message(piece: GaussianBatch) -> Gaussians:
 NO_GAUSSIANS = gaussians_message(NOTHING)
 
 
-def piece_of(message: Gaussians) -> GaussianBatch:
+def batch_of(message: Gaussians) -> GaussianBatch:
     """Convert a message to a batch.
 
     The arrays are read-only views of the message. If `labels` of the message is empty, the batch
@@ -43,14 +43,14 @@ def piece_of(message: Gaussians) -> GaussianBatch:
     return GaussianBatch(ids, message.params.numpy(), message.anchors.numpy(), labels)
 
 
-def rechunk(pieces: Iterable[GaussianBatch], parts: int, size: int) -> Iterator[Gaussians]:
-    """Regroup the batches `pieces` into exactly `parts` messages of at most `size` Gaussians.
+def rechunk(batches: Iterable[GaussianBatch], parts: int, size: int) -> Iterator[Gaussians]:
+    """Regroup batches into exactly `parts` messages of at most `size` Gaussians.
 
     All messages have `size` Gaussians except for the last ones, which may be smaller or empty.
     """
     waiting, made = NOTHING, 0
-    for piece in pieces:
-        waiting = GaussianBatch(*map(np.concatenate, zip(waiting, piece, strict=True)))
+    for batch in batches:
+        waiting = GaussianBatch(*map(np.concatenate, zip(waiting, batch, strict=True)))
         while len(waiting.ids) >= size and made < parts - 1:
             yield gaussians_message(waiting.at(slice(size)))
             waiting = waiting.at(slice(size, None))

@@ -211,9 +211,9 @@ class MapPublisher:
         yield from self.deltas(now, with_changed=True)
         self._since_snapshot, self._in_snapshot = 0, self._map.size()
         parts = max(1, -(-self._map.size() // self.config.max_gaussians_per_message))
-        pieces = rechunk(self._map.batches(), parts, self.config.max_gaussians_per_message)
+        messages = rechunk(self._map.batches(), parts, self.config.max_gaussians_per_message)
         exposures = self._map.views.exposures
-        for part, gaussians in enumerate(pieces):
+        for part, gaussians in enumerate(messages):
             named = list(exposures) if part == 0 else []
             matrices = [exposures[k].matrix for k in named]
             yield MapSnapshot(

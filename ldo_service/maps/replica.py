@@ -7,7 +7,7 @@ from ldo_service.gaussians.model import GaussianBatch, GaussianMap
 from ldo_service.gaussians.pruning import weightiest
 from ldo_service.schemas import MapDelta, MapSnapshot
 
-from .messages import piece_of
+from .messages import batch_of
 
 NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)  # Default gains and biases, [2, 3].
 # A bounded replica is reduced to its limit when its size exceeds the limit by this factor.
@@ -83,8 +83,8 @@ class MapReplica:
             )
         if delta.removed.shape[0]:
             self.map.remove(np.isin(self.map.ids, delta.removed.numpy()))
-        self._change(piece_of(delta.changed))
-        self._add(piece_of(delta.added))
+        self._change(batch_of(delta.changed))
+        self._add(batch_of(delta.added))
         self.label_names = delta.label_names or self.label_names
         self.version = delta.version
         return True
@@ -125,7 +125,7 @@ class MapReplica:
             return False
         self.map, self._next_id = GaussianMap(), 0
         for number in range(part.parts):
-            self._add(piece_of(self._parts[number].gaussians))
+            self._add(batch_of(self._parts[number].gaussians))
         self.label_names = self._parts[0].label_names
         self.version, self.is_behind = part.version, False
         self._parts.clear()
@@ -140,13 +140,13 @@ class MapReplica:
         if part.version != self._applied_version:
             self._last_ids.clear()
             self._applied_version = part.version
-        piece = piece_of(part.gaussians)
-        first, last = self._span(part, piece.ids)
+        batch = batch_of(part.gaussians)
+        first, last = self._span(part, batch.ids)
         self.map.remove((self.map.ids >= first) & (self.map.ids <= last))
-        self.map.reinsert(*piece.at(piece.ids < self._next_id))
-        self._add(piece)
+        self.map.reinsert(*batch.at(batch.ids < self._next_id))
+        self._add(batch)
         self.label_names = part.label_names or self.label_names
-        self._last_ids[part.part] = int(piece.ids[-1]) if len(piece.ids) else -1
+        self._last_ids[part.part] = int(batch.ids[-1]) if len(batch.ids) else -1
         if len(self._last_ids) == part.parts:
             self.version, self.is_behind = part.version, False
             self._last_ids.clear()
