@@ -1,4 +1,8 @@
-"""RGB-D odometry: direct alignment to keyframes and relocalization by features."""
+"""RGB-D odometry: direct alignment to keyframes and relocalization by features.
+
+Masks and stored keyframes have the working resolution: that of the finest pyramid level, about
+320 pixels wide (`PyramidConfig.working_width_px`).
+"""
 
 from .alignment import AlignConfig, Alignment, align
 from .odometry import Odometry

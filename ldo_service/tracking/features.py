@@ -2,7 +2,7 @@
 
 Neither method needs an accurate initial guess. Tracking uses both after large motions, and
 relocalization uses features alone. ORB is fast and sufficient from frame to frame. SIFT takes ten
-times as long and also matches surfaces at half or twice the distance.
+times as long and also matches a surface that is half or twice as far away.
 
 GICP (`small_gicp`) estimates the pose of scenes without texture from their shape. GICP pairs each
 point with the nearest point of the other cloud, whereas the module `alignment` pairs points along

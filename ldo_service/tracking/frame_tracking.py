@@ -264,13 +264,13 @@ class FrameTracker:
             return tracked
         database = self.state.records_of_other_submaps(keyframe.submap)
         found = self._relocalize(view, database, is_lost=False)
-        look = measurement = None
+        match = measurement = None
         if found is not None:
             there, alignment = found[0], found[1].alignment
-            look = SubmapMatch.at(there, alignment, tracked.submap, tracked.T_odom_camera)
+            match = SubmapMatch.at(there, alignment, tracked.submap, tracked.T_odom_camera)
             measurement = SubmapMeasurement.of(there, alignment)
-        self.state = replace(self.state, submaps=before.with_search_result(look, config))
-        if look is None or not before.is_confirmed_by(look, config):
+        self.state = replace(self.state, submaps=before.with_search_result(match, config))
+        if match is None or not before.is_confirmed_by(match, config):
             return tracked
         needed = KeyframeKind.REFERENCE
         return replace(tracked, needed_keyframe=needed, submap_measurement=measurement)

@@ -61,18 +61,18 @@ class MapFix:
             return MapFix(tracked.submap)
         return replace(self, frames_since_search=self.frames_since_search + 1)
 
-    def with_search_result(self, look: SubmapMatch, config: SubmapConfig) -> "MapFix":
+    def with_search_result(self, match: SubmapMatch, config: SubmapConfig) -> "MapFix":
         """Return the pose of odometry in the map after a relocalization match.
 
         T_map_odom changes only if the previous match agrees with the new one.
         """
         is_confirmed = self.pending_match is not None and self.pending_match.is_consistent_with(
-            look, config
+            match, config
         )
-        T_map_odom = look.T_there_here if is_confirmed else self.T_map_odom
+        T_map_odom = match.T_there_here if is_confirmed else self.T_map_odom
         # Search again soon after a match that is not confirmed.
         since = 0 if is_confirmed else config.search_interval_frames - config.confirm_after
-        return replace(self, T_map_odom=T_map_odom, pending_match=look, frames_since_search=since)
+        return replace(self, T_map_odom=T_map_odom, pending_match=match, frames_since_search=since)
 
     def pack(self) -> dict[str, Any]:
         """Return the fix as arrays and plain values."""
@@ -175,8 +175,8 @@ class Localizer(Odometry):
         T_map_camera = keyframe.T_odom_keyframe @ alignment.T_reference_camera
         T_map_odom = se3.orthonormalize(T_map_camera @ se3.inverse(tracked.T_odom_camera))
         median_depth_m = keyframe.reference.median_depth_m
-        look = SubmapMatch(tracked.submap, MAP, T_map_odom, tracked.T_odom_camera, median_depth_m)
-        self._fix = self._fix.with_search_result(look, self.config.submaps)
+        match = SubmapMatch(tracked.submap, MAP, T_map_odom, tracked.T_odom_camera, median_depth_m)
+        self._fix = self._fix.with_search_result(match, self.config.submaps)
 
 
 def load_keyframe_database(folder: Path) -> KeyframeDatabase:

@@ -194,7 +194,7 @@ class Submaps:
         """Return whether two submaps are merged, directly or through other submaps."""
         return self.roots[submap] == self.roots[other]
 
-    def is_confirmed_by(self, look: SubmapMatch, config: SubmapConfig) -> bool:
+    def is_confirmed_by(self, match: SubmapMatch, config: SubmapConfig) -> bool:
         """Return whether a match confirms the pending match.
 
         Both matches must agree on the relative pose of the submaps, and the camera poses of their
@@ -203,8 +203,8 @@ class Submaps:
         last = self.pending_match
         return (
             last is not None
-            and last.is_consistent_with(look, config)
-            and last.is_distinct_from(look, config)
+            and last.is_consistent_with(match, config)
+            and last.is_distinct_from(match, config)
         )
 
     def with_search_result(self, found: SubmapMatch | None, config: SubmapConfig) -> "Submaps":
