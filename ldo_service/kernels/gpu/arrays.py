@@ -32,16 +32,16 @@ class Arrays(Protocol):
         """Return an array of zeros."""
 
     def nonzero(self, array: Any) -> Any:
-        """Return the places [V] int32 of the values that are not 0, ascending."""
+        """Return the indices [V] int32 of the values that are not 0, ascending."""
 
     def stable_order(self, keys: Any) -> Any:
-        """Return the places [M] int32 that sort the keys; equal keys keep their order."""
+        """Return the indices [M] int32 that sort the keys; equal keys keep their order."""
 
     def take(self, array: Any, places: Any) -> Any:
-        """Return the rows of an array at some places."""
+        """Return the rows of an array at the indices `places`."""
 
     def put(self, array: Any, places: Any, values: Any) -> None:
-        """Write rows of an array at some places, in place."""
+        """Replace the rows of an array at the indices `places`, in place."""
 
     def offsets(self, counts: Any) -> tuple[Any, int]:
         """Return the sums [M] int32 of all counts before each one, and the sum of all counts.
@@ -55,11 +55,11 @@ class Arrays(Protocol):
         """Return each value as often as its count says; `total` is the sum of the counts."""
 
     def starts(self, ascending: Any, n: int) -> Any:
-        """Return the first places [n + 1] int32 of the values 0 to n in an ascending array."""
+        """Return the index of the first value >= k in an ascending array for k = 0 .. n, int32."""
 
 
 def checked_total(total: int) -> int:
-    """Return the number of pairs of a Gaussian and a tile, if each pair has a place in int32.
+    """Return the number of pairs of a Gaussian and a tile, if it fits into int32.
 
     Raises:
         ConfigError: There are more pairs.

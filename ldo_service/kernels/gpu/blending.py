@@ -1,11 +1,12 @@
 """Blending of splats front to back, and its derivative; see `kernels/blend.hpp`.
 
-A tile has 16x16 pixels, in 16 blocks of 4x4 pixels. A pair is a splat and a tile that it may reach;
-`projection` describes both and the layout of a splat. A program of one warp blends a tile. The
-pixels have the shape [16 pixels, 16 blocks], because the pixels of a block finish together. In this
-order, a thread holds eight
-pixels of one block, so that sums over pixels stay in its registers except for one exchange between
-threads. In the other order, each sum takes 32 shuffle instructions instead of 5.
+A tile has 16x16 pixels, in 16 blocks of 4x4 pixels. A pair is a splat and a tile that it may reach.
+The module `projection` describes the layout of a splat.
+
+A program of one warp blends a tile. The pixels have the shape [16 pixels, 16 blocks], because the
+pixels of a block finish together. In this order, a thread holds eight pixels of one block, so that
+sums over pixels stay in its registers except for one exchange between threads. In the other order,
+each sum takes 32 shuffle instructions instead of 5.
 """
 
 import triton

@@ -178,7 +178,7 @@ def color_gradient(
         width: W.
         height: H.
         l1: Weight of L1, divided by the number of values 3 H W.
-        d_ssim: Negative weight of D-SSIM, divided by the number of values; D-SSIM is 1 - SSIM.
+        d_ssim: Minus the weight of D-SSIM = 1 - SSIM, divided by the number of values.
         by_planes: Output, [5, H, W], of which the color planes are written.
         l1s: Output, [programs]: sum of the absolute errors of each program.
         squares: Output, [programs]: sum of the squared errors of each program.

@@ -26,7 +26,7 @@ LOW_PASS = np.float32(0.3)  # Variance that the image adds to each splat, px^2.
 def view_of(
     T_camera_map: np.ndarray, intrinsics: tuple[float, float, float, float], binning: int = 1
 ) -> np.ndarray:
-    """Return the 18 float32 values of a view; `projection` describes their layout.
+    """Return the 18 float32 values of a view; the module `projection` describes their layout.
 
     Args:
         T_camera_map: [4, 4] or [3, 4].
@@ -49,7 +49,7 @@ class Splats:
     """Projection of N Gaussians.
 
     Attributes:
-        splats: [N, 16]; `projection` describes the layout.
+        splats: [N, 16]; the module `projection` describes the layout.
         ranges: Tiles x0 y0 x1 y1 of each splat, both ends included, [N, 4].
         pairs: Number of tiles of each splat, [N]; 0 if it is not drawn.
     """

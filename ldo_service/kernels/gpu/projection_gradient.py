@@ -198,7 +198,7 @@ def project_backward(
 
     Args:
         rows: Gaussians, [N, 16]; changed with ADAM.
-        view: View, [18]; `projection` describes the layout.
+        view: View, [18]; the module `projection` describes the layout.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         visible: Rows that are drawn, [n_visible], ascending; one lane computes one of them.
