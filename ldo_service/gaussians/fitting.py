@@ -23,7 +23,7 @@ TRIES_PER_DRAW = 4
 
 @dataclass(frozen=True, slots=True)
 class ViewSamplingConfig:
-    """Settings that determine to which keyframes the map is fitted after a new keyframe.
+    """Settings that determine which keyframes the map is fitted to after a new keyframe.
 
     Without iterations on random keyframes, the map would get worse in places that the newest
     keyframe does not show. In published ablations, iterations on random keyframes gain 4.2 dB PSNR,

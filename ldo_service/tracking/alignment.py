@@ -159,6 +159,7 @@ class AlignConfig:
     """Settings of direct alignment."""
 
     residuals: ResidualConfig = field(default_factory=ResidualConfig)
+    # Brightness change and noise from which alignment starts.
     start: BrightnessModel = field(default_factory=BrightnessModel)
     iterations: tuple[int, ...] = (8, 8, 10, 10)  # Maximum per level, the finest first.
     # A pyramid level has converged when a step moves its image by fewer pixels than this.

@@ -48,7 +48,7 @@ class OdometryState:
     mapping_keyframe: KeyframeRecord | None = None
     motion: ConstantVelocity = field(default_factory=ConstantVelocity)
     history: ResidualHistory = field(default_factory=ResidualHistory)
-    status: TrackingStatus = TrackingStatus.OK
+    status: TrackingStatus = TrackingStatus.OK  # Status of the last frame.
     frames_since_keyframe: int = 0  # Frames since the reference keyframe was set.
     next_id: int = 0  # Id of the next keyframe.
     origin: KeyframeOrigin = KeyframeOrigin.NEW

@@ -154,7 +154,9 @@ class TrackingResult:
     intensity_sigma: float  # Photometric noise, gray levels.
     depth_noise_scale: float  # Geometric noise as a multiple of `DepthNoise`.
     iterations: int  # Iterations of alignment over all pyramid levels.
-    hypothesis_spread_rad: float  # Spread of the supported hypotheses; 0 for a single one.
+    # Distance to the farthest other pose that the images support; 0 if there is none. See
+    # `PoseHypothesis`.
+    hypothesis_spread_rad: float
     is_contradictory: bool  # True if color and depth contradict each other.
     # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
     dynamic_mask: np.ndarray | None
