@@ -120,11 +120,14 @@ class StateFiles(Protocol):
         """Remove files that the last snapshot, which is saved now, does not need."""
 
     def kept(self, *, is_previous_complete: bool) -> None:
-        """Remove files that neither the last kept generation nor the one before needs.
+        """Remove files that no generation of the state needs any more.
+
+        The stage calls this method each time it has kept the saved state as a generation; see
+        `runtime.generations`.
 
         Args:
-            is_previous_complete: Whether the generation kept before the last one is complete, so
-                that no older one is needed.
+            is_previous_complete: Whether the generation kept before this one is complete. If it is
+                not, the service may still fall back to an older one, and no file is removed.
         """
 
     def retired_bytes(self) -> int:
@@ -136,10 +139,10 @@ class StateFiles(Protocol):
         ...
 
     def begin_sync(self) -> None:
-        """Note that the stage begins to sync `unsynced_files`."""
+        """Record that the stage now syncs the files that `unsynced_files` returned last."""
 
     def end_sync(self) -> None:
-        """Note that the files of the last `begin_sync` are on the disk."""
+        """Record that the files of the last `begin_sync` are on the disk."""
 
 
 class Actor:
@@ -230,7 +233,8 @@ class Actor:
     def on_saved(self) -> None:
         """Handle the notification that the last snapshot or checkpoint was written.
 
-        If the stage keeps older generations of the state, it notifies only `files`.
+        While the stage keeps older generations of the state (`runtime.generations`), it calls
+        `StateFiles.kept` of `files` instead of this method.
         """
         if self.files is not None:
             self.files.saved()

@@ -160,7 +160,7 @@ class Checkpointer:
     def keep(
         self, actor: Actor, generation: int, completed: int
     ) -> tuple[GenerationFiles | None, list[Path]]:
-        """Keep the last saved state as a generation.
+        """Keep the last saved state as a generation; see `runtime.generations`.
 
         Args:
             actor: The actor.
@@ -169,7 +169,7 @@ class Checkpointer:
 
         Returns:
             The files of the generation, which the caller must write, and the other files and
-            folders to sync.
+            folders, which the caller must sync.
 
         Raises:
             OSError: A file cannot be read.

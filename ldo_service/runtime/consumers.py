@@ -23,7 +23,8 @@ class Consumer:
     limit: int = 0  # Offset of the first message that exceeds the consumer's window.
     repeated_from: int = -1  # Offset at which the last retransmission began; -1 if there was none.
     repeated_at_s: float = 0.0  # Event-loop time of the last retransmission.
-    # Event-loop time at which the consumer's window became full; None while it is not full.
+    # Time of the stage's `RunningClock` at which the window was found full, seconds; None while it
+    # is not full.
     shut_since_s: float | None = None
     # Offset after the last message that was sent to a consumer with policy Backlog, and the
     # event-loop time at which it was sent. Unused for other consumers.
@@ -37,9 +38,9 @@ class Consumers:
     Consumers in `expected` are required: they must not miss a message. Each consumer has one of two
     policies:
 
-    - `Lossless`: The producer waits for credit of the consumer. It has no credit while a required
-      consumer is disconnected. A consumer that is not required limits the credit only while it is
-      connected.
+    - `Lossless`: The producer waits until the consumer grants it credit: a number of messages that
+      it may send. While a required consumer is disconnected, the producer has no credit. A consumer
+      that is not required limits the credit only while it is connected.
     - `Backlog`: The producer never waits for the consumer, and stores its unhandled messages on
       disk: the backlog. The credit of the consumer only decides how many messages of the backlog
       the producer sends next.
@@ -141,7 +142,7 @@ class Consumers:
         consumer.is_awaited = not (has_backlog or name in self.with_backlog)
 
     def note_sent(self, seq: int, now_s: float) -> None:
-        """Note that message `seq` was published to all consumers at event-loop time `now_s`.
+        """Record that message `seq` was published to all consumers at event-loop time `now_s`.
 
         For a consumer with policy `Backlog`, the message counts as sent only if the window of the
         consumer is not full and all earlier messages were sent to it. Otherwise the consumer
@@ -218,6 +219,11 @@ class Consumers:
 
         The window is the limit of unhandled messages. Only connected consumers with policy
         `Lossless` count.
+
+        Args:
+            now_s: Current time of the stage's `RunningClock`, seconds.
+            patience_s: Time that a window may be full, seconds.
+            seq: Offset of the producer's next message.
         """
         names: list[str] = []
         for name, consumer in self._known.items():
@@ -229,7 +235,10 @@ class Consumers:
         return names
 
     def evict(self, name: str) -> None:
-        """Treat a stalled consumer as disconnected while `is_still_stuck`."""
+        """Treat a stalled consumer as disconnected.
+
+        This ends when the consumer sends a credit message for which `is_still_stuck` is False.
+        """
         self._evicted[name] = self._known[name].handled
         self.leave(name)
 

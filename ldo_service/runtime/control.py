@@ -8,8 +8,9 @@ ignore the first new corrections.
 
 If a reset does not reach all actors, some states are from before the reset and some from after it.
 `Control` therefore writes a marker to the disk before the first actor is reset. It removes the
-marker when the empty states of all actors are kept as an older generation. While the marker exists,
-no frames are taken, and the next start of the service completes the reset.
+marker once the empty states of all actors are on the disk as a generation, the copy of all states
+to which the service falls back (`generations`). While the marker exists, no frames are taken, and
+the next start of the service completes the reset.
 """
 
 import asyncio
@@ -73,7 +74,8 @@ class Control:
                 previous process left it, this object completes the reset.
             pause_marker: File that exists while the service is paused; None: no file. If the
                 previous process left it, this object pauses the sources.
-            generations: Keeper of older generations, which a reset replaces; None: there is none.
+            generations: Keeper of the generations of all states, which a reset replaces; None:
+                there is none.
         """
         self._generations = generations
         self._reset_marker, self._pause_marker = reset_marker, pause_marker
@@ -191,7 +193,7 @@ class Control:
         return f"{', '.join(self._actors)} restarted with an empty state.{still}"
 
     async def _replace_generations(self) -> None:
-        """Keep the empty states, so that no failure brings back the map from before the reset.
+        """Keep the empty states as a generation, so that no failure brings back the old map.
 
         Raises:
             ControlError: The states cannot be kept.
@@ -206,9 +208,9 @@ class Control:
         else:
             return
         raise ControlError(
-            f"all actors are empty, but their states cannot be kept as an older generation: "
-            f"{problem}. A power cut could bring back the old map. If the disk is full, free some "
-            "space, then repeat the command."
+            "all actors are empty, but the older generation of their states, to which the service "
+            f"falls back after a power cut, cannot be replaced: {problem}. A power cut could bring "
+            "back the old map. If the disk is full, free some space, then repeat the command."
         )
 
     async def _resume_actors(self) -> None:

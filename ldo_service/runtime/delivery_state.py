@@ -52,7 +52,7 @@ class LoggedInput(NamedTuple):
         return cls(topic, bytes(body), credits, backlog)
 
     def situation(self, actor: Actor) -> FlowStatus:
-        """Return the flow status of the step, by topic instead of topic name."""
+        """Return the flow status of the step, with topics instead of topic names as keys."""
         return FlowStatus(
             credits=counts_by_topic(self.credits, (out.topic for out in actor.outputs)),
             backlog=counts_by_topic(self.backlog, (port.topic for port in actor.inputs)),
@@ -84,7 +84,11 @@ class RestoredState:
 
     @classmethod
     def of(cls, state: State | None) -> "RestoredState":
-        """Split a state that the store has loaded; None or empty if no state was saved."""
+        """Split a saved state into the actor's state and the delivery state.
+
+        Args:
+            state: State that the store has loaded; None or empty if no state was saved.
+        """
         if not state:
             return cls(is_none=True)
         links = state.get(OFFSETS, {"in": {}, "out": {}})  # Absent without lossless links.
@@ -132,11 +136,13 @@ class DeliveryState:
 
         Args:
             own: State of the actor, by part.
-            taken: Input of the last step; None unless `Actor.lags`.
+            taken: Input of the last step; None unless `Actor.lags`, because `own` then includes
+                the last step.
             whole: True if `own` is a checkpoint: it includes the last step and needs no log.
 
         Returns:
-            Parts to save. If the actor's state is new, the write-ahead log is empty.
+            Parts to save. If `own` has changed since the last call, it includes the last step, and
+            the write-ahead log is empty.
         """
         is_new = own.keys() != self._own.keys() or any(own[p] is not self._own[p] for p in own)
         if is_new or whole:

@@ -1,4 +1,4 @@
-"""Older generations of the states of all actors, to which the service falls back.
+"""Generations: synced copies of the states of all actors, to which the service falls back.
 
 A power cut or a bad disk may damage the state that an actor saved after its last step. The actors
 of a service keep their states as a generation about once a second, while messages arrive. A
@@ -7,9 +7,9 @@ handled a message that its producer has not produced, and each producer still ha
 a consumer has not handled.
 
 `GenerationKeeper` asks the actors one after the other, consumers first, so that a producer is newer
-than its consumers. It then compares the positions in all states. Only if they fit, it writes the
-number of the generation to the marker file, which completes the generation. The generation before
-is deleted when the next one is kept.
+than its consumers. It then compares the positions in all states. If they are consistent, it writes
+the number of the generation to the marker file, which completes the generation. The previous
+generation is deleted when the next one is kept.
 """
 
 import asyncio
@@ -48,8 +48,8 @@ def completed_generation(store: FolderStore) -> int | None:
 
     Raises:
         DamagedStateError: The marker file is damaged.
-        DataError: Another version of the service wrote it.
-        OSError: It cannot be read.
+        DataError: Another version of the service wrote the marker file.
+        OSError: The marker file cannot be read.
     """
     marker = read_contents(store.folder / MARKER)
     return marker.generation if marker else None
@@ -67,10 +67,10 @@ def complete_generation(store: FolderStore, number: int) -> None:
 
 
 def confirm_completed(store: FolderStore) -> int:
-    """Return the number of the last complete generation once it is certain to be on the disk.
+    """Write the marker file again, and return the number of the last complete generation.
 
-    If syncing the marker file fails, a reader may find its new content, and a power cut may bring
-    back the old one. No generation may be deleted until this function has written it again.
+    If an earlier sync of the marker file failed, a reader finds its new content, but a power cut
+    may bring back the old one. No generation may be deleted until this function has succeeded.
 
     Returns:
         The number; 0 if there is no complete generation, or if the marker file is damaged.
@@ -94,8 +94,8 @@ def actors_of_completed(store: FolderStore) -> set[str]:
 
     Raises:
         DamagedStateError: The marker file is damaged.
-        DataError: Another version of the service wrote it.
-        OSError: It cannot be read.
+        DataError: Another version of the service wrote the marker file.
+        OSError: The marker file cannot be read.
     """
     marker = read_contents(store.folder / MARKER)
     return set(marker.files) if marker else set()
@@ -104,10 +104,21 @@ def actors_of_completed(store: FolderStore) -> set[str]:
 def problem_of_completed(
     store: FolderStore, actors: Sequence[str], number: int
 ) -> DataError | str | None:
-    """Check the states of the last complete generation; see `problem_of_states`.
+    """Check the states of the last complete generation.
 
-    An actor may have no state in it, because the actor had none at that time. If the marker file
-    says that the actor had one, its missing state is a problem.
+    An actor that had no state when the generation was kept has none in it. If the marker file lists
+    the actor, its missing state is a problem.
+
+    Args:
+        store: Store of the states.
+        actors: The actors.
+        number: Number of the last complete generation.
+
+    Returns:
+        None if the states are valid. Otherwise the problem, as `problem_of_states` returns it.
+
+    Raises:
+        DataError: A state or the marker file cannot be read.
     """
     had_state = actors_of_completed(store)
     lost = [actor for actor in actors if actor in had_state and not store.exists(actor, number)]
@@ -167,7 +178,7 @@ def problem_of_states(
 
 
 def _inconsistent_states(pasts: Mapping[str, RestoredState]) -> Iterator[str]:
-    """Describe each topic of which the saved states of producer and consumer do not fit.
+    """Describe each topic of which the saved states of producer and consumer are inconsistent.
 
     The consumer has then handled messages of another run, or messages unknown to the producer,
     whose saved state is older. Or the consumer's state is older, and needs messages that the
@@ -196,7 +207,10 @@ def _inconsistent_states(pasts: Mapping[str, RestoredState]) -> Iterator[str]:
 
 
 class GenerationKeeper:
-    """Task of a running service that keeps generations of the states of its actors."""
+    """Task of a running service that keeps the states of its actors as a generation every second.
+
+    A generation is a synced copy of the states of all actors, to which the service falls back.
+    """
 
     def __init__(self, commander: CommandSender, store: FolderStore, actors: Sequence[str]) -> None:
         """Prepare the task; `run` starts it.
@@ -218,9 +232,10 @@ class GenerationKeeper:
         self.lock = asyncio.Lock()  # Held while a generation is kept, and during a reset.
 
     def age_s(self) -> float:
-        """Return the time since the last complete generation had the states of that time, seconds.
+        """Return the time since the last complete generation was up to date, seconds.
 
-        Any thread may call this method.
+        A generation is up to date until an actor handles a further message. Any thread may call
+        this method.
         """
         return time.monotonic() - self._current_s
 
@@ -234,15 +249,15 @@ class GenerationKeeper:
     async def keep(self, *, is_forced: bool = False) -> str:
         """Keep one generation; the caller must hold `lock`.
 
-        If an actor does not answer, or if the states do not fit, the generation before stays the
-        last complete one.
+        If an actor does not answer, or if the states do not belong together, the previous
+        generation stays the last complete one.
 
         Args:
             is_forced: Keep a generation even if no messages were handled since the last one.
 
         Returns:
-            An empty text if the last complete generation has the present states. Otherwise, the
-            reason.
+            An empty text if the last complete generation is now up to date. Otherwise, the reason
+            why no new one is complete.
         """
         try:
             problem = await self._keep(is_forced=is_forced)

@@ -31,10 +31,10 @@ class Inlet:
 
     port: In
     waiting: deque[Delivery] = field(default_factory=deque)
-    delivered: int = 0
-    dropped: int = 0
-    rejected: int = 0
-    gaps: int = 0
+    delivered: int = 0  # Messages that were handled.
+    dropped: int = 0  # Messages dropped because newer ones came.
+    rejected: int = 0  # Malformed or too large messages.
+    gaps: int = 0  # Messages of a lossless input that were not the next one, or arrived too early.
     peak: int = 0  # Maximum length of the queue so far.
     paused: int = 0  # Messages dropped while the stage was paused.
     numbers: SequenceTracker = field(default_factory=SequenceTracker)
@@ -165,7 +165,7 @@ class LosslessInlet(Inlet):
         return True
 
     def discard_backlog(self) -> None:
-        """Keep the queued messages of a paused stage, because no message may be lost."""
+        """Do nothing, because a lossless input of a paused stage must keep its messages."""
 
     def reset(self) -> None:
         """Clear the queue and the connection; the producer must send its hello again."""
@@ -200,10 +200,13 @@ class LosslessInlet(Inlet):
         return InletPosition(self.epoch, handled)
 
     def grant(self, consumer: str, *, waits_for_disk: bool = False) -> ConsumerHello | Credit:
-        """Return the message for the producer: a hello until it is connected, then credit.
+        """Return the message to send to the producer.
+
+        It is a hello until the producer has sent its hello. After that, it is the credit: the range
+        of messages that the producer may send.
 
         Args:
-            consumer: Name of this actor.
+            consumer: Name of the actor with this input.
             waits_for_disk: True if the stage takes no messages because its disk is full.
         """
         if not self.is_connected:

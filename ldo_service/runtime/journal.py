@@ -7,8 +7,9 @@
 | `journal/gap`   | `Gap`        | Entries are missing from here on.                               |
 
 Inputs are recorded between these entries, each on the channel of its topic, with its encoded bytes.
-Steps are numbered from 0 in each file. The outputs of an actor depend only on its state at the
-start, its inputs and the flow status. `ldo_service.recordings.replay` can therefore repeat and
+Steps are numbered from 0 in each file. The flow status is the credit of the actor's outputs and the
+backlog of its inputs (`FlowStatus`). The outputs of an actor depend only on its state at the start,
+its inputs and the flow status. `ldo_service.recordings.replay` can therefore repeat and
 verify every step.
 """
 
@@ -53,7 +54,7 @@ class Output(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Started(msgspec.Struct, frozen=True, kw_only=True):
-    """Start of a new or restored actor."""
+    """Journal entry for the start of a new or restored actor."""
 
     step: int  # Number of the next step.
     state: dict[str, bytes] | None  # Parts as `state_codec` encodes them; None: a new actor.
@@ -63,28 +64,30 @@ class Started(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Input, flow status and outputs of one step."""
+    """Journal entry for one step: its input, flow status and outputs."""
 
-    step: int
+    step: int  # Number of the step.
     kind: Kind
     taken: int  # Number of the input in this file; -1: no input.
     topic: str = ""  # Topic of the input.
     source: str = ""  # Header fields of the input.
     epoch: int = 0
     seq: int = 0
-    checksum: str = ""  # Checksum of the input.
+    checksum: str = ""  # CRC-32 of the encoded input; see `journal.checksum`.
     credits: dict[str, int] = {}  # Messages that could be sent without waiting, by topic.
     outputs: tuple[Output, ...] = ()
-    digest: str = ""  # Digest of all outputs in order.
+    digest: str = ""  # Digest of all outputs in order; see `digest_of`.
     error: str = ""  # Exception of a failed step.
     backlog: dict[str, int] = {}  # Messages queued behind the input, by topic.
 
 
 class Gap(msgspec.Struct, frozen=True, kw_only=True):
-    """Missing entries of a journal."""
+    """Journal entry in place of entries that are missing from here on."""
 
     step: int  # Number of the first missing step.
-    reason: Literal["slow", "limit", "state"]  # Disk too slow; size limit; state not writable.
+    # The disk was too slow (slow), the recording reached its maximum size (limit), or a saved state
+    # could not be recorded (state).
+    reason: Literal["slow", "limit", "state"]
     lost: int = 0  # Inputs that were not recorded; 0: unknown.
 
 

@@ -49,11 +49,11 @@ class PendingOutput:
 
 @dataclass
 class ActorThread:
-    """Actor with its own thread."""
+    """Actor on a logical clock, with a thread of its own."""
 
     actor: Actor
     rank: int  # Position of the actor in the graph.
-    latency_ticks: int
+    latency_ticks: int  # Ticks from the input of a step to the delivery of its outputs.
     thread: ThreadPoolExecutor
     # Wall time of each step, ms, except steps that only stored their input.
     step_ms: list[float] = field(default_factory=list)

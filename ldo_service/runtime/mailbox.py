@@ -43,7 +43,7 @@ class Mailbox:
 
     Any thread may add messages; only the event loop takes them. A delivery counts as handled when
     `done` is called. If the actor's process is killed before this call, the restored actor receives
-    the message again, unless the input has policy Latest.
+    the message again, unless the input has policy `Latest`.
     """
 
     def __init__(
@@ -62,8 +62,8 @@ class Mailbox:
             consumer: Name of the actor.
             ports: Inputs of the actor.
             transport: The network.
-            max_bytes: Maximum size of a message of a Latest input, bytes. Lossless inputs have no
-                limit, because their messages come from actors of the service.
+            max_bytes: Maximum size of a message of an input with policy `Latest`, bytes. Lossless
+                inputs have no limit, because their messages come from actors of the service.
             past: Position of the previous process on each lossless topic, by topic name.
             is_held: Begin as after `pause`.
         """
@@ -245,8 +245,11 @@ class Mailbox:
     def put_command(self, order: StageCommand) -> list[StageCommand]:
         """Queue a command; `take` returns it before all deliveries.
 
-        A `keep` replaces each one that still waits. Otherwise, an actor that was busy for minutes
-        would keep its state once for each of them.
+        A command `keep` replaces earlier commands `keep` in the queue. Otherwise, an actor that was
+        busy for minutes would keep its state once for each of them.
+
+        Args:
+            order: The command.
 
         Returns:
             The replaced commands.
@@ -259,7 +262,7 @@ class Mailbox:
     def pause(self) -> None:
         """Let `take` return only commands until `resume`.
 
-        Latest inputs drop their messages and count them. Lossless inputs keep their messages.
+        Inputs with policy `Latest` drop their messages and count them. Lossless inputs keep theirs.
         """
         with self._lock:
             self._held = True

@@ -39,8 +39,8 @@ class Outbox:
             log: Log on disk, which has its own maximum size; None: all messages are in memory.
             max_bytes: Maximum size of an outbox in memory, bytes. The oldest messages beyond it are
                 dropped. None: the log or the consumers' windows limit the size of the outbox.
-            retained_from: Number of the first message that a kept generation of the state needs;
-                None if no generation is kept.
+            retained_from: Number of the first message that a generation of the states needs; see
+                `runtime.generations`. None if there is no generation.
         """
         self._lock = Lock()
         self._memory = deque(unhandled)
@@ -129,24 +129,24 @@ class Outbox:
         return min(in_memory, self._log.after(seq, end) if self._log else end)
 
     def first_needed(self, handled: int) -> int:
-        """Return the number of the first message that a consumer or a kept generation needs.
+        """Return the number of the first message that a consumer or a generation needs.
 
         Args:
-            handled: Number of the first message that a consumer has not handled.
+            handled: All consumers have handled the messages before this number.
         """
         return min([handled, *self._handled_at_keeps[:1]])
 
     def keep(self, handled: int, *, is_previous_complete: bool) -> None:
-        """Retain the messages that the next generation needs.
+        """Retain the messages that the next generation of the states needs.
 
-        The consumers keep their states before this producer does. The producer must then still have
-        all messages that they had not handled, although they have handled some of them since. A
-        generation therefore needs the messages that were unhandled when the producer kept the
-        generation before.
+        The consumers keep their states first (`runtime.generations`). Until this producer keeps its
+        own state, they may handle further messages, which their kept states still need. The outbox
+        therefore retains all messages that were unhandled at the previous call of this method.
 
         Args:
-            handled: Number of the first message that a consumer has not handled.
-            is_previous_complete: Whether the generation kept before this one is complete.
+            handled: All consumers have handled the messages before this number.
+            is_previous_complete: Whether the generation of the previous call is complete, so that
+                no older one is needed.
         """
         if is_previous_complete:
             del self._handled_at_keeps[:-2]
@@ -154,9 +154,10 @@ class Outbox:
         self._handled_at_keeps.append(handled)
 
     def forget(self, before: int) -> None:
-        """Delete the messages below `before`, which all consumers have handled.
+        """Delete the messages before number `before`, which all consumers have handled.
 
-        Messages that a kept generation needs are retained. A log has its own maximum size.
+        Messages that a generation of the states needs stay; see `keep`. In memory, they stay only
+        while the outbox has at most `MAX_RETAINED_BYTES`.
         """
         needed = self.first_needed(before)
         if self._log:

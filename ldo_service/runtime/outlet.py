@@ -199,11 +199,11 @@ class Outlet:
 
     @property
     def handled(self) -> int:
-        """Offset of the first message that a consumer has not handled."""
+        """Offset of the first message that at least one consumer has not handled."""
         return min(self._consumers.handled(self._seq), self._seq)
 
     def position(self) -> OutletPosition | None:
-        """Return the position to save; None if there is no required consumer."""
+        """Return the position that the stage saves; None if there is no required consumer."""
         if not self._consumers.expected:
             return None
         logged_from = self.outbox.first_needed(self.handled) if self.outbox.is_logged else None

@@ -20,7 +20,9 @@ from .supervision_policy import SupervisionConfig
 
 @dataclass(frozen=True, slots=True)
 class OutletOpener:
-    """Opener of the outlets of a stage, which continue at the positions of the previous process.
+    """Opener of the outlets of a stage. An outlet is the sending half of a topic.
+
+    Each outlet continues the message numbers of the actor's previous process.
 
     Attributes:
         transport: The network.
@@ -45,8 +47,9 @@ class OutletOpener:
 
         Args:
             port: The output of the actor.
-            source: Name of the actor, and epoch of the topic if `past` has no position of it.
-            past: Saved position of the previous process, by topic name.
+            source: Name of the actor, and the epoch, which identifies a numbering of messages. The
+                epoch is used only if `past` does not have the topic.
+            past: Saved position of each outlet of the previous process, by topic name.
         """
         name, epoch = source
         topic = port.topic.name
@@ -118,9 +121,10 @@ class Outlets:
         }
 
     def past(self) -> dict[str, OutletPosition | None]:
-        """Return the position to save of each outlet, by topic name.
+        """Return the position of each outlet, which the stage saves, by topic name.
 
-        The position is None if the topic has no required consumer.
+        A position is the number of the next message, with all unhandled messages. It is None if the
+        topic has no required consumer.
         """
         return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
 
@@ -166,7 +170,11 @@ class Outlets:
             outlet.reset(epoch)
 
     def keep(self, *, is_previous_complete: bool) -> None:
-        """Retain the messages that the next generation of the state needs; see `Outbox.keep`."""
+        """Retain the messages that the next generation of the states needs; see `Outbox.keep`.
+
+        Args:
+            is_previous_complete: Whether the previous generation of the states is complete.
+        """
         for outlet in self._all.values():
             outlet.outbox.keep(outlet.handled, is_previous_complete=is_previous_complete)
 
@@ -178,7 +186,7 @@ class Outlets:
         """Evict every consumer whose window of unhandled messages has been full for too long.
 
         Args:
-            now_s: Time of a clock that stands still while this process does not run, seconds.
+            now_s: Current time of the stage's `RunningClock`, seconds.
         """
         for outlet in self._all.values():
             outlet.evict_stalled(now_s)

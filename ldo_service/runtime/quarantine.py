@@ -39,23 +39,28 @@ class QuarantinedMessage(msgspec.Struct, frozen=True, kw_only=True):
     epoch: int
     seq: int
     stamp_ns: int
-    deliveries: int
-    body: bytes
+    deliveries: int  # Number of deliveries, each of which ended the process.
+    body: bytes  # Encoded message.
 
 
 class Quarantine:
     """Count of the deliveries of the current message, and folder of quarantined messages.
 
-    Only lossless inputs deliver a message again. A message is suspected if its process ended
-    during an earlier delivery. A process with several actors handles one suspected message at a
-    time. If the process ends again, only that message gets a further count.
+    Before a stage handles a message of a lossless input, it writes to the disk how often the
+    message was delivered. If the process ends while it handles the message, the restarted stage
+    receives the message again, as a suspected one. After `MAX_DELIVERIES` deliveries, the stage
+    puts the message into the folder instead of handling it.
+
+    A process with several actors handles one suspected message at a time. If the process ends
+    again, the deliveries of only that message increase. Messages of other inputs are never
+    delivered again, so they are not counted.
 
     Attributes:
         count: Number of quarantined messages since the state folder is in use.
     """
 
     def __init__(self, folder: Path | None, suspects: asyncio.Lock | None = None) -> None:
-        """Read the count of the previous process.
+        """Read the counts that the previous process wrote.
 
         Args:
             folder: Folder of the counts and messages; None: nothing is counted.

@@ -57,9 +57,9 @@ class ActorRestorer:
 
         Args:
             worker: Thread of the actor.
-            is_charged: Whether the failure counts in the restart budget. A failed message does not
-                count at its first attempt. If the second attempt fails too, the fault is in the
-                message, and no message may end the stage.
+            is_charged: Whether the failure counts in the restart budget. It is False for a failed
+                message: if both attempts fail, the fault is in the message, and no message may end
+                the stage. If the second attempt succeeds, the stage calls `charge`.
 
         Raises:
             RestartsExhausted: The budget is used up.
@@ -96,7 +96,14 @@ class FailureLog:
         self._failures, self._dead_letters = LogLimit(LOG_PERIOD_S), LogLimit(LOG_PERIOD_S)
 
     def step_failed(self, name: str, what: str, *, is_of_message: bool) -> None:
-        """Log the current exception as the failure of a step."""
+        """Log the current exception as the failure of a step.
+
+        Args:
+            name: Name of the actor.
+            what: Description of the step, such as "handling Keyframe".
+            is_of_message: Whether the step handled a message, so that at most one failure per
+                minute is logged.
+        """
         if not is_of_message or self._failures.is_due():
             log.exception("%s: %s failed; restoring the actor.", name, what)
 

@@ -9,12 +9,13 @@ The service sends commands to its stages over a network that may lose messages:
 
 Commands:
 
-- `pause`: Take no messages. Latest inputs drop arriving messages and count them as paused. A file
-  marks a paused service, so that it is paused after a restart too.
+- `pause`: Take no messages. Inputs with policy `Latest` drop arriving messages and count them as
+  paused. A file marks a paused service, so that it is paused after a restart too.
 - `resume`: Take messages again.
 - `reset`: Start with an empty state and a new epoch.
 - `save`: Write the whole state now.
-- `keep`: Keep the last saved state as a generation, to which the service can fall back.
+- `keep`: Keep the last saved state as part of a generation, to which the service can fall back; see
+  `generations`.
 
 `control.Control` gives these commands to all stages of a service.
 """
@@ -48,8 +49,9 @@ class StageCommand(msgspec.Struct, frozen=True, array_like=True):
     number: int  # Unique number of the command.
     what: What
     stage: str
-    generation: int = 0  # Number of the generation to keep.
-    completed: int = 0  # Number of the last generation that all actors have completed.
+    # Both are for `keep`: the number of the generation to keep, and of the last complete one.
+    generation: int = 0
+    completed: int = 0
 
 
 class StageReply(msgspec.Struct, frozen=True, array_like=True):

@@ -37,11 +37,12 @@ class UnsavedStateError(Exception):
 class StateSaver:
     """Saver of the state of one stage.
 
-    While the disk is full, the saver retries and the stage takes no messages, with two exceptions:
+    While the disk is full, the saver retries and the stage takes no messages. Two kinds of stages
+    without lossless inputs continue:
 
-    - A stage continues if it has no lossless inputs and its outputs do not block it. Messages that
-      it makes wait until its state is saved, and the actor sees a credit of 0 for them.
-    - A stage continues if it has no lossless inputs and no consumer needs its outputs.
+    - A stage with a nonblocking output (`Out.is_nonblocking`). Messages for required consumers wait
+      until its state is saved, and `Actor.has_credit` is False for them.
+    - A stage whose outputs have no required consumer.
 
     A stage that is about to end does not wait for the disk.
     """
@@ -99,7 +100,7 @@ class StateSaver:
         *,
         whole: bool = False,
     ) -> bool:
-        """Save the current state, and retry while the disk is full.
+        """Save the current state; most stages retry while the disk is full.
 
         Args:
             actor: The actor of the stage.
@@ -108,8 +109,8 @@ class StateSaver:
             whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`.
 
         Returns:
-            True if the state is saved. False if it is not saved and the stage need not wait for the
-            disk.
+            True if the state is saved. False if the disk is full and the stage is one of those that
+            continue nevertheless; see `StateSaver`.
 
         Raises:
             UnsavedStateError: The stage is about to end and the state cannot be written.
@@ -140,7 +141,8 @@ class StateSaver:
     ) -> None:
         """Keep the last saved state as a generation, and write it in the background.
 
-        While a generation is being written, which takes long on a slow disk, none is begun.
+        A generation is a copy of all states, to which the service falls back. While one is being
+        written, which takes long on a slow disk, none is begun.
 
         Args:
             actor: The actor of the stage.
@@ -185,7 +187,7 @@ class StateSaver:
             report(order, "")
 
     def close(self) -> None:
-        """Stop waiting for the disk; no generation is reported any more."""
+        """Stop writing a generation; the service gets no reply to its command `keep`."""
         for task in self._syncing:
             task.cancel()
 

@@ -35,6 +35,9 @@ class RestartBudget:
     def record_failure(self, now_s: float) -> float:
         """Count a failure and return the delay before the restart, in seconds.
 
+        Args:
+            now_s: Event-loop time of the failure, seconds.
+
         Raises:
             RestartsExhausted: The budget is used up.
         """
@@ -45,7 +48,11 @@ class RestartBudget:
         return delay_s
 
     def delay_s(self, now_s: float) -> float:
-        """Return the delay in seconds before a restart that does not count in the budget."""
+        """Return the delay before a restart, in seconds, without counting a failure.
+
+        Args:
+            now_s: Event-loop time of the restart, seconds.
+        """
         while self._failed_at_s and self._failed_at_s[0] < now_s - self._window_s:
             self._failed_at_s.popleft()
         recent = max(len(self._failed_at_s), 1)
@@ -91,7 +98,7 @@ class RunningClock:
         self._stopped_s = 0.0
 
     def tick(self, period_s: float) -> float:
-        """Note that the process runs; call it every `period_s` seconds.
+        """Record that the process runs; call this method every `period_s` seconds.
 
         Returns:
             How long the process was paused since the last call, seconds; usually 0.
