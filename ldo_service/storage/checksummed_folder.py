@@ -115,12 +115,12 @@ class ChecksummedFolder:
         return [self._path(number) for number in sorted(self._unsynced | self._syncing)]
 
     def begin_sync(self) -> None:
-        """Mark the files in `unsynced_files` as being synced; the caller syncs them."""
+        """Record that the caller now syncs the files that `unsynced_files` returned last."""
         self._syncing |= self._unsynced
         self._unsynced.clear()
 
     def end_sync(self) -> None:
-        """Note that the files of the last `begin_sync` are on the disk."""
+        """Record that the files of the last `begin_sync` are on the disk."""
         self._syncing.clear()
 
     def _path(self, number: int) -> Path:

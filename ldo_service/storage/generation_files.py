@@ -1,4 +1,8 @@
-"""Files of one generation of an actor's state, which are copied and synced to the disk."""
+"""Files of one generation of an actor's state, which are copied and synced to the disk.
+
+A generation is a copy of the states of all actors, to which the service falls back; see
+`runtime.generations`.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -15,11 +15,11 @@ class MemoryStore:
         self._states: dict[str, State] = {}
 
     def backlog_folder(self, actor: str) -> None:  # noqa: ARG002
-        """Return None: unhandled messages are kept in memory, as the states are."""
+        """Return None, because unhandled messages stay in memory, as the states do."""
         return
 
     def quarantine_folder(self, actor: str) -> None:  # noqa: ARG002
-        """Return None: the deliveries of messages are not counted."""
+        """Return None, because a count in memory ends with the process that a message ends."""
         return
 
     def save(self, actor: str, state: State, unsynced: Iterable[Path] = ()) -> None:  # noqa: ARG002

@@ -67,7 +67,7 @@ class MessageLog:
         Args:
             folder: Folder of the log; created with the first message.
             epoch: Epoch of the numbers.
-            first: Number of the first message that is still needed.
+            first: Number of the first message that a consumer or a generation of the states needs.
             end: Number after the last message to keep. A killed process may have written messages
                 with this number and above.
             max_bytes: Maximum size of the log, bytes.
@@ -223,8 +223,8 @@ class MessageLog:
         """Delete the segments that only hold messages with numbers below `before`.
 
         Args:
-            before: Number of the first message that is still needed.
-            handled: Number of the first message that a consumer still needs. The earlier ones do
+            before: Number of the first message that a consumer or a generation of the states needs.
+            handled: All consumers have handled the messages before this number. These messages do
                 not count as dropped if the log exceeds its maximum size.
         """
         with self._lock:

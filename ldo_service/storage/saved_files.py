@@ -25,10 +25,13 @@ class SavedFiles:
         self._backlog = store.backlog_folder(actor)
 
     def check_unsynced(self, generation: int = NEWEST) -> None:
-        """Check the files outside the folder of the state that a power cut may have damaged.
+        """Check the files that were possibly not synced to the disk when the state was saved.
+
+        They are outside the folder of the state, and a power cut may have damaged them.
 
         Args:
-            generation: Number of an older generation; by default the state after the last step.
+            generation: Number of a generation of the states; by default the state after the last
+                step.
 
         Raises:
             DamagedStateError: A file is missing or damaged.
@@ -43,7 +46,9 @@ class SavedFiles:
                 ) from error
 
     def sync_unsynced(self) -> None:
-        """Sync the files that `check_unsynced` checks; the actor may then remove them.
+        """Sync the files that `check_unsynced` checks, and remove them from its list.
+
+        The actor may then remove those that it does not need, and the state stays valid.
 
         Raises:
             OSError: The disk is full, or a file cannot be read.

@@ -26,7 +26,7 @@ def decode_state(body: bytes) -> Any:
     try:
         return msgspec.msgpack.decode(body, ext_hook=_array_from_ext)
     except UNREADABLE as error:
-        raise msgspec.DecodeError(f"cannot be decoded: {error}") from error
+        raise msgspec.DecodeError(f"the encoded state cannot be decoded: {error}") from error
 
 
 def _array_to_ext(value: object) -> msgspec.msgpack.Ext:
@@ -47,7 +47,7 @@ def _array_to_ext(value: object) -> msgspec.msgpack.Ext:
 
 def _array_from_ext(code: int, data: memoryview) -> Any:
     if code != ARRAY_CODE:
-        raise ValueError(f"MessagePack extension {code} must be {ARRAY_CODE} in a saved state")
+        raise ValueError(f"MessagePack extension {code} is unknown; only {ARRAY_CODE} is an array")
     dtype, shape, raw = msgspec.msgpack.decode(data, type=tuple[str, tuple[int, ...], bytes])
     array = np.frombuffer(raw, dtype).reshape(shape).copy()
     return array if shape else array[()]

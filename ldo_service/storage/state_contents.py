@@ -21,7 +21,8 @@ UNCHECKED_VERSION = 3
 class StateContents(msgspec.Struct, frozen=True):
     """Files of one state, and their format version.
 
-    An older version of the service reads `files` and `version`, and refuses the state.
+    The fields `files` and `version` never change, so that an older version of the service can read
+    them and reject a newer state.
     """
 
     files: dict[str, str]  # File name of each part.
@@ -29,8 +30,8 @@ class StateContents(msgspec.Struct, frozen=True):
     checks: dict[str, tuple[int, int]] = {}  # Size in bytes and CRC-32 of the file of each part.
     # Number of the generation that these files belong to; 0 for a state saved after a step.
     generation: int = 0
-    # Files outside the folder to which the parts refer, and which may not be synced to the disk;
-    # their paths are relative to the parent of the folder of all states.
+    # Files outside the folder to which the parts refer, and which are possibly not synced to the
+    # disk yet; their paths are relative to the parent of the folder of all states.
     unsynced: tuple[str, ...] = ()
     checksum: int = 0  # CRC-32 of the encoded contents with checksum 0.
 
@@ -43,7 +44,7 @@ class StateContents(msgspec.Struct, frozen=True):
 
     @property
     def has_damaged_version(self) -> bool:
-        """Return whether the checksum shows that only the version number is damaged."""
+        """True if the checksum shows that only the version number is damaged."""
         own = msgspec.structs.replace(self, version=STATE_VERSION)
         return self.version != STATE_VERSION and own._checksum() == self.checksum
 

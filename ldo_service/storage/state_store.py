@@ -57,7 +57,7 @@ class StateStore(Protocol):
         ...
 
     def save(self, actor: str, state: State, unsynced: Iterable[Path] = ()) -> None:
-        """Replace the state of an actor; an empty state is ignored."""
+        """Replace the state of an actor; an empty state is ignored. See `FolderStore.save`."""
         ...
 
     def load(self, actor: str) -> State | None:
@@ -75,11 +75,11 @@ class StateStore(Protocol):
         ...
 
     def is_kept(self, actor: str) -> bool:
-        """Return whether an older generation of the actor's state exists."""
+        """Return whether the actor's state has a generation, to which the service can fall back."""
         ...
 
     def give_up(self, actor: str) -> None:
-        """Delete all generations of the state of an actor."""
+        """Delete all generations of an actor's state; the state after the last step stays."""
         ...
 
     def has_fallen_back(self, actor: str) -> bool:
@@ -132,8 +132,8 @@ class FolderStore:
         Args:
             actor: Name of the actor.
             state: The state.
-            unsynced: Files of a `ChecksummedFolder` to which the state refers, and which may not be
-                synced to the disk; see `SavedFiles`.
+            unsynced: Files to which the state refers, and which are possibly not synced to the disk
+                yet. The store only saves their paths, for `SavedFiles` to check them later.
 
         Raises:
             OSError: The state cannot be written; the old state stays unchanged.
@@ -198,7 +198,7 @@ class FolderStore:
 
         Args:
             actor: Name of the actor.
-            generation: Number of an older generation; by default the state after the last step.
+            generation: Number of a generation; by default the state after the last step.
             prefixes: Load only the parts whose names begin with one of these prefixes.
 
         Returns:
@@ -292,14 +292,14 @@ class FolderStore:
     def keep(
         self, actor: str, generation: int, completed: int, unsynced: Iterable[Path] = ()
     ) -> GenerationFiles:
-        """Keep the last saved state as a generation, and forget all others except one.
+        """Keep the last saved state as a generation, and forget all others except `completed`.
 
         Args:
             actor: Name of the actor.
             generation: Number of the generation, which no earlier one has.
             completed: Number of the newest generation that all actors have completed.
-            unsynced: Files that `save` has got and that are still not synced. The caller syncs them
-                too.
+            unsynced: Those of the files given to `save` that are not synced to the disk yet. The
+                caller must sync them.
 
         Returns:
             The files of the generation, which the caller must write.
@@ -336,7 +336,7 @@ class FolderStore:
         return new
 
     def give_up(self, actor: str) -> None:
-        """Delete all generations of the state of an actor, but not the state itself.
+        """Delete all generations of an actor's state; the state after the last step stays.
 
         Raises:
             OSError: The disk cannot be written.
@@ -357,11 +357,11 @@ class FolderStore:
             self._remove_unused(actor, copies)
 
     def exists(self, actor: str, generation: int = NEWEST) -> bool:
-        """Return whether an actor has a state."""
+        """Return whether an actor has a state in a generation; by default after the last step."""
         return (self.folder / actor / list_name(generation)).exists()
 
     def is_kept(self, actor: str) -> bool:
-        """Return whether an older generation of the actor's state exists."""
+        """Return whether the actor's state has a generation, to which the service can fall back."""
         if actor in self._kept:
             return bool(self._kept[actor])
         return any((self.folder / actor).glob(GENERATION.format("*")))
