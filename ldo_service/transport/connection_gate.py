@@ -48,10 +48,10 @@ MAX_ALERT_BYTES = 64
 
 
 class Connection:
-    """Connection of a program, and the connection to the router that carries its bytes.
+    """Connection of a client program, and the connection to the router that carries its bytes.
 
     Attributes:
-        address: Address of the program.
+        address: IP address of the client.
         has_spoken: The first bytes of a handshake have arrived.
         is_proven: The router has answered the certificate of the client.
     """
@@ -67,7 +67,10 @@ class Connection:
         self._deadline = gate.loop.call_later(HANDSHAKE_S, gate.refuse, self)
 
     def from_client(self, data: bytes) -> None:
-        """Pass bytes of the program on; before the first ones, wait for a turn."""
+        """Pass bytes from the client on to the router.
+
+        The first bytes wait until the gate connects to the router; see `Gate.wait_for_turn`.
+        """
         if self.router is not None:
             self._has_client_answered = self._has_router_spoken
             self.router.write(data)
@@ -81,7 +84,7 @@ class Connection:
             self._gate.wait_for_turn(self)
 
     def from_router(self, data: bytes) -> None:
-        """Pass bytes of the router on, and note the answer to the client's certificate."""
+        """Pass bytes from the router on to the client, and detect the answer to its certificate."""
         if not self._has_router_spoken:
             self._has_router_spoken = HELLO_RETRY not in data[:64]
         elif self._has_client_answered and not self.is_proven:
@@ -93,7 +96,7 @@ class Connection:
         self.client.write(data)
 
     def start(self, router: asyncio.Transport) -> None:
-        """Begin to pass bytes on."""
+        """Begin to pass bytes on to the router."""
         self.router = router
         if self.is_closed:
             self._leave_router()
@@ -101,7 +104,7 @@ class Connection:
             router.write(self.hello)
 
     def close(self) -> None:
-        """Close the connection of the program and the one to the router."""
+        """Close the connection of the client and the one to the router."""
         if self.is_closed:
             return
         self.is_closed = True
@@ -130,7 +133,10 @@ class Connection:
 
 
 class Side(asyncio.Protocol):
-    """Protocol of one of the two connections, which slows the sender to the receiver's speed."""
+    """Protocol of one side of the gate: a connection of a client, or one to the router.
+
+    It slows the sender to the receiver's speed.
+    """
 
     def __init__(self, gate: "Gate", connection: Connection | None = None) -> None:
         self._gate, self._connection = gate, connection
@@ -169,7 +175,11 @@ class Side(asyncio.Protocol):
 
 
 class Gate:
-    """Connections of the gate, and their limits."""
+    """Gate between clients on the network and the TLS port of the router; see the module.
+
+    It limits the connections that are unproven: the router has not answered the certificate of
+    their client.
+    """
 
     def __init__(self, host: str, port: int, max_connections: int) -> None:
         """Initialize inside a running event loop.
@@ -191,7 +201,7 @@ class Gate:
         self._refused = 0  # Number of connections closed because of a limit since the last report.
 
     def admit(self, new: Connection) -> None:
-        """Add a connection, and close an unproven one if there are too many."""
+        """Add a connection; if there are too many, close one that is unproven."""
         self._open[new] = None
         unproven = [one for one in self._open if not one.is_proven]
         if len(unproven) > MAX_UNPROVEN or len(self._open) > self._max_connections:
@@ -202,7 +212,7 @@ class Gate:
             self.refuse(min(crowd, key=lambda one: one.has_spoken))
 
     def refuse(self, connection: Connection) -> None:
-        """Close an unproven connection because of a limit, and report the number of these."""
+        """Close an unproven connection because of a limit, and count it for the next report."""
         connection.close()
         self._refused += 1
         if self._refused == 1:
@@ -219,12 +229,15 @@ class Gate:
             connection.close()
 
     def wait_for_turn(self, connection: Connection) -> None:
-        """Connect to the router as soon as the address has few handshakes."""
+        """Connect to the router as soon as few enough handshakes are under way.
+
+        The limits are `MAX_HANDSHAKES` for the client's address, and `MAX_ALL_HANDSHAKES` in all.
+        """
         self._waiting[connection] = None
         self._start_waiting()
 
     def end_handshake(self, connection: Connection) -> None:
-        """Let the next connection shake hands with the router."""
+        """Remove a connection from those in a handshake, and let the next one connect."""
         self._handshakes.pop(connection, None)
         self._start_waiting()
 

@@ -37,8 +37,9 @@ class Endpoint:
     # Path of a Unix socket on which a router with TLS keys also listens, for its own child
     # processes; empty if there is none. This link still works when the certificate has expired.
     local_socket: str = ""
-    # Address on loopback on which a router with TLS keys listens behind its gate, which listens on
-    # `endpoint`; empty: the router listens on `endpoint` itself.
+    # Address on loopback, such as tls/127.0.0.1:40123, on which a router with TLS keys listens. Its
+    # gate (`connection_gate`) listens on `endpoint` and passes connections on to this address.
+    # Empty: there is no gate, and the router listens on `endpoint` itself.
     behind_gate: str = ""
 
     def __post_init__(self) -> None:

@@ -55,9 +55,9 @@ class Header(msgspec.Struct, frozen=True, array_like=True):
     """
 
     source: str  # Name of the producer.
-    epoch: int  # Changes when the producer restarts its numbering.
+    epoch: int  # Positive number of the producer's numbering; it changes when `seq` restarts at 0.
     seq: int  # Offset of the message in this epoch.
-    stamp_ns: int
+    stamp_ns: int  # Stamp of the message.
     key: str = ""  # Value of the field that `Topic.key` names, for `Latest(per_key=True)`.
 
     def __post_init__(self) -> None:
@@ -80,7 +80,7 @@ class ConsumerHello(msgspec.Struct, frozen=True, tag="join", array_like=True):
 
 
 class Credit(msgspec.Struct, frozen=True, tag="grant", array_like=True):
-    """Position and credit of a consumer."""
+    """Position and credit of a consumer, sent to the producer."""
 
     consumer: str
     epoch: int  # Epoch of the producer.
@@ -102,7 +102,7 @@ class Credit(msgspec.Struct, frozen=True, tag="grant", array_like=True):
 class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
     """Handshake of a producer."""
 
-    epoch: int
+    epoch: int  # Epoch of the producer.
     starts: dict[str, int]  # Offset of the first message for each known consumer, by name.
 
     def __post_init__(self) -> None:
@@ -127,13 +127,13 @@ class OutletPosition(NamedTuple):
     epoch: int
     seq: int  # Offset of the next message.
     unhandled: tuple[UnackedMessage, ...] = ()
-    # Offset of the first unhandled message, if a log on disk has the unhandled
-    # messages; None without a log.
+    # Offset of the first message that is still needed, if the messages are in a log on disk instead
+    # of in `unhandled`; None without a log.
     logged_from: int | None = None
 
     @property
     def handled(self) -> int:
-        """Offset of the first message that a consumer has not handled; `seq` if there is none."""
+        """Offset of the first message that a consumer may still need; `seq` if there is none."""
         if self.logged_from is not None:
             return self.logged_from
         return self.unhandled[0].seq if self.unhandled else self.seq

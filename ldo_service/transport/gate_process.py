@@ -30,14 +30,17 @@ DESCRIPTORS_PER_CONNECTION = 4
 
 @contextmanager
 def guarded(network: Endpoint) -> Iterator[tuple[Endpoint, "GateProcess | None"]]:
-    """Run the gate of a router with TLS keys inside the block.
+    """Run the gate of a router with TLS keys while the block runs.
+
+    The gate limits the connections of programs without keys; see `connection_gate`.
 
     Args:
-        network: Endpoint of the router. The gate listens on its address.
+        network: Endpoint of the router. The gate listens on its address, and passes connections on
+            to the router on another port.
 
     Yields:
-        The endpoint for the router, which listens behind the gate, and the gate. Without a plain
-        address and port, the same endpoint and None.
+        The endpoint with the port for the router, and the gate. If the address has more than host
+        and port, such as `#iface=eth0`, there is no gate: `network` and None.
 
     Raises:
         UnavailableError: The address is in use or does not exist.
@@ -61,7 +64,7 @@ def guarded(network: Endpoint) -> Iterator[tuple[Endpoint, "GateProcess | None"]
 
 
 class GateProcess:
-    """The process of a gate, which is started again when it ends."""
+    """Process of the gate in front of a router, which is started again when it ends."""
 
     def __init__(self, listener: socket.socket, router_port: int) -> None:
         """Start the process.

@@ -96,7 +96,7 @@ class MemoryTransport:
         return MemoryPublisher(self, key)
 
     def deliver(self, key: str, header: bytes, body: bytes) -> None:
-        """Call the subscribers of a key, unless the message is lost."""
+        """Call the subscribers of a key, unless `lose` returns True for the key."""
         if not self._lose(key):
             for on_message in list(self._subscribers.get(key, ())):
                 on_message(header, memoryview(body))

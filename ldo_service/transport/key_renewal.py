@@ -1,8 +1,9 @@
 """Renewal of the TLS keys of a running router.
 
 Zenoh reads keys and access list when a session opens. If the files change, `KeyRenewal` opens a
-second router with the new files, connects it to the router of the service over the Unix socket, and
-sends the gate there. Programs connect again by themselves.
+second router with the new files, and connects it to the router of the service over the Unix socket.
+The gate (`connection_gate`), to which programs connect, then closes their connections and passes
+new ones on to the second router. Programs connect again by themselves.
 """
 
 import logging
@@ -42,7 +43,7 @@ class KeyRenewal:
         """Remember the files as they are; the router must have read them just now.
 
         Args:
-            gate: Gate of the router.
+            gate: Process of the gate, which passes connections on to the router.
             network: Endpoint of the router, with keys and a Unix socket.
             on_renewed: Called with the new keys, on the thread of this object.
         """

@@ -69,10 +69,11 @@ def open_front_router(network: Endpoint, keys: TlsKeys, port: int) -> zenoh.Sess
     Args:
         network: Endpoint of the service, with a Unix socket.
         keys: The renewed keys.
-        port: Port on loopback, behind the gate.
+        port: Port on loopback on which the router listens. The gate (`connection_gate`) passes
+            connections of other machines on to it.
 
     Raises:
-        ConfigError: The keys or the access list cannot be used.
+        ConfigError: The keys, or `access.yaml` in their folder, cannot be used.
     """
     listen = f"tls/{LOOPBACK}:{port}"
     config = _session_config(replace(network, keys=keys, behind_gate=listen), router=True)
