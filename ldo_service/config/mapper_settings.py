@@ -115,7 +115,7 @@ class SemanticsSettings:
     """Labels of Gaussians."""
 
     # Minimum fraction of a Gaussian that a region must cover to label the Gaussian. This is
-    # theta_IoU (paper, III.A).
+    # theta_IoU (LDO-SLAM paper, III.A).
     min_overlap: Ratio = advanced(0.3)
     # Maximum number of names in the vocabulary. A further name becomes `other`.
     max_label_names: Annotated[int, Meta(ge=1, le=MAX_LABELS)] = advanced(MAX_LABELS)
@@ -125,15 +125,17 @@ class SemanticsSettings:
 class ObjectSettings:
     """Objects in the map."""
 
-    # Number of keyframes that must observe a candidate before it becomes an object (paper, III.C).
+    # Number of keyframes that must observe a candidate before it becomes an object (LDO-SLAM paper,
+    # III.C).
     min_observations: PositiveInt = 3
     # Maximum number of objects in the map. The default number takes 6 MB of memory, and a few
     # ms per keyframe if all objects are in view.
     max_objects: PositiveInt = 2000
-    # Minimum IoU of the boxes of a detection and an object to associate the two (paper, III.C).
+    # Minimum IoU of the boxes of a detection and an object to associate the two (LDO-SLAM paper,
+    # III.C).
     min_iou: PositiveRatio = advanced(0.4)
     # Number of consecutive keyframes that may miss a visible object before it is removed
-    # (paper, III.C).
+    # (LDO-SLAM paper, III.C).
     max_misses: PositiveInt = advanced(10)
 
 
@@ -141,16 +143,17 @@ class ObjectSettings:
 class OpenVocabularySettings:
     """Requests to the labeller for labels of image regions."""
 
-    # Score from which a detection needs no label from the labeller (paper, III.B).
+    # Minimum score of a detection whose region needs no label from the labeller (LDO-SLAM paper,
+    # III.B).
     confident_score: Ratio = advanced(0.6)
-    # Average number of label requests per keyframe. The paper requests labels on 10 to 25 % of the
-    # frames.
+    # Average number of label requests per keyframe. The LDO-SLAM paper requests labels on 10 to
+    # 25 % of the frames.
     requests_per_keyframe: PositiveFloat = advanced(2.5)
     # True counts detector boxes as votes for the label of a region. False leaves the label to the
     # labeller alone.
     detector_votes: bool = advanced(True)
-    # Minimum confidence of a label result that is used. A value of 0.5 lowers the recall on
-    # synthetic:flat by 7 percentage points.
+    # Minimum confidence of a result of the labeller; results below it are not used. A value of 0.5
+    # lowers the recall on synthetic:flat by 7 percentage points.
     min_confidence: Ratio = advanced(0.3)
 
 

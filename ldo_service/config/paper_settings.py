@@ -1,4 +1,4 @@
-"""Settings that are constants of the paper, or switch to the rules of the paper."""
+"""Settings that are constants of the LDO-SLAM paper, or switch to its rules."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -18,7 +18,7 @@ from .values import (
 
 @dataclass(frozen=True, slots=True)
 class PaperSettings:
-    """Constants of the paper, and switches that replace the default rules by those of the paper.
+    """Constants of the LDO-SLAM paper, and switches from the default rules to those of the paper.
 
     With them, the results of the paper can be reproduced. A user need not tune them.
     """

@@ -106,9 +106,9 @@ class KeyframeSettings:
     min_interval_frames: PositiveInt = advanced(1)
     # Maximum number of frames between reference keyframes, if the camera moved at all.
     max_interval_frames: PositiveInt = advanced(30)
-    # A mapping keyframe is made if the motion since the last mapped frame exceeds this
-    # fraction of the rotation or translation limit. A value above 1 makes none. Mapping
-    # keyframes improve PSNR by 0.4 dB on the sequence kitchen.
+    # Fraction of max_rotation_rad or max_translation_ratio. A mapping keyframe is made if the
+    # motion since the last mapped frame exceeds it; frames are not tracked against this keyframe.
+    # A value above 1 makes none. Mapping keyframes improve PSNR by 0.4 dB on the sequence kitchen.
     mapping_only_ratio: PositiveFloat = advanced(0.33)
     # Number of keyframes after which the tracker searches for a known keyframe before it makes a
     # new keyframe. With fewer keyframes, every new one improves the map. 0 never searches.
@@ -162,10 +162,12 @@ class QualitySettings:
     # The pose of a frame is WEAK if the frame shows less than this fraction of the surface in the
     # reference keyframe. The default was chosen on one apartment.
     weak_overlap: Ratio = advanced(0.15)
-    # A pose is WEAK if the ratio of its residual to the running median exceeds this value. A
-    # pose that features confirm closely is WEAK above a ratio of 6, and LOST above 15.
+    # A pose is WEAK if the ratio of its residual to the median residual of the last OK frames
+    # exceeds this value. A pose that features confirm closely is WEAK above a ratio of 6, and LOST
+    # above 15.
     weak_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(2.5)
-    # A pose is LOST if the ratio of its residual to the running median exceeds this value.
+    # A pose is LOST if the ratio of its residual to the median residual of the last OK frames
+    # exceeds this value.
     lost_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(5.0)
     # The pose of a frame is LOST if the frame shows less than this fraction of the surface in the
     # reference keyframe.
