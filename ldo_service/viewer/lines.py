@@ -22,7 +22,7 @@ Color = tuple[int, int, int]  # RGB, 0..255.
 JUMP_M = 1.0  # Minimum length of a jump.
 JUMPS = 10.0  # Minimum length of a jump as a multiple of the median step.
 FRUSTUM_M = 0.12  # Distance from a keyframe's camera center to the drawn outline of its image.
-MAX_SIGHTS = 8  # Maximum number of detections drawn per keyframe; more would hide each other.
+MAX_DETECTIONS = 8  # Maximum number of detections drawn per keyframe; more would hide each other.
 # Intrinsics for drawing keyframes until their own intrinsics are known.
 UNKNOWN_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 
@@ -94,29 +94,29 @@ def keyframe_lines(
     return Lines.of(np.array([se3.transform(T, shape) for T in keyframes]), color)
 
 
-def sight_lines(
+def detection_lines(
     keyframes: Mapping[int, np.ndarray],
     camera: Camera | None,
-    sights: Mapping[int, Iterable[ObjectBox]],
+    detections: Mapping[int, Iterable[ObjectBox]],
 ) -> Lines:
     """Return the boxes of detections, drawn in the image outlines of their keyframes.
 
     Args:
         keyframes: T_map_camera of each keyframe, [4, 4], by id.
         camera: Intrinsics of the keyframes; None draws nothing.
-        sights: Detections of each keyframe.
+        detections: Detections of each keyframe, by id.
     """
     shown = [
-        (T, sight)
+        (T, detection)
         for keyframe, T in keyframes.items()
-        for sight in itertools.islice(sights.get(keyframe, ()), MAX_SIGHTS)
+        for detection in itertools.islice(detections.get(keyframe, ()), MAX_DETECTIONS)
     ]
     if camera is None or not shown:
         return Lines.together(())
     T_map_camera = np.array([T for T, _ in shown])[:, None, None]  # [M, 1, 1, 4, 4]
-    outlines = _outlines(camera, np.array([sight.box_px for _, sight in shown]))
+    outlines = _outlines(camera, np.array([detection.box_px for _, detection in shown]))
     points = (T_map_camera[..., :3, :3] @ outlines[..., None])[..., 0] + T_map_camera[..., :3, 3]
-    colors = np.array([color_of(sight.name) for _, sight in shown], np.uint8)
+    colors = np.array([color_of(detection.name) for _, detection in shown], np.uint8)
     return Lines(
         points.reshape(-1, 2, 3).astype(np.float32),
         np.broadcast_to(colors[:, None, None], outlines.shape).reshape(-1, 2, 3),

@@ -35,9 +35,9 @@ from ldo_service.schemas.topics import (
 )
 
 from . import panel
-from .lines import MAX_SIGHTS
+from .lines import MAX_DETECTIONS
 from .live_poses import LiveKeyframes, LivePath, T_map_camera_of
-from .scene import Layer, ObjectBox, Scene, sights_of
+from .scene import Layer, ObjectBox, Scene, detections_of
 from .view_config import ViewerConfig
 
 # Maximum number of actors in the panel. Without a limit, messages could add names without end.
@@ -142,19 +142,21 @@ class LiveScene:
 
     def _take_objects(self, objects: MapObjects) -> None:
         if self.scene.objects is None:  # Add detections from before the viewer subscribed.
-            sights = sights_of(objects)
-            newest = sorted(sights)[-self._config.max_keyframes :]
-            self.scene.sights = {k: sights[k] for k in newest} | self.scene.sights
+            detections = detections_of(objects)
+            newest = sorted(detections)[-self._config.max_keyframes :]
+            self.scene.detections = {k: detections[k] for k in newest} | self.scene.detections
             self._changed.add("keyframes")
         self.scene.objects = objects
         self._changed.add("objects")
 
     def _take_boxes(self, boxes: DetectionBoxes) -> None:
-        found = (ObjectBox(one.label, one.box_px) for one in islice(boxes.detections, MAX_SIGHTS))
-        sights = self.scene.sights
-        sights[boxes.keyframe] = tuple(found)
-        while len(sights) > self._config.max_keyframes:
-            del sights[next(iter(sights))]
+        found = (
+            ObjectBox(one.label, one.box_px) for one in islice(boxes.detections, MAX_DETECTIONS)
+        )
+        detections = self.scene.detections
+        detections[boxes.keyframe] = tuple(found)
+        while len(detections) > self._config.max_keyframes:
+            del detections[next(iter(detections))]
         self._changed.add("keyframes")
 
     def _take_loop(self, loop: LoopClosure) -> None:

@@ -16,7 +16,7 @@ from ldo_service.runs.folder import REFINED
 from ldo_service.runs.records import LOOPS, OBJECTS, read_loops, read_objects, refuse_state
 
 from . import panel
-from .scene import Layer, Scene, sights_of, thinned
+from .scene import Layer, Scene, detections_of, thinned
 from .view_config import ViewerConfig
 
 Signature = tuple[int, int]  # Time of the last change, ns, and size, bytes.
@@ -32,7 +32,7 @@ class RunFolder:
         """Open the folder.
 
         Raises:
-            DataError: If the folder does not exist, or was not written by a run.
+            DataError: The folder does not exist, or was not written by a run.
         """
         if not folder.is_dir():
             raise DataError(
@@ -117,7 +117,7 @@ class RunFolder:
         self._summary = value
 
     def read_frames(self, path: Path) -> None:
-        """Count the lines of frames.csv: one for each frame, and one with the column names."""
+        """Count the frames for the panel: the lines of frames.csv below the column names."""
         try:
             self._frames = max(0, path.read_bytes().count(b"\n") - 1)
         except OSError as error:
@@ -150,7 +150,7 @@ class RunFolder:
     def read_objects(self, path: Path) -> None:
         """Read the objects, and the detections of each object in its best keyframes."""
         self.scene.objects = read_objects(path.parent)
-        self.scene.sights = sights_of(self.scene.objects)
+        self.scene.detections = detections_of(self.scene.objects)
 
     def read_loops(self, path: Path) -> None:
         found = read_loops(path.parent)

@@ -38,14 +38,14 @@ class Scene:
 
     # Gaussians, [N, 16], see `gaussians.rows`; valid until the next update.
     rows: np.ndarray = field(default_factory=lambda: np.zeros((0, ROW), np.float32))
-    # Camera positions as published, [K, 3].
+    # Camera path as the tracker published it, [K, 3]; NaN where unknown.
     online: np.ndarray = field(default_factory=NOTHING.copy)
-    # Camera positions after the last correction, [K, 3].
+    # Camera path after the last correction of the pose graph, [K, 3].
     final: np.ndarray = field(default_factory=NOTHING.copy)
     keyframes: dict[int, np.ndarray] = field(default_factory=dict)  # T_map_camera, [4, 4], by id.
     camera: Camera | None = None  # Rectified camera of the keyframes; None until it is known.
-    # Detections in each keyframe, by keyframe id.
-    sights: dict[int, tuple[ObjectBox, ...]] = field(default_factory=dict)
+    # Detections in each keyframe, drawn as boxes in the outline of its image, by keyframe id.
+    detections: dict[int, tuple[ObjectBox, ...]] = field(default_factory=dict)
     objects: MapObjects | None = None
     loops: tuple[tuple[int, int], ...] = ()  # Ids of reference and keyframe of each loop closure.
     # Current pose of the camera, or the pose at the end of a run, [4, 4]; None until it is known.
@@ -71,14 +71,14 @@ class Source(Protocol):
         ...
 
 
-def sights_of(objects: MapObjects) -> dict[int, tuple[ObjectBox, ...]]:
+def detections_of(objects: MapObjects) -> dict[int, tuple[ObjectBox, ...]]:
     """Return the detections of all objects in their views, by keyframe id."""
-    sights: dict[int, tuple[ObjectBox, ...]] = {}
+    detections: dict[int, tuple[ObjectBox, ...]] = {}
     for one in objects.objects:
         for view in one.views:
-            others = sights.get(view.keyframe, ())
-            sights[view.keyframe] = (*others, ObjectBox(one.name, view.box_px))
-    return sights
+            others = detections.get(view.keyframe, ())
+            detections[view.keyframe] = (*others, ObjectBox(one.name, view.box_px))
+    return detections
 
 
 def thinned(values: np.ndarray, most: int) -> np.ndarray:

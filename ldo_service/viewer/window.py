@@ -24,10 +24,10 @@ from .lines import (
     ONLINE,
     Lines,
     box_lines,
+    detection_lines,
     keyframe_lines,
     loop_lines,
     path_lines,
-    sight_lines,
 )
 from .panel import escaped
 from .scene import Layer, Scene, Source, splats_of
@@ -41,7 +41,7 @@ LEGEND = {  # Checkboxes of layers that can be hidden.
     "online": "path, online",
     "final": "path, corrected",
     "keyframes": "keyframes",
-    "sights": "detections",
+    "detections": "detections",
     "objects": "objects",
     "labels": "names",
     "loops": "loops",
@@ -184,7 +184,7 @@ class Window:
         chosen = sorted(scene.keyframes)[:: max(1, -(-len(scene.keyframes) // most))]
         keyframes = {k: scene.keyframes[k] for k in chosen}
         self._draw_lines("keyframes", keyframe_lines(keyframes.values(), scene.camera))
-        self._draw_lines("sights", sight_lines(keyframes, scene.camera, scene.sights))
+        self._draw_lines("detections", detection_lines(keyframes, scene.camera, scene.detections))
         self._draw_loops()
         if self._leveled_by and len(scene.keyframes) >= 2 * self._leveled_by:
             self._level()
@@ -209,10 +209,10 @@ class Window:
 
     def _shown_objects(self) -> list[MapObject]:
         found = self._scene.objects
-        by_sights = sorted(
+        by_observations = sorted(
             found.objects if found else (), key=lambda one: (-one.observation_count, one.id)
         )
-        return by_sights[: self._config.max_objects]
+        return by_observations[: self._config.max_objects]
 
     def _draw_name(self, one: MapObject) -> None:
         text, position = f"{one.name} {one.confidence:.0%}", one.T_map_object.translation
@@ -325,7 +325,7 @@ def _require_own(address: str) -> None:
     With the address of another machine, viser would try one port after the other and never stop.
 
     Raises:
-        ConfigError: If the machine does not have the address.
+        ConfigError: The machine does not have the address.
     """
     try:
         ((family, *_, where), *_) = socket.getaddrinfo(address, 0, type=socket.SOCK_STREAM)
@@ -345,7 +345,7 @@ def open_window(source: Source, config: ViewerConfig, title: str) -> Iterator[Wi
     The port is the first free one from `config.port` on.
 
     Raises:
-        ConfigError: If the machine does not have the address.
+        ConfigError: The machine does not have the address.
     """
     _require_own(config.address)
     # INFO would log a line per browser, and ERROR a traceback for each program that opens the port

@@ -68,7 +68,7 @@ def scene_of(rows: np.ndarray, *objects: MapObject) -> Scene:
         final=path + np.array([0, 0.1, 0]),
         keyframes=keyframes,
         camera=Camera(64, 48, 60.0, 60.0, 31.5, 23.5),
-        sights={1: (ObjectBox("chair", (10.0, 10.0, 30.0, 30.0)),)},
+        detections={1: (ObjectBox("chair", (10.0, 10.0, 30.0, 30.0)),)},
         objects=msgspec.structs.replace(found, objects=objects),
         loops=((0, 2),),
         T_map_camera=keyframes[0],

@@ -12,13 +12,13 @@ from ldo_service.schemas import MapObjects
 from ldo_service.viewer.lines import (
     FRUSTUM_M,
     JUMP_M,
-    MAX_SIGHTS,
+    MAX_DETECTIONS,
     box_lines,
     color_of,
+    detection_lines,
     keyframe_lines,
     loop_lines,
     path_lines,
-    sight_lines,
 )
 from ldo_service.viewer.scene import ObjectBox, thinned
 from tests.schemas.examples import EXAMPLES
@@ -49,7 +49,7 @@ def test_detection_is_drawn_at_the_pixels_of_its_box() -> None:
     boxes = {
         7: (ObjectBox("cup", (10.0, 5.0, 20.0, 15.0)), ObjectBox("sofa", (0.0, 0.0, 60.0, 40.0)))
     }
-    lines = sight_lines({7: T_MAP_CAMERA, 8: np.eye(4)}, CAMERA, boxes)
+    lines = detection_lines({7: T_MAP_CAMERA, 8: np.eye(4)}, CAMERA, boxes)
     assert lines.points.shape == (8, 2, 3)
     corners = [(10, 5), (20, 5), (20, 15), (10, 15)]
     np.testing.assert_allclose(project(lines.points[:4, 0]), corners, atol=1e-3)
@@ -59,10 +59,10 @@ def test_detection_is_drawn_at_the_pixels_of_its_box() -> None:
 
 
 def test_detections_need_a_camera_and_are_bounded_in_number() -> None:
-    boxes = {7: tuple(ObjectBox("cup", (i, 0.0, i + 1.0, 1.0)) for i in range(2 * MAX_SIGHTS))}
-    assert len(sight_lines({7: T_MAP_CAMERA}, None, boxes).points) == 0
-    assert len(sight_lines({7: T_MAP_CAMERA}, CAMERA, boxes).points) == 4 * MAX_SIGHTS
-    assert len(sight_lines({}, CAMERA, boxes).points) == 0
+    boxes = {7: tuple(ObjectBox("cup", (i, 0.0, i + 1.0, 1.0)) for i in range(2 * MAX_DETECTIONS))}
+    assert len(detection_lines({7: T_MAP_CAMERA}, None, boxes).points) == 0
+    assert len(detection_lines({7: T_MAP_CAMERA}, CAMERA, boxes).points) == 4 * MAX_DETECTIONS
+    assert len(detection_lines({}, CAMERA, boxes).points) == 0
 
 
 def test_object_box_has_the_pose_size_and_color_of_its_object() -> None:

@@ -107,7 +107,7 @@ def test_messages_of_all_topics_reach_the_scene(robot: Robot, source: LiveSource
         changed.update(source.update())
         scene = source.scene
         single = (scene.camera, scene.T_map_camera, scene.objects)
-        collections = (scene.sights, scene.keyframes, scene.loops)
+        collections = (scene.detections, scene.keyframes, scene.loops)
         has_health = EXAMPLES["health"].actor in scene.facts
         return has_health and all(collections) and not any(value is None for value in single)
 

@@ -178,9 +178,9 @@ def test_detections_are_kept_for_the_newest_keyframes(clock: Clock) -> None:
             stamp_ns=0, keyframe=keyframe, width=64, height=48, detections=(cup,), network="n"
         )
         assert "keyframes" in changed_by(live, boxes)
-    assert list(live.scene.sights) == [2, 3, 4]
-    (sight,) = live.scene.sights[4]
-    assert (sight.name, sight.box_px) == ("cup", (1.0, 2.0, 3.0, 4.0))
+    assert list(live.scene.detections) == [2, 3, 4]
+    (detection,) = live.scene.detections[4]
+    assert (detection.name, detection.box_px) == ("cup", (1.0, 2.0, 3.0, 4.0))
 
 
 def test_late_viewer_takes_missing_boxes_from_the_first_objects(live: LiveScene) -> None:
@@ -189,11 +189,11 @@ def test_late_viewer_takes_missing_boxes_from_the_first_objects(live: LiveScene)
         stamp_ns=0, keyframe=1, width=64, height=48, detections=(cup,), network="n"
     )
     assert "keyframes" in changed_by(live, boxes, objects_seen_in(1, 5))
-    assert [sight.name for sight in live.scene.sights[1]] == ["cup"], (
+    assert [detection.name for detection in live.scene.detections[1]] == ["cup"], (
         "received boxes take precedence"
     )
-    (sight,) = live.scene.sights[5]
-    assert sight.box_px == (5.0, 6.0, 7.0, 8.0)
+    (detection,) = live.scene.detections[5]
+    assert detection.box_px == (5.0, 6.0, 7.0, 8.0)
     assert "keyframes" not in changed_by(live, objects_seen_in(9)), "later objects add no boxes"
 
 

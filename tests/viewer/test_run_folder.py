@@ -55,8 +55,8 @@ def test_objects_have_boxes_in_the_keyframes_that_show_them(run: Path) -> None:
     folder = RunFolder(run, CONFIG)
     folder.update()
     assert folder.scene.objects is not None
-    (sight,) = folder.scene.sights[0]
-    assert (sight.name, sight.box_px) == (map_object.name, view.box_px)
+    (detection,) = folder.scene.detections[0]
+    assert (detection.name, detection.box_px) == (map_object.name, view.box_px)
 
 
 def test_loops_are_pairs_of_keyframes(run: Path) -> None:

@@ -16,7 +16,7 @@ from ldo_service.viewer.view_config import ViewerConfig
 from ldo_service.viewer.window import Server, Window, open_window
 from tests.viewer.scenes import EVERY_LAYER, GREEN, RED, ManualSource, chair, scene_of, wall
 
-NODES = ("gaussians", "online", "final", "keyframes", "sights", "objects", "loops", "names/7")
+NODES = ("gaussians", "online", "final", "keyframes", "detections", "objects", "loops", "names/7")
 CONFIG = ViewerConfig(port=0, gaussians_s=2.0)
 
 
