@@ -156,8 +156,8 @@ class FileArchive:
         if size_gb > config.max_gb:
             raise OSError(
                 errno.EFBIG,
-                f"these files have {1e-9 * added_bytes:.3g} GB, and would enlarge the recording to "
-                f"{size_gb:.3g} GB, more than recording.max_gb={config.max_gb:g}",
+                f"the new files have {1e-9 * added_bytes:.3g} GB, and would enlarge the recording "
+                f"to {size_gb:.3g} GB, more than recording.max_gb={config.max_gb:g}",
             )
 
 

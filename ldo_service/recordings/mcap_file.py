@@ -106,7 +106,7 @@ class McapIndex:
 
     def _read_index(self, file: BinaryIO, size: int) -> None:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise ValueError("the file is not an MCAP file")
+            raise ValueError("it is not an MCAP file")
         for opcode, start, length in _records(file, size):
             if opcode == Opcode.CHUNK:
                 data = _read_chunk(file)
@@ -168,8 +168,8 @@ def _read_chunk(file: BinaryIO) -> bytes:
     """Read and decompress the chunk at the current position of the file."""
     chunk = Chunk.read(ReadDataStream(file))
     announced = frame_content_size(chunk.data) if chunk.compression == "zstd" else 0
-    if max(announced, chunk.uncompressed_size) > MAX_CHUNK_BYTES:
-        raise ValueError(f"a chunk has more than the maximum of {MAX_CHUNK_BYTES} bytes")
+    if (size := max(announced, chunk.uncompressed_size)) > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk has {size} bytes, more than the maximum of {MAX_CHUNK_BYTES}")
     data, length = get_chunk_data_stream(chunk)
     return data.read(length)
 

@@ -45,8 +45,8 @@ class ReplayReport:
     failures: int = 0  # Steps that failed when they were recorded.
     failures_repeated: int = 0  # Steps that failed when recorded, and again in the replay.
     dead_lettered: int = 0  # Messages that became dead letters.
-    taken: Counter[str] = field(default_factory=Counter)  # Number of inputs by topic.
-    made: Counter[str] = field(default_factory=Counter)  # Number of outputs by topic.
+    taken: Counter[str] = field(default_factory=Counter)  # Number of replayed inputs, by topic.
+    made: Counter[str] = field(default_factory=Counter)  # Number of replayed outputs, by topic.
     notes: list[str] = field(default_factory=list)  # Sentences for the user.
     # False if the recording has a gap. Its end at the size limit does not count as a gap.
     is_complete: bool = True

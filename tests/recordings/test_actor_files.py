@@ -192,7 +192,7 @@ def test_files_beyond_the_limit_leave_a_gap_and_one_error(
 ) -> None:
     path = record_start(tmp_path / "recording", files, RecordConfig(max_gb=5e-9))
     assert entries(path) == [Gap(step=0, reason="state")]
-    assert caplog.text.count("cannot be recorded: these files have 9e-09 GB") == 1
+    assert caplog.text.count("cannot be recorded: the new files have 9e-09 GB") == 1
 
 
 def replayed(path: Path, folder: Path) -> tuple[ReplayReport, list[dict[str, bytes]]]:
