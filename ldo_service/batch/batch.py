@@ -1,4 +1,4 @@
-"""Batch of recordings: jobs for those without results, and the outcome of each one."""
+"""Batch of recordings: a job for each one without results, and the outcome of every recording."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence

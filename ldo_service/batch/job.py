@@ -90,17 +90,17 @@ class BatchJob(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Costs(msgspec.Struct, frozen=True, kw_only=True):
-    """Resources that the process of a recording used."""
+    """Resources that a job used: the process that ran and evaluated one recording."""
 
-    wall_s: float  # Time until the results are published.
+    wall_s: float  # Wall time until the results are published.
     cpu_s: float  # CPU time of all threads of the process, including its start.
     run_cpu_s: float  # CPU time of SLAM alone, a part of `cpu_s`.
     evaluation_cpu_s: float
     peak_rss_mb: float
     source_bytes: int
     result_bytes: int
-    recording_s: float  # Time from the first to the last used frame.
-    host: str
+    recording_s: float  # Duration of the recording, from the first to the last used frame.
+    host: str  # Name of the machine.
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):

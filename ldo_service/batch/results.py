@@ -27,7 +27,7 @@ VOLATILE = frozenset({"frames.csv", "summary.json", "loops.json", "config.yaml",
 
 
 class ResultFile(msgspec.Struct, frozen=True):
-    """File of a result."""
+    """Size and checksum of a file in a folder of results."""
 
     size_bytes: int
     sha256: str
@@ -36,17 +36,17 @@ class ResultFile(msgspec.Struct, frozen=True):
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """Content of result.json."""
 
-    key: str
+    key: str  # Digest of everything that the results depend on; see `BatchJob.key`.
     outcome: Outcome
-    files: dict[str, ResultFile]
+    files: dict[str, ResultFile]  # Every other file of the folder, by name.
 
 
 @dataclass(frozen=True, slots=True)
 class ResultFolder:
     """Folder of the result of one recording."""
 
-    store: Store
-    key: str
+    store: Store  # The folder.
+    key: str  # Key that the results in the folder must have; see `BatchJob.key`.
 
     @staticmethod
     def of(job: BatchJob) -> "ResultFolder":
@@ -58,7 +58,9 @@ class ResultFolder:
         return ResultFolder(open_store(job.out).at(job.folder), job.key)
 
     def finished(self) -> Outcome | None:
-        """Return the outcome of finished results with this key; None if there are none.
+        """Return the outcome of the results in the folder; None unless they are finished.
+
+        Finished results are complete and have the key of the job.
 
         Raises:
             DataError: The folder cannot be read.
