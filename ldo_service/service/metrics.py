@@ -19,7 +19,9 @@ from ldo_service.transport.keys import expiry_warning
 MAX_ACTORS = 64  # Limit of the stored names, because messages may contain any name.
 COMES_BACK_S = 5.0  # Time for an actor to restart after it was killed at its heartbeat timeout.
 
-OLD_GENERATION_S = 60.0  # Age of the older generation of the states above which `warnings` has it.
+# Age in seconds of the last generation of the states, the copy to which the service falls back,
+# above which `HealthCollector.warnings` reports it.
+OLD_GENERATION_S = 60.0
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]
 
@@ -135,7 +137,7 @@ class HealthCollector(Collector):
                 seconds; None without keys.
         """
         self.certificate_until_s = certificate_until_s
-        # Function that returns the age of the older generation of all states, seconds; None if the
+        # Function that returns the age of the last generation of the states, seconds; None if the
         # service keeps none.
         self.generation_age_s: Callable[[], float] | None = None
         self._robot, self._actors = robot, tuple(actors)
@@ -239,8 +241,8 @@ class HealthCollector(Collector):
         age_s = self.generation_age_s() if self.generation_age_s else 0.0
         if age_s > OLD_GENERATION_S:
             yield (
-                f"the states could not be kept for {age_s:.0f} s, and a power cut could lose the "
-                "keyframes of this time"
+                "the generation of the states to which the service falls back is out of date for "
+                f"{age_s:.0f} s, and a power cut could lose the keyframes of this time"
             )
 
 

@@ -9,8 +9,8 @@ It listens on loopback by default.
   The reply describes only the current state.
 - `/readyz`: 200 while no actor is silent and no actor fails on every message, else 503 with the
   names of these actors. A restart of the service does not help an actor that fails. The reply
-  also warns, without another status, of a certificate that expires within 30 days, and if the
-  states could not be kept as an older generation for a minute.
+  also warns, without another status, of a certificate that expires within 30 days. It warns too if
+  the generation of the states to which the service falls back is out of date for a minute.
 """
 
 import socket

@@ -101,7 +101,7 @@ def open_recorder(
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """Live service, or a child process of it."""
+    """Process of a live service: its main process, or one that runs only some of its actors."""
 
     config: Config
     network: Endpoint
@@ -209,7 +209,7 @@ class Service:
         return [name for name in names if name not in self.config.service.remote_actors]
 
     def _open_generations(self, transport: ZenohTransport) -> GenerationKeeper | None:
-        """Return the keeper of older generations; a temporary state needs none."""
+        """Return the keeper of generations of the states; a temporary state needs none."""
         if self.only or not self.is_state_kept:
             return None
         store = FolderStore(self.state / "state")

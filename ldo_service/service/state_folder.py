@@ -90,7 +90,8 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
 
     The states of the actors refer to the same keyframe ids and graph versions. If one state were
     missing or older, the service would connect keyframes of two different runs. If a state is
-    damaged, or if the states do not match, all actors fall back to the last complete generation.
+    damaged, or if the states do not match, all actors fall back to the last complete generation, a
+    synced copy of all states (`runtime.generations`).
 
     Args:
         folder: The state folder.
