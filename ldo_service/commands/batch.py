@@ -1,4 +1,4 @@
-"""Command `ldo batch`."""
+"""Command `ldo batch`: run, evaluate and export many recordings."""
 
 import sys
 import tempfile

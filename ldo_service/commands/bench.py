@@ -1,4 +1,4 @@
-"""Command `ldo bench`."""
+"""Command `ldo bench`: measure the speed of the Gaussian optimizer, or of the mapper."""
 
 import json
 import tempfile

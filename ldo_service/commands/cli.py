@@ -120,7 +120,7 @@ def _refuse_renamed_options(words: Sequence[str]) -> None:
     """Check that no option has been renamed.
 
     Raises:
-        ConfigError: If an option has been renamed; the message states the new name.
+        ConfigError: An option has been renamed; the message states the new name.
     """
     for word in words:
         option = word.partition("=")[0]

@@ -1,4 +1,4 @@
-"""Command `ldo control`."""
+"""Command `ldo control`: control a running service, refine its map, or add a label."""
 
 from typing import Annotated, Literal
 
@@ -73,7 +73,7 @@ def ask_to_refine(service: Client, iterations: int) -> None:
     """Request refinement iterations from the mapper.
 
     Raises:
-        ConfigError: If the number of iterations is out of bounds.
+        ConfigError: The number of iterations is out of bounds.
     """
     try:
         service.refine(iterations)
@@ -86,7 +86,7 @@ def run_control_verb(service: Client, verb: str) -> None:
     """Run a control command in all actors and print the result.
 
     Raises:
-        StageError: If an actor did not execute the command.
+        StageError: An actor did not execute the command.
     """
     answer = service.control(verb)
     if not answer.ok:

@@ -1,4 +1,4 @@
-"""Command `ldo demo`."""
+"""Command `ldo demo`: track, map and label a built-in synthetic room, and evaluate the result."""
 
 import os
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Command `ldo doctor`."""
+"""Command `ldo doctor`: check this machine and a running service, or the camera of a run."""
 
 import importlib.util
 import os
@@ -209,10 +209,15 @@ def certificates(endpoint: str, keys: Path | None) -> Iterator[Finding]:
 
 
 def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[ActorStatus]:
-    """Listen to a service for LISTEN_S and return the status of every actor.
+    """Listen to a service for LISTEN_S seconds and return the status of every actor.
+
+    Args:
+        robot: Name of the robot.
+        endpoint: Address of the service's router.
+        keys: Folder with TLS keys; None for a service without keys.
 
     Raises:
-        ConfigError: If no router answers on the endpoint.
+        ConfigError: No router answers on the endpoint.
     """
     heard: dict[str, tuple[float, Health]] = {}
     with (

@@ -1,4 +1,4 @@
-"""Command `ldo eval`."""
+"""Command `ldo eval`: evaluate the trajectory, loop closures, map and labels of a run."""
 
 import json
 import sys
@@ -46,7 +46,8 @@ NO_LPIPS = "LPIPS is not computed; --lpips FILE.onnx adds it."
 def label_table(rows: list[LabelErrors]) -> Table:
     """Return a table of label metrics.
 
-    It has a row for each combination of a map, a list of names and a minimum class size (`GATES`).
+    It has a row for each combination of a map, a list of class names by which the labels are scored
+    (`LabelErrors.lists`), and a minimum class size (`GATES`).
     """
     table = Table("map", "names", "classes", *FIGURES, "per image", "frames")
     for row in rows:
@@ -152,7 +153,7 @@ def run_config(folder: Path) -> Config:
     """Read the configuration that a run was made with.
 
     Raises:
-        DataError: If the folder has no config.yaml.
+        DataError: The folder has no config.yaml.
     """
     return load_config(require_file(folder, "config.yaml"))
 

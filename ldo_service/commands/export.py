@@ -1,4 +1,4 @@
-"""Command `ldo export`."""
+"""Command `ldo export`: write the map or the trajectory of a run for other programs."""
 
 from contextlib import nullcontext
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Lines of `ldo doctor`."""
+"""Results of the checks of `ldo doctor`, printed as lines."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Command `ldo info`."""
+"""Command `ldo info`: print what is in a data set or recording."""
 
 import json
 from dataclasses import asdict

@@ -38,7 +38,7 @@ class RealSenseOptions:
         """Return the stream with these options.
 
         Raises:
-            ConfigError: If the size or the rate is invalid.
+            ConfigError: The size or the rate is invalid.
         """
         width, _, height = self.size.partition("x")
         if not (width.isdecimal() and height.isdecimal()):
@@ -98,7 +98,7 @@ class RosOptions:
         """Return the topics.
 
         Raises:
-            ConfigError: If a topic is missing or has an invalid name.
+            ConfigError: A topic is missing or has an invalid name.
         """
         if not (self.color and self.depth):
             raise ConfigError("`ldo publish ros2` needs --color TOPIC and --depth TOPIC.")
@@ -118,7 +118,7 @@ def frames_of_ros(
         notify: Callback that receives notes for the user.
 
     Raises:
-        ConfigError: If the service has keys and `options.bridge` is empty: the router of the
+        ConfigError: The service has keys and `options.bridge` is empty: the router of the
             service then does not forward topics of ROS 2.
     """
     if service.keys is not None and not options.bridge:
@@ -146,7 +146,7 @@ def require_no_sequence(source: str, **options: object) -> None:
     """Check that no option is given that applies only to sequences.
 
     Raises:
-        ConfigError: If such an option is given.
+        ConfigError: Such an option is given.
     """
     for name, value in options.items():
         if value:

@@ -1,4 +1,4 @@
-"""Command `ldo models`."""
+"""Command `ldo models`: register, list and remove detectors and encoder pairs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,7 +127,7 @@ def add(verb: AddModel) -> None:
     """Register a detector or an encoder pair, and print its layout and classes.
 
     Raises:
-        ConfigError: If a file cannot be used.
+        ConfigError: A file cannot be used.
     """
     model = _add_pair(verb) if verb.is_pair else _add_detector(verb)
     about = model.about
@@ -156,7 +156,7 @@ def show(console: Console) -> None:
     """Print a table of the registered networks.
 
     Raises:
-        LdoError: If a network is damaged.
+        LdoError: A network is damaged.
     """
     registered, damaged = Models(), 0
     table = Table("name", "layout", "classes", "license", "sha256", "")

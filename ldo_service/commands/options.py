@@ -146,7 +146,7 @@ def localizing(config: Config, folder: Path | None) -> Config:
     If the folder is None, the configuration is unchanged.
 
     Raises:
-        DataError: If the folder has no map.
+        DataError: The folder has no map.
     """
     if folder is None:
         return config

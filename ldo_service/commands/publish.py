@@ -1,4 +1,4 @@
-"""Command `ldo publish`."""
+"""Command `ldo publish`: send the frames of a sequence or a camera to a service."""
 
 import time
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Command `ldo query`."""
+"""Command `ldo query`: find objects of a map by name."""
 
 import json
 from collections.abc import Sequence
@@ -134,7 +134,7 @@ def _labeller_of(run: Path) -> VlmLabellerConfig | None:
     """Return the settings of the run's labeller; None if the run had no encoder pair.
 
     Raises:
-        TextComparisonError: If the configuration of the run cannot be read, or is of an earlier
+        TextComparisonError: The configuration of the run cannot be read, or is of an earlier
             version.
     """
     try:

@@ -1,4 +1,4 @@
-"""Command `ldo replay`."""
+"""Command `ldo replay`: replay a recording, and compare the outputs with the recorded ones."""
 
 import itertools
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Command `ldo run`."""
+"""Command `ldo run`: track and map a sequence offline, and write the results to a folder."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -180,7 +180,7 @@ def execute(
         console: Console of the progress bar.
 
     Raises:
-        ConfigError: If the folder of the run cannot be written.
+        ConfigError: The folder of the run cannot be written.
     """
     with progress("run", job.work, console) as advance:
         try:
@@ -198,7 +198,7 @@ def kept_front_end(
     """Open the recorded outputs of tracker and detector; return None without --reuse-front-end.
 
     Raises:
-        ConfigError: If the run would replace the recording that it reads.
+        ConfigError: The run would replace the recording that it reads.
     """
     if run is None:
         return None
@@ -248,7 +248,7 @@ def require_compatible(options: Mapping[str, object]) -> None:
         options: Values of the options by name; a true value means that the option is given.
 
     Raises:
-        ConfigError: If two such options are given.
+        ConfigError: Two such options are given.
     """
     for option, others in EXCLUSIVE.items():
         wrong = [other for other in others if options[other]]
@@ -260,7 +260,7 @@ def require_separate(localize: Path | None, out: Path, refine: int) -> None:
     """Check that localization does not change the map that it uses.
 
     Raises:
-        ConfigError: If the run would refine or replace that map.
+        ConfigError: The run would refine or replace that map.
     """
     if localize and refine:
         raise ConfigError("--localize never changes the map. Remove --refine-iterations.")

@@ -1,4 +1,4 @@
-"""Commands `ldo serve` and `ldo record`."""
+"""Commands `ldo serve` and `ldo record`: run the service, and record the inputs of its actors."""
 
 from contextlib import ExitStack
 from dataclasses import replace

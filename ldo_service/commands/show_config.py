@@ -1,4 +1,4 @@
-"""Command `ldo config`."""
+"""Command `ldo config`: print the effective configuration with comments."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""Command `ldo simulate`."""
+"""Command `ldo simulate`: run all actors on a logical clock, and print digests of their outputs."""
 
 import json
 from dataclasses import asdict

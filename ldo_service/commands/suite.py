@@ -1,4 +1,4 @@
-"""Command `ldo suite`."""
+"""Command `ldo suite`: run and evaluate several sequences and variants, and print tables."""
 
 import sys
 from pathlib import Path
@@ -82,7 +82,7 @@ def _require_folder(folder: Path) -> None:
     """Create the folder, so that a wrong path is found before hours of runs.
 
     Raises:
-        ConfigError: If the folder cannot be created.
+        ConfigError: The folder cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

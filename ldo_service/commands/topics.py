@@ -1,4 +1,4 @@
-"""Command `ldo topics`."""
+"""Command `ldo topics`: list the topics of the service, with their producers and consumers."""
 
 import json
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Command `ldo view`."""
+"""Command `ldo view`: show a map in a browser."""
 
 import importlib.util
 import time
@@ -55,7 +55,7 @@ def require_viser() -> None:
     """Check that viser is installed.
 
     Raises:
-        ConfigError: If viser is not installed.
+        ConfigError: viser is not installed.
     """
     if importlib.util.find_spec("viser") is None:
         raise ConfigError(f"the window needs viser. Install it by {install_command('viewer')}.")
@@ -75,8 +75,8 @@ def source_of(
         config: Settings of the viewer.
 
     Raises:
-        DataError: If the folder was not written by a run.
-        ConfigError: If no service answers.
+        DataError: The folder was not written by a run.
+        ConfigError: No service answers.
     """
     if where != LIVE:
         yield RunFolder(Path(where).expanduser(), config)
