@@ -95,10 +95,10 @@ class Costs(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float  # Wall time until the results are published.
     cpu_s: float  # CPU time of all threads of the process, including its start.
     run_cpu_s: float  # CPU time of SLAM alone, a part of `cpu_s`.
-    evaluation_cpu_s: float
-    peak_rss_mb: float
-    source_bytes: int
-    result_bytes: int
+    evaluation_cpu_s: float  # CPU time of the evaluation, a part of `cpu_s`.
+    peak_rss_mb: float  # Largest resident memory of the process.
+    source_bytes: int  # Size of the recording.
+    result_bytes: int  # Size of the results.
     recording_s: float  # Duration of the recording, from the first to the last used frame.
     host: str  # Name of the machine.
 

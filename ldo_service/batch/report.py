@@ -40,8 +40,8 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
 
     ldo: str  # Version of LDO-SLAM.
     finished: str  # Time, ISO 8601.
-    wall_s: float
-    is_interrupted: bool
+    wall_s: float  # Duration of the batch.
+    is_interrupted: bool  # True if the batch ended early.
     counts: dict[str, int]  # Number of recordings by status.
     totals: dict[str, float]  # Sums over all recordings with results.
     recordings: list[Outcome]

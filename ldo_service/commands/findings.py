@@ -24,7 +24,7 @@ class Finding:
     # "ok", "absent" (an optional part is missing), "note" (information), "warn" (results may be
     # worse than they could be) or "bad" (needs action).
     mark: str
-    text: str
+    text: str  # Sentence about the result, and for "warn" and "bad" about what to do.
 
 
 def show(findings: Iterable[Finding]) -> None:

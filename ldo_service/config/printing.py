@@ -20,7 +20,7 @@ from .values import ADVANCED
 class Setting:
     """Setting of a configuration: its path, its value and the comment that explains it."""
 
-    path: str
+    path: str  # Names of the sections and the field, joined by dots.
     value: Any
     text: str  # The value as YAML.
     comment: str

@@ -58,11 +58,11 @@ CHECK_EVERY_BYTES = 64_000_000
 class MessageLocation:
     """Location of a message body: bytes [start, start + size) of the file or of a chunk in it."""
 
-    topic: str
+    topic: str  # Name of the topic, or channel of a journal entry.
     number: int  # Sequence number in the MCAP file.
-    stamp_ns: int
-    start: int
-    size: int
+    stamp_ns: int  # MCAP publish time: the stamp of the message.
+    start: int  # Position of the body, bytes.
+    size: int  # Size of the body, bytes.
     chunk: int | None  # Offset of the chunk in the file; None if the message is not in a chunk.
 
 
@@ -71,8 +71,8 @@ class McapIndex:
     """Index of the messages in an MCAP file."""
 
     path: Path
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    # Sorted by position in the file.
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # Metadata records, by name.
+    # Locations of the messages, sorted by position in the file.
     locations: list[MessageLocation] = field(default_factory=list)
     is_whole: bool = False  # True if the file was closed and not cut off.
 

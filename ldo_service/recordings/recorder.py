@@ -40,8 +40,8 @@ ENTRY_BYTES = 1000  # Estimated memory of a queued entry in addition to its body
 class Taken:
     """Recorded input of the next step; a failed step is repeated with the same input."""
 
-    number: int
-    stamp_ns: int
+    number: int  # Sequence number of the input in the MCAP file.
+    stamp_ns: int  # Stamp of the message.
     delivery: Delivery
 
 

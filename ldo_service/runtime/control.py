@@ -40,7 +40,7 @@ MIN_S = 2.0
 # Time between two attempts to complete a reset that the previous process began, seconds.
 COMPLETE_AGAIN_S = 2.0
 # Time for all attempts to keep the empty states after a reset, and between two of them, seconds.
-# A stage that is still writing the generation before refuses to begin another one.
+# A stage that is still writing the previous generation refuses to begin another one.
 KEEP_FOR_S, KEEP_AGAIN_S = 2 * KEEP_WITHIN_S, 1.0
 
 

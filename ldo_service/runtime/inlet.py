@@ -30,14 +30,14 @@ class Inlet:
     """Queue and counters of an input with policy `Latest`."""
 
     port: In
-    waiting: deque[Delivery] = field(default_factory=deque)
+    waiting: deque[Delivery] = field(default_factory=deque)  # Queued messages, oldest first.
     delivered: int = 0  # Messages that were handled.
     dropped: int = 0  # Messages dropped because newer ones came.
     rejected: int = 0  # Malformed or too large messages.
     gaps: int = 0  # Messages of a lossless input that were not the next one, or arrived too early.
     peak: int = 0  # Maximum length of the queue so far.
     paused: int = 0  # Messages dropped while the stage was paused.
-    numbers: SequenceTracker = field(default_factory=SequenceTracker)
+    numbers: SequenceTracker = field(default_factory=SequenceTracker)  # Counter of lost messages.
 
     def number(self, header: Header) -> None:
         """Count the messages that were lost before the one with this header."""

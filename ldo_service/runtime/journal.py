@@ -49,8 +49,8 @@ WITHOUT_INPUT: frozenset[Kind] = frozenset(("resumed", "idle", "idle_failed", "f
 class Output(msgspec.Struct, frozen=True, array_like=True):
     """Digest of one output of a step."""
 
-    topic: str
-    digest: str
+    topic: str  # Name of the topic.
+    digest: str  # Digest of the encoded message; see `journal.digest`.
 
 
 class Started(msgspec.Struct, frozen=True, kw_only=True):
@@ -67,7 +67,7 @@ class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Journal entry for one step: its input, flow status and outputs."""
 
     step: int  # Number of the step.
-    kind: Kind
+    kind: Kind  # Outcome of the step.
     taken: int  # Number of the input in this file; -1: no input.
     topic: str = ""  # Topic of the input.
     source: str = ""  # Header fields of the input.

@@ -33,8 +33,8 @@ from .stage_commands import StageCommand
 
 log = logging.getLogger(__name__)
 
-# Maximum size in bytes of all messages of Latest inputs that wait in one mailbox: two of the
-# largest messages. A burst of four raw frames of 1080p has 33 MB.
+# Maximum size in bytes of all queued messages of inputs with policy `Latest` in one mailbox: two of
+# the largest messages. A burst of four raw frames of 1080p has 33 MB.
 MAX_WAITING_BYTES = 128_000_000
 
 

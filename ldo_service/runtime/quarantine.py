@@ -34,8 +34,8 @@ _CHECKSUM = struct.Struct("<I")  # CRC-32 of the record, after it.
 class QuarantinedMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Content of a file in the quarantine folder, as MessagePack."""
 
-    topic: str
-    source: str
+    topic: str  # Name of the topic.
+    source: str  # Header fields of the message; see `flow_control.Header`.
     epoch: int
     seq: int
     stamp_ns: int

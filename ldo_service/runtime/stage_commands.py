@@ -47,8 +47,8 @@ class StageCommand(msgspec.Struct, frozen=True, array_like=True):
     """Command to one stage."""
 
     number: int  # Unique number of the command.
-    what: What
-    stage: str
+    what: What  # The command; see the module.
+    stage: str  # Name of the stage that executes it.
     # Both are for `keep`: the number of the generation to keep, and of the last complete one.
     generation: int = 0
     completed: int = 0

@@ -28,17 +28,17 @@ class StageMetrics:
 
     heartbeat: Heartbeat | None = None  # Heartbeat of this process, if a parent process reads it.
     state: Literal["starting", "ready", "draining"] = "starting"
-    steps: int = 0
-    failures: int = 0
-    restarts: int = 0
-    dead_lettered: int = 0
+    steps: int = 0  # Messages handled.
+    failures: int = 0  # Exceptions in handlers, restores and final messages, and failed saves.
+    restarts: int = 0  # Restores of the actor after a failure, in this process.
+    dead_lettered: int = 0  # Messages that failed twice.
     dead_lettered_in_a_row: int = 0  # Dead letters since the last message that was handled.
     quarantined: int = 0  # Messages that ended the process repeatedly, since the first start.
     # Durations of the last 200 timed steps, ms; see `record_step`.
     step_ms: deque[float] = field(default_factory=lambda: deque(maxlen=200))
-    last_step_ms: float = 0.0
-    last_stamp_ns: int = 0
-    finished_at_s: float = field(default_factory=time.monotonic)
+    last_step_ms: float = 0.0  # Duration of the last step, ms.
+    last_stamp_ns: int = 0  # Stamp of the last handled message.
+    finished_at_s: float = field(default_factory=time.monotonic)  # End of the last step.
     started_at_s: float | None = None  # Start of the current step; None between steps.
     facts: dict[str, float] = field(
         default_factory=dict

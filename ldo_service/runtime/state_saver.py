@@ -150,7 +150,7 @@ class StateSaver:
             report: Function that is called once the generation is written, with an error or "".
         """
         if self._syncing:
-            report(order, "is still writing the generation before")
+            report(order, "is still writing the previous generation")
             return
         generation = order.generation, order.completed
         is_previous_complete = self._checkpointer.is_last_kept(order.completed)

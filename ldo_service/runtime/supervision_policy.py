@@ -122,8 +122,9 @@ class SupervisionConfig:
 
     # Maximum restarts within `restart_window_s`; a restart does not cure a more frequent fault.
     max_restarts: int = 5
-    restart_window_s: float = 60.0
-    restart_delay_s: float = 0.05  # Doubled with each failure in the window.
+    restart_window_s: float = 60.0  # Time window of `max_restarts`, seconds.
+    # Delay before a restart, seconds. It doubles with each failure in the window up to the maximum.
+    restart_delay_s: float = 0.05
     restart_delay_max_s: float = 5.0
     heartbeat_s: float = 0.5  # Heartbeat period.
     # Maximum duration of a step, seconds: a hundred times the slowest one measured (mapper with 1.5

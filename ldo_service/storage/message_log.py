@@ -26,9 +26,9 @@ _RECORD = struct.Struct("<QIII")
 class LoggedMessage(NamedTuple):
     """Message of a log."""
 
-    seq: int
-    header: bytes
-    body: bytes
+    seq: int  # Number of the message.
+    header: bytes  # Encoded header.
+    body: bytes  # Encoded message.
 
 
 @dataclass

@@ -26,7 +26,7 @@ class StateContents(msgspec.Struct, frozen=True):
     """
 
     files: dict[str, str]  # File name of each part.
-    version: int = STATE_VERSION
+    version: int = STATE_VERSION  # Version of the content of the parts.
     checks: dict[str, tuple[int, int]] = {}  # Size in bytes and CRC-32 of the file of each part.
     # Number of the generation that these files belong to; 0 for a state saved after a step.
     generation: int = 0

@@ -127,9 +127,9 @@ class Rule:
     """
 
     name: str  # Name of the rule, part of its id.
-    flows: tuple[str, ...]
-    messages: tuple[str, ...]
-    keys: tuple[str, ...]
+    flows: tuple[str, ...]  # "ingress", "egress" or both.
+    messages: tuple[str, ...]  # Kinds of Zenoh messages, such as "put" and "query".
+    keys: tuple[str, ...]  # Zenoh key expressions, relative to the robot.
 
     def for_robot(self, robot: str, part: str) -> dict[str, Any]:
         """Return the rule in Zenoh's format; `part` is the prefix of the rule's id."""

@@ -116,16 +116,17 @@ class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
 class UnackedMessage(NamedTuple):
     """Numbered message that at least one consumer has not handled."""
 
-    seq: int
-    header: bytes
-    body: bytes
+    seq: int  # Offset of the message.
+    header: bytes  # Encoded `Header`.
+    body: bytes  # Encoded message.
 
 
 class OutletPosition(NamedTuple):
     """Saved position of a producer on a topic, with its unhandled messages."""
 
-    epoch: int
+    epoch: int  # Epoch of the producer's numbering.
     seq: int  # Offset of the next message.
+    # Messages that at least one required consumer has not handled; empty if a log has them.
     unhandled: tuple[UnackedMessage, ...] = ()
     # Offset of the first message that is still needed, if the messages are in a log on disk instead
     # of in `unhandled`; None without a log.

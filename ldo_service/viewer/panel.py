@@ -61,7 +61,7 @@ def share_shown(shown: int, there: int) -> str:
 # --- of a service ---------------------------------------------------------------------------------
 @dataclass(slots=True)
 class Rate:
-    """Rate of a counter over the last RATE_OVER_S."""
+    """Rate of a counter over the last RATE_OVER_S seconds."""
 
     _counts: deque[tuple[float, int]] = field(default_factory=deque)  # Times in s, and counts.
 
@@ -85,8 +85,8 @@ class HeartbeatRecord:
     """Last heartbeat of an actor, and the time when it was received."""
 
     health: Health
-    at_s: float
-    rate: Rate
+    at_s: float  # Time of receipt on the clock of the scene, monotonic seconds.
+    rate: Rate  # Rate of the actor's steps.
 
 
 @dataclass(slots=True)
@@ -94,7 +94,7 @@ class HeardPose:
     """Last pose, and the time when it was received."""
 
     pose: TrackedPose
-    at_s: float
+    at_s: float  # Time of receipt on the clock of the scene, monotonic seconds.
 
 
 def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:

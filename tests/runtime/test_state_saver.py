@@ -102,7 +102,7 @@ async def test_generation_is_not_begun_while_the_one_before_is_written(
         first = asyncio.create_task(keep(1))
         await eventually(lambda: disk.synced)
         for generation in (2, 3):
-            assert await keep(generation) == "is still writing the generation before"
+            assert await keep(generation) == "is still writing the previous generation"
         assert len(disk.synced) == 1
         disk.is_free.set()
         assert await first == ""
