@@ -72,8 +72,11 @@ class ActorRestorer:
             await asyncio.sleep(record(now_s))
             try:
                 actor = await worker.run(self.restore)
-            except DamagedStateError:
-                raise  # The next start of the service falls back to an older state.
+            except DamagedStateError as error:
+                raise DamagedStateError(
+                    f"{error}. At its next start, the service falls back to an older generation of "
+                    "the states, if there is one."
+                ) from error
             except Exception:
                 log.exception(
                     "%s: restoring its last state failed; retrying within the restart budget. If "
