@@ -76,7 +76,14 @@ def demo_config() -> Config:
 def rows(
     summary: dict[str, Any], size: str, results: Results, found: MapObjects
 ) -> Iterator[tuple[str, str]]:
-    """Yield the names and values of the printed table."""
+    """Yield the names and values of the printed table.
+
+    Args:
+        summary: Content of summary.json of the run.
+        size: Size of a frame, such as 640x480, pixels.
+        results: Comparison of the run with ground truth.
+        found: Objects of the map.
+    """
     yield "frames", f"{summary['frames']} of {size}"
     yield "tracking", ", ".join(f"{count} {name}" for name, count in summary["status"].items())
     for name, errors in (results.trajectories or {}).items():

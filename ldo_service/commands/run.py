@@ -197,6 +197,13 @@ def kept_front_end(
 ) -> FrontEnd | None:
     """Open the recorded outputs of tracker and detector; return None without --reuse-front-end.
 
+    Args:
+        run: Folder of the earlier run, the value of --reuse-front-end; None without this option.
+        out: Folder of the new run.
+        settings: Configuration of the new run.
+        sequence: Frames of the new run.
+        selection: Stride and maximum number of frames of the new run.
+
     Raises:
         ConfigError: The run would replace the recording that it reads.
     """
@@ -219,7 +226,12 @@ def format_unmerged(gaussians: int) -> str:
 
 
 def format_localization(statuses: dict[str, int], folder: Path) -> str:
-    """Return a note on the result of localization in a finished map."""
+    """Return a note on the result of localization in a finished map.
+
+    Args:
+        statuses: Number of frames, by tracking status.
+        folder: Run folder with the map.
+    """
     if statuses["OK"] + statuses["WEAK"] == 0:
         return (
             f"No frame was localized. Check that {folder} is a map of this place, made from "

@@ -164,7 +164,14 @@ def _object_to_message(
 def observations_to_messages(
     observed: ObjectUpdate, names: Sequence[str], keyframe: int, stamp_ns: int
 ) -> list[ObjectObservation]:
-    """Return the messages of the observations and misses of objects in a keyframe."""
+    """Return the messages of the observations and misses of objects in a keyframe.
+
+    Args:
+        observed: Observations and misses of the keyframe.
+        names: Names of the classes, by index.
+        keyframe: Id of the keyframe.
+        stamp_ns: Stamp of the keyframe.
+    """
     return [
         ObjectObservation(
             stamp_ns=stamp_ns,

@@ -46,7 +46,7 @@ class Transport(Protocol):
         ...
 
     def subscribe(self, key: str, on_message: OnMessage) -> None:
-        """Subscribe to a key."""
+        """Call `on_message` for each message on a key; the call may be on any thread."""
         ...
 
     def declare_liveliness(self, name: str) -> None:

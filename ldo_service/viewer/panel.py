@@ -98,7 +98,7 @@ class HeardPose:
 
 
 def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:
-    """Return the tracking status and the rate of poses as text."""
+    """Return the tracking status and the rate of poses as text, at the time `now_s` of `at_s`."""
     if heard is None:
         return "no pose yet"
     pose, silent_s = heard.pose, now_s - heard.at_s
