@@ -136,8 +136,8 @@ class DeliveryState:
 
         Args:
             own: State of the actor, by part.
-            taken: Input of the last step; None unless `Actor.lags`, because `own` then includes
-                the last step.
+            taken: Input of the last step; None unless `Actor.lags`, because the `own` of any other
+                actor includes the last step.
             whole: True if `own` is a checkpoint: it includes the last step and needs no log.
 
         Returns:

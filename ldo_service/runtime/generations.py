@@ -207,7 +207,7 @@ def _inconsistent_states(pasts: Mapping[str, RestoredState]) -> Iterator[str]:
 
 
 class GenerationKeeper:
-    """Task of a running service that keeps the states of its actors as a generation every second.
+    """Task of a running service that regularly keeps the states of its actors as a generation.
 
     A generation is a synced copy of the states of all actors, to which the service falls back.
     """

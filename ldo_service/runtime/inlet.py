@@ -34,7 +34,7 @@ class Inlet:
     delivered: int = 0  # Messages that were handled.
     dropped: int = 0  # Messages dropped because newer ones came.
     rejected: int = 0  # Malformed or too large messages.
-    gaps: int = 0  # Messages of a lossless input that were not the next one, or arrived too early.
+    gaps: int = 0  # Messages of a lossless input that came out of order or beyond its window.
     peak: int = 0  # Maximum length of the queue so far.
     paused: int = 0  # Messages dropped while the stage was paused.
     numbers: SequenceTracker = field(default_factory=SequenceTracker)  # Counter of lost messages.
