@@ -1,4 +1,4 @@
-"""Data association between the regions of a keyframe and object landmarks (paper, III.C).
+"""Data association between the regions of a keyframe and objects (LDO-SLAM paper, III.C).
 
 An object landmark has a sample of Gaussians, called its members. The predicted box of a landmark
 encloses the members that are not occluded according to the measured depth. It estimates the box
@@ -38,7 +38,7 @@ class MapView:
         camera: Intrinsics of the keyframe.
         T_map_camera: Pose of the camera, [4, 4].
         rows: Gaussians of the map, [N, 16].
-        labels: Label rows of the Gaussians, [N, 32].
+        labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
         ids: Ids of the Gaussians, [N] int64, ascending.
         anchors: Anchor keyframes of the Gaussians, [N] int32.
         indices: Rows of the Gaussians that contribute to the image, [V] uint32, ascending.

@@ -1,4 +1,8 @@
-"""Copy of the semantics of a map that processes keyframes later; see `ordered_semantics`."""
+"""Copy of the labels and objects of a map, which waits for label results.
+
+The copy processes each keyframe after the map, as soon as the results of all earlier label requests
+have arrived; see `ordered_semantics`.
+"""
 
 import hashlib
 from collections.abc import Iterator, Mapping
@@ -102,7 +106,7 @@ class GaussianLabels:
 
     Attributes:
         ids: Ids of the Gaussians, [N], ascending.
-        labels: Labels of the Gaussians, [N, 32].
+        labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
         next_id: Lower bound of the ids of Gaussians that were created later.
     """
 
@@ -145,7 +149,7 @@ class GaussianLabels:
         return changed
 
     def _of(self, gaussians: GaussianMap) -> np.ndarray:
-        """Return the labels of the N Gaussians of a map that are in memory, [N, 32].
+        """Return the label rows of the N Gaussians of a map that are in memory, [N, 32] uint8.
 
         A Gaussian that is newer than this copy gets no label. A Gaussian that was on disk when the
         copy was made keeps its label in the map.

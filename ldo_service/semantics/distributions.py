@@ -18,7 +18,7 @@ def mean_distributions(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
         p_k = sum_m w_km p_km / sum_m w_km
 
-    Paper, III.C (landmarks).
+    See the landmarks in the LDO-SLAM paper, III.C.
 
     Args:
         labels: Label rows of the Gaussians, [K, M, 32] uint8.
@@ -100,7 +100,7 @@ def divergence(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 def entropy(p: np.ndarray) -> np.ndarray:
     """Return the entropies H = -sum_c p_c log p_c of dense distributions [..., C].
 
-    The result has the shape [...] and the unit nat. Paper, III.C.
+    The result has the shape [...] and the unit nat. See the LDO-SLAM paper, III.C.
     """
     return -np.sum(p * np.log(np.where(p > 0, p, 1)), axis=-1)
 

@@ -10,8 +10,8 @@ from ldo_service.gaussians.model import new_labels as new_labels
 from ldo_service.kernels import _labels
 
 BACKGROUND, OTHER = 0, 1  # The first two labels of every vocabulary.
-MAX_LABELS = 256  # C_max (paper, III.B)
-SLOTS = 5  # L (paper, III.B)
+MAX_LABELS = 256  # Maximum labels of a map: C_max (paper, III.B).
+SLOTS = 5  # Labels stored per Gaussian: L (paper, III.B).
 NOT_SEEN, MISS = -2, -1  # Values in place of an observed label; see `Observations`.
 # Label row of one Gaussian, 32 bytes; all zero if the Gaussian was never observed.
 ROW = np.dtype(
@@ -31,10 +31,12 @@ ROW = np.dtype(
 class ConsistencyConfig:
     """Settings of the label smoothing among neighbors."""
 
-    sigma_m: float = 0.05  # sigma_cons (paper, III.A).
+    # Scale of the distance in the weight of a neighbor: sigma_cons (paper, III.A).
+    sigma_m: float = 0.05
     # Maximum distance of neighbors: three sigma. Farther Gaussians would have weights below 2e-4.
     radius_m: float = 0.15
-    rate: float = 0.1  # Step size, 0..1. The default equals 1 - lambda (paper, III.A).
+    # Step size, 0..1. The default equals 1 - lambda, the step of the label update (paper, III.A).
+    rate: float = 0.1
 
     def __post_init__(self) -> None:
         if not (self.sigma_m > 0 and self.radius_m > 0 and 0 <= self.rate <= 1):
@@ -54,7 +56,8 @@ class Disagreement:
         k_ij = w_ij exp(-|mu_i - mu_j|^2 / sigma^2),  w_ij = 1 / |N_i|
 
     Attributes:
-        literal: sum_ij k_ij [s_i != s_j], as the paper prints it; it has no gradient.
+        literal: sum_ij k_ij [s_i != s_j], as printed in the LDO-SLAM paper, III.A; it has no
+            gradient.
         expected: sum_ij k_ij (1 - p_i . p_j), which the smoothing step reduces.
     """
 
@@ -85,7 +88,7 @@ def smooth_labels(
 
     Args:
         rows: Gaussians of the map, [N, 16].
-        labels: Label rows of the Gaussians, [N, 32].
+        labels: Label rows of the Gaussians, [N, 32] uint8, see `ROW`.
         indices: Rows to smooth, [V] uint32, ascending.
         config: Settings of the smoothing.
         threads: Number of threads.
@@ -198,7 +201,7 @@ def observe(
     the factor 1 - hold_back exp(-2 H) (1 - confidence) multiplies a with `paper` and w with
     `corrected`. It is applied only if p has a label other than background.
 
-    The result is bitwise equal for any number of threads. Paper, III.A.
+    The result is bitwise equal for any number of threads. See the LDO-SLAM paper, III.A.
 
     Raises:
         ValueError: If the shapes or types of the arrays do not fit.

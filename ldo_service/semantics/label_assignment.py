@@ -1,4 +1,4 @@
-"""Assignment of Gaussians to the regions of a keyframe (paper, III.A).
+"""Assignment of Gaussians to the regions of a keyframe (LDO-SLAM paper, III.A).
 
 The kernel is `kernels/assignment.hpp`; `tests/reference/assignment.py` implements it in NumPy.
 """
@@ -99,8 +99,8 @@ class Assignment:
     Attributes:
         regions: Number of the region of each Gaussian, [V] int32. UNMATCHED: in no region. HIDDEN:
             outside of the image, or rejected by the depth test at its pixel.
-        overlaps: Overlap of each Gaussian with its region, measured as the setting `rule` says,
-            [V] float32; 0 without a region.
+        overlaps: Overlap of each Gaussian with its region, [V] float32, 0..1; 0 without a region.
+            `AssignmentConfig.rule` selects the measure: IoU or covered fraction of the splat.
         depths_m: Depths of the Gaussians in the camera frame, [V] float32.
     """
 

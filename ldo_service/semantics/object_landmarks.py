@@ -119,9 +119,12 @@ def _in_order(ids: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def reliable_members(table: np.ndarray) -> np.ndarray:
     """Return which members are reliable, [K, 256] bool.
 
-    A member is a Gaussian of a landmark's sample, with a number of votes. It is reliable if it has
-    at least a third of the votes of the landmark's member with the most votes. Gaussians next to
-    an object get few votes, because the edges of regions vary between keyframes.
+    The members of a landmark are at most 256 of its Gaussians; each has a number of votes. A member
+    is reliable if it has at least a third of the most votes that any member of the landmark has.
+    Gaussians next to an object get few votes, because the edges of regions vary between keyframes.
+
+    Args:
+        table: Landmarks, [K] records of `LANDMARK`.
     """
     return (table["votes"] > 0) & (3 * table["votes"] >= table["votes"].max(axis=1, keepdims=True))
 
@@ -163,7 +166,7 @@ def derive(
     Args:
         table: Landmarks, [K] records of `LANDMARK`.
         rows: Gaussians of the map, [N, 16].
-        labels: Label rows of the Gaussians, [N, 32].
+        labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
         ids: Ids of the Gaussians, [N], ascending.
         anchors: Anchor keyframes of the Gaussians, [N].
         least: Minimum number of members that are used.

@@ -1,4 +1,4 @@
-"""Objects of the map: creation, association, merge and removal (paper, III.C)."""
+"""Objects of the map: creation, association, merge and removal (LDO-SLAM paper, III.C)."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -342,7 +342,7 @@ class Objects:
 
         Args:
             rows: Gaussians of the map, [N, 16].
-            labels: Label rows of the Gaussians, [N, 32].
+            labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
             ids: Ids of the Gaussians, [N], ascending.
             anchors: Anchor keyframes of the Gaussians, [N].
             seen_from: Camera and T_map_camera [4, 4] that select the landmarks in view; None: all.

@@ -1,4 +1,4 @@
-"""Settings of the objects: association, creation, merge and removal (paper, III.C)."""
+"""Settings of the objects: association, creation, merge and removal (LDO-SLAM paper, III.C)."""
 
 from dataclasses import dataclass, field
 
@@ -7,12 +7,13 @@ from ldo_service.errors import ConfigError, named
 
 @dataclass(frozen=True, slots=True)
 class AssociationConfig:
-    """Settings of the data association."""
+    """Settings of the data association between objects of the map and regions of a keyframe."""
 
     # Minimum IoU of the predicted box of an object and the box of a region (paper, III.C).
     min_iou: float = 0.4
-    # Minimum `common_mass` of the label distributions of an object and a region. It prevents, for
-    # example, a match of a cup with the table whose box contains the cup.
+    # Minimum common mass of the label distributions of an object and a region, 0..1: the sum of the
+    # smaller probabilities. It prevents, for example, a match of a cup with the table whose box
+    # contains the cup.
     min_shared: float = 0.3
     # Maximum gap between the depth ranges of an object and a region, and tolerance of the occlusion
     # test (paper, III.A: delta_z).

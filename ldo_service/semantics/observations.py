@@ -48,7 +48,7 @@ class ObjectUpdate:
 
     observations: tuple[ObservedObject, ...] = ()  # Observations and misses.
     created: tuple[int, ...] = ()  # Ids of new objects.
-    # Pairs of a removed id and the id of the object that it was merged into.
+    # Pairs (removed id, id of the object that it was merged into).
     merged: tuple[tuple[int, int], ...] = ()
     removed: tuple[int, ...] = ()  # Ids of objects removed after misses.
 

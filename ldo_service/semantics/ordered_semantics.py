@@ -5,10 +5,11 @@ names of their regions and for the choice of the next label requests. If keyfram
 before an earlier result has arrived, labels and objects therefore depend on the speed of the
 labeller and of the detector.
 
-The live semantics never wait. Before they process a keyframe while a label result is missing, a
-copy of them is made. While no message arrives, the copy processes the same keyframes again. It
-processes each one after the results of all earlier requests. Results that are known are not
-requested again. When the copy has processed all keyframes, it replaces the live semantics.
+The live semantics, which the map shows, never wait for label results. Before they process a
+keyframe while a label result is missing, a copy of them is made. The copy processes this keyframe
+and all later ones a second time, whenever the mapper has no message to handle. It processes each
+keyframe only after the results of all earlier requests. Results that are known are not requested
+again. When the copy has processed all keyframes, it replaces the live semantics.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,10 +38,13 @@ FIRST_REGION = 1 << 32
 
 
 class OrderedSemantics:
-    """Live semantics of a map, and a copy that processes keyframes after all earlier results.
+    """Labels and objects of a map, and a copy of them that waits for label results.
+
+    The copy processes each keyframe again, after the results of all earlier label requests. It
+    exists only while results are missing, and replaces the live semantics at the end.
 
     Attributes:
-        live: The semantics that the map shows.
+        live: The labels and objects that the map shows; they never wait for label results.
     """
 
     def __init__(
@@ -79,10 +83,15 @@ class OrderedSemantics:
         return self._noted(self.live.on_keyframe_mapped(keyframe))
 
     def apply_label(self, region: int, keyframe: int, answer: RegionLabelResult) -> bool:
-        """Store a label result, and fuse it into `live` if that requested it.
+        """Store a label result for the copy, and fuse it into `live` if `live` requested it.
+
+        Args:
+            region: Id of the region in the request.
+            keyframe: Keyframe of the request.
+            answer: The label result.
 
         Returns:
-            True if the label was fused.
+            True if the label was fused into `live`.
         """
         sent = [one for one in self._sent if (one.id, one.keyframe) == (region, keyframe)]
         if sent:
@@ -98,7 +107,7 @@ class OrderedSemantics:
         self._sent.append(self._waiting.pop(region))
 
     def withdraw(self, region: int, keyframe: int, *, is_replaced: bool) -> None:
-        """Drop a label request that was not sent; the copy makes it again if it needs it.
+        """Drop a label request that was not sent; the copy of the semantics may make it again.
 
         Args:
             region: Id of the region in the request.
@@ -155,9 +164,10 @@ class OrderedSemantics:
         return self._copy is not None and not self._waiting and not self._sent
 
     def step(self) -> "OrderedStep":
-        """Apply one label result in the copy, or process one keyframe in it.
+        """Advance the copy of the semantics by one label result or one keyframe.
 
-        After the last keyframe, the copy replaces the live semantics.
+        Label results come before the keyframe after them. After the last keyframe, the copy
+        replaces the live semantics.
         """
         copy, gaussians = self._copy, self._map.gaussians
         assert copy is not None
@@ -206,7 +216,7 @@ class OrderedSemantics:
         self._copy = saved and DelayedCopy.restored(saved, self._new_semantics(saved["semantics"]))
 
     def metrics(self) -> dict[str, float]:
-        """Return the counters of the live semantics and of the copies."""
+        """Return the counters of the live semantics and of their copies."""
         return {
             **self.live.metrics(),
             # Keyframes that are still to be processed again, while no message arrives.
@@ -219,7 +229,7 @@ class OrderedSemantics:
 
 @dataclass(frozen=True, slots=True)
 class OrderedStep:
-    """Label requests of a step of `OrderedSemantics`, and whether its copy is finished."""
+    """Result of a step of the copy that `OrderedSemantics` has."""
 
     requests: tuple[Region, ...]  # Regions to send to the labeller.
     is_done: bool  # True if the copy has replaced the live semantics.

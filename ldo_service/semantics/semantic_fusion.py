@@ -1,7 +1,7 @@
 """Fusion of a keyframe's regions into the labels of the map.
 
-Detections and open-vocabulary labels of a region are fused first (paper, III.B). Label images
-render the labels of the map.
+The detector's and the labeller's label of a region are first fused into one (LDO-SLAM paper,
+III.B). The module also renders the labels of the map as label images.
 """
 
 from dataclasses import dataclass, field
@@ -43,11 +43,13 @@ from .label_assignment import HIDDEN, Assignment, AssignmentConfig, Regions, ass
 
 @dataclass(frozen=True, slots=True)
 class FusionConfig:
-    """Settings of the fusion of detector and labeller."""
+    """Settings of the fusion of detector and labeller; `fuse_confidences` has the formula."""
 
+    # Weight of the detector: by the confidences (adaptive), constant (fixed), or always 1, so that
+    # the labeller is ignored (detector).
     rule: Literal["adaptive", "fixed", "detector"] = "adaptive"
-    beta: float = 2.0  # Exponent of the reliabilities (paper, III.B).
-    epsilon: float = 1e-6  # Term against division by zero (paper, III.B).
+    beta: float = 2.0  # Exponent in the formula of `adaptive` (paper, III.B).
+    epsilon: float = 1e-6  # Term against division by zero with `adaptive` (paper, III.B).
     fixed_alpha: float = 0.5  # Weight of the detector with `fixed`, an ablation (paper, IV.C).
 
     def __post_init__(self) -> None:
@@ -68,7 +70,7 @@ class FusedLabels:
 
     Attributes:
         labels: Fused labels, [V] int16.
-        confidences: Fused confidences, SemConf in the paper, [V] float32, 0..1.
+        confidences: Fused confidences, [V] float32, 0..1; SemConf in the LDO-SLAM paper, III.B.
         alpha: Weight of the detector, [V] float32, 0..1.
         by_detector: Contribution of the detector, alpha Conf_YOLO, [V] float32.
     """
@@ -135,7 +137,7 @@ def reliable_label_mask(labels: np.ndarray, top: np.ndarray, least: float) -> np
     """Return the pixels where the map has a reliable label other than background, [H, W] bool.
 
     Args:
-        labels: Label rows of the Gaussians, [N, 32].
+        labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
         top: Row of the Gaussian that contributes most to each pixel, [H, W]; negative if no
             Gaussian contributes.
         least: Minimum probability of the label.
@@ -163,7 +165,7 @@ def label_image(
 
     Args:
         rows: Gaussians of the map, [N, 16].
-        labels: Label rows of the Gaussians, [N, 32].
+        labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
         shown: Rendering of the image with the Gaussians that contribute to it.
         camera: Intrinsics of the image.
         T_camera_map: Transform from the map to the camera, [4, 4].
@@ -245,7 +247,7 @@ def fuse_detections(
 
     Args:
         rows: Gaussians of the map, [N, 16].
-        labels: Label rows of the Gaussians, [N, 32].
+        labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
         indices: Rows of the Gaussians that contribute to the image, [V] uint32, ascending.
         camera: Intrinsics of the keyframe.
         T_map_camera: Pose of the camera, [4, 4].
@@ -253,10 +255,12 @@ def fuse_detections(
         detections: Labels of the regions by detector and labeller.
         config: Settings of the fusion.
         is_late: True if the keyframe was fused before, and `detections` has only the regions whose
-            labels by the labeller arrived later. Gaussians outside of these regions then get no
-            miss. Gaussians whose fused label is the detector's are not observed a second time.
+            labels by the labeller arrived later. Gaussians outside of these regions then count as
+            not seen, and not as background. Gaussians for which the fusion chooses the detector's
+            label are not updated a second time.
         undetectable: Labels that the detector does not know, [256] bool. Gaussians with such a
-            label get no miss. None: the detector knows all labels.
+            label do not count as background where they are in no region. None: the detector knows
+            all labels.
         threads: Number of threads.
 
     Returns:
