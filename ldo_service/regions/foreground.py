@@ -338,7 +338,7 @@ class RegionDetections:
         )
 
     def scores(self) -> np.ndarray:
-        """Return the score of each box, [M]: the larger of the two confidences.
+        """Return the score of each box, [M]: the larger confidence of detector and labeller.
 
         Scores decide which of several overlapping regions a Gaussian is assigned to.
         """

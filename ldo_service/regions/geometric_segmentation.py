@@ -43,8 +43,8 @@ _3X3 = np.ones((3, 3), np.uint8)
 class GeometricSegmentationConfig:
     """Settings of the segmentation.
 
-    Lengths are in pixels of the small image, see `PlaneConfig`. The values were chosen on the same
-    data as those of `PlaneConfig`.
+    Names that end in `_px` are in pixels of the small image, see `PlaneConfig`. The values were
+    chosen on the same data as those of `PlaneConfig`.
     """
 
     planes: PlaneConfig = field(default_factory=PlaneConfig)
@@ -72,9 +72,9 @@ class GeometricSegmentationConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Segment:
-    """Segment of a keyframe."""
+    """Segment of a keyframe: the pixels of a possible object or of a structural plane."""
 
-    kind: Kind
+    kind: Kind  # One of the five kinds; the module describes them.
     part: Foreground  # Mask of the segment.
 
 

@@ -1,4 +1,4 @@
-"""Label requests to an open-vocabulary labeller, and the use of its label results (paper, III.B).
+"""Label requests to an open-vocabulary labeller, and use of its results (LDO-SLAM paper, III.B).
 
 A label result arrives later than its keyframe. It labels the pixels of a region in that keyframe,
 so box and mask of the region are stored until the result arrives. The result is also stored as a
@@ -35,7 +35,9 @@ from .region_tracker_config import RegionTrackerConfig
 class OpenVocabularyConfig:
     """Settings of open-vocabulary labels."""
 
+    # Choice of the regions of a keyframe that need a label.
     trigger: RegionProposalConfig = field(default_factory=RegionProposalConfig)
+    # Tracking of these regions, and the time of their label requests.
     regions: RegionTrackerConfig = field(default_factory=RegionTrackerConfig)
     # Minimum probability of a reliable label in the map. Pixels with such a label need no label
     # request (paper, III.B).
@@ -171,8 +173,9 @@ class OpenVocabularyLabeling:
             vocabulary: Vocabulary of the map.
 
         Returns:
-            One box with the labels by the detector and by the labeller. None if the result has no
-            label or no pending request, or if the votes of the region give another label.
+            One box with the labels by the detector and by the labeller. None if the result is not
+            used: it has no label or no pending request, or, with its vote counted, another label
+            still has the most votes of the region.
         """
         pending = self._open.pop((region, keyframe), None)
         if pending is None:
@@ -275,7 +278,7 @@ class OpenVocabularyLabeling:
         *,
         is_fused: bool = True,
     ) -> "OpenVocabularyLabeling":
-        """Restore the labels from `pack`."""
+        """Restore the labels from `pack`; the other arguments are those of the constructor."""
         out = OpenVocabularyLabeling(config, is_fused=is_fused)
         out._regions = RegionTracker.unpack(packed["regions"], out.config.regions)
         out._open = {
@@ -305,13 +308,14 @@ def match_boxes_to_regions(
 ) -> tuple[Foreground | None, ...]:
     """Return the mask of the region that belongs to each of the detector's boxes.
 
-    The mask is that of a segment by depth and creases, or else the foreground of the box without
-    structural planes. Segments by color ("flat") are not used, because they include the edge of the
-    surface behind the object.
+    `RegionProposal.number` names the box of a region. The mask is a segment by depth and creases if
+    one fits the box, else the foreground of the box from which structural planes are removed.
+    Segments by color ("flat") are not used, because they include the edge of the surface behind the
+    object.
 
     Args:
         boxes: Number of boxes.
-        found: Regions of the keyframe.
+        found: Regions of the keyframe, from `propose_regions`.
 
     Returns:
         For each box, its mask; None if the box has no region.
@@ -331,10 +335,10 @@ def add_region_labels(
 ) -> RegionDetections:
     """Add the labels of regions to the detections of a keyframe.
 
-    A region with a box gives its label to the box as the open label. If `boxes_vote`, the
-    detector's label of the box is dropped, because its vote is already a part of the region's
-    label. A region without a box is added as a new box, unless it is a part of a larger region with
-    the same label.
+    The label of a region with a box becomes the box's label by the labeller
+    (`RegionDetections.open_labels`). If `boxes_vote`, the detector's label of the box is dropped,
+    because its vote is already a part of the region's label. A region without a box is added as a
+    new box, unless it is a part of a larger region with the same label.
 
     Args:
         detections: Detections of the keyframe.

@@ -26,8 +26,8 @@ class PlaneConfig:
     """Settings of the planes.
 
     With these values, regions covered the objects of the sequence `synthetic:flat` best; no other
-    data were tried. Lengths in pixels refer to the small image, which is the depth image scaled
-    down to a width of about `width_px`.
+    data were tried. Names that end in `_px` are in pixels of the small image, which is the depth
+    image scaled down to a width of about `width_px`.
     """
 
     # Width of the small image; at this width, normals over a few pixels are stable enough.
@@ -45,7 +45,7 @@ class PlaneConfig:
     # Maximum fraction of a structural plane's outline past which a farther surface is visible. No
     # farther surface is counted where the border of the image cuts the plane.
     behind: float = 0.3
-    # Range of the distances outside of the outline at which farther surfaces are counted.
+    # Range of distances outside of the outline in which farther surfaces are counted.
     gap_px: tuple[int, int] = (3, 8)
 
     def __post_init__(self) -> None:

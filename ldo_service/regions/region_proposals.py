@@ -1,7 +1,7 @@
-"""Region proposals of a keyframe for an open-vocabulary labeller (paper, III.B).
+"""Region proposals of a keyframe for an open-vocabulary labeller.
 
-In the paper, a label is requested for a region if the region's best detection has a score below 0.6
-or gives no reliable label. Two kinds of regions are therefore proposed:
+The LDO-SLAM paper (III.B) requests a label for a region if the region's best detection has a score
+below 0.6 or gives no reliable label. Two kinds of regions are therefore proposed:
 
 - Boxes with a low score that do not show the object of a box with a high score.
 - Segments by depth, creases or color (see `geometric_segmentation`) that match no box and whose
@@ -28,7 +28,11 @@ _ORDER = ("flat", "apart", "standing", "convex")  # The first kind of similar re
 
 @dataclass(frozen=True, slots=True)
 class RegionProposalConfig:
-    """Settings of the region proposals."""
+    """Settings of the region proposals.
+
+    A region is a possible object in the image of a keyframe: the foreground of a detector's box, or
+    a segment, see `geometric_segmentation`.
+    """
 
     sure: float = 0.6  # Minimum score of a detection that needs no label request (paper, III.B).
     # Minimum IoU of two boxes that show the same object; the box with the lower score is dropped.
@@ -234,10 +238,11 @@ def regions_of_image(
 ) -> list[RegionProposal]:
     """Return the segments of an image that a labeller could recognize, without near duplicates.
 
-    The pixels of segments `standing` are removed from the masks of segments `apart`.
+    A segment of the kind `standing`, such as a cup, lies inside one of the kind `apart`, such as
+    the table below it. Its pixels are removed from the mask of the segment `apart`.
 
     Args:
-        found: Segments of the image.
+        found: Segments of the image, see `geometric_segmentation`.
         shape: Height and width of the image.
         config: Settings.
     """

@@ -99,7 +99,7 @@ class RegionTracker:
                 continue
             region = self._same(observation, known, taken) or self._new(observation)
             taken.add(region.id)
-            region = merge_observation(region, observation, config.max_boxes)
+            region = merge_observation(region, observation, config.max_box_votes)
             if candidate.score < config.settled:
                 args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
                 region = self._with_view(region, observation, region_view(*args, config.view))
@@ -110,7 +110,7 @@ class RegionTracker:
             region = observation and self._same(observation, known, taken)
             if observation and region and self._label_of(region)[0]:
                 taken.add(region.id)
-                self._keep(merge_observation(region, observation, config.max_boxes))
+                self._keep(merge_observation(region, observation, config.max_box_votes))
                 observed.append((region.id, candidate))
         observed += self._propagated(known, taken)
         region_labels = self._region_labels(observed, known)

@@ -11,7 +11,11 @@ MAX_VIEWS = 8  # Maximum views in a label request.
 
 @dataclass(frozen=True, slots=True)
 class RegionTrackerConfig:
-    """Settings of the region tracks."""
+    """Settings of the region tracks.
+
+    A region track is an image region that is followed over keyframes. A view of it is the crop of
+    one keyframe around it; a label request sends the best views to the labeller.
+    """
 
     views: int = 5  # Maximum views in a label request, the best ones.
     # Minimum views before a label request. A region with a single view may be an error of depth.
@@ -25,8 +29,8 @@ class RegionTrackerConfig:
     per_keyframe: float = 2.5
     # Maximum label requests at one keyframe, if earlier keyframes made fewer than per_keyframe.
     at_once: int = 4
-    # A label is requested again if the summed quality of the views is at least this multiple of the
-    # sum at the last request.
+    # Factor by which the summed quality of the views must have grown since the last label request
+    # of a region for the next one.
     gain: float = 1.3
     # A label result with at least this confidence, or a box with at least this score, ends the
     # label requests of a region.
@@ -107,6 +111,6 @@ class RegionTrackerConfig:
             )
 
     @property
-    def max_boxes(self) -> float:
-        """Sum of the votes for a label up to which boxes add votes; 0 if boxes do not vote."""
+    def max_box_votes(self) -> float:
+        """Maximum sum of the votes for a label to which boxes add; 0 if boxes do not vote."""
         return self.answer_weight if self.boxes_vote else 0.0
