@@ -253,8 +253,8 @@ class Vocabulary:
         start = len(FIRST_NAMES)
         if tuple(names[:start]) != FIRST_NAMES or not start <= len(names) <= vocabulary.cap:
             raise ValueError(
-                f"the stored vocabulary has {len(names)} names. Expected: first the {start} names "
-                f"of every new vocabulary, and at most {vocabulary.cap} names in total"
+                f"the stored vocabulary has {len(names)} names. It must begin with background, "
+                f"other and the {start - 2} names of COCO, and have at most {vocabulary.cap} names"
             )
         vocabulary._names = list(names)
         vocabulary._indices = {name: index for index, name in enumerate(names)}

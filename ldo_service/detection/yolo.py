@@ -50,7 +50,7 @@ class Layout:
     boxes_per_cell: int
     has_objectness: bool  # True: a score for any object precedes the scores of the classes.
     is_channels_first: bool  # True: the output is [1, channels, N]; false: [1, N, channels].
-    is_centered: bool  # True: the image is centered in the input; false: upper left corner.
+    is_centered: bool  # True: the image is in the center of the padded input; false: upper left.
     is_rgb: bool  # True: the colors of the input are RGB; false: BGR.
     value_scale: float  # Factor that converts pixel values 0..255 to values of the input.
 
@@ -219,10 +219,10 @@ def layout_named(name: str) -> Layout:
 def find_grid(count: int, input_px: tuple[int, int]) -> Grid | None:
     """Return the grid for a network that predicts `count` boxes, or None if no grid fits.
 
-    A grid has consecutive strides and one or three boxes per cell. No two grids for the same input
-    have the same number of boxes. The boxes are sorted by stride, the smallest first. With
-    three boxes per cell, the cells of each stride are repeated three times, one repetition after
-    the other.
+    A grid has one or several consecutive strides of 4, 8, 16, 32 and 64 pixels, and one or three
+    boxes per cell. No two grids for the same input have the same number of boxes. The boxes are
+    sorted by stride, the smallest first. With three boxes per cell, the cells of each stride are
+    repeated three times, one repetition after the other.
 
     Args:
         count: Number of boxes.

@@ -151,7 +151,10 @@ def _logprobs(raw: msgspec.Raw) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True)
 class HttpConfig:
-    """Settings of the requests to a vision-language model."""
+    """Settings of the requests to a vision-language model.
+
+    A request shows one view of a region: a crop of the color image of a keyframe around the region.
+    """
 
     model: str = ""  # Name of the model on the server; empty: the server's only model.
     views: int = 2  # Maximum views of a region that are sent, in one request each.

@@ -35,7 +35,7 @@ MAX_LABELS = 5  # Maximum labels of a region; less probable ones are noise.
 
 @dataclass(frozen=True, slots=True)
 class DualEncoderConfig:
-    """Settings of a pair of encoders."""
+    """Settings of a labeller that consists of an image encoder and a text encoder."""
 
     # Texts for a name, with {} in place of the name; the mean of their embeddings is used.
     prompts: tuple[str, ...] = (
@@ -50,7 +50,8 @@ class DualEncoderConfig:
     # Factor on the cosines before the softmax; 0: the factor in the files of the pair, or CLIP's
     # 100.
     logit_scale: float = 0.0
-    # Names that have a probability like all others but are never returned, such as wall and floor.
+    # Names of what is no object, such as wall and floor. Each has a probability like all other
+    # names, and a region for which one of them is the most probable gets no label.
     nothing: tuple[str, ...] = ()
     # Execution providers of onnxruntime, by preference: cuda, tensorrt, ...
     providers: tuple[str, ...] = ("cpu",)
@@ -153,13 +154,13 @@ class DualEncoder:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Canonical names to choose from, without the names in `nothing`."""
+        """Canonical names that the labeller returns; those in `config.nothing` are excluded."""
         nothing = set(map(canonical, self.config.nothing))
         return tuple(name for name in self._listed if name not in nothing)
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Names to choose from and names in `nothing`, in the spelling for the text encoder."""
+        """Compared names, with those in `config.nothing`, in the spelling for the text encoder."""
         return tuple(self._listed.values())
 
     def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
@@ -174,7 +175,7 @@ class DualEncoder:
             crops: Views of the region, each [h, w, 3] uint8 RGB.
 
         Returns:
-            The labels; empty if the most probable name is one of `nothing`.
+            The labels; empty if the most probable name is in `config.nothing`.
         """
         self._place_listed()
         rows, known_names = np.stack([self._rows[name] for name in self._listed]), set(self.names)

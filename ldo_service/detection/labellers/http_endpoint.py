@@ -110,7 +110,7 @@ class HttpClient:
         Args:
             path: Path of the request below the address.
             body: Content of the request, JSON.
-            until_s: Deadline by the clock, seconds.
+            until_s: Deadline, in seconds of the clock that the client was created with.
 
         Raises:
             DeadlineExceeded: If the deadline passes before the server had `timeout_s`.
@@ -160,7 +160,7 @@ class HttpClient:
 
         Args:
             pause_s: Minimum time to wait.
-            until_s: Deadline by the clock, seconds.
+            until_s: Deadline, in seconds of the clock that the client was created with.
             failure: Error that is raised if the next attempt is not allowed before the deadline.
         """
         now_s = self._clock()

@@ -185,9 +185,10 @@ class CachedEmbeddings:
 
 
 class TextEmbeddings:
-    """Text embeddings of a pair of encoders: from the file if it has the name, else computed."""
+    """Text embeddings that are read from a file, or computed if the file does not have the text."""
 
     def __init__(self, cached: CachedEmbeddings | None, encoder: TextEncoder | None) -> None:
+        """Combine a file of embeddings and a text encoder; either may be None."""
         self.cached, self.encoder = cached, encoder
 
     def find(self, text: str) -> np.ndarray | None:
