@@ -153,7 +153,8 @@ class FinishedRun:
     maps: tuple[PosedMap, ...]
     vlm_calls: int | None = None  # Calls of the labeller; None if the run did not record them.
     loops: FoundLoops | None = None  # Found loops; None if loop closing was off.
-    keyframes: Mapping[int, int] = field(default_factory=dict)  # Frame index by keyframe id.
+    # Index in the sequence of each keyframe's frame, by keyframe id.
+    keyframes: Mapping[int, int] = field(default_factory=dict)
 
     def frame(self, index: int) -> RunFrame:
         """Return the frame with an index in the sequence."""

@@ -96,7 +96,11 @@ class Iteration:
         return self._rasterizer.gradients(self._by_planes)
 
     def descent(self) -> VisibleGaussians:
-        """Compute the derivatives of `backward`, and take a step of Adam in the same pass."""
+        """Compute the same derivatives as `backward`, and take a step of Adam in the same pass.
+
+        Returns:
+            The Gaussians that contribute to the image, which the step changed.
+        """
         return self._adam.step_fused(self.gaussians, self._rasterizer, self._by_planes, rate=0.1)
 
     def steps(self) -> Steps:

@@ -23,12 +23,12 @@ class LabelSet:
     Attributes:
         name: Name of the list in tables of results.
         names: The label names by index.
-        place: Function that maps any label name to the corresponding name in the list.
+        listed_name: Function that maps any label name to the corresponding name in the list.
     """
 
     name: str
     names: tuple[str, ...]
-    place: Callable[[str], str]
+    listed_name: Callable[[str], str]
 
     def of_truth(self, class_names: Sequence[str]) -> np.ndarray:
         """Return a table from class ids of the data set to indices in the list, [256] uint8.
@@ -38,7 +38,7 @@ class LabelSet:
         table = np.full(256, VOID, np.uint8)
         for class_id, name in enumerate(class_names):
             if not is_void(name):
-                table[class_id] = self.names.index(self.place(name))
+                table[class_id] = self.names.index(self.listed_name(name))
         return table
 
     def of_map(self, names: Sequence[str]) -> np.ndarray:
@@ -48,37 +48,44 @@ class LabelSet:
         """
         table = np.full(256, UNKNOWN, np.uint8)
         for label, name in enumerate(names):
-            if self.place(name) in self.names:
-                table[label] = self.names.index(self.place(name))
+            if self.listed_name(name) in self.names:
+                table[label] = self.names.index(self.listed_name(name))
         return table
 
 
 def coco_list(class_names: Iterable[str]) -> LabelSet:
-    """Return the list of background and the COCO classes that a data set contains.
+    """Return a list of names: background, then the COCO classes that a data set contains.
 
     The table of synonyms maps names of the data set to COCO classes. Names without a COCO class map
-    to background, except `other`, which is not in the list.
+    to background. The map's label `other`, for an object without a known name, is not in the list
+    and therefore always wrong.
+
+    Args:
+        class_names: Names of the classes of the data set.
     """
     mapped = {coco_class(name) for name in class_names}
     return LabelSet("COCO", (BACKGROUND, *(n for n in COCO if n in mapped)), _in_coco)
 
 
 def full_list(class_names: Iterable[str]) -> LabelSet:
-    """Return the list of background and all object names of a data set.
+    """Return a list of names: background, then all object names of a data set.
 
     An object that has a COCO class is listed under the name of that class.
+
+    Args:
+        class_names: Names of the classes of the data set.
 
     Raises:
         DataError: If there are more names than a label image can hold.
     """
-    placed = (place_of_object(name) for name in class_names if not is_void(name))
+    placed = (object_name(name) for name in class_names if not is_void(name))
     names = tuple(dict.fromkeys((BACKGROUND, *placed)))
     if len(names) > MAX_NAMES:
         raise DataError(
             f"the data set has {len(names)} object names, expected at most {MAX_NAMES}. Merge "
             "some of its classes."
         )
-    return LabelSet("all names", names, place_of_object)
+    return LabelSet("all names", names, object_name)
 
 
 def object_labels(map_names: Sequence[str]) -> np.ndarray:
@@ -87,7 +94,7 @@ def object_labels(map_names: Sequence[str]) -> np.ndarray:
     Labels of building parts, such as walls, become background. All other labels stay unchanged.
     """
     table = np.arange(256, dtype=np.uint8)
-    table[[k for k, name in enumerate(map_names) if place_of_object(name) == BACKGROUND]] = 0
+    table[[k for k, name in enumerate(map_names) if object_name(name) == BACKGROUND]] = 0
     return table
 
 
@@ -96,11 +103,11 @@ def is_void(name: str) -> bool:
     return normalized(name) in VOID_NAMES
 
 
-def place_of_object(name: str) -> str:
-    """Map a label name to the corresponding name in the full list.
+def object_name(name: str) -> str:
+    """Map a label name to the corresponding name of a full list, see `full_list`.
 
-    Parts of the building map to background. Any other name maps to its COCO class, or to its
-    canonical form if there is no such class.
+    Parts of the building, such as wall, map to background. Any other name maps to its COCO class,
+    or to its canonical form if there is no such class.
     """
     plain = canonical(name)
     return BACKGROUND if plain in BUILDING else coco_class(plain) or plain

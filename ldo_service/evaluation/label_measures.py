@@ -9,7 +9,7 @@ from ldo_service.detection.vocabulary import COCO
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.sequence import FrameLabels
 
-from .label_lists import BACKGROUND, VOID, LabelSet, place_of_object
+from .label_lists import BACKGROUND, VOID, LabelSet, object_name
 
 NEAREST_M = 0.05  # Minimum depth in the second camera of a point that is compared.
 SAME_SURFACE = 0.02  # Maximum relative difference of two depths that show one surface.
@@ -34,8 +34,8 @@ class Correspondences:
 class Agreement:
     """Agreement of labels at corresponding pixels of pairs of images."""
 
-    same: int = 0  # Pixels with the same object in both views.
-    objects: int = 0  # Pixels with an object in at least one view.
+    same: int = 0  # Number of pixels with the same object label in both views.
+    objects: int = 0  # Number of pixels with an object label in at least one view.
 
     def __add__(self, other: "Agreement") -> "Agreement":
         return Agreement(self.same + other.same, self.objects + other.objects)
@@ -93,12 +93,12 @@ def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) ->
 class DetectionCounts:
     """Recall and precision of the names in a map, with the counts that they are computed from.
 
-    An instance counts either objects or pixels.
+    The three counts are either all of objects or all of pixels.
     """
 
     right: int = 0  # Named correctly in the map.
-    wanted: int = 0  # Named in the ground truth.
-    named: int = 0  # Named in the map.
+    wanted: int = 0  # Named in the ground truth; recall is right / wanted.
+    named: int = 0  # Named in the map; precision is right / named.
 
     def __add__(self, other: "DetectionCounts") -> "DetectionCounts":
         return DetectionCounts(
@@ -144,7 +144,7 @@ class OpenNames:
 
         Args:
             frame: Ground-truth labels of the view.
-            truth: Index of the true name in the list of names of this object, or VOID,
+            truth: Index of the true name in `labels`, the list given to the constructor, or VOID,
                 [H, W] uint8.
             shown: Labels of the map, [H, W] uint8.
         """
@@ -177,8 +177,8 @@ class OpenNames:
 
 
 def is_beyond_coco(name: str) -> bool:
-    """Return whether a name denotes an object without a COCO class; `other` does not."""
-    return place_of_object(name) not in (BACKGROUND, "other", *COCO)
+    """Return whether a name denotes an object without a COCO class; the name "other" does not."""
+    return object_name(name) not in (BACKGROUND, "other", *COCO)
 
 
 def _table(names: Sequence[str]) -> np.ndarray:
@@ -193,7 +193,7 @@ def _table(names: Sequence[str]) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
-    """Segmentation metrics, 0..1; NaN if no pixel is evaluated."""
+    """Segmentation metrics, 0..1; NaN if no pixel is evaluated; see `segmentation`."""
 
     classes: int  # Number of evaluated classes.
     pixel_accuracy: float  # Fraction of the pixels with ground truth that have the right label.
@@ -229,7 +229,7 @@ def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
 
 
 def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
-    """Return the metrics of a confusion matrix [C, C + 1].
+    """Return the metrics of a confusion matrix.
 
         accuracy = right / true,  IoU = right / (true + shown - right)
 
@@ -238,6 +238,11 @@ def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
     have more than the fraction `gate` of the true pixels. Pixels with an unknown name in the map
     are wrong. Pixel accuracy, mean accuracy, mean IoU and frequency-weighted IoU are those of Long
     et al., CVPR 2015, section 5.
+
+    Args:
+        counts: Number of pixels by true class and by class in the map, [C, C + 1], as `confusion`
+            returns it. Class 0 is background; the last column is for unknown names in the map.
+        gate: Minimum fraction of the true pixels, 0..1, of a class in the means.
 
     Example: a cup has two pixels, of which one is found, and one pixel of the wall is labelled cup.
 

@@ -124,16 +124,16 @@ def painted(color: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
 def error_colors(
     color: np.ndarray, truth: np.ndarray, shown: np.ndarray, labels: LabelSet
 ) -> np.ndarray:
-    """Draw the label errors in the colors of `ERRORS`.
+    """Draw each kind of label error in its color; `ERRORS` lists kinds and colors.
 
     Pixels are gray where both label images have background, and black where the ground truth is
     void.
 
     Args:
         color: Camera image, RGB [H, W, 3] uint8.
-        truth: True indices in the list, [H, W] uint8.
-        shown: Indices of the map's names in the list, [H, W] uint8.
-        labels: The list.
+        truth: Indices of the true names in `labels`, [H, W] uint8.
+        shown: Indices of the map's names in `labels`, [H, W] uint8.
+        labels: Names of the labels.
 
     Returns:
         The picture, RGB [H, W, 3] uint8.
@@ -185,17 +185,17 @@ def sheet_of_labels(
 
 
 def frames_to_show(errors: ListErrors, count: int = VIEWS) -> list[tuple[int, str]]:
-    """Choose frames with objects, spread from the worst to the best.
+    """Choose frames with objects for the contact sheet, spread from the worst to the best.
 
     Frames are ranked by the fraction of their object pixels with the right label. Frames in which
     at most the fraction MIN_OBJECTS of the pixels show an object are not chosen.
 
     Args:
-        errors: Errors of one list of names.
+        errors: Errors of the labels, for the names by which the frames are ranked.
         count: Number of frames.
 
     Returns:
-        Index of each frame and the text above its row of the sheet, ascending by index.
+        Index of each frame and the text above it on the contact sheet, ascending by index.
     """
     shares = {}
     for frame, counts in zip(errors.frames, errors.confusions, strict=True):

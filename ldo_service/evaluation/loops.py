@@ -36,7 +36,7 @@ class ComparedPair:
     newer: tuple[int, ...]
     older: tuple[int, ...]
     is_closure: bool  # False if the candidate was rejected.
-    ms: float | None  # Duration of the comparison; None if not measured.
+    ms: float | None  # Duration of the comparison in milliseconds; None if not measured.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -85,11 +85,11 @@ class SeenKeyframe:
 class LoopErrors:
     """Scores of loop closing, see `PROTOCOL`; a ratio is None if its denominator is 0."""
 
-    closures: int
-    true_closures: int
+    closures: int  # Number of loop closures of the run.
+    true_closures: int  # Closures that connect a true pair of subgraphs.
     queries: int  # Subgraphs that form a true pair with an older subgraph.
     closed_queries: int  # Queries with a closure to an older subgraph of a true pair.
-    candidates: int
+    candidates: int  # Number of pairs of subgraphs that were compared.
     position_errors_m: tuple[float, ...]  # One per closure whose keyframes have true poses.
     rotation_errors_deg: tuple[float, ...]  # One per closure whose keyframes have true poses.
     ms: tuple[float, ...]  # Duration of the comparison of each candidate that was timed.

@@ -240,4 +240,4 @@ def save_picture(path: Path, image: np.ndarray) -> None:
         OSError: If the file cannot be written.
     """
     if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-        raise OSError(f"{path} cannot be written")
+        raise OSError(f"{path} cannot be written; check its suffix and the free disk space")

@@ -55,11 +55,12 @@ def evaluate_run(
     Args:
         run: The run.
         sequence: Source of the run, with ground truth and true labels if known.
-        advance: Progress function, called with the number of frames done so far; `work` returns
-            the total.
+        advance: Progress function, called with the number of frames done so far; the function
+            `work` of this module returns the total.
         distance: LPIPS, see `views.evaluate_rendering`; None to omit LPIPS.
         threads: Threads of the renderer.
-        evaluated: Frames whose renderings are evaluated; None for those of both protocols.
+        evaluated: Frames whose renderings are evaluated; None for all held-out frames and every
+            fifth training frame, see `views.PROTOCOL`.
 
     Raises:
         DataError: If a file of the run does not fit the sequence, or nothing can be evaluated.

@@ -54,10 +54,10 @@ instead of objects."""
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ListErrors:
-    """Errors for one list of names.
+    """Errors of the labels, evaluated with one list of label names.
 
     Attributes:
-        labels: The list, C names.
+        labels: The list of C names.
         frames: Indices of the frames.
         confusions: Confusion matrix [C, C + 1] of each frame, see `label_measures.confusion`.
     """
@@ -72,7 +72,12 @@ class ListErrors:
         return np.sum(self.confusions, axis=0)
 
     def figures(self, gate: float) -> Segmentation:
-        """Return the metrics of all pixels together, see `label_measures.segmentation`."""
+        """Return the metrics of all pixels of all frames together.
+
+        Args:
+            gate: Minimum fraction of the true pixels, 0..1, of a class in the means over classes;
+                see `label_measures.segmentation`.
+        """
         return segmentation(self.pooled, gate)
 
     def per_image_iou(self) -> float:
@@ -85,9 +90,9 @@ class ListErrors:
 class LabelErrors:
     """Errors of the labels of one map."""
 
-    map: str
-    lists: tuple[ListErrors, ...]
-    consistency: Agreement
+    map: str  # Name of the map, such as "online" or "refined".
+    lists: tuple[ListErrors, ...]  # Errors for each list of label names.
+    consistency: Agreement  # Agreement of the map's labels between the frames of a pair.
     pairs: int  # Number of frame pairs compared for consistency.
     objects: DetectionCounts  # Objects whose name has no COCO class.
     pixels: DetectionCounts  # Pixels whose name has no COCO class.

@@ -51,10 +51,10 @@ class TrajectoryErrors:
     """
 
     poses: int  # Number of associated poses.
-    ate_m: ErrorStatistics
+    ate_m: ErrorStatistics  # Absolute trajectory error: distances of the positions.
     rpe_poses: int  # Interval of the relative errors: the number of poses in 1 s.
-    rpe_translation_m: ErrorStatistics | None
-    rpe_rotation_deg: ErrorStatistics | None
+    rpe_translation_m: ErrorStatistics | None  # Relative pose error, translation.
+    rpe_rotation_deg: ErrorStatistics | None  # Relative pose error, rotation.
     T_truth_estimate: np.ndarray  # Alignment, [4, 4].
 
 

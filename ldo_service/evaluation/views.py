@@ -46,7 +46,7 @@ class DepthError:
     """Error of the rendered depth of one image."""
 
     l1_m: float  # Mean absolute error; NaN if no pixel was compared.
-    share: float  # Compared pixels as a fraction of the measured ones; NaN if none is measured.
+    share: float  # Fraction of the pixels with measured depth that were compared; NaN if none.
 
 
 def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -192,7 +192,7 @@ class RenderedView:
 
 @dataclass(frozen=True, slots=True)
 class ViewErrors:
-    """Errors of one frame, see `PROTOCOL`."""
+    """Errors of one rendered frame; the constant `PROTOCOL` of this module defines each metric."""
 
     frame: int  # Index in the sequence.
     psnr_db: float
@@ -204,10 +204,10 @@ class ViewErrors:
 
 @dataclass(frozen=True, slots=True)
 class RenderingErrors:
-    """Errors of one map under one protocol, frame by frame."""
+    """Errors of one map under one protocol (see the constant `PROTOCOL`), frame by frame."""
 
-    map: str
-    protocol: str
+    map: str  # Name of the map, such as "online" or "refined".
+    protocol: str  # Name of the protocol, a key of HELD_OUT or TRAINING.
     views: tuple[ViewErrors, ...]
 
     def mean(self, figure: str) -> float | None:
@@ -267,7 +267,7 @@ TRAINING = {"B training": measured_pixels}
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedFrames:
-    """Frames to evaluate: held-out frames for protocol A, some training frames for protocol B.
+    """Frames to evaluate: held-out frames (protocol A) and some training frames (protocol B).
 
     Both include LOST frames, which have no pose.
     """
@@ -277,7 +277,7 @@ class EvaluatedFrames:
 
     @staticmethod
     def of(frames: Iterable[RunFrame]) -> "EvaluatedFrames":
-        """Select the frames for each protocol from all frames of a run."""
+        """Select all held-out frames and every fifth training frame of a run."""
         frames = tuple(frames)
         training = tuple(frame for frame in frames if not frame.is_held_out)
         return EvaluatedFrames(
@@ -290,7 +290,7 @@ class EvaluatedFrames:
         return [frame for frame in (*self.held_out, *self.training) if not frame.is_lost]
 
     def counts(self) -> str:
-        """Return a text with the numbers of frames of protocols A and B."""
+        """Return a text with the numbers of held-out frames (A) and training frames (B)."""
         if not self.held_out:
             a = "A: none, because all frames were mapped; use `ldo run --hold-out-every 5`."
         else:
@@ -339,7 +339,7 @@ def evaluate_rendering(
     distance: Distance | None = None,
     threads: int = 1,
 ) -> list[RenderingErrors]:
-    """Compute the errors of each map under each protocol that has frames.
+    """Compute the errors of each map under each protocol of HELD_OUT and TRAINING with frames.
 
     Args:
         sequence: Source of the frames.
@@ -369,7 +369,7 @@ def evaluate_rendering(
 def evaluate_view(
     view: RenderedView, is_held_out: bool, distance: Distance | None = None
 ) -> Iterator[tuple[str, ViewErrors]]:
-    """Yield the name of each protocol for a frame, and the errors of the frame by that protocol.
+    """Yield the errors of a frame under each protocol (see `PROTOCOL`), after its name.
 
     Args:
         view: The frame with its rendering.
