@@ -170,8 +170,8 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             folder name, a metric is unknown, or `front_end` is invalid.
     """
 
-    title: str
-    about: str = ""
+    title: str  # Title of the tables.
+    about: str = ""  # Text below the title.
     # Source by name of the sequence: a folder within the data folder, or synthetic:...
     sequences: dict[str, str]
     # Settings by name of the variant, as for `ldo run --set`.
@@ -188,7 +188,7 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     refine: int = 0
     stride: int = 1
     max_frames: int | None = None  # `None` uses all frames.
-    # Published values by method, sequence and metric.
+    # Published values for comparison: the number by method, then sequence, then metric.
     published: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
