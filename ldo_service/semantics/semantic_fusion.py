@@ -199,6 +199,7 @@ def label_image(
 class SemanticFusionConfig:
     """Settings for fusing the labels of image regions into the map."""
 
+    # Pixels that a detection labels: the foreground in its box, or the whole box.
     region: Literal["foreground", "box"] = "foreground"
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     nesting: NestingConfig = field(default_factory=NestingConfig)

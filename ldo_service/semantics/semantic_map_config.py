@@ -17,7 +17,9 @@ class SemanticMapConfig:
 
     labelling: SemanticFusionConfig = field(default_factory=SemanticFusionConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
+    # Label requests to the labeller, and the use of its results.
     naming: OpenVocabularyConfig = field(default_factory=OpenVocabularyConfig)
+    # Classes that move by themselves, such as people.
     movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
     # Minimum score of a detection of a dynamic class, such as a person, that removes the
     # surface from the map. Detections with this score need no label request either. The score is
