@@ -1,11 +1,11 @@
-"""Pose graph of keyframes and landmarks (paper, III.C).
+"""Pose graph of keyframes and landmarks (LDO-SLAM paper, III.C).
 
 Only this package imports gtsam. gtsam holds the GIL during every call, so the pose-graph optimizer
 runs in its own process.
 
 The unknowns are T_k, the pose of keyframe k in the map; mu_l [3], the centroid of landmark l; and
-p_l, the distribution of landmark l over C classes. The paper has four kinds of edges with these
-costs:
+p_l, the distribution of landmark l over C classes. The paper has four kinds of edges (factors of
+the graph) with these costs:
 
     odometry      |log(T_ab^-1 T_a^-1 T_b)|^2_Omega          tracking, keyframe refinements
     loops         rho(|log(T_ab^-1 T_a^-1 T_b)|^2_Omega)     verified loop closures

@@ -44,7 +44,9 @@ class BridgeEdge:
 def check_against_bridge(
     known: FactorStore, closure: RelativePose, start: Variables, initial: Variables
 ) -> tuple[ClosureDecision, Variables]:
-    """Check a loop closure against all other measurements, bridge edges included.
+    """Check a loop closure against all other measurements, also those that are bridge edges.
+
+    A bridge edge is the loop closure that merged two components of the graph.
 
     Args:
         known: The other measurements.

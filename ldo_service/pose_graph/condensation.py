@@ -67,7 +67,10 @@ class CondensedKeyframes:
         return CondensedKeyframes(*(getattr(self, name)[row : row + 1] for name in self.__slots__))
 
     def head_and_tail(self, row: int) -> tuple[int, int]:
-        """Return the ids of the head and of the tail of the condensed keyframe of one row."""
+        """Return the keyframe ids of head and tail of the condensed keyframe of one row.
+
+        They are the last variable before the keyframe and the first variable after it.
+        """
         return int(self.start_variables[row]), int(self.end_variables[row])
 
     def index(self) -> dict[int, int]:
@@ -75,11 +78,11 @@ class CondensedKeyframes:
         return {int(k): row for row, k in enumerate(self.keyframes)}
 
     def interpolated_poses(self, T_heads: np.ndarray, T_tails: np.ndarray) -> np.ndarray:
-        """Return T_map_keyframe [F, 4, 4], between the variables before and after each keyframe.
+        """Return T_map_keyframe [F, 4, 4], interpolated between head and tail of each keyframe.
 
         Args:
-            T_heads: T_map_head of each condensed keyframe, [F, 4, 4].
-            T_tails: T_map_tail of each condensed keyframe, [F, 4, 4].
+            T_heads: Pose T_map_head of the last variable before each keyframe, [F, 4, 4].
+            T_tails: Pose T_map_tail of the first variable after each keyframe, [F, 4, 4].
         """
         return interpolate(T_heads @ self.T_head, T_tails @ self.T_tail, self.fractions)
 
@@ -250,14 +253,14 @@ def condense(
     T_map: Mapping[int, np.ndarray],
     noise: NoiseConfig,
 ) -> Condensed:
-    """Condense a group: compute one measurement from its head to its tail.
+    """Condense a group: compute one measurement from its first keyframe (head) to its last (tail).
 
     The measurement is computed only from the measurements and loop closures within the group, with
     the head fixed. Information from outside the group would otherwise count twice.
 
     Args:
-        group: Ids of the keyframes, in order; the last one is the tail.
-        measured: Odometry measurements by pair of variables.
+        group: Ids of the keyframes, in order; the first one is the head, the last one the tail.
+        measured: Odometry measurements by the ids of their two keyframes.
         closures: Accepted loop closures within the group.
         T_map: Current pose T_map_keyframe [4, 4] of each keyframe of the group.
         noise: Noise of the measurements.

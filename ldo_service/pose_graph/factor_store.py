@@ -64,9 +64,9 @@ class FactorStore:
     def add_measurement(self, m: RelativePose) -> Name:
         """Store an odometry measurement and return the name of its factor.
 
-        If both keyframes are variables, the measurement replaces an older one of the same pair. If
-        a keyframe is condensed, the measurement is transferred to variables. It is then stored only
-        if this pair of variables has no odometry measurement.
+        If both keyframes are variables, the measurement replaces an older one of the same pair.
+        Otherwise, it is transferred to the variables that `ends` selects, and stored only if these
+        have no odometry measurement yet.
         """
         between = self.between_variables(m)
         pair = between.a, between.b
@@ -164,13 +164,13 @@ class FactorStore:
     def interpolation_error_sigmas(self, keyframe: int, variables: Variables) -> float:
         """Return the difference between two estimates of the pose of a condensed keyframe.
 
-        One estimate follows from the pose of the head, the other one from the pose of the tail.
+        One follows from the last variable before the keyframe, the other from the first one after.
 
         Returns:
-            The largest absolute value of the six components of the difference, in standard
-            deviations of a loop closure (`sigma_loop_rad`, `sigma_loop_m`). This value is
-            multiplied by a fraction, 0..0.5: the way from the nearer variable to the keyframe,
-            divided by the way from head to tail. The result is 0 if the keyframe is a variable.
+            The largest absolute component of the difference, in standard deviations of a loop
+            closure (`sigma_loop_rad`, `sigma_loop_m`). It is multiplied by the distance of the
+            keyframe from the nearer variable, as a fraction, 0..0.5, of the path between the
+            variables. The result is 0 if the keyframe is a variable.
         """
         row = self.rows.get(keyframe)
         if row is None:
@@ -183,7 +183,7 @@ class FactorStore:
         return min(share, 1 - share) * float((off / sigmas).max())
 
     def relative(self, without: Pair | None = None) -> Iterable[RelativePose]:
-        """Yield measurements between variables, except closures and the bridge edge `without`."""
+        """Yield the measurements except closures and `without`, a bridge between components."""
         yield from self.odometry.values()
         yield from self.condensed.values()
         bridges = (m for pair, m in self.bridges.items() if pair != without)
@@ -214,8 +214,9 @@ class FactorStore:
     def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
         """Return the two variables to which the keyframes a and b of a measurement are transferred.
 
-        Each keyframe is transferred to the nearer one of its head and its tail. If this gives the
-        same variable for a and b, both keyframes are transferred to their heads instead.
+        A keyframe that is a variable is kept. A condensed keyframe is replaced by the nearer one of
+        its head, the last variable before it, and its tail, the first variable after it. If this
+        gives the same variable for a and b, both are replaced by their heads instead.
 
         Returns:
             For a, then for b: the id of the variable, and T_variable_keyframe [4, 4].
@@ -300,6 +301,11 @@ class FactorStore:
         """Return all factors, with the given closures instead of the accepted ones.
 
         The closures get no robust kernel, so that costs of different solutions can be compared.
+
+        Args:
+            closures: Loop closures to use.
+            initial: Values with which the variables were added to the incremental solver; the
+                first keyframe of each component is fixed at its value.
         """
         others = [self.factor(name, initial) for name in self.names() if name[0] != "closure"]
         return [*others, *(self._closure_factor(closure, 0.0) for closure in closures)]

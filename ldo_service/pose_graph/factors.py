@@ -18,7 +18,10 @@ from .solver import point_key
 
 @dataclass(frozen=True, slots=True)
 class NoiseConfig:
-    """Noise of measurements, in addition to the information matrix that a measurement contains."""
+    """Noise of measurements: bounds of the noise that a measurement states, and noise added to it.
+
+    A measurement of a relative pose states its own noise by an information matrix.
+    """
 
     # Sigma of the prior that fixes the first keyframe of each component, rad and m.
     first_sigma: float = 1e-6
@@ -86,12 +89,14 @@ class NoiseConfig:
 class BoxObservation:
     """Observation of a landmark as a box in the image of a keyframe."""
 
-    keyframe: int
-    landmark: int
+    keyframe: int  # Id of the keyframe.
+    landmark: int  # Id of the landmark.
     center_px: np.ndarray  # Center of the box, [2].
-    sigma_px: float
+    sigma_px: float  # Standard deviation of the center.
     intrinsics: np.ndarray  # fx, fy, cx, cy in pixels, [4].
-    weight: float = 1.0  # exp(-2 H) if the entropy H of the observed classes is high, else 1.
+    # Factor on the squared residual: exp(-2 H) if the entropy H of the observed classes is high,
+    # else 1.
+    weight: float = 1.0
 
 
 def information(sigma_rad: float, sigma_m: float) -> np.ndarray:
@@ -155,8 +160,10 @@ def box_factor(
 ) -> gtsam.NonlinearFactor:
     """Return the reprojection factor of an observation.
 
-    Its cost is s rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2) with s = `independent_observations`. A
-    point behind the camera has a constant cost and no gradient.
+    Its cost is s rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2). pi projects the landmark mu into the image
+    of keyframe k with the pose T_k. The observation has the center z, the noise sigma and the
+    weight w. rho is the Cauchy kernel and s is `independent_observations`. A point behind the
+    camera has a constant cost and no gradient.
 
     Args:
         observation: The observation.

@@ -61,12 +61,13 @@ def fuse_labels(
         min_p  lambda sum_lk w_k KL(p_l || q_lk)
              + w_sem / 2 sum_ij (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j]
 
-    The method is Gauss-Seidel (paper, III.C): each sweep minimizes over one landmark after the
+    q_lk and w_k are distribution and weight of the observation of landmark l in keyframe k. The
+    method is Gauss-Seidel (LDO-SLAM paper, III.C): each sweep minimizes over one landmark after the
     other, in the order of their ids. The neighbors with equal argmax are determined again each time
     that a landmark is minimized. The result is deterministic.
 
     Args:
-        evidence: Evidence of each landmark, by its id.
+        evidence: Sums over the observations q_lk with weights w_k of each landmark l, by its id.
         covisible: Pairs of landmarks that are observed in the same keyframe; each pair counts once.
         lambda_sem: Weight of the observations.
         w_sem: Weight of the similarity.

@@ -15,7 +15,7 @@ from .label_fusion import Evidence, fuse_labels
 from .loop_closures import Pair
 from .pose_graph import PoseGraph
 
-MAX_CLASSES = 256  # C_max of the paper, III.B
+MAX_CLASSES = 256  # Maximum classes: C_max (paper, III.B).
 BORDER_PX = 2.0  # A box closer to the border of the image counts as cut off.
 
 
@@ -39,10 +39,14 @@ def triangulate(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, floa
 
 @dataclass(frozen=True, slots=True)
 class ObjectLandmarkConfig:
-    """Settings of object landmarks."""
+    """Settings of object landmarks.
+
+    Names with `vague` concern uncertain labels, those whose entropy is above `vague_nats`.
+    """
 
     lambda_sem: float = 0.5  # Weight of the observed labels (paper, III.C).
-    w_sem: float = 0.1  # Weight of the similarity (paper, III.C).
+    # Weight of the similarity of landmarks that a keyframe shows together (paper, III.C).
+    w_sem: float = 0.1
     # Limit of the entropy H. Above it, an observation has the weight exp(-2 H), and a landmark is
     # uncertain, so that it is removed earlier (paper, III.C).
     vague_nats: float = 0.5
@@ -176,7 +180,8 @@ class ObjectLandmarks:
         self._waiting: list[LandmarkObservation] = []
         self._pairs: set[Pair] = set()  # Pairs of landmarks that a keyframe shows together.
         self._saved: dict[str, Any] = {}  # Entry `known` of the snapshot; empty if outdated.
-        self.skipped = 0  # Number of keyframes at which waiting observations were not yet added.
+        # Number of keyframes at which `needs_update` left observations waiting, for the metrics.
+        self.skipped = 0
 
     def observe(self, seen: LandmarkObservation) -> None:
         """Store an observation for the next `update_graph`."""
@@ -188,9 +193,9 @@ class ObjectLandmarks:
 
     # --- into the graph ---------------------------------------------------------------------------
     def needs_update(self) -> bool:
-        """Return whether to call `update_graph` now.
+        """Return whether `update_graph` must be called now.
 
-        Call this once per keyframe, since it counts `skipped` keyframes.
+        Call this once per keyframe: if observations stay waiting, it increments `skipped`.
         """
         config = self._config
         if not self._waiting:

@@ -25,7 +25,10 @@ Sigmas = Callable[[Variables, RelativePose], float]
 
 @dataclass(frozen=True, slots=True)
 class LoopClosureConfig:
-    """Limits for the acceptance of loop closures."""
+    """Limits for the acceptance of loop closures.
+
+    A residual in sigmas is divided by the standard deviation of the measurement.
+    """
 
     # Maximum increase of the sum of squared residuals by a closure: the 99.73 % quantile (3
     # sigma) of chi^2 with six degrees of freedom. The residual of the closure alone does not show

@@ -360,7 +360,7 @@ class PoseGraph:
         return {"keys": initial[0], "values": initial[1], "known": self._known.pack()}
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state; the entry `base` is the same object until the next rebuild."""
+        """Return `base`, an object that each rebuild of the solver replaces, and later changes."""
         return {"base": self._base, "changes": list(self._changes)}
 
     def restore(self, state: Mapping[str, Any]) -> None:

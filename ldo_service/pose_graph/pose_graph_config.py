@@ -10,7 +10,11 @@ from .loop_closures import LoopClosureConfig
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphConfig:
-    """Parameters of the pose graph."""
+    """Parameters of the pose graph.
+
+    The variables of the graph are keyframes. A condensed keyframe is no variable: its pose is
+    interpolated between the variables before and after it.
+    """
 
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     closures: LoopClosureConfig = field(default_factory=LoopClosureConfig)
@@ -24,7 +28,7 @@ class PoseGraphConfig:
     # closure. No group is split if there is already one group per `keyframes_each` keyframes, to
     # bound the solver's time.
     max_interpolation_sigmas: float = 0.1
-    keyframes_each: int = 5
+    keyframes_each: int = 5  # Minimum keyframes per group, on average, for a group to be split.
     # Maximum number of changes of the graph between two rebuilds of the solver. A restored graph
     # repeats the changes since the last rebuild, with bitwise equal results.
     max_changes: int = 64
