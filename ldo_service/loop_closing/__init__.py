@@ -3,7 +3,7 @@
 Coarse step: `place_database` compares histograms of labels, of their layout and of visual words.
 Fine step: `verification` estimates the pose between two keyframes, and rejects the candidate if any
 check fails. The checks are strict, because a false loop closure damages the map more than a missed
-one. Paper, III.C.
+one. See the LDO-SLAM paper, III.C.
 """
 
 from .loop_detector import LoopCandidateResult, LoopDetector, LoopsConfig

@@ -24,7 +24,8 @@ class ConsistencyCheckConfig:
     """Limits of the drift that a loop hypothesis implies, and of its ambiguity."""
 
     drift_m: float = 0.5  # Allowed position drift on any path.
-    drift: float = 0.1  # Additional drift per meter of path; ten times that of depth cameras.
+    # Additional position drift in meters per meter of path; ten times that of depth cameras.
+    drift: float = 0.1
     turn_rad: float = 0.35  # Allowed rotation drift on any path.
     turn_rad_per_m: float = 0.02  # Additional rotation drift per meter of path; 1.1 degrees.
     # Maximum pose difference of two cameras that see the same surfaces. view_rad is the

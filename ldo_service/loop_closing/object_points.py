@@ -23,16 +23,17 @@ HIDDEN_NAMES = OTHER + 1
 
 @dataclass(frozen=True, slots=True)
 class LandmarkConfig:
-    """Parameters of the landmarks of a subgraph."""
+    """Parameters of the landmarks of a subgraph: objects, each found from several detections."""
 
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     # Detections with the same label belong to one object if their distance is below this limit.
     # It is half the width of a chair.
     same_m: float = 0.4
-    # Maximum KL divergence of matching landmarks in both directions, nats (paper, III.C).
+    # Maximum KL divergence of the label distributions of two matching landmarks, in both
+    # directions, nats (paper, III.C).
     max_divergence: float = 0.3
-    # Maximum distance of matched landmarks. It is large because the boxes may show different
-    # sides of an object.
+    # Maximum distance of two matching landmarks after alignment by the pose between the subgraphs.
+    # It is large because the boxes may show different sides of an object.
     reach_m: float = 0.25
     # Minimum landmarks that agree with a pose; three determine a pose but do not confirm it.
     min_inliers: int = 4
@@ -236,10 +237,10 @@ class LandmarkAgreement:
 def possible_pairs(
     old: SubgraphLandmarks, new: SubgraphLandmarks, config: LandmarkConfig
 ) -> np.ndarray:
-    """Return the index pairs [M, 2] of landmarks with similar label distributions.
+    """Return the index pairs (old, new) of landmarks with similar label distributions, [M, 2].
 
-    The KL divergence must be below `config.max_divergence` in both directions (paper,
-    III.C: 0.3 nats).
+    The KL divergence must be below `config.max_divergence` in both directions. The default, 0.3
+    nats, comes from the LDO-SLAM paper, III.C.
     """
     return np.argwhere(_divergences(old, new) < config.max_divergence)
 

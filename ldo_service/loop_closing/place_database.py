@@ -118,13 +118,15 @@ class RetrievalConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RetrievalMatch:
-    """Stored subgraph that is similar to a new one."""
+    """Stored subgraph that is similar to a new one; all values are 0..1, 1 for equal subgraphs."""
 
     subgraph: Subgraph
     similarity: float  # Cosine of the label histograms.
-    layout: float  # Cosine of the layout histograms.
+    layout: float  # Cosine of the histograms of pairs of labels and their distance.
     appearance: float  # Cosine of the visual-word histograms.
-    score: float  # Score by which candidates are ranked, see `PlaceDatabase._scores`.
+    # Score by which candidates are ranked: (appearance + (similarity + layout) / 2) / 2, if both
+    # subgraphs have detections and no setting excludes labels or images.
+    score: float
 
 
 class PlaceDatabase:
@@ -153,7 +155,10 @@ class PlaceDatabase:
         return len(self.subgraphs)
 
     def add(self, subgraph: Subgraph) -> None:
-        """Store a subgraph; remove one if there are too many."""
+        """Store a subgraph; if there are now more than the setting `count`, remove one.
+
+        The class describes which one is removed.
+        """
         self.subgraphs.append(subgraph)
         self._names.add(subgraph.names)
         self._layout.add(subgraph.layout)
@@ -169,7 +174,9 @@ class PlaceDatabase:
             table.remove(index)
 
     def query(self, new: Subgraph, is_possible: np.ndarray) -> list[RetrievalMatch]:
-        """Return at most K stored subgraphs that may show the same place, the likeliest first.
+        """Return the stored subgraphs that may show the same place, the likeliest first.
+
+        The setting `candidates` limits their number.
 
         Args:
             new: Subgraph to search for.

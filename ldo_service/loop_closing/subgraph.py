@@ -1,4 +1,7 @@
-"""Subgraphs: groups of consecutive keyframes, the unit of loop detection. Paper, III.C."""
+"""Subgraphs: groups of consecutive keyframes, which loop detection compares.
+
+See the LDO-SLAM paper, III.C.
+"""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -17,18 +20,20 @@ from .object_points import DetectionPoints, SubgraphLandmarks
 
 @dataclass(frozen=True, slots=True)
 class SubgraphConfig:
-    """Settings of subgraphs."""
+    """Settings of subgraphs: groups of consecutive keyframes that are compared as a whole."""
 
-    min_keyframes: int = 3  # Minimum keyframes (paper, III.C).
-    max_keyframes: int = 5  # Maximum keyframes (paper, III.C).
+    min_keyframes: int = 3  # Minimum keyframes of a subgraph (paper, III.C).
+    max_keyframes: int = 5  # Maximum keyframes of a subgraph (paper, III.C).
     # A subgraph is complete with `min_keyframes` keyframes if the rotation plus parallax from its
     # first to its last keyframe exceeds this. Half of the view of a depth camera is then new.
+    # Parallax is the distance divided by the median depth.
     turned_rad: float = 0.5
     # A new subgraph begins if the rotation plus parallax between two keyframes exceeds this.
     # Consecutive keyframes are 0.35 rad apart, unless frames were dropped.
     gap_rad: float = 1.5
-    # Number of stored keyframes per subgraph, 0.13 MB each at 640x480. With a larger number, no
-    # more loops were found on the sequences kitchen and `synthetic:flat`.
+    # Number of keyframes of a complete subgraph that are stored for later comparisons, 0.13 MB each
+    # at 640x480. With a larger number, no more loops were found on the sequences kitchen and
+    # `synthetic:flat`.
     kept_views: int = 2
 
     def __post_init__(self) -> None:
@@ -166,8 +171,8 @@ def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfi
 def is_complete(views: Sequence[SubgraphKeyframe], config: SubgraphConfig) -> bool:
     """Return whether the keyframes `views` form a complete subgraph.
 
-    A subgraph is complete with `max_keyframes` keyframes, or with `min_keyframes` if the camera
-    moved enough (`turned_rad`).
+    A subgraph is complete with `max_keyframes` keyframes. It is also complete with `min_keyframes`
+    if the rotation plus parallax from the first to the last keyframe exceeds `turned_rad`.
     """
     if len(views) < config.min_keyframes:
         return False

@@ -50,7 +50,7 @@ FIT_LEVEL = 1  # Pyramid level of 160 pixels width: 19,200 points suffice for th
 
 @dataclass(frozen=True, slots=True)
 class VerificationConfig:
-    """Parameters of the verification."""
+    """Parameters of the verification of loop candidates, which are pairs of subgraphs."""
 
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     fit: DepthConsistencyConfig = field(default_factory=DepthConsistencyConfig)
@@ -297,7 +297,7 @@ class Verifier:
     def accept_unverified(self, proposal: LoopHypothesis) -> VerificationResult:
         """Accept the pose from landmarks as a loop closure without refinement or checks.
 
-        The paper of LDO-SLAM closes loops like this, after its comparison of landmarks. The mode
+        The LDO-SLAM paper closes loops like this, after its comparison of landmarks. The mode
         `semantic` does the same, for comparison with the other modes.
         """
         sigma_m = self._config.landmarks.reach_m / np.sqrt(proposal.inliers)
