@@ -133,8 +133,9 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     if scheme == "synthetic":
         if not options.is_default:
             raise ConfigError(
-                f"the depth of {source} is registered to color already. Remove the registration "
-                "options."
+                f"the depth of {source} is registered to color already. Remove "
+                "dataset.register_depth and dataset.T_color_depth; in Python, remove the "
+                "registration options of SequenceOptions."
             )
         return open_synthetic(name or "room")
     path = Path(source).expanduser()

@@ -56,8 +56,8 @@ class StoredMessage:
     # Stamp in the header of the message; where it is 0, the time of recording. It is
     # meaningless for types without a header.
     stamp_ns: int
-    connection: Any  # Connection of rosbags.
-    place: Any  # Entry of the index (ROS 1), or a `_Ros2Place`.
+    connection: Any  # Connection of rosbags: topic and type of the message.
+    place: Any  # Location in the file: entry of the index (ROS 1), or a `_Ros2Place`.
 
 
 class BagFile:
@@ -299,7 +299,9 @@ def _require_magic(path: Path) -> None:
         with path.open("rb") as file:
             found = file.read(len(magic))
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+        raise DataError(
+            f"{path} cannot be read: {error.strerror}. Check its permissions, or copy it again."
+        ) from error
     if not found:
         raise DataError(f"{path} is empty. Copy it again, or check that the recorder had started.")
     if found != magic:

@@ -45,7 +45,12 @@ def parse_stamp(seconds: str) -> int:
 
 
 def inside(folder: Path, name: str) -> Path | None:
-    """Return the path of a file that a list names, or None if it is outside the folder."""
+    """Return the path of a file in a folder, or None if its name leads outside of the folder.
+
+    Args:
+        folder: Folder of the data set.
+        name: Relative path of the file, as a file of the data set lists it.
+    """
     path = Path(name)
     return None if path.is_absolute() or ".." in path.parts or "\0" in name else folder / path
 

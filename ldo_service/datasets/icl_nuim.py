@@ -61,7 +61,7 @@ class IclNuimSequence(Sequence):
 
     @staticmethod
     def matches(folder: Path) -> bool:
-        """Return whether a folder has one of the layouts."""
+        """Return whether a folder has one of the layouts of ICL-NUIM."""
         is_tum = (folder / "rgb.txt").is_file()
         if (folder / ASSOCIATIONS).is_file() and (folder / "rgb").is_dir() and not is_tum:
             return True

@@ -55,8 +55,9 @@ class Layout:
         """
         if not (self.has_options or options.is_default):
             raise ConfigError(
-                f"the depth of {path} ({self.name}) is registered to color already. Remove the "
-                "registration options."
+                f"the depth of {path} ({self.name}) is registered to color already. Remove "
+                "dataset.register_depth and dataset.T_color_depth; in Python, remove the "
+                "registration options of SequenceOptions."
             )
         if options.topics and not self.has_topics:
             raise ConfigError(

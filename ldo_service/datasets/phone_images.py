@@ -44,7 +44,7 @@ class PhoneGrid:
 
     @property
     def camera(self) -> Camera:
-        """Camera of the grid."""
+        """Intrinsics of the resampled images: those of the color camera, scaled to the grid."""
         full, n = self.color_camera, self.block
         return Camera(
             full.width // n,
@@ -132,8 +132,8 @@ def enlarge_depth(
     Args:
         depth: Depth, [Hd, Wd], in any unit; 0 or NaN where not measured.
         size: Height and width of the grid, pixels.
-        view: Height and width of the depth image, in pixels of the grid. The grid may be smaller
-            by less than a pixel.
+        view: Height and width of the depth image's field of view, in pixels of the grid. `size`
+            is this rounded down.
 
     Returns:
         [H, W]. It is `depth` itself if the sizes are equal, else float32 in the same unit.

@@ -108,7 +108,7 @@ class Record3DSequence(Sequence):
         """
         entry = self._archive.getinfo(name)
         if entry.file_size > MAX_BYTES:
-            raise ValueError(f"its file {name} has {entry.file_size} bytes, more than {MAX_BYTES}")
+            raise ValueError(f"{name} has {entry.file_size} bytes, expected at most {MAX_BYTES}")
         return self._archive.read(entry)
 
     def _frame_bytes(self, name: str) -> bytes:

@@ -16,7 +16,7 @@ from .files import is_rigid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rig:
-    """Color and depth camera of a sensor."""
+    """Intrinsics and relative pose of the color and the depth camera of a sensor."""
 
     color_camera: Camera
     depth_camera: Camera

@@ -156,12 +156,16 @@ class RosBagSequence(Sequence):
             DataError: None of the first frames can be read.
         """
         reason = ""
-        for index in range(min(TRIES, len(self._frames))):
+        tries = min(TRIES, len(self._frames))
+        for index in range(tries):
             try:
                 return self._images(index)
             except FrameError as error:
                 reason = reason or str(error)
-        raise DataError(f"none of the first frames of {self._bag.path} can be read: {reason}")
+        raise DataError(
+            f"the first frames of {self._bag.path} cannot be read ({tries} tried). The first "
+            f"error: {reason}"
+        )
 
 
 def _ascending(messages: list[StoredMessage], topic: Topic) -> list[StoredMessage]:

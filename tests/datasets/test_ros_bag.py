@@ -493,7 +493,7 @@ def test_unknown_distortion_and_encoding_are_rejected(tmp_path: Path) -> None:
     reject(path, "color/camera_info in .*: distortion model 'equidistant' is not supported")
     bayer = image("bayer_rggb8", PIXELS[..., 0], header(10**9, FRAME))
     path = write_bag(tmp_path / "b", "mcap", [*small(color=""), (1, COLOR, bayer)])
-    reject(path, "none of the first frames .* can be read.*'bayer_rggb8' is not supported")
+    reject(path, "first frames of .* cannot be read.*'bayer_rggb8' is not supported")
 
 
 def test_damaged_message_is_a_frame_error_and_the_others_are_read(tmp_path: Path) -> None:
