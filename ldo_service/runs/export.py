@@ -37,7 +37,8 @@ class Job:
     out: Path
     voxel_m: float | None  # Side of a voxel; None for the default of the format.
     up: Up  # Axis of the map that points up.
-    heights_m: tuple[float, float]  # Height range of the floor plan above the first camera.
+    # Lowest and highest height of the voxels in the floor plan, above the first camera.
+    heights_m: tuple[float, float]
     threads: int  # Threads of mesh and occupancy.
     advance: Advance
 
@@ -64,7 +65,8 @@ def export_map(
         run: Folder of the run, whose outputs are never replaced.
         voxel_m: Side of a voxel of mesh and occupancy, meters; None for the default.
         up: Axis of the map that points up, for the floor plan of occupancy.
-        heights_m: Height range of the floor plan in meters above the first camera.
+        heights_m: Lowest and highest height of the voxels in the floor plan of occupancy, meters
+            above the first camera.
         overwrite: True replaces an earlier file.
         threads: Threads of mesh and occupancy; None for all cores.
         advance: Function that receives the progress of mesh and occupancy.

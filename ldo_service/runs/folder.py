@@ -260,7 +260,7 @@ class RunWriter:
     def save(self, folder: Path, summary: dict[str, Any]) -> None:
         """Write all files to an existing folder; more messages may be recorded afterwards.
 
-        A record that was started with a folder can only be saved in this folder.
+        A writer that was created with a folder can save only to this folder.
         """
         self.folder, self.summary = folder, summary
         if isinstance(self._csv_file, io.StringIO):

@@ -62,7 +62,7 @@ class MapMeasurement(msgspec.Struct, frozen=True, kw_only=True):
     source: str  # Name of the source.
     frames: int
     keyframes: int
-    effort: int  # Effort per keyframe, as in mapper.iterations.
+    effort: int  # Wanted optimizer iterations per keyframe, as in the setting mapper.iterations.
     iterations: int  # Iterations that were run, of all keyframes together.
     gaussians: int
     fps: float  # Frames of the source per CPU second of the mapper.
@@ -174,7 +174,8 @@ class TrackedSource:
 
         Args:
             config: Settings of the map builder.
-            effort: Effort per keyframe, as in mapper.iterations.
+            effort: Number of optimizer iterations per keyframe, as in the setting
+                mapper.iterations.
             refine_iterations: Number of iterations after the last keyframe.
 
         Raises:

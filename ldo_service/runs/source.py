@@ -118,10 +118,10 @@ def T_base_camera(config: Config) -> np.ndarray:
 def interleave_prior(
     frames: Iterable[CameraRgbd], prior: Trajectory | None
 ) -> Iterator[tuple[Message, ...]]:
-    """Yield each frame with the poses of the odometry prior that precede it.
+    """Yield each frame after the poses of the odometry prior that its tracking needs.
 
-    These are the poses that a live service would receive before the frame: all remaining poses, up
-    to and including the first one that is not older than the frame.
+    These are all remaining poses whose stamps are before the frame, and the first one at or after
+    it. The pose at the stamp of the frame can then be interpolated.
 
     Args:
         frames: The frames.
