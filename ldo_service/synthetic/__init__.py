@@ -66,4 +66,4 @@ def open_synthetic(name: str) -> SyntheticSequence | FlatSequence | HandheldSequ
     if handheld.MARK in plain:
         return HandheldSequence.named(plain, **changes)
     known = ", ".join(f"synthetic:{known}" for known in SCENES)
-    raise DataError(f"unknown sequence synthetic:{plain}; known are {known}.")
+    raise DataError(f"unknown sequence synthetic:{plain}. Choose one of {known}.")

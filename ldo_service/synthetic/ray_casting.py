@@ -19,7 +19,7 @@ ROW_POSES, ROW_MARGIN_PX = 5, 4.0
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """Nearest surfaces along P rays."""
+    """Nearest surfaces along P rays; every ray hits one, because the shell encloses the scene."""
 
     depth_m: np.ndarray  # Depth [P], z in the camera frame.
     surface: np.ndarray  # Index [P] of the surface: 0-5 are the shell's faces, 6 + k is solid k.

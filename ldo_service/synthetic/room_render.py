@@ -20,9 +20,11 @@ QUARTERS_PX = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 class RoomRendering:
     """One rendered frame of the room."""
 
-    light: np.ndarray  # Light [H, W, 3] float64 in 0..1.
+    light: np.ndarray  # RGB values [H, W, 3] float64 in 0..1, before rounding to 8 bits.
     depth_m: np.ndarray  # Depth z [H, W] float64, exact at pixel centers.
-    is_visitor: np.ndarray  # Mask [H, W] of the pixels that show a visitor.
+    # Mask [H, W] bool of the pixels that show a solid which is in the room for this frame alone,
+    # such as a walking person.
+    is_visitor: np.ndarray
 
     @property
     def color(self) -> np.ndarray:

@@ -114,7 +114,7 @@ class SyntheticSequence(Sequence):
         """
         if name not in NAMED:
             known = ", ".join(f"synthetic:{known}" for known in NAMED)
-            raise DataError(f"unknown sequence synthetic:{name}; known are {known}.")
+            raise DataError(f"unknown sequence synthetic:{name}. Choose one of {known}.")
         config = replace(NAMED[name], **changes)
         seed = f"@{config.seed}" if config.seed else ""
         return SyntheticSequence(config, f"synthetic:{name}{seed}")

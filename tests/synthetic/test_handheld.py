@@ -241,5 +241,5 @@ def test_names_choose_effects() -> None:
 
 @pytest.mark.parametrize("name", ["tour-handheld:fog", "garden-handheld", "tour-handheldx"])
 def test_unknown_name_is_refused_with_the_known_ones(name: str) -> None:
-    with pytest.raises(DataError, match="known are"):
+    with pytest.raises(DataError, match="Choose"):
         open_synthetic(name)

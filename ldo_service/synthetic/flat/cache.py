@@ -129,7 +129,7 @@ class FrameCache:
         body = data[_HEADER.size :]
         if len(body) != sum(lengths) or _digest(body) != digest:
             raise FrameError(
-                f"the {len(data)} bytes do not match the length or digest in the header."
+                f"its {len(data)} bytes do not match the length or digest in its header"
             )
         parts, start = [], 0
         for length in lengths:

@@ -17,11 +17,12 @@ from .scene_object import CLASS_NAMES, SceneObject
 class Flat:
     """Building with its objects and lamps."""
 
-    panels: tuple[Panel, ...]
-    things: tuple[SceneObject, ...]
+    panels: tuple[Panel, ...]  # Walls, floors and ceilings.
+    things: tuple[SceneObject, ...]  # Objects.
     rooms: tuple[int, ...]  # Room index of each object; the lamp of that room lights the object.
-    textures: dict[str, Texture]
-    lamps_m: tuple[tuple[float, float, float], ...]  # Center of the lamp of each room.
+    textures: dict[str, Texture]  # Textures of panels and objects, by name.
+    # Center of the lamp of each room in the world frame, x, y, z.
+    lamps_m: tuple[tuple[float, float, float], ...]
     shell: Solid  # Encloses the building; never visible.
 
 

@@ -1,4 +1,7 @@
-"""Sequences of `flat` and `twins`, with a parallel renderer that fills their cache."""
+"""Sequences through two buildings, with a parallel renderer that fills their cache.
+
+`flat` is a furnished flat of two rooms, and `twins` are four equal offices along a corridor.
+"""
 
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -53,6 +56,7 @@ class FlatConfig:
     # True adds motion blur, exposure drift, noise and a Kinect's depth errors.
     noise: bool = True
     seed: int = 0  # Seed of textures, materials, hand shake and noise.
+    # Building: the furnished `flat`, or `twins`, four equal offices.
     scene: Literal["flat", "twins"] = field(default="flat", repr=False)
 
     def __post_init__(self) -> None:
@@ -101,7 +105,7 @@ class FlatSequence(Sequence):
             DataError: If the name is unknown.
         """
         if name not in NAMED:
-            raise DataError(f"unknown sequence synthetic:{name}; known are {', '.join(NAMED)}.")
+            raise DataError(f"unknown sequence synthetic:{name}. Choose one of {', '.join(NAMED)}.")
         config = replace(NAMED[name], **changes)
         seed = f"@{config.seed}" if config.seed else ""
         return FlatSequence(config, f"synthetic:{name}{seed}")

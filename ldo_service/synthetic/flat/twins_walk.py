@@ -50,7 +50,7 @@ PASSED = np.array([0.0, -0.2, 1.46, 0.87, 0.48, -0.10])
 
 
 def knots() -> np.ndarray:
-    """Return the knots [K, 6] of the walk."""
+    """Return the knots of the walk, [K, 6]: camera center x, y, z in meters, viewing direction."""
     rows = []
     for office, direction, visited in STATIONS:
         there = VISIT if visited else PASSED[None]

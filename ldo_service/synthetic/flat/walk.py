@@ -69,11 +69,14 @@ TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE = 0.2, 0.0015, 0.004
 class CameraPath:
     """Motion along a closed camera path; one turn takes `frames` frames."""
 
-    # Knots [K, 6]: camera center in meters and viewing direction.
+    # Knots of a closed spline in the world frame, [K, 6]: camera center x, y, z in meters, and
+    # viewing direction.
     knots: np.ndarray
     frames: int
-    along: np.ndarray  # Spline parameter [M + 1], in knots, at equal time steps.
-    # Knots [K, 7] of closed splines that are added to camera center, viewing direction and roll.
+    # Position on the spline at M + 1 equal steps of time, [M + 1]: 1.5 is halfway from knot 1 to 2.
+    along: np.ndarray
+    # Hand shake: knots [S, 7] of closed splines, at equal steps of time, that are added to camera
+    # center, viewing direction and roll.
     shakes: tuple[np.ndarray, ...]
 
     def pose(self, frame: float) -> np.ndarray:
@@ -97,7 +100,8 @@ def hand_held(
         seed: Seed of sway and tremor.
         knots: Camera center in meters and viewing direction along the closed path, [K, 6].
         frames: Number of frames of the walk.
-        walk_m_s: Speed of walking relative to TURN_RAD_S, see `timed_positions`.
+        walk_m_s: Speed of walking. Only its ratio to the speed of turning, TURN_RAD_S, matters,
+            because the walk is scaled to its number of frames.
     """
     rng = np.random.default_rng([seed, 2])
     sway = _shake(rng, frames, SWAY_S, SWAY_EYE_M, SWAY_GAZE)
@@ -117,6 +121,10 @@ def timed_positions(knots: np.ndarray = KNOTS, walk_m_s: float = WALK_M_S) -> np
 
     Long steps and steps with a large turn take more time, according to walk_m_s and TURN_RAD_S. The
     sequence scales all times to its own duration.
+
+    Args:
+        knots: Camera center x, y, z in meters and viewing direction of each knot, [K, 6].
+        walk_m_s: Speed of walking.
     """
     place = np.arange(len(knots) * STEPS_PER_KNOT + 1) / STEPS_PER_KNOT
     state = closed_spline(knots, place[:-1])

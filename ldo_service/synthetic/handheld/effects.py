@@ -51,5 +51,5 @@ def parse_effects(text: str, name: str) -> Effects:
             values["depth"] = word
         elif word != "none":
             known = ", ".join(("all", "none", *SWITCHES, *SENSORS))
-            raise DataError(f"synthetic:{name}: unknown effect {word!r}; known are {known}.")
+            raise DataError(f"synthetic:{name}: unknown effect {word!r}. Choose from {known}.")
     return Effects(**values)  # type: ignore[arg-type]

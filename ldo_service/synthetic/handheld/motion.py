@@ -17,10 +17,14 @@ TREMOR_S, TREMOR_EYE_M, TREMOR_RAD = 0.2, 0.002, 0.008
 class HandMotion:
     """Motion along a closed camera path; one turn takes `duration_s`."""
 
-    knots: np.ndarray  # Camera center in meters and viewing direction, [M, 6].
-    along: np.ndarray  # Spline parameter [K + 1], in knots, at equal time steps.
+    # Knots of a closed spline in the world frame, [M, 6]: camera center x, y, z in meters, and
+    # viewing direction.
+    knots: np.ndarray
+    # Position on the spline at K + 1 equal steps of time, [K + 1]: 1.5 is halfway from knot 1 to 2.
+    along: np.ndarray
     duration_s: float
-    # Knots [S, 7] of closed splines that are added to camera center, viewing direction and roll.
+    # Hand shake: knots [S, 7] of closed splines, at equal steps of time, that are added to camera
+    # center, viewing direction and roll.
     shakes: tuple[np.ndarray, ...]
 
     def poses(self, times_s: np.ndarray) -> np.ndarray:

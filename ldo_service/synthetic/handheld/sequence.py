@@ -105,8 +105,8 @@ class FlatScene:
 class Walk:
     """Scene with the motion of the camera through it."""
 
-    scene: Callable[[int], Scene]  # Creates the scene of a seed.
-    motion: Callable[[int], HandMotion]  # Creates the motion of a seed.
+    scene: Callable[[int], Scene]  # Function of the seed that creates the scene.
+    motion: Callable[[int], HandMotion]  # Function of the seed that creates the motion.
     frames: int
     rate_hz: int
 
@@ -129,8 +129,8 @@ NAMED = tuple(f"{name}{MARK}" for name in WALKS)
 class HandheldConfig:
     """Parameters of a simulated sequence; equal values give equal bytes."""
 
-    walk: str = "room"
-    effects: Effects = field(default_factory=Effects)
+    walk: str = "room"  # Scene and motion, a key of WALKS.
+    effects: Effects = field(default_factory=Effects)  # Effects of real cameras to simulate.
     seed: int = 0  # Seed of textures, hand shake, delay, bias and noise.
 
     def __post_init__(self) -> None:
@@ -177,7 +177,7 @@ class HandheldSequence(Sequence):
         scene, _, effects = name.partition(MARK)
         if scene not in WALKS or (effects and not effects.startswith(":")):
             known = ", ".join(f"synthetic:{known}" for known in NAMED)
-            raise DataError(f"unknown sequence synthetic:{name}; known are {known}.")
+            raise DataError(f"unknown sequence synthetic:{name}. Choose one of {known}.")
         config = replace(HandheldConfig(scene, parse_effects(effects, name)), **changes)
         seed = f"@{config.seed}" if config.seed else ""
         return HandheldSequence(config, f"synthetic:{name}{seed}")
