@@ -83,7 +83,10 @@ class SeenKeyframe:
 
 @dataclass(frozen=True, slots=True)
 class LoopErrors:
-    """Scores of loop closing, see `PROTOCOL`; a ratio is None if its denominator is 0."""
+    """Scores of loop closing; a ratio is None if its denominator is 0.
+
+    A pair of subgraphs is true if both show the same surfaces, see the constant `PROTOCOL`.
+    """
 
     closures: int  # Number of loop closures of the run.
     true_closures: int  # Closures that connect a true pair of subgraphs.
@@ -149,7 +152,7 @@ def _seen(id: int, index: int, sequence: Frames, T_world_camera: np.ndarray) -> 
 
 
 def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> LoopErrors:
-    """Score loop closing by `PROTOCOL`.
+    """Score loop closing as the constant `PROTOCOL` of this module describes.
 
     Args:
         found: Candidates and closures of a run.

@@ -45,7 +45,7 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryErrors:
-    """Errors of a trajectory, see `PROTOCOL`.
+    """Errors of a trajectory; the constant `PROTOCOL` of this module describes them.
 
     The relative errors are None if the poses span less than 1 s.
     """
@@ -59,7 +59,7 @@ class TrajectoryErrors:
 
 
 def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors:
-    """Compute the errors of an estimated trajectory by `PROTOCOL`.
+    """Compute the errors of an estimated trajectory as the constant `PROTOCOL` describes.
 
     Raises:
         DataError: If fewer than 3 estimated poses have a true pose within 20 ms.

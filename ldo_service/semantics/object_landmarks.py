@@ -216,8 +216,8 @@ def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndar
 
         mu = sum_m w_m x_m / sum_m w_m,  Sigma = sum_m w_m (x_m - mu) (x_m - mu)' / sum_m w_m
 
-    The points at the two ends of each axis, 2 % each, are excluded as outliers. Paper, III.C
-    (landmarks).
+    The points at the two ends of each axis, 2 % each, are excluded as outliers. See the landmarks
+    in the LDO-SLAM paper, III.C.
 
     Args:
         p_map: Points in the map frame, [K, M, 3], meters.

@@ -1,4 +1,4 @@
-"""Open-vocabulary labellers of image regions (paper, III.B).
+"""Open-vocabulary labellers of image regions (LDO-SLAM paper, III.B).
 
 Labeller      interface of all labellers, which the actor vlm_labeller uses
 DualEncoder   dual_encoder.py: image and text encoder with a common embedding space, as in CLIP;
