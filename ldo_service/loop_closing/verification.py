@@ -150,8 +150,8 @@ class Verifier:
         """Return the pose with the most feature inliers, marked as rejected if it is not confirmed.
 
         Pairs of keyframes are matched until a second keyframe of `new` gives the same pose as the
-        best pair so far. If none does, `_from_single_keyframe` tries to confirm the best pose in
-        another way, and rejects the hypothesis if this fails.
+        best pair so far. If none does, matching landmarks or the verification of another keyframe
+        of `new` must confirm the best pose; otherwise, the hypothesis is rejected.
         """
         found: list[LoopHypothesis] = []
         for a, b in islice(_likely_pairs(old, new), self._config.pairs):

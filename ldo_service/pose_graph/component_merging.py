@@ -80,8 +80,9 @@ def T_new_old(measured: RelativePose, pose: Pose, *, moves_b: bool) -> np.ndarra
 def conflicting_bridges(known: FactorStore, closure: RelativePose) -> list[BridgeEdge]:
     """Return the bridge edges that lie between the two keyframes of a closure.
 
-    If several components were merged one after the other, several bridge edges may lie between the
-    keyframes. Any of these edges may be wrong.
+    A bridge edge is a loop closure that merged two components of the graph. If several components
+    were merged one after the other, several bridge edges may lie between the keyframes. Any of
+    these edges may be wrong.
     """
     bridges = (BridgeEdge(pair, _connected_by(known, pair)) for pair in known.bridges)
     return [bridge for bridge in bridges if bridge.is_across(pair_of(closure))]
@@ -111,8 +112,9 @@ def best_bridge_removal(
 ) -> tuple[BridgeEdge, FactorStore, Variables] | None:
     """Replace one of several bridge edges by a rejected closure if more closures then agree.
 
-    Each edge is tried; see `replace_bridge_by_consensus`. The chosen edge is the one whose
-    replacement leaves the most accepted closures.
+    A bridge edge is a loop closure that merged two components of the graph. Each edge is tried; see
+    `replace_bridge_by_consensus`. The chosen edge is the one whose replacement leaves the most
+    accepted closures.
 
     Args:
         known: Store of all measurements, which is not changed.
@@ -147,8 +149,8 @@ def replace_bridge_by_consensus(
 ) -> tuple[FactorStore, Variables] | None:
     """Replace a bridge edge by a rejected closure if more closures are then accepted.
 
-    The accepted closures between the two sides of the edge are counted before and after the
-    replacement.
+    A bridge edge is a loop closure that merged two components of the graph. The accepted closures
+    between the two sides of the edge are counted before and after the replacement.
 
     Args:
         known: Store of all measurements, which is not changed.

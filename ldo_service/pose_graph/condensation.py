@@ -91,7 +91,8 @@ class CondensedKeyframes:
 
         Args:
             row: Row of the keyframe.
-            pose: Function that returns T_map_keyframe [4, 4] of the head and of the tail, by id.
+            pose: Function that returns T_map_keyframe [4, 4] of a variable by its id. It is called
+                with the variables before (head) and after (tail) the keyframe.
         """
         one = self.only(row)
         T_head, T_tail = (pose(k)[None] for k in one.head_and_tail(0))
@@ -193,10 +194,10 @@ def condense_between(
 
 @dataclass(frozen=True, slots=True)
 class Condensed:
-    """Condensed group: the measurement from its head to its tail, and its condensed keyframes."""
+    """Condensed group of keyframes."""
 
-    edge: RelativePose
-    interpolated: CondensedKeyframes
+    edge: RelativePose  # Measurement from the first keyframe of the group to the last one.
+    interpolated: CondensedKeyframes  # The keyframes between these two.
 
 
 def group_to_condense(
@@ -208,9 +209,10 @@ def group_to_condense(
 ) -> list[int]:
     """Choose the next group to condense: the oldest chain of at least `size` + 1 keyframes.
 
-    Each keyframe of the chain but the first has an odometry measurement from an earlier one.
-    The tail of a group is the head of the next group. The head or tail of an existing group must
-    stay a variable, so it can only be the head of a new group.
+    Each keyframe of the chain but the first has an odometry measurement from an earlier one. The
+    first keyframe of a group is its head, and the last one its tail, which is also the head of the
+    next group. The head or tail of an existing group must stay a variable, so it can only be the
+    head of a new group.
 
     The keyframe that follows the tail should be measured relative to the tail. If it is measured
     only relative to keyframes inside the group, these measurements are transferred to the head or

@@ -142,11 +142,11 @@ class FactorStore:
             self.add_measurement(m)
 
     def restore_variable(self, keyframe: int) -> None:
-        """Make a condensed keyframe a variable again, between its head and its tail.
+        """Make a condensed keyframe a variable again.
 
-        Two measurements replace the one from head to tail: from the head to the keyframe, and from
-        the keyframe to the tail. The covariance of the replaced measurement is divided between them
-        in proportion to `CondensedKeyframes.fractions`.
+        Two measurements replace the one from the variable before it to the variable after it: to
+        the keyframe, and from the keyframe. The covariance of the replaced measurement is divided
+        between them in proportion to `CondensedKeyframes.fractions`.
         """
         row = self.rows[keyframe]
         head, tail = self.interpolated.head_and_tail(row)
@@ -311,7 +311,7 @@ class FactorStore:
         return [*others, *(self._closure_factor(closure, 0.0) for closure in closures)]
 
     def closure_sigmas(self, variables: Variables, closure: RelativePose) -> float:
-        """Return the largest absolute component of a closure's whitened residual [6], in sigmas."""
+        """Return the largest absolute component of a closure's residual [6], in its sigmas."""
         m = self._closure(closure)
         residual = closure_residual(variables[m.a], variables[m.b], m)
         return float(np.abs(np.linalg.cholesky(m.information).T @ residual).max())
@@ -361,7 +361,7 @@ class FactorStore:
         return {k: moved.get(k, value) for k, value in variables.items()}
 
     def keep_rejected(self, closure: RelativePose) -> None:
-        """Store a rejected closure that contradicts a bridge edge; keep only the newest ones."""
+        """Store a closure that contradicts a merge of components; keep only the newest ones."""
         contradicting = {**self.contradicting, pair_of(closure): closure}
         self.contradicting = dict(
             list(contradicting.items())[-self.closures.config.max_contradicting :]

@@ -194,6 +194,8 @@ class LoopClosureSet:
     def with_replaced_bridge(self, bridge: Pair, closure: Pair) -> "LoopClosureSet":
         """Return the set after a closure replaced a bridge edge; the old edge is listed as removed.
 
+        A bridge edge is a loop closure that merged two components of the graph.
+
         Args:
             bridge: Keyframes of the old bridge edge.
             closure: Keyframes of the closure that replaced it.
