@@ -91,7 +91,7 @@ class DepthFeatures:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Planes:
-    """Planes of a keyframe, in the small image.
+    """Planes of a keyframe, in the small image (see `PlaneConfig`).
 
     Attributes:
         number: Number of the plane of each pixel, [h, w] int32, from 1; 0 without a plane.
@@ -111,7 +111,7 @@ def shrink_factor(width: int, config: PlaneConfig) -> int:
 def compute_depth_features(
     depth_m: np.ndarray, camera: Camera, config: PlaneConfig
 ) -> DepthFeatures:
-    """Scale a depth image down to the small image, and compute its features.
+    """Scale a depth image down to a width of about `width_px`, and compute its features.
 
     Args:
         depth_m: Depth, [H, W], meters; 0 where unknown.

@@ -27,7 +27,7 @@ Warn = Callable[[str], None]
 class Selection:
     """Selection of frames of a sequence."""
 
-    stride: int = 1
+    stride: int = 1  # Every `stride`-th frame is selected.
     max_frames: int | None = None  # Unlimited if None.
 
     def __post_init__(self) -> None:

@@ -26,12 +26,12 @@ SAMPLES = 5  # Number of frames that are read, evenly spaced.
 class Timing:
     """Stamps of the frames of a source."""
 
-    frames: int
+    frames: int  # Number of frames.
     first_stamp_s: float
-    duration_s: float
+    duration_s: float  # Last stamp minus first stamp.
     rate_hz: float | None  # Inverse of the median interval; None for a single frame.
     gaps: int  # Number of intervals longer than MIN_GAP_PERIODS median intervals.
-    longest_interval_s: float | None
+    longest_interval_s: float | None  # Longest interval; None for a single frame.
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +43,8 @@ class DepthInfo:
     offset_ms: float | None
     max_offset_ms: float | None
     # Values of the sampled frames that can be read; None if there is none.
-    valid_ratio: float | None
-    median_m: float | None
+    valid_ratio: float | None  # Fraction of the pixels with a depth.
+    median_m: float | None  # Median depth.
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class SourceInfo:
     timing: Timing
     camera: dict[str, Any]  # Fields of `Camera`.
     depth: DepthInfo
-    sampled_frames: int
+    sampled_frames: int  # Number of frames that were read for the description.
     unreadable_frames: int  # Number of sampled frames that cannot be read.
     why_unreadable: str | None  # Problem of the first of these; None if there is none.
     true_poses: int  # Number of poses of the ground truth; 0 if there is none.

@@ -175,14 +175,14 @@ def request_key(region: Region) -> bytes:
 
 
 def renumbered(objects: Objects, before: Objects, first_new: int) -> Objects:
-    """Return the objects of the copy with the ids that they have in the live semantics.
+    """Return the objects of a `DelayedCopy` with the ids that the map already shows.
 
-    An object that is new in the copy gets the id of the live object with which it has the most
-    Gaussians in common. Each id is given once; without a match, an object gets an unused id.
+    An object that is new in the copy gets the id of the new object in the map with which it has the
+    most Gaussians in common. Each id is given once; without a match, an object gets an unused id.
 
     Args:
         objects: Objects of the copy.
-        before: Objects of the live semantics.
+        before: Objects that the map shows.
         first_new: First id that was unused when the copy was made.
     """
     packed, known = objects.pack(), before.pack()
@@ -210,8 +210,10 @@ def next_id_of(objects: Objects) -> int:
 def common_members(members: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the numbers of common members of K and R landmarks, [K, R].
 
+    The members of a landmark are a sample of its Gaussians.
+
     Args:
-        members: Ids of Gaussians, [K, 256]; NO_MEMBER where unused.
+        members: Ids of the members, [K, 256]; NO_MEMBER where unused.
         others: The same, [R, 256].
     """
     shared = [

@@ -354,8 +354,8 @@ def observations(
     """Return the observations of Gaussians.
 
     A Gaussian in a region gets the label of the region with a confidence. A visible Gaussian that
-    is in no region gets a miss. The extent of an object is the side of a square with the area of
-    its box, converted to meters at the depth of the Gaussian.
+    is in no region gets the label MISS. The extent of an object is the side of a square with the
+    area of its box, converted to meters at the depth of the Gaussian.
 
     Args:
         where: Region of each Gaussian.

@@ -64,6 +64,7 @@ class SyntheticConfig:
     frames: int = 120
     width_px: int = 320
     height_px: int = 240
+    # Path of the camera through the room.
     path: Literal["look_around", "tour", "linger"] = "look_around"
     noise: bool = False  # True adds the depth errors of a Kinect; False gives exact depth.
     person: bool = False  # True adds a person who walks through the room.
