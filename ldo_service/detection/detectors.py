@@ -16,7 +16,7 @@ from .yolo import EXPECTED, Letterbox, detect_layout, layout_named
 
 @dataclass(frozen=True, slots=True)
 class NetworkConfig:
-    """Settings of a detector."""
+    """Settings of a detector, which finds objects of known classes in an image."""
 
     # Layout of the output: yolov5, yolox or yolov8; empty: determined by the shape of the output.
     layout: str = ""

@@ -18,7 +18,7 @@ CORE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class DynamicClassConfig:
-    """Settings of the dynamic classes."""
+    """Settings of the mask of objects that may move by themselves."""
 
     # Classes of COCO that move by themselves: living beings and vehicles. Carried objects are
     # omitted, because they move with a person.

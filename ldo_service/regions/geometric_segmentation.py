@@ -41,7 +41,7 @@ _3X3 = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True, slots=True)
 class GeometricSegmentationConfig:
-    """Settings of the segmentation.
+    """Settings of the segmentation of a keyframe by geometry and color.
 
     Names that end in `_px` are in pixels of the small image, see `PlaneConfig`. The values were
     chosen on the same data as those of `PlaneConfig`.

@@ -33,7 +33,7 @@ from .region_tracker_config import RegionTrackerConfig
 
 @dataclass(frozen=True, slots=True)
 class OpenVocabularyConfig:
-    """Settings of open-vocabulary labels."""
+    """Settings of the label requests to the open-vocabulary labeller, and of its results."""
 
     # Choice of the regions of a keyframe that need a label.
     trigger: RegionProposalConfig = field(default_factory=RegionProposalConfig)

@@ -23,7 +23,7 @@ _EPSILON = np.float32(1e-6)
 
 @dataclass(frozen=True, slots=True)
 class PlaneConfig:
-    """Settings of the planes.
+    """Settings of the planes that are fitted to the depth of a keyframe.
 
     With these values, regions covered the objects of the sequence `synthetic:flat` best; no other
     data were tried. Names that end in `_px` are in pixels of the small image, which is the depth

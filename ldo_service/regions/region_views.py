@@ -14,7 +14,7 @@ from .foreground import Foreground, pixels_of
 
 @dataclass(frozen=True, slots=True)
 class ViewConfig:
-    """Settings of the views."""
+    """Settings of the views of a region: the crops for the labeller, and their quality."""
 
     context: float = 0.15  # Margin around the box as a fraction of its sides.
     side_px: int = 336  # Maximum side of the crop; a larger one is scaled down.

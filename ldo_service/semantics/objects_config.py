@@ -46,7 +46,7 @@ class AssociationConfig:
 
 @dataclass(frozen=True, slots=True)
 class ObjectsConfig:
-    """Settings of the objects."""
+    """Settings of the objects of the map: when they are created, merged and removed."""
 
     association: AssociationConfig = field(default_factory=AssociationConfig)
     # Keyframes that must observe a candidate before it becomes an object (paper, III.C).
