@@ -267,10 +267,7 @@ TRAINING = {"B training": measured_pixels}
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedFrames:
-    """Frames to evaluate: held-out frames (protocol A) and some training frames (protocol B).
-
-    Both include LOST frames, which have no pose.
-    """
+    """Held-out frames (protocol A) and some training frames (protocol B), LOST ones included."""
 
     held_out: tuple[RunFrame, ...]
     training: tuple[RunFrame, ...]
