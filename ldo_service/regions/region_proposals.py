@@ -216,7 +216,8 @@ def labeled_regions(
 ) -> list[RegionProposal]:
     """Return the regions in `found` that have a reliable label in the map and match no box.
 
-    Regions that stand on an object are excluded, because they are proposals already.
+    Regions of the kind `standing`, such as a cup on a table, are excluded: they are proposed even
+    if the map has a label there.
 
     Args:
         boxes_px: Boxes of the detector, [M, 4], x0 y0 x1 y1, pixels.

@@ -15,9 +15,10 @@ from .state_contents import StateContents, check_of
 
 @dataclass
 class GenerationFiles:
-    """Files that a generation adds to the disk; any thread may call `write`.
+    """Files of one actor that a generation adds to the disk; any thread may call `write`.
 
-    A generation has copies of its own, so that a damaged file of the current state leaves it whole.
+    A generation is a copy of the saved states of all actors at one time, to which the service can
+    fall back. It has copies of its own, so that a damaged file of the current state leaves it whole.
     A part that did not change since the last complete generation is not copied again.
     """
 

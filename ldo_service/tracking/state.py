@@ -68,7 +68,7 @@ class OdometryState:
 
     @property
     def is_relayed(self) -> bool:
-        """True if the reference is a relay, which is no keyframe."""
+        """True if the frame to which new frames are aligned, the reference, is no keyframe."""
         return self.keyframe is not None and self.keyframe.relay is not None
 
     def records_of_other_submaps(self, submap: int) -> KeyframeDatabase:
