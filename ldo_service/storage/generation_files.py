@@ -18,8 +18,8 @@ class GenerationFiles:
     """Files of one actor that a generation adds to the disk; any thread may call `write`.
 
     A generation is a copy of the saved states of all actors at one time, to which the service can
-    fall back. It has copies of its own, so that a damaged file of the current state leaves it whole.
-    A part that did not change since the last complete generation is not copied again.
+    fall back. It has copies of its own, so that a damaged file of the current state leaves it
+    whole. A part that did not change since the last complete generation is not copied again.
     """
 
     folder: Path  # Folder of the actor's state.
