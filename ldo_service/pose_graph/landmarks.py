@@ -127,7 +127,7 @@ class LandmarkObservation:
     def pack(self) -> dict[str, Any]:
         """Return the fields as plain values.
 
-        The distribution is stored sparsely: few of its 256 entries are not zero.
+        The label distribution is stored sparsely: few of its 256 probabilities are not zero.
         """
         values = {name: getattr(self, name) for name in self.__slots__}
         labels = np.flatnonzero(self.distribution)
