@@ -187,8 +187,8 @@ class ViewerSettings:
     # Port on which the window is served. If it is in use, the next free port is taken. 0 uses any
     # free port.
     port: Annotated[int, Meta(ge=0, le=65535)] = 8080
-    # Maximum number of Gaussians in the browser, at 32 bytes each. The Gaussians of the largest
-    # weight are sent.
+    # Maximum number of Gaussians in the browser, at 32 bytes each. Those that cover
+    # the most area with the highest opacity are sent.
     max_gaussians: PositiveInt = 300_000
     # Interval of updates of the window, seconds. The default shows poses at 5 Hz.
     update_interval_s: PositiveFloat = advanced(0.2)

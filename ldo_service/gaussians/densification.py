@@ -153,7 +153,7 @@ class DensificationConfig:
     frames.
     """
 
-    # Criteria by which the map explains a pixel (paper, III.A).
+    # Criteria by which the map explains a pixel (LDO-SLAM paper, III.A).
     # A pixel with more transmittance is unexplained. 0.5: -0.5 dB, 4 % fewer Gaussians.
     max_transmittance: float = 0.3
     # A pixel shows new surface if its depth is less than the rendered depth by more than this

@@ -96,8 +96,8 @@ class GaussianOptimizerConfig:
     # Fraction of the effort after a new keyframe that is spent at half resolution, before the rest.
     # Such an iteration improves the map almost as much as one at full resolution.
     half_share: float = 0.8
-    # Number of visible Gaussians at which an iteration spends half of its time on the pixels and
-    # half on the Gaussians.
+    # Number of visible Gaussians at which an iteration is assumed to spend half of its time on the
+    # pixels and half on the Gaussians. The effort of an iteration is computed from it.
     usual_reach: int = 60_000
 
     # Each iteration moves the exposure of its keyframe by this fraction of the way to the

@@ -19,7 +19,7 @@ class PruningConfig:
 
     min_opacity: float = 0.005  # Kerbl et al., 2023, sec. 5.2.
     # Largest length of a Gaussian's longest axis, relative to the mean longest axis of the other
-    # Gaussians in its neighborhood (paper, III.A).
+    # Gaussians in its neighborhood (LDO-SLAM paper, III.A).
     max_relative_scale: float = 10.0
     neighborhood_m: float = 0.25  # Edge of the cubes of space that are the neighborhoods.
     # A Gaussian must be visible in the image of its anchor keyframe or of the newest keyframe.
@@ -94,7 +94,7 @@ def weights(rows: np.ndarray) -> np.ndarray:
 
 
 def weightiest(rows: np.ndarray, most: int) -> np.ndarray:
-    """Return the mask [N] bool of the `most` rows with the largest weight; all if N <= `most`."""
+    """Return the mask [N] bool of the `most` rows of the largest `weights`; all if N <= `most`."""
     mask = np.ones(len(rows), bool)
     if len(rows) > most:
         mask[np.argsort(weights(rows), kind="stable")[: len(rows) - most]] = False

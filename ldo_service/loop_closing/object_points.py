@@ -30,7 +30,7 @@ class LandmarkConfig:
     # It is half the width of a chair.
     same_m: float = 0.4
     # Maximum KL divergence of the label distributions of two matching landmarks, in both
-    # directions, nats (paper, III.C).
+    # directions, nats (LDO-SLAM paper, III.C).
     max_divergence: float = 0.3
     # Maximum distance of two matching landmarks after alignment by the pose between the subgraphs.
     # It is large because the boxes may show different sides of an object.

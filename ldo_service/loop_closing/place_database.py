@@ -89,15 +89,15 @@ class RetrievalConfig:
     """Parameters of the search for similar subgraphs."""
 
     # Minimum number of camera frames between two subgraphs. Subgraphs with fewer frames between
-    # them are not loop candidates (paper, III.C).
+    # them are not loop candidates (LDO-SLAM paper, III.C).
     exclude_frames: int = 100
-    candidates: int = 5  # K, the maximum number of candidates (paper, III.C).
-    # theta_loop, the minimum cosine of the label histograms (paper, III.C).
+    candidates: int = 5  # K, the maximum number of candidates (LDO-SLAM paper, III.C).
+    # theta_loop, the minimum cosine of the label histograms (LDO-SLAM paper, III.C).
     min_similarity: float = 0.75
     # A subgraph with different labels is also a candidate if the cosine of the visual words is at
     # least this value. For example, the cosine of the labels is below theta_loop if a detector
     # misses two of five objects. With a value above 1, similar labels are always required, as in
-    # the paper.
+    # the LDO-SLAM paper.
     min_appearance: float = 0.35
     # Maximum number of stored subgraphs; if there are more, `PlaceDatabase` removes some.
     count: int = 1000

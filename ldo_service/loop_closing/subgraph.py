@@ -22,8 +22,8 @@ from .object_points import DetectionPoints, SubgraphLandmarks
 class SubgraphConfig:
     """Settings of subgraphs: groups of consecutive keyframes that are compared as a whole."""
 
-    min_keyframes: int = 3  # Minimum keyframes of a subgraph (paper, III.C).
-    max_keyframes: int = 5  # Maximum keyframes of a subgraph (paper, III.C).
+    min_keyframes: int = 3  # Minimum keyframes of a subgraph (LDO-SLAM paper, III.C).
+    max_keyframes: int = 5  # Maximum keyframes of a subgraph (LDO-SLAM paper, III.C).
     # A subgraph is complete with `min_keyframes` keyframes if the rotation plus parallax from its
     # first to its last keyframe exceeds this. Half of the view of a depth camera is then new.
     # Parallax is the distance divided by the median depth.

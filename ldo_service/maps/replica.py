@@ -21,9 +21,10 @@ class MapReplica:
     delta, it sets `is_behind` and does not change until it has received a complete snapshot.
 
     A bounded replica has at most `max_gaussians`, plus up to a quarter more for a short time. It
-    keeps the Gaussians with the largest weight. After a missed delta, it sets `is_behind` and still
-    applies further deltas, so it may have errors until the next snapshot. It applies each part of a
-    snapshot on arrival: the Gaussians of the part replace all Gaussians in the same range of ids.
+    keeps the Gaussians with the largest weight, opacity times area. After a missed delta, it sets
+    `is_behind` and still applies further deltas, so it may have errors until the next snapshot. It
+    applies each part of a snapshot on arrival: the Gaussians of the part replace all Gaussians in
+    the same range of ids.
 
     Args:
         max_gaussians: Limit of a bounded replica; None for an exact one.

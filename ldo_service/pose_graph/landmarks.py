@@ -15,7 +15,7 @@ from .label_fusion import Evidence, fuse_labels
 from .loop_closures import Pair
 from .pose_graph import PoseGraph
 
-MAX_CLASSES = 256  # Maximum classes: C_max (paper, III.B).
+MAX_CLASSES = 256  # Maximum classes: C_max (LDO-SLAM paper, III.B).
 BORDER_PX = 2.0  # A box closer to the border of the image counts as cut off.
 
 
@@ -44,13 +44,14 @@ class ObjectLandmarkConfig:
     Names with `vague` concern uncertain labels, those whose entropy is above `vague_nats`.
     """
 
-    lambda_sem: float = 0.5  # Weight of the observed labels (paper, III.C).
-    # Weight of the similarity of landmarks that a keyframe shows together (paper, III.C).
+    lambda_sem: float = 0.5  # Weight of the observed labels (LDO-SLAM paper, III.C).
+    # Weight of the similarity of landmarks that a keyframe shows together (LDO-SLAM paper, III.C).
     w_sem: float = 0.1
     # Limit of the entropy H. Above it, an observation has the weight exp(-2 H), and a landmark is
-    # uncertain, so that it is removed earlier (paper, III.C).
+    # uncertain, so that it is removed earlier (LDO-SLAM paper, III.C).
     vague_nats: float = 0.5
-    # Minimum number of observations at which a landmark is added to the graph (paper, III.C).
+    # Minimum number of observations at which a landmark is added to the graph (LDO-SLAM paper,
+    # III.C).
     min_observations: int = 3
     # Minimum value of the largest angle between two rays to a new landmark: 5 degrees. At this
     # angle, an error of 12 px changes a depth of 2 m by 0.5 m (focal length 525 px).
@@ -58,7 +59,8 @@ class ObjectLandmarkConfig:
     # Maximum observations of a landmark in the graph. If there are more, the first and the newest
     # observations are kept, half of this number each.
     max_observations: int = 32
-    misses: int = 10  # Consecutive misses after which a landmark is removed (paper, III.C).
+    # Consecutive misses after which a landmark is removed (LDO-SLAM paper, III.C).
+    misses: int = 10
     vague_misses: int = 5  # Consecutive misses after which an uncertain landmark is removed.
     # Number of keyframes without an observation after which an uncertain landmark is removed.
     vague_keyframes: int = 20

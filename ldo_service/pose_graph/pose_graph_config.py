@@ -18,8 +18,8 @@ class PoseGraphConfig:
 
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     closures: LoopClosureConfig = field(default_factory=LoopClosureConfig)
-    # Keyframes per group (paper, III.C: 10). The first one stays a variable; the others are
-    # condensed.
+    # Keyframes per group (LDO-SLAM paper, III.C: 10). The first one stays a variable; the others
+    # are condensed.
     condense_keyframes: int = 10
     # Number of newest keyframes that are not condensed, because their measurements still change.
     window_keyframes: int = 20

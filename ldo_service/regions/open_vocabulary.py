@@ -40,7 +40,7 @@ class OpenVocabularyConfig:
     # Tracking of these regions, and the time of their label requests.
     regions: RegionTrackerConfig = field(default_factory=RegionTrackerConfig)
     # Minimum probability of a reliable label in the map. Pixels with such a label need no label
-    # request (paper, III.B).
+    # request (LDO-SLAM paper, III.B).
     reliable: float = 0.6
     # Minimum confidence of a label result. With 0.5, the recall on the sequence `synthetic:flat` is
     # 7 percentage points lower. Results below 0.3 are rare if the labeller recognizes that a region

@@ -34,7 +34,8 @@ class RegionProposalConfig:
     a segment, see `geometric_segmentation`.
     """
 
-    sure: float = 0.6  # Minimum score of a detection that needs no label request (paper, III.B).
+    # Minimum score of a detection that needs no label request (LDO-SLAM paper, III.B).
+    sure: float = 0.6
     # Minimum IoU of two boxes that show the same object; the box with the lower score is dropped.
     same_iou: float = 0.5
     # Minimum IoU of a detector's box and the box of a region that show the same object.

@@ -24,8 +24,8 @@ class RegionTrackerConfig:
     patience: int = 3
     max_requests: int = 3  # Maximum label requests for a region.
     # Maximum number of label requests per keyframe, on average; regions with the best views come
-    # first. Half of the regions show no object. The paper makes requests on 10-25 % of the frames
-    # (paper, IV.B.8). On the sequence `synthetic:flat`, 1.0 requests per keyframe are made.
+    # first. Half of the regions show no object. The LDO-SLAM paper makes requests on 10-25 % of
+    # the frames (IV.B.8). On the sequence `synthetic:flat`, 1.0 requests per keyframe are made.
     per_keyframe: float = 2.5
     # Maximum label requests at one keyframe, if earlier keyframes made fewer than per_keyframe.
     at_once: int = 4
@@ -40,8 +40,8 @@ class RegionTrackerConfig:
     # many votes as one label result with confidence 1.
     answer_weight: float = 4.0
     # True: boxes vote for the label of a region. False: labels of boxes are fused per Gaussian
-    # (paper, III.B), and only the labeller labels a region. A change of this setting does not
-    # affect the votes of regions that are restored from a checkpoint.
+    # (LDO-SLAM paper, III.B), and only the labeller labels a region. A change of this setting does
+    # not affect the votes of regions that are restored from a checkpoint.
     boxes_vote: bool = True
     # Minimum votes for a label: one box with a score of 0.6, or four with 0.3.
     min_votes: float = 0.35
@@ -53,7 +53,7 @@ class RegionTrackerConfig:
     # the mask of the other.
     overlap: float = 0.6
     # Maximum difference between the depth of a visible point of a region and the measured depth at
-    # the point's pixel (paper, III.A: delta_z).
+    # the point's pixel (LDO-SLAM paper, III.A: delta_z).
     max_gap_m: float = 0.1
     # Minimum points of a region that must be visible in a keyframe to match the region there.
     min_points: int = 12

@@ -115,7 +115,9 @@ class RestoredState:
 
 
 class DeliveryState:
-    """Builder of the state that a stage saves, as named parts.
+    """Builder of what a stage, which runs an actor, saves: messages and the actor's own state.
+
+    The result consists of named parts.
 
     An unchanged part stays the same object, so that the store does not write it again.
     """

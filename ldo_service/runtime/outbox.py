@@ -156,8 +156,9 @@ class Outbox:
     def forget(self, before: int) -> None:
         """Delete the messages before number `before`, which all consumers have handled.
 
-        Messages that a generation of the states needs stay; see `keep`. In memory, they stay only
-        while the outbox has at most `MAX_RETAINED_BYTES`.
+        Messages that a generation (an older copy of all saved states) needs are kept, see `keep`.
+        An outbox that is not on the disk keeps them only while it has at most
+        `MAX_RETAINED_BYTES`.
         """
         needed = self.first_needed(before)
         if self._log:

@@ -10,8 +10,8 @@ from ldo_service.gaussians.model import new_labels as new_labels
 from ldo_service.kernels import _labels
 
 BACKGROUND, OTHER = 0, 1  # The first two labels of every vocabulary.
-MAX_LABELS = 256  # Maximum labels of a map: C_max (paper, III.B).
-SLOTS = 5  # Labels stored per Gaussian: L (paper, III.B).
+MAX_LABELS = 256  # Maximum labels of a map: C_max (LDO-SLAM paper, III.B).
+SLOTS = 5  # Labels stored per Gaussian: L (LDO-SLAM paper, III.B).
 NOT_SEEN, MISS = -2, -1  # Values in place of an observed label; see `Observations`.
 # Label row of one Gaussian, 32 bytes; all zero if the Gaussian was never observed.
 ROW = np.dtype(
@@ -31,11 +31,12 @@ ROW = np.dtype(
 class ConsistencyConfig:
     """Settings of the label smoothing among neighbors."""
 
-    # Scale of the distance in the weight of a neighbor: sigma_cons (paper, III.A).
+    # Scale of the distance in the weight of a neighbor: sigma_cons (LDO-SLAM paper, III.A).
     sigma_m: float = 0.05
     # Maximum distance of neighbors: three sigma. Farther Gaussians would have weights below 2e-4.
     radius_m: float = 0.15
-    # Step size, 0..1. The default equals 1 - lambda, the step of the label update (paper, III.A).
+    # Step size, 0..1. The default equals 1 - lambda, the step of the label update in the
+    # LDO-SLAM paper, III.A.
     rate: float = 0.1
 
     def __post_init__(self) -> None:
@@ -127,10 +128,11 @@ class LabelConfig:
 
     ema: Literal["paper", "corrected"] = "corrected"  # Rule of the update; see `observe`.
     # Factor by which each new observation reduces the weight of earlier ones: lambda
-    # (paper, III.A).
+    # (LDO-SLAM paper, III.A).
     keep: float = 0.9
     # Number of misses in a row that turn a Gaussian into background by the rule `paper`: N_miss
-    # (paper, III.A). A miss is a keyframe that shows the Gaussian, but no region at the Gaussian.
+    # (LDO-SLAM paper, III.A). A miss is a keyframe that shows the Gaussian, but no region at the
+    # Gaussian.
     miss_limit: int = 5
     # A miss with `corrected` is evidence for background if the object would appear large enough for
     # the detector to find it. The next three settings define this.

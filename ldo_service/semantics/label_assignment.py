@@ -22,13 +22,13 @@ HIDDEN, UNMATCHED = -2, -1  # Values in place of a region's number; see `Assignm
 class AssignmentConfig:
     """Settings of the assignment of Gaussians to regions."""
 
-    # Measure of the overlap of a splat and a region. `iou` is the measure of the paper. It labels
-    # almost no Gaussian, because a splat is a few pixels wide and a box is hundreds of pixels wide.
-    # `coverage` is the area of the intersection divided by the area of the splat.
+    # Measure of the overlap of a splat and a region. `iou` is the measure of the LDO-SLAM paper. It
+    # labels almost no Gaussian, because a splat is a few pixels wide and a box is hundreds of pixels
+    # wide. `coverage` is the area of the intersection divided by the area of the splat.
     rule: Literal["coverage", "iou"] = "coverage"
-    min_overlap: float = 0.3  # Minimum overlap: theta_IoU (paper, III.A).
+    min_overlap: float = 0.3  # Minimum overlap: theta_IoU (LDO-SLAM paper, III.A).
     # Maximum difference between the depth of a Gaussian and the measured depth: delta_z
-    # (paper, III.A).
+    # (LDO-SLAM paper, III.A).
     max_depth_gap_m: float = 0.1
     # `two_sided` accepts a Gaussian only at the measured depth. `one_sided`, the test of the paper,
     # also accepts a Gaussian in front of the measured surface.

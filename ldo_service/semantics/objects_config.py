@@ -9,14 +9,14 @@ from ldo_service.errors import ConfigError, named
 class AssociationConfig:
     """Settings of the data association between objects of the map and regions of a keyframe."""
 
-    # Minimum IoU of the predicted box of an object and the box of a region (paper, III.C).
+    # Minimum IoU of the predicted box of an object and the box of a region (LDO-SLAM paper, III.C).
     min_iou: float = 0.4
     # Minimum common mass of the label distributions of an object and a region, 0..1: the sum of the
     # smaller probabilities. It prevents, for example, a match of a cup with the table whose box
     # contains the cup.
     min_shared: float = 0.3
     # Maximum gap between the depth ranges of an object and a region, and tolerance of the occlusion
-    # test (paper, III.A: delta_z).
+    # test (LDO-SLAM paper, III.A: delta_z).
     max_depth_gap_m: float = 0.1
     min_gaussians: int = 8  # Minimum Gaussians of a region; fewer do not determine its position.
     # Maximum regions per keyframe; those with the most Gaussians are used. Images of COCO have 7
@@ -49,18 +49,19 @@ class ObjectsConfig:
     """Settings of the objects of the map: when they are created, merged and removed."""
 
     association: AssociationConfig = field(default_factory=AssociationConfig)
-    # Keyframes that must observe a candidate before it becomes an object (paper, III.C).
+    # Keyframes that must observe a candidate before it becomes an object (LDO-SLAM paper, III.C).
     min_keyframes: int = 3
     # Maximum divergence (nats) between the label distributions of a candidate and of its
-    # observation. At a larger one, the candidate's count of observations restarts (paper, III.C).
+    # observation. At a larger one, the candidate's count of observations restarts (LDO-SLAM
+    # paper, III.C).
     max_divergence: float = 0.2
-    # Misses in a row after which an object is removed (paper, III.C).
+    # Misses in a row after which an object is removed (LDO-SLAM paper, III.C).
     miss_limit: int = 10
     # Misses in a row after which an object is removed if the entropy of its label
     # distribution is above `uncertain_entropy`.
     uncertain_miss_limit: int = 5
     # Entropy (nats) of the label distribution above which an object is removed earlier
-    # (paper, III.C).
+    # (LDO-SLAM paper, III.C).
     uncertain_entropy: float = 0.5
     # Misses in a row after which a candidate is removed; it can be created again.
     candidate_miss_limit: int = 3

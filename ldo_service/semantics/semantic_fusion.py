@@ -48,9 +48,10 @@ class FusionConfig:
     # Weight of the detector: by the confidences (adaptive), constant (fixed), or always 1, so that
     # the labeller is ignored (detector).
     rule: Literal["adaptive", "fixed", "detector"] = "adaptive"
-    beta: float = 2.0  # Exponent in the formula of `adaptive` (paper, III.B).
-    epsilon: float = 1e-6  # Term against division by zero with `adaptive` (paper, III.B).
-    fixed_alpha: float = 0.5  # Weight of the detector with `fixed`, an ablation (paper, IV.C).
+    beta: float = 2.0  # Exponent in the formula of `adaptive` (LDO-SLAM paper, III.B).
+    epsilon: float = 1e-6  # Term against division by zero with `adaptive` (LDO-SLAM paper, III.B).
+    # Weight of the detector with `fixed`, an ablation (LDO-SLAM paper, IV.C).
+    fixed_alpha: float = 0.5
 
     def __post_init__(self) -> None:
         if self.rule not in ("adaptive", "fixed", "detector"):
