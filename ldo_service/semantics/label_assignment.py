@@ -23,8 +23,8 @@ class AssignmentConfig:
     """Settings of the assignment of Gaussians to regions."""
 
     # Measure of the overlap of a splat and a region. `iou` is the measure of the LDO-SLAM paper. It
-    # labels almost no Gaussian, because a splat is a few pixels wide and a box is hundreds of pixels
-    # wide. `coverage` is the area of the intersection divided by the area of the splat.
+    # labels almost no Gaussian, because a splat is a few pixels wide and a box is hundreds of
+    # pixels wide. `coverage` is the area of the intersection divided by the area of the splat.
     rule: Literal["coverage", "iou"] = "coverage"
     min_overlap: float = 0.3  # Minimum overlap: theta_IoU (LDO-SLAM paper, III.A).
     # Maximum difference between the depth of a Gaussian and the measured depth: delta_z
