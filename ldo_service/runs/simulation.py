@@ -37,7 +37,7 @@ class Digests:
         self._states[actor].update(digest(encode(message)).encode())
 
     def made(self) -> dict[str, ActorDigest]:
-        """Return the digest of each actor, by name."""
+        """Return the digest of the outputs of each actor, by name of the actor."""
         return {
             actor: ActorDigest(count, self._states[actor].hexdigest())
             for actor, count in self._counts.items()
@@ -52,7 +52,7 @@ def simulate_graph(
     advance: Advance,
     prior: Trajectory | None = None,
 ) -> dict[str, ActorDigest]:
-    """Run all actors over the selected frames and return the digest of each actor, by its name.
+    """Run all actors over the selected frames and return the digest of each actor's outputs, by its name.
 
     The digests do not depend on the load of the machine or on the number of threads, see
     `runtime.logical_clock`.

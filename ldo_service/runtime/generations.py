@@ -115,10 +115,11 @@ def problem_of_completed(
         number: Number of the last complete generation.
 
     Returns:
-        None if the states are valid. Otherwise the problem, as `problem_of_states` returns it.
+        None if the states are valid. The error of a damaged state. Otherwise a description of a
+        missing state, or of two states that do not belong together.
 
     Raises:
-        DataError: A state or the marker file cannot be read.
+        DataError: A state or the marker file cannot be read, see `problem_of_states`.
     """
     had_state = actors_of_completed(store)
     lost = [actor for actor in actors if actor in had_state and not store.exists(actor, number)]

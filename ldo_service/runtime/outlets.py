@@ -1,4 +1,4 @@
-"""Set of all outlets of one actor."""
+"""Outlets of one actor; an outlet sends the messages of one topic to their consumers."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

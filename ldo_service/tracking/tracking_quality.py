@@ -112,9 +112,9 @@ class TrackingQualityConfig:
 
 @dataclass(frozen=True, slots=True)
 class ResidualHistory:
-    """Photometric and geometric noise of the last OK frames."""
+    """Photometric and geometric noise of the last OK frames, oldest first."""
 
-    intensity_sigmas: tuple[float, ...] = ()  # Gray levels of the reference.
+    intensity_sigmas: tuple[float, ...] = ()  # Gray levels of the reference image.
     depth_noise_scales: tuple[float, ...] = ()  # Multiples of `DepthNoise`.
 
     def extended(self, alignment: Alignment, config: TrackingQualityConfig) -> "ResidualHistory":

@@ -201,7 +201,7 @@ class Gate:
         self._refused = 0  # Number of connections closed because of a limit since the last report.
 
     def admit(self, new: Connection) -> None:
-        """Add a connection; if there are too many, close one that is unproven."""
+        """Add a connection; if there are too many, close one without an accepted certificate."""
         self._open[new] = None
         unproven = [one for one in self._open if not one.is_proven]
         if len(unproven) > MAX_UNPROVEN or len(self._open) > self._max_connections:
