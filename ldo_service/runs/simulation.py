@@ -52,7 +52,7 @@ def simulate_graph(
     advance: Advance,
     prior: Trajectory | None = None,
 ) -> dict[str, ActorDigest]:
-    """Run all actors over the selected frames and return the digest of each actor's outputs, by its name.
+    """Run all actors over the selected frames and return the digest of the outputs of each actor.
 
     The digests do not depend on the load of the machine or on the number of threads, see
     `runtime.logical_clock`.

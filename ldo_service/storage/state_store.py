@@ -79,7 +79,7 @@ class StateStore(Protocol):
         ...
 
     def give_up(self, actor: str) -> None:
-        """Delete the older generations of an actor's state, but not the state after the last step."""
+        """Delete all generations of an actor's state, but keep the state after the last step."""
         ...
 
     def has_fallen_back(self, actor: str) -> bool:
@@ -336,7 +336,7 @@ class FolderStore:
         return new
 
     def give_up(self, actor: str) -> None:
-        """Delete the older generations of an actor's state, but not the state after the last step.
+        """Delete all generations of an actor's state, but keep the state after the last step.
 
         Raises:
             OSError: The disk cannot be written.
