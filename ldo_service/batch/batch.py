@@ -90,7 +90,8 @@ class Batch:
     def job(self, recording: Recording) -> BatchJob:
         """Return the job of a recording.
 
-        The folder of its results is named after the recording and the first digits of the key.
+        The folder of its results is named after the recording and the first `KEY_DIGITS` digits of
+        `key_of`, the digest of everything that the results depend on.
         """
         key = key_of(recording, self.plan)
         return BatchJob(

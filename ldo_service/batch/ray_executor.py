@@ -24,9 +24,9 @@ GB = 10**9
 class RayNeeds:
     """Resources that Ray reserves for each recording."""
 
-    cpus: int
-    memory_gb: float
-    gpus: float
+    cpus: int  # CPU cores.
+    memory_gb: float  # Memory of the host, GB.
+    gpus: float  # Graphics processors; a fraction shares one.
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,11 +40,13 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
 
     ldo: str  # Version of LDO-SLAM.
     finished: str  # Time, ISO 8601.
-    wall_s: float  # Duration of the batch.
+    wall_s: float  # Duration of the batch, seconds.
     is_interrupted: bool  # True if the batch ended early.
     counts: dict[str, int]  # Number of recordings by status.
-    totals: dict[str, float]  # Sums over all recordings with results.
-    recordings: list[Outcome]
+    # Sums of the `Costs` of all recordings with results, by the name of the field: cpu_s,
+    # recording_s, source_bytes and result_bytes.
+    totals: dict[str, float]
+    recordings: list[Outcome]  # Outcome of each recording.
 
 
 def report_of(outcomes: Sequence[Outcome], wall_s: float, *, is_interrupted: bool) -> Report:
@@ -52,7 +54,7 @@ def report_of(outcomes: Sequence[Outcome], wall_s: float, *, is_interrupted: boo
 
     Args:
         outcomes: Outcome of each recording.
-        wall_s: Duration of the batch.
+        wall_s: Duration of the batch, seconds.
         is_interrupted: True if the batch was interrupted.
     """
     costs = [outcome.costs for outcome in outcomes if outcome.costs]

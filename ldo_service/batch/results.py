@@ -30,14 +30,14 @@ class ResultFile(msgspec.Struct, frozen=True):
     """Size and checksum of a file in a folder of results."""
 
     size_bytes: int
-    sha256: str
+    sha256: str  # SHA-256 of the content, hexadecimal.
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """Content of result.json."""
 
     key: str  # Digest of everything that the results depend on; see `BatchJob.key`.
-    outcome: Outcome
+    outcome: Outcome  # Outcome of the recording.
     files: dict[str, ResultFile]  # Every other file of the folder, by name.
 
 

@@ -170,8 +170,8 @@ class Store:
 class Entry:
     """Folder or file in a listing."""
 
-    store: Store
-    is_file: bool
+    store: Store  # The folder or file.
+    is_file: bool  # False for a folder.
 
 
 def open_store(url: str) -> Store:
