@@ -98,7 +98,13 @@ class HeardPose:
 
 
 def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:
-    """Return the tracking status and the rate of poses as text, at the time `now_s` of `at_s`."""
+    """Return the tracking status and the rate of poses as text.
+
+    Args:
+        heard: The last pose; None if no pose was received yet.
+        poses: Rate of the received poses.
+        now_s: Current time on the clock of `HeardPose.at_s`, seconds.
+    """
     if heard is None:
         return "no pose yet"
     pose, silent_s = heard.pose, now_s - heard.at_s
@@ -110,7 +116,12 @@ def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:
 
 
 def of_health(heard: Iterable[HeartbeatRecord], now_s: float) -> str:
-    """Return a table with state, step rate, step time, drops and memory of each actor."""
+    """Return a table with state, step rate, step time, drops and memory of each actor.
+
+    Args:
+        heard: The last heartbeat of each actor.
+        now_s: Current time on the clock of `HeartbeatRecord.at_s`, seconds.
+    """
     rows = [_row(one, now_s) for one in sorted(heard, key=lambda one: one.health.actor)]
     if not rows:
         return "No heartbeat yet. Check the robot name, and run `ldo doctor`."
