@@ -45,8 +45,9 @@ class AddKeys:
 
     Copy this folder to the machine of the program, and pass it to the program with --keys. The
     command also updates the access control list `access.yaml` in the folder of each service. Copy
-    the new list into the key folder of each running service, which uses it within seconds. Restart
-    only a service under systemd or with --client.
+    the new list into the key folder of each running service, which uses it within seconds. Two
+    kinds of services read their keys only at their start, so restart them: services under systemd,
+    and services with --client.
 
       ldo keys add DIR service mule --robot mule --host mule.local
       ldo keys add DIR camera front --robot mule
@@ -91,8 +92,9 @@ class RevokeKeys:
     """Revoke keys, and delete their folder on this machine.
 
     Copy the new `access.yaml` into the key folder of each running service, which then rejects the
-    keys within seconds. Restart only a service under systemd or with --client. A separate router
-    needs a new configuration of `ldo keys router` and a restart.
+    keys within seconds. Two kinds of services read their keys only at their start, so restart them:
+    services under systemd, and services with --client. A separate router needs a new configuration
+    of `ldo keys router` and a restart.
     """
 
     folder: Folder
@@ -157,8 +159,8 @@ def keys(verb: Verb) -> None:
             CertificateAuthority(verb.folder).remove(verb.name)
             print(
                 f"{verb.name} is revoked. Copy the new {ACCESS} into the key folder of every "
-                "service: until then the keys remain valid there. Restart only a service under "
-                "systemd or with --client."
+                "service: until then the keys remain valid there. Restart each service under "
+                "systemd or with --client, which reads its keys only at its start."
             )
 
 
