@@ -24,6 +24,7 @@ class GenerationFiles:
 
     folder: Path  # Folder of the actor's state.
     list_name: str = ""  # Name of the list of the files; empty if the actor has no state.
+    # List of the files of the generation.
     contents: StateContents = field(default_factory=lambda: StateContents({}))
     sources: dict[str, str] = field(default_factory=dict)  # File to copy, by part.
     is_written: bool = False  # True once `write` has succeeded.

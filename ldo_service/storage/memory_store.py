@@ -9,7 +9,7 @@ from .state_store import State
 class MemoryStore:
     """Store in memory; the states are lost when the process ends, but not when an actor fails."""
 
-    syncs = False
+    syncs = False  # The states do not survive a power cut.
 
     def __init__(self) -> None:
         self._states: dict[str, State] = {}
@@ -19,7 +19,7 @@ class MemoryStore:
         return
 
     def quarantine_folder(self, actor: str) -> None:  # noqa: ARG002
-        """Return None, because a count in memory ends with the process that a message ends."""
+        """Return None: memory cannot keep a record of messages that end the process."""
         return
 
     def save(self, actor: str, state: State, unsynced: Iterable[Path] = ()) -> None:  # noqa: ARG002
@@ -42,16 +42,16 @@ class MemoryStore:
         completed: int,  # noqa: ARG002
         unsynced: Iterable[Path] = (),  # noqa: ARG002
     ) -> None:
-        """Keep nothing: memory does not survive the process."""
+        """Keep no generation (synced copy of all states): memory does not survive the process."""
         return
 
     def is_kept(self, actor: str) -> bool:  # noqa: ARG002
-        """Return False: there are no older generations."""
+        """Return False, because no generation of the state is kept."""
         return False
 
     def give_up(self, actor: str) -> None:
-        """Do nothing: there are no older generations."""
+        """Do nothing, because no generations exist that could be deleted."""
 
     def has_fallen_back(self, actor: str) -> bool:  # noqa: ARG002
-        """Return False: there are no older generations."""
+        """Return False, because no older state is kept that could replace a damaged one."""
         return False

@@ -169,7 +169,8 @@ class MessageLog:
     def pop_unsynced(self) -> list[Path]:
         """Return the files written since the last call, and their folders.
 
-        The caller must sync them, again if that fails.
+        The next call does not return them again. The caller must therefore sync them, and retry if
+        that fails.
         """
         with self._lock:
             paths = sorted(self._unsynced)

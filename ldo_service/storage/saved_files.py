@@ -46,9 +46,9 @@ class SavedFiles:
                 ) from error
 
     def sync_unsynced(self) -> None:
-        """Sync the files that `check_unsynced` checks, and remove them from its list.
+        """Sync the files that `check_unsynced` checks, and empty the list of these files.
 
-        The actor may then remove those that it does not need, and the state stays valid.
+        A file that the actor removes later then does not count as missing.
 
         Raises:
             OSError: The disk is full, or a file cannot be read.

@@ -83,7 +83,7 @@ class StateStore(Protocol):
         ...
 
     def has_fallen_back(self, actor: str) -> bool:
-        """Return whether the last loaded state is an older generation."""
+        """Return whether the last loaded state is one to which the service has fallen back."""
         ...
 
 
@@ -385,7 +385,7 @@ class FolderStore:
             write_atomically(folder / CONTENTS, contents.encode(), syncs=True)
 
     def has_fallen_back(self, actor: str) -> bool:
-        """Return whether the last loaded state is an older generation."""
+        """Return whether the last loaded state is one to which the service has fallen back."""
         return actor in self._fallen_back
 
 
