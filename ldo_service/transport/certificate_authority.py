@@ -51,11 +51,11 @@ HEAD = "# Role of each certificate. `ldo keys` writes this file; routers read it
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Name, common name and role of a certificate that the authority issued."""
+    """Certificate that the authority issued."""
 
-    name: str
-    common_name: str
-    grantee: AccessEntry
+    name: str  # Name of the keys, which the user chose.
+    common_name: str  # Common name in the certificate: the name of the keys and a random number.
+    grantee: AccessEntry  # Role, robot and last valid day.
 
 
 class CertificateAuthority:

@@ -6,12 +6,12 @@ for 0.1 s. The gate therefore owns the port that other machines see, and passes 
 of the router on loopback. It does not decrypt them: programs and router check each other's
 certificates as they do without a gate.
 
-A connection is *unproven* until the router has answered the client's certificate. The gate
+A connection is *unproven* until the router has accepted the client's certificate. The gate
 
 - passes nothing on before the first bytes of a TLS handshake have arrived,
 - closes a connection that is unproven for longer than `HANDSHAKE_S`,
-- closes an unproven connection when there are more than `MAX_UNPROVEN`, of the address that has
-  most of them, and among these one that has sent nothing,
+- closes an unproven connection when there are more than `MAX_UNPROVEN`: one of the address with
+  the most unproven connections, and if possible one that has sent nothing,
 - lets at most `MAX_HANDSHAKES` connections of an address, and `MAX_ALL_HANDSHAKES` in all, shake
   hands with the router at a time.
 
@@ -53,7 +53,7 @@ class Connection:
     Attributes:
         address: IP address of the client.
         has_spoken: The first bytes of a handshake have arrived.
-        is_proven: The router has answered the certificate of the client.
+        is_proven: The router has accepted the certificate of the client.
     """
 
     def __init__(self, gate: "Gate", client: asyncio.Transport) -> None:
@@ -177,7 +177,7 @@ class Side(asyncio.Protocol):
 class Gate:
     """Gate between clients on the network and the TLS port of the router; see the module.
 
-    It limits the connections that are unproven: the router has not answered the certificate of
+    It limits the connections that are unproven: the router has not accepted the certificate of
     their client.
     """
 
@@ -201,7 +201,10 @@ class Gate:
         self._refused = 0  # Number of connections closed because of a limit since the last report.
 
     def admit(self, new: Connection) -> None:
-        """Add a connection; if there are too many, close one without an accepted certificate."""
+        """Add a connection; if there are too many, close an unproven one.
+
+        A connection is unproven until the router has accepted the certificate of its client.
+        """
         self._open[new] = None
         unproven = [one for one in self._open if not one.is_proven]
         if len(unproven) > MAX_UNPROVEN or len(self._open) > self._max_connections:

@@ -30,9 +30,9 @@ NOT_IN_NAMES = "/*$?#@ "  # Characters with a meaning in Zenoh, and separators o
 class Endpoint:
     """Name of a robot, address of its router, and TLS keys."""
 
-    robot: str = "robot"
-    endpoint: str = DEFAULT_ENDPOINT
-    keys: TlsKeys | None = None
+    robot: str = "robot"  # Name of the robot.
+    endpoint: str = DEFAULT_ENDPOINT  # Address of the router.
+    keys: TlsKeys | None = None  # TLS keys; None for a connection without TLS.
     max_message_mb: int = MAX_MESSAGE_MB  # Receivers drop larger messages.
     # Path of a Unix socket on which a router with TLS keys also listens, for its own child
     # processes; empty if there is none. This link still works when the certificate has expired.

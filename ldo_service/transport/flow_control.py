@@ -106,11 +106,14 @@ class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
     starts: dict[str, int]  # Offset of the first message for each known consumer, by name.
 
     def __post_init__(self) -> None:
-        if self.epoch <= 0 or not all(0 <= start < MAX_SEQ for start in self.starts.values()):
-            raise ValueError(
-                f"hello epoch={self.epoch} must be positive, and all starts must be within "
-                "0..2^62-1"
-            )
+        if self.epoch <= 0:
+            raise ValueError(f"hello epoch={self.epoch} must be positive")
+        for start in self.starts.values():
+            if not 0 <= start < MAX_SEQ:
+                raise ValueError(
+                    f"hello has the offset {start} of the first message for a consumer, which must "
+                    "be within 0..2^62-1"
+                )
 
 
 class UnackedMessage(NamedTuple):
