@@ -172,10 +172,13 @@ def _fall_back(
     if older is None:
         if isinstance(problem, str):
             raise ConfigError(f"in {store.folder.parent} {problem}. {advice}")
-        raise DamagedStateError(f"{problem}. There is no older generation of it. {advice}")
+        raise DamagedStateError(
+            f"{problem}. There is no older copy of the states to fall back to. {advice}"
+        )
     if damage := problem_of_completed(store, sorted(actors), older):
         raise DamagedStateError(
-            f"{problem}. The older generation {older} is not usable either: {damage}. {advice}"
+            f"{problem}. The older copy of the states, generation {older}, is not usable either: "
+            f"{damage}. {advice}"
         )
     log.error(
         "%s: %s. All actors fall back to generation %d of their states. The keyframes since then, "

@@ -165,7 +165,7 @@ def test_state_without_an_undamaged_generation_is_one_error_and_unchanged(state:
         flip(path)
     before = {path: path.read_bytes() for path in files_of(state)}
     for _ in range(2):
-        with pytest.raises(DamagedStateError, match="older generation 2 is not usable either"):
+        with pytest.raises(DamagedStateError, match="generation 2, is not usable either"):
             claim(state)
     assert DamagedStateError.exit_code == 3, "the unit starts the service again"
     assert {path: path.read_bytes() for path in files_of(state)} == before
