@@ -233,8 +233,8 @@ class Actor:
     def on_saved(self) -> None:
         """Handle the notification that the last snapshot or checkpoint was written.
 
-        While the stage keeps older generations of the state (`runtime.generations`), it calls
-        `StateFiles.kept` of `files` instead of this method.
+        If the service keeps copies of the state to which it can fall back (`runtime.generations`),
+        the stage does not call this method. It calls `self.files.kept` instead.
         """
         if self.files is not None:
             self.files.saved()

@@ -44,8 +44,6 @@ class Consumers:
     - `Backlog`: The producer never waits for the consumer, and stores its unhandled messages on
       disk: the backlog. The credit of the consumer only decides how many messages of the backlog
       the producer sends next.
-
-    The argument `seq` of all methods is the offset of the producer's next message.
     """
 
     def __init__(
@@ -81,16 +79,22 @@ class Consumers:
         """Return the number of messages that may be sent now without waiting for a consumer.
 
         The result is UNLIMITED if the producer need not wait for any consumer.
+
+        Args:
+            seq: Offset of the producer's next message.
         """
         awaited = [c for c in self._known.values() if c.is_awaited]
         limits = [c.limit - seq if c.alive else 0 for c in awaited]
         return max(0, min(limits, default=UNLIMITED))
 
     def window_room(self, seq: int) -> int:
-        """Return the number of messages that fit into the window of every consumer.
+        """Return the number of messages, from `seq` on, that fit into the window of every consumer.
 
         Consumers with policy `Backlog` count too. The result is 0 if a consumer is disconnected, or
         if there are no consumers.
+
+        Args:
+            seq: Offset of the producer's next message.
         """
         limits = [c.limit - seq if c.alive else 0 for c in self._known.values()]
         return max(0, min(limits, default=0))
@@ -98,7 +102,8 @@ class Consumers:
     def handled(self, seq: int) -> int:
         """Return the offset of the first message that at least one consumer has not handled.
 
-        The result is `seq` if there are no consumers.
+        Args:
+            seq: Offset of the producer's next message, which is the result without consumers.
         """
         return min((c.handled for c in self._known.values()), default=seq)
 
@@ -109,7 +114,7 @@ class Consumers:
         The other messages stay in the backlog on disk.
 
         Args:
-            seq: Offset of the next message.
+            seq: Offset of the producer's next message.
             awaited_only: Ignore the consumers with policy `Backlog`.
         """
         awaited = [c for c in self._known.values() if c.is_awaited]
@@ -119,9 +124,10 @@ class Consumers:
         return has_awaited and has_others
 
     def behind(self, seq: int) -> dict[str, int]:
-        """Return the number of unhandled messages of each consumer, by name.
+        """Return the number of unhandled messages of each consumer with policy `Backlog`, by name.
 
-        Only consumers with policy `Backlog` are included.
+        Args:
+            seq: Offset of the producer's next message.
         """
         return {name: seq - c.handled for name, c in self._known.items() if not c.is_awaited}
 
@@ -132,8 +138,13 @@ class Consumers:
     def join(self, name: str, seq: int, *, has_backlog: bool = False) -> None:
         """Connect a consumer that sent a hello.
 
-        A new consumer starts at message `seq`. A known consumer receives again all messages that it
-        has not handled. `has_backlog` is True for a consumer with policy `Backlog`.
+        A new consumer starts at the next message. A known consumer receives again all messages that
+        it has not handled.
+
+        Args:
+            name: Name of the consumer.
+            seq: Offset of the producer's next message.
+            has_backlog: True for a consumer with policy `Backlog`.
         """
         self._evicted.pop(name, None)
         consumer = self._known.setdefault(name, Consumer(handled=seq))

@@ -46,7 +46,13 @@ class LoggedInput(NamedTuple):
 
     @classmethod
     def of(cls, topic: str, body: bytes | memoryview, situation: FlowStatus) -> "LoggedInput":
-        """Create the log entry of a message."""
+        """Create the log entry of a message.
+
+        Args:
+            topic: Name of the topic; empty for idle work.
+            body: Encoded message.
+            situation: Flow status of the actor before the step that handles the message.
+        """
         credits = {topic.name: count for topic, count in situation.credits.items()}
         backlog = {topic.name: count for topic, count in situation.backlog.items()}
         return cls(topic, bytes(body), credits, backlog)
@@ -143,8 +149,9 @@ class DeliveryState:
             whole: True if `own` is a checkpoint: it includes the last step and needs no log.
 
         Returns:
-            Parts to save. If `own` has changed since the last call, it includes the last step, and
-            the write-ahead log is empty.
+            Parts to save: those of `own`, and the inputs handled since `own`. A part of `own` that
+            is another object than in the last call shows that `own` includes the last step. The
+            write-ahead log is then empty.
         """
         is_new = own.keys() != self._own.keys() or any(own[p] is not self._own[p] for p in own)
         if is_new or whole:

@@ -104,10 +104,10 @@ def actors_of_completed(store: FolderStore) -> set[str]:
 def problem_of_completed(
     store: FolderStore, actors: Sequence[str], number: int
 ) -> DataError | str | None:
-    """Check the states of the last complete generation.
+    """Check the states of the last complete generation: synced copies of the states of all actors.
 
-    An actor that had no state when the generation was kept has none in it. If the marker file lists
-    the actor, its missing state is a problem.
+    An actor may have no state in it, because it had none at that time. The marker file
+    (`generation.msgpack`) lists the actors that had one: a missing state of theirs is a problem.
 
     Args:
         store: Store of the states.
@@ -115,8 +115,8 @@ def problem_of_completed(
         number: Number of the last complete generation.
 
     Returns:
-        None if the states are valid. The error of a damaged state. Otherwise a description of a
-        missing state, or of two states that do not belong together.
+        None if the states are valid; a DataError if a state is damaged; a text if a state is
+        missing, or if two states do not belong together.
 
     Raises:
         DataError: A state or the marker file cannot be read, see `problem_of_states`.
@@ -151,8 +151,8 @@ def problem_of_states(
         is_quick: Read only the positions on each topic, and not the states themselves.
 
     Returns:
-        None if the states are valid. The error of a damaged state. Otherwise a description of two
-        states that do not belong together.
+        None if the states are valid; a DataError if a state is damaged; a text if a state is
+        missing, or if two states do not belong together.
 
     Raises:
         DataError: A state cannot be read because of the disk or a limit of the process, or another
@@ -241,17 +241,20 @@ class GenerationKeeper:
         return time.monotonic() - self._current_s
 
     async def run(self) -> None:
-        """Keep a generation every `KEEP_EVERY_S` seconds if messages were handled since."""
+        """Write a synced copy of all states every `KEEP_EVERY_S` seconds while messages arrive.
+
+        See `keep`. The method ends only when its task is cancelled.
+        """
         while True:
             async with self.lock:
                 await self.keep()
             await asyncio.sleep(KEEP_EVERY_S)
 
     async def keep(self, *, is_forced: bool = False) -> str:
-        """Keep one generation; the caller must hold `lock`.
+        """Keep one generation: write a synced copy of the states of all actors.
 
-        If an actor does not answer, or if the states do not belong together, the previous
-        generation stays the last complete one.
+        The caller must hold `lock`. If an actor does not answer, or if the states do not belong
+        together, the previous generation stays the last complete one.
 
         Args:
             is_forced: Keep a generation even if no messages were handled since the last one.

@@ -27,14 +27,18 @@ class Delivery:
 
 @dataclass
 class Inlet:
-    """Queue and counters of an input with policy `Latest`."""
+    """Queue and counters of an input.
+
+    This class is for inputs with policy `Latest`. Its subclass `LosslessInlet` is for other inputs.
+    """
 
     port: In
     waiting: deque[Delivery] = field(default_factory=deque)  # Queued messages, oldest first.
     delivered: int = 0  # Messages that were handled.
     dropped: int = 0  # Messages dropped because newer ones came.
     rejected: int = 0  # Malformed or too large messages.
-    gaps: int = 0  # Messages of a lossless input that came out of order or beyond its window.
+    # Messages that came out of order or when the window was full; counted by `LosslessInlet`.
+    gaps: int = 0
     peak: int = 0  # Maximum length of the queue so far.
     paused: int = 0  # Messages dropped while the stage was paused.
     numbers: SequenceTracker = field(default_factory=SequenceTracker)  # Counter of lost messages.
@@ -49,7 +53,7 @@ class Inlet:
         return True
 
     def offer(self, delivery: Delivery) -> list[Delivery]:
-        """Queue a delivery, and return the older deliveries that are dropped in exchange."""
+        """Queue a delivery, and return the older deliveries that are dropped for it."""
         self.waiting.append(delivery)
         displaced = self._overflow(delivery)
         for old in displaced:

@@ -70,12 +70,12 @@ class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
     kind: Kind  # Outcome of the step.
     taken: int  # Number of the input in this file; -1: no input.
     topic: str = ""  # Topic of the input.
-    source: str = ""  # Header fields of the input.
+    source: str = ""  # Header fields of the input: `source`, `epoch` and `seq`.
     epoch: int = 0
     seq: int = 0
     checksum: str = ""  # CRC-32 of the encoded input; see `journal.checksum`.
     credits: dict[str, int] = {}  # Messages that could be sent without waiting, by topic.
-    outputs: tuple[Output, ...] = ()
+    outputs: tuple[Output, ...] = ()  # Outputs in order.
     digest: str = ""  # Digest of all outputs in order; see `digest_of`.
     error: str = ""  # Exception of a failed step.
     backlog: dict[str, int] = {}  # Messages queued behind the input, by topic.

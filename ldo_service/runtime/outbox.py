@@ -131,6 +131,8 @@ class Outbox:
     def first_needed(self, handled: int) -> int:
         """Return the number of the first message that a consumer or a generation needs.
 
+        A generation is an older copy of all saved states; see `keep`.
+
         Args:
             handled: All consumers have handled the messages before this number.
         """

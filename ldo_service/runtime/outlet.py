@@ -76,8 +76,7 @@ class Outlet:
             expected: Names of the required consumers.
             evict_after_s: Time after which a consumer with a full window is evicted, seconds.
             on_evicted: Called with the name of an evicted consumer.
-            past: Position of the previous process. The outlet continues the numbering of that
-                process, and sends again the messages that a required consumer has not handled.
+            past: Position of the previous process: its next offset, and messages to send again.
             with_backlog: Names of the required consumers with policy `Backlog`.
             outbox: Storage of unhandled messages; by default in memory.
         """
@@ -92,8 +91,7 @@ class Outlet:
         self.outbox = outbox or Outbox(past.unhandled)
         self._unsent = deque(past.unhandled)
         self._changed = asyncio.Event()  # The state of a consumer changed.
-        # Consumers that have received messages which this outlet never sent.
-        self._ahead: set[str] = set()
+        self._ahead: set[str] = set()  # Consumers with messages that this outlet never sent.
         self._repeating: asyncio.Task[None] | None = None
         # Publisher of each consumer's backlog, and the task that is sending on it, by consumer.
         self._backlogs: dict[str, Publisher] = {}
@@ -182,8 +180,7 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until every lossless consumer has received all messages.
 
-        It waits at most `FLUSH_BACKLOG_S` seconds for consumers with policy `Backlog`, because they
-        may be stopped.
+        Consumers with policy `Backlog` may be stopped: it waits at most `FLUSH_BACKLOG_S` for them.
         """
         self._post_hellos()  # Each consumer immediately replies with its credit.
         while not self._consumers.all_received(self._seq, awaited_only=True):
@@ -203,7 +200,10 @@ class Outlet:
         return min(self._consumers.handled(self._seq), self._seq)
 
     def position(self) -> OutletPosition | None:
-        """Return the position that the stage saves; None if there is no required consumer."""
+        """Return the position to save: the next offset, and the unhandled messages.
+
+        The result is None if the topic has no required consumer.
+        """
         if not self._consumers.expected:
             return None
         logged_from = self.outbox.first_needed(self.handled) if self.outbox.is_logged else None

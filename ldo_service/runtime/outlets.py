@@ -121,22 +121,21 @@ class Outlets:
         }
 
     def past(self) -> dict[str, OutletPosition | None]:
-        """Return the position of each outlet, which the stage saves, by topic name.
+        """Return the position of each outlet to save with the state of the actor, by topic name.
 
-        A position is the number of the next message, with all unhandled messages. It is None if the
-        topic has no required consumer.
+        See `Outlet.position`.
         """
         return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
 
     def stage_outputs(self, produced: Sequence[Produced]) -> None:
-        """Stage the outputs of a step."""
+        """Assign numbers to the outputs of a step, and hold them until `release` or `discard`."""
         for out in produced:
             self._all[type(out.message)].stage_message(out.message, out.body)
 
     async def release(self, *, is_saved: bool = True) -> None:
-        """Send the staged outputs of a step.
+        """Send the outputs of a step that `stage_outputs` holds.
 
-        If the step is not saved, outputs on topics with required consumers stay staged.
+        If the step is not saved, outputs on topics with required consumers are held further.
 
         Args:
             is_saved: Whether the step is saved.
@@ -155,7 +154,7 @@ class Outlets:
             outlet.store()
 
     def discard(self) -> None:
-        """Discard the staged outputs."""
+        """Discard the outputs that `stage_outputs` holds."""
         for outlet in self._all.values():
             outlet.rollback()
 

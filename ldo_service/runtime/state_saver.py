@@ -187,7 +187,7 @@ class StateSaver:
             report(order, "")
 
     def close(self) -> None:
-        """Stop writing a generation; the service gets no reply to its command `keep`."""
+        """Cancel the writing that `keep` began; the service gets no reply to its command."""
         for task in self._syncing:
             task.cancel()
 

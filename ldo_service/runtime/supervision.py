@@ -60,15 +60,15 @@ class StopRequest:
 
     @property
     def is_requested(self) -> bool:
-        """True after the first request."""
+        """True after the first call of `request`."""
         return self._soft.is_set()
 
     async def wait_soft(self) -> None:
-        """Wait for the first request."""
+        """Wait for the first call of `request`, which requests a soft stop."""
         await self._soft.wait()
 
     async def wait_hard(self) -> None:
-        """Wait for the second request."""
+        """Wait for the second call of `request`, which requests a hard stop."""
         await self._hard.wait()
 
 

@@ -72,7 +72,7 @@ class LogLimit:
         self._due_at_s = float("-inf")
 
     def is_due(self) -> bool:
-        """Return whether to write the line now."""
+        """Return True at most once per period; the caller then writes its log line."""
         now_s = self._clock()
         if now_s < self._due_at_s:
             return False
