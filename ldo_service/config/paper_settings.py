@@ -27,28 +27,28 @@ class PaperSettings:
     # LDO-SLAM paper's IoU of box and Gaussian (III.A). IoU labels almost no Gaussian, because a
     # splat has few pixels.
     assignment_rule: Literal["coverage", "iou"] = advanced("coverage")
-    # Pixels that a detection labels: the foreground in its box, or the whole box as in the paper
-    # (III.A).
+    # Pixels that a detection labels: the foreground in its box, or the whole box as in the LDO-SLAM
+    # paper, III.A.
     label_region: Literal["foreground", "box"] = advanced("foreground")
     # Maximum distance of a labelled Gaussian from the measured depth, meters. This is delta_z
     # (LDO-SLAM paper, III.A).
     max_depth_gap_m: PositiveFloat = advanced(0.1)
-    # Depth test of a labelled Gaussian: at the measured depth (two_sided), or not behind it as in
-    # the paper (one_sided, III.A).
+    # Depth test of a labelled Gaussian: at the measured depth (two_sided), or not behind it
+    # (one_sided, as in the LDO-SLAM paper, III.A).
     depth_test: Literal["two_sided", "one_sided"] = advanced("two_sided")
     # Rule of the moving average of labels: that of this implementation (corrected), or that of the
-    # paper (III.A).
+    # LDO-SLAM paper, III.A (paper).
     ema_rule: Literal["corrected", "paper"] = advanced("corrected")
     # Fraction of its past that the moving average keeps. This is lambda (LDO-SLAM paper, III.A).
     ema_keep_ratio: Annotated[float, Meta(ge=0, lt=1)] = advanced(0.9)
-    # Fraction by which both rules weaken uncertain observations of settled Gaussians. The paper has
-    # no such factor, which is 0 (III.A).
+    # Fraction by which both rules weaken uncertain observations of settled Gaussians. The LDO-SLAM
+    # paper (III.A) has no such factor, which is 0.
     ema_hold_back_ratio: Ratio = advanced(1.0)
-    # Number of successive keyframes without an observation after which the paper's rule removes a
-    # label. This is N_miss (III.A).
+    # Number of successive keyframes without an observation after which `ema_rule: paper` removes a
+    # label. This is N_miss (LDO-SLAM paper, III.A).
     label_max_misses: Annotated[int, Meta(ge=1, le=255)] = advanced(5)
-    # Rule that fuses detector and labeller: by their reliabilities as in the paper (adaptive,
-    # III.B), by a fixed weight (fixed), or not at all (detector).
+    # Rule that fuses detector and labeller: by their reliabilities (adaptive, as in the LDO-SLAM
+    # paper, III.B), by a fixed weight (fixed), or not at all (detector).
     fusion_rule: Literal["adaptive", "fixed", "detector"] = advanced("adaptive")
     # Constant beta of the adaptive fusion (LDO-SLAM paper, III.B).
     fusion_beta: PositiveFloat = advanced(2.0)
@@ -75,8 +75,8 @@ class PaperSettings:
     subgraph_min_keyframes: PositiveInt = advanced(3)
     # Maximum number of keyframes in a subgraph (LDO-SLAM paper, III.C).
     subgraph_max_keyframes: Annotated[int, Meta(ge=2)] = advanced(5)
-    # Information of an observation of a landmark, relative to that of an independent one. The paper
-    # treats all observations as independent, which is 1 (III.C).
+    # Information of an observation of a landmark, relative to that of an independent one. The
+    # LDO-SLAM paper (III.C) treats all observations as independent, which is 1.
     observation_information_ratio: Annotated[float, Meta(gt=0, le=1)] = advanced(1 / 320)
     # Weight of the observed classes of a landmark (LDO-SLAM paper, III.C).
     lambda_sem: PositiveFloat = advanced(0.5)
