@@ -24,15 +24,15 @@ from .semantic_map import SemanticMap
 
 @dataclass(eq=False, slots=True)
 class DelayedCopy:
-    """Copy of the semantics that processes each keyframe after all earlier label results.
+    """Copy of a map's labels and objects, which processes each keyframe later than the map.
 
-    A label result is the answer of the labeller to a label request.
+    It waits until the results of all earlier label requests to the labeller have arrived.
 
     Attributes:
-        semantics: The copy.
-        labels: Its labels of the Gaussians.
+        semantics: The copied semantics except the labels of the Gaussians.
+        labels: The copied labels of the Gaussians.
         first_object: First id of the objects that were created after the copy was made.
-        results_due: Requests whose results must be applied before the next keyframe, in order.
+        results_due: Regions whose label results come before the next keyframe, in order.
         keyframes: Detections of the keyframes to process, in order.
     """
 
@@ -57,7 +57,7 @@ class DelayedCopy:
             results: Label results that have arrived, by `request_key` of their requests.
 
         Returns:
-            Label requests whose results must arrive before the next call.
+            Regions whose label results must arrive before the next call.
         """
         missing = [one for one in self.results_due if request_key(one) not in results]
         if missing:
@@ -85,7 +85,7 @@ class DelayedCopy:
 
     @staticmethod
     def restored(state: Mapping[str, Any], semantics: SemanticMap) -> "DelayedCopy":
-        """Restore a copy from the result of `snapshot`.
+        """Return the `DelayedCopy` whose state `snapshot` returned.
 
         Args:
             state: The result of `snapshot`.

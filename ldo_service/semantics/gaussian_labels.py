@@ -84,8 +84,8 @@ def smooth_labels(
     distribution. All p on the right have their values before the step.
 
     Neighbors are Gaussians in `indices` within radius_m. They are chosen from at most sixteen
-    candidates in voxels two sigma wide: at most eight Gaussians from the same voxel, and the others
-    from the surrounding voxels. The result is bitwise equal for any number of threads.
+    candidates in voxels with a side of 2 sigma_m: at most eight Gaussians from the same voxel, and
+    the others from the surrounding voxels. The result is bitwise equal for any number of threads.
 
     Args:
         rows: Gaussians of the map, [N, 16].

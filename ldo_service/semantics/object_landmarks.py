@@ -37,7 +37,8 @@ LANDMARK = np.dtype(
         ("covariance", "<f8", (3, 3)),  # m^2
         ("T_map_object", "<f8", (4, 4)),  # Center and axes of the object's box.
         ("size", "<f8", 3),  # Extents of the box along its axes, m.
-        ("weights", "<f4", KEPT),  # Sparse label distribution: weights of `labels`.
+        # Sparse label distribution: probabilities of `labels`, the highest first.
+        ("weights", "<f4", KEPT),
         ("labels", "u1", KEPT),
         ("members", "<i8", MEMBERS),  # Ids of Gaussians in shuffled order, then NO_MEMBER.
         ("votes", "i1", MEMBERS),  # Votes of the members; see `observations.update_votes`.
@@ -58,18 +59,21 @@ def new_landmarks(n: int, keyframe: int) -> np.ndarray:
 
 
 def distributions(table: np.ndarray) -> np.ndarray:
-    """Return the dense label distributions of landmarks, [K, C]."""
+    """Return the dense label distributions [K, 256] of K records of `LANDMARK`."""
     return dense(table["labels"], table["weights"])
 
 
 def labels_of(table: np.ndarray) -> np.ndarray:
-    """Return the heaviest label other than background of each landmark, [K] uint8."""
+    """Return the most probable label other than background of K records of `LANDMARK`, [K] uint8.
+
+    The labels of a record are sorted, the most probable first.
+    """
     first = table["labels"][:, 0]
     return np.where(first == BACKGROUND, table["labels"][:, 1], first)
 
 
 def entropies(table: np.ndarray) -> np.ndarray:
-    """Return the entropies of the label distributions, [K], nats."""
+    """Return the entropies [K], nats, of the label distributions of K records of `LANDMARK`."""
     return entropy(distributions(table))
 
 
@@ -334,7 +338,8 @@ def moved(table: np.ndarray, T_new_old: np.ndarray) -> None:
 def within(table: np.ndarray, camera: Camera, T_camera_map: np.ndarray) -> np.ndarray:
     """Return which landmarks may be in view of a camera, [K] bool.
 
-    The test is whether a bounding sphere of the landmark intersects the camera's view.
+    The test is whether a bounding sphere of the landmark intersects the camera's view. `table` has
+    K records of `LANDMARK`.
     """
     p = table["centroid"] @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
     # Twice the radius of the box's bounding sphere, because some members lie outside of the box.

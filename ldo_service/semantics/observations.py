@@ -30,7 +30,7 @@ class ObservedObject:
         box: Box of the observed region or, for a miss, the predicted box of the object, [4],
             x0 y0 x1 y1, pixels.
         distribution: Label distribution of the Gaussians in the region or, for a miss, of the
-            object, [C].
+            object, [256].
         entropy: Entropy of that distribution, nats.
         is_miss: True if the object should have been visible and was not observed.
     """
@@ -64,7 +64,12 @@ class KeyframeSemantics:
 
 
 def one_each(members: np.ndarray) -> np.ndarray:
-    """Return votes [K, 256] int8 for members [K, 256]: 1 for each member, 0 for NO_MEMBER."""
+    """Return the first votes of the members of K landmarks: one for each member, [K, 256] int8.
+
+    Args:
+        members: Ids of the Gaussians of each landmark's sample, [K, 256]; NO_MEMBER where unused,
+            which gets 0 votes.
+    """
     return (members != NO_MEMBER).astype(np.int8)
 
 

@@ -38,7 +38,7 @@ FIRST_REGION = 1 << 32
 
 
 class OrderedSemantics:
-    """Labels and objects of a map, and a copy of them that waits for label results.
+    """Labels and objects of a map, and a copy of them that waits for label results: `DelayedCopy`.
 
     The copy processes each keyframe again, after the results of all earlier label requests. It
     exists only while results are missing, and replaces the live semantics at the end.
@@ -83,7 +83,7 @@ class OrderedSemantics:
         return self._noted(self.live.on_keyframe_mapped(keyframe))
 
     def apply_label(self, region: int, keyframe: int, answer: RegionLabelResult) -> bool:
-        """Store a label result for the copy, and fuse it into `live` if `live` requested it.
+        """Store a label result for a `DelayedCopy`; fuse it into `live` if `live` requested it.
 
         Args:
             region: Id of the region in the request.
@@ -107,7 +107,7 @@ class OrderedSemantics:
         self._sent.append(self._waiting.pop(region))
 
     def withdraw(self, region: int, keyframe: int, *, is_replaced: bool) -> None:
-        """Drop a label request that was not sent; the copy of the semantics may make it again.
+        """Drop a label request that was not sent; a `DelayedCopy` may make it again.
 
         Args:
             region: Id of the region in the request.
@@ -160,11 +160,11 @@ class OrderedSemantics:
 
     # --- copy -------------------------------------------------------------------------------------
     def has_work(self) -> bool:
-        """Return whether `step` can be called: the copy exists, and no label result is missing."""
+        """Return whether `step` can be called: a `DelayedCopy` exists and misses no result."""
         return self._copy is not None and not self._waiting and not self._sent
 
     def step(self) -> "OrderedStep":
-        """Advance the copy of the semantics by one label result or one keyframe.
+        """Advance the `DelayedCopy` by one label result or one keyframe.
 
         Label results come before the keyframe after them. After the last keyframe, the copy
         replaces the live semantics.
@@ -195,7 +195,7 @@ class OrderedSemantics:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return the state of the live semantics and of the copy, without the labels of the map."""
+        """Return the state of `live` and of the `DelayedCopy`, without the labels of the map."""
         return {
             **self.live.snapshot(),
             "requests": [
@@ -216,7 +216,7 @@ class OrderedSemantics:
         self._copy = saved and DelayedCopy.restored(saved, self._new_semantics(saved["semantics"]))
 
     def metrics(self) -> dict[str, float]:
-        """Return the counters of the live semantics and of their copies."""
+        """Return the counters of the live semantics and of each `DelayedCopy` so far."""
         return {
             **self.live.metrics(),
             # Keyframes that are still to be processed again, while no message arrives.
@@ -229,7 +229,7 @@ class OrderedSemantics:
 
 @dataclass(frozen=True, slots=True)
 class OrderedStep:
-    """Result of a step of the copy that `OrderedSemantics` has."""
+    """Result of `OrderedSemantics.step`."""
 
     requests: tuple[Region, ...]  # Regions to send to the labeller.
     is_done: bool  # True if the copy has replaced the live semantics.

@@ -40,7 +40,14 @@ class SavedSemantics:
 
 
 def write_semantics(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> None:
-    """Write label rows [N, 32], in the order of the Gaussians in map.ply, and the label names."""
+    """Write the labels of the Gaussians of a map.
+
+    Args:
+        path: The file.
+        labels: Label rows of the Gaussians in the order of map.ply, [N, 32] uint8, see
+            `gaussian_labels.ROW`.
+        names: Names of the labels, by index.
+    """
     rows = fields(labels)
     columns: dict[str, Any] = {name: rows[name] for name in COLUMNS}
     with path.open("wb") as file:
