@@ -316,7 +316,13 @@ class RegionDetections:
     def of_detector(
         cls, boxes: np.ndarray, labels: np.ndarray, confidences: np.ndarray
     ) -> "RegionDetections":
-        """Return detections with labels by the detector alone; the class describes the arrays."""
+        """Return detections with labels by the detector alone.
+
+        Args:
+            boxes: Boxes, [M, 4], x0 y0 x1 y1, pixels.
+            labels: Labels, [M].
+            confidences: Confidences of the labels, [M], 0..1.
+        """
         return cls(boxes, labels, confidences, labels, np.zeros(len(boxes), np.float32))
 
     @classmethod

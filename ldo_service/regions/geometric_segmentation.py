@@ -54,8 +54,8 @@ class GeometricSegmentationConfig:
     # Minimum difference of the normals (rad) at a concave crease that divides a segment.
     crease: float = 0.35
     color_step: float = 1.5  # Minimum gradient (Lab per pixel) of a color edge.
-    # Minimum color difference between a flat segment and the main color of its structural plane
-    # (Lab, lightness weighted by half).
+    # Minimum color difference between a flat segment, such as a picture or a rug, and the main
+    # color of the wall, floor or ceiling that it lies on (Lab, lightness weighted by half).
     color_gap: float = 4.5
 
     def __post_init__(self) -> None:

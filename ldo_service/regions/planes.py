@@ -32,7 +32,8 @@ class PlaneConfig:
 
     # Width of the small image; at this width, normals over a few pixels are stable enough.
     width_px: int = 320
-    blur_px: float = 2.0  # Blur of the inverse depth for normals.
+    # Standard deviation of the Gaussian blur of the inverse depth, before normals are computed.
+    blur_px: float = 2.0
     min_cosine: float = 0.94  # Minimum cosine of normals 4 px apart on one surface.
     max_step: float = 0.04  # Maximum relative depth step within 3x3 pixels of one surface.
     # Allowance, 1 / m of inverse depth, by which a step may exceed max_step. At large distances,
@@ -42,10 +43,10 @@ class PlaneConfig:
     most: int = 24  # Maximum number of surfaces to which planes are fitted; the largest are used.
     # Maximum difference, 1 / m, between the inverse depth of a plane and of its pixels.
     tolerance: float = 0.006
-    # Maximum fraction of a structural plane's outline past which a farther surface is visible. No
-    # farther surface is counted where the border of the image cuts the plane.
+    # A plane is structural (a wall, floor or ceiling) if a farther surface is visible past less
+    # than this fraction of its outline. None is counted where the image border cuts the plane.
     behind: float = 0.3
-    # Range of distances outside of the outline in which farther surfaces are counted.
+    # Range of distances outside of the outline in which a farther surface is searched for.
     gap_px: tuple[int, int] = (3, 8)
 
     def __post_init__(self) -> None:

@@ -239,7 +239,7 @@ def _enlarged(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> 
 
 
 class RegionMatcher:
-    """Matching of known regions with the regions of a keyframe."""
+    """Matching of known regions with the regions of one keyframe, given to the constructor."""
 
     def __init__(
         self,
@@ -303,7 +303,7 @@ class RegionMatcher:
                 yield region.id
 
     def overlaps(self, shown: Sequence[tuple[int, Foreground]]) -> np.ndarray:
-        """Estimate the IoU of each pair of M regions' masks in the keyframe.
+        """Estimate the IoU of each pair of M regions' masks in the matcher's keyframe.
 
         The IoU of regions a and b is estimated from two fractions: the fraction of a's points in
         the mask of b, and the fraction of b's points in the mask of a.
@@ -327,7 +327,7 @@ class RegionMatcher:
         return iou
 
     def propagated(self, region: int) -> Foreground | None:
-        """Propagate the mask of a known region into the keyframe; see `propagate_mask`."""
+        """Project the mask of a known region into the matcher's keyframe; see `propagate_mask`."""
         i = next(i for i, one in enumerate(self._regions) if one.id == region)
         shape, is_its = self._regions[i].shape, self._seen.of == i
         T_map_now, T_map_seen = (self._T_map_keyframe[k] for k in (self._keyframe, shape.keyframe))

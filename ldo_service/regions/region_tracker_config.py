@@ -112,5 +112,5 @@ class RegionTrackerConfig:
 
     @property
     def max_box_votes(self) -> float:
-        """Maximum sum of the votes for a label to which boxes add; 0 if boxes do not vote."""
+        """Sum of a label's votes up to which boxes add votes; 0 if boxes do not vote."""
         return self.answer_weight if self.boxes_vote else 0.0
