@@ -39,7 +39,7 @@ class Network:
         """
         wanted = available(providers)
         if not path.is_file():
-            raise ModelError("there is no such file. Give the path of an ONNX file.")
+            raise ModelError(f"{path} does not exist. Give the path of an ONNX file.")
         try:
             self._session = _session(path, wanted, threads)
         except Exception as error:  # Errors of onnxruntime have no common base class.

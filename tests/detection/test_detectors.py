@@ -149,7 +149,7 @@ def test_truncated_file_raises(tmp_path) -> None:
 
 
 def test_missing_file_raises(tmp_path) -> None:
-    with pytest.raises(ModelError, match="no such file"):
+    with pytest.raises(ModelError, match=r"absent\.onnx does not exist"):
         OnnxDetector(tmp_path / "absent.onnx")
 
 

@@ -160,7 +160,10 @@ class DualEncoder:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Compared names, with those in `config.nothing`, in the spelling for the text encoder."""
+        """Names that `label` compares with a crop, as spelled for the text encoder.
+
+        They include the names in `config.nothing`, such as wall and floor.
+        """
         return tuple(self._listed.values())
 
     def label(self, crops: Sequence[np.ndarray]) -> list[ScoredLabel]:
