@@ -86,7 +86,7 @@ class Iteration:
         return self._planes
 
     def loss(self) -> np.ndarray:
-        """Compute the derivatives of the loss with respect to the planes, [5, H, W]."""
+        """Compute the loss derivatives with respect to the planes of `forward`, [5, H, W]."""
         frame = self._color, self._depth_m, self._exposure
         image_loss(self._planes, *frame, _WEIGHTS, self._by_planes, threads=self.threads)
         return self._by_planes

@@ -266,9 +266,11 @@ def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
 
 
 def class_ious(counts: np.ndarray) -> np.ndarray:
-    """Return the IoU of each class of a confusion matrix [C, C + 1], [C].
+    """Return the IoU of each class, [C]; NaN if a class is neither in ground truth nor map.
 
-    The IoU is NaN for a class that is neither in the ground truth nor in the map.
+    Args:
+        counts: Number of pixels by true class (row) and by class in the map (column), [C, C + 1],
+            as `confusion` returns it. The last column is for unknown names in the map.
     """
     right = np.diag(counts)
     union = counts.sum(axis=1) + counts.sum(axis=0)[:-1] - right

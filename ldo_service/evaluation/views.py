@@ -152,9 +152,10 @@ class RenderedView:
     exposure: Exposure = field(default_factory=Exposure)
     # Pixels that show the camera image, not the rim of rectification, [H, W] bool; None for all.
     valid: np.ndarray | None = None
-    # Correction of the camera at the time of the frame; `shown` has its vignetting and shutter.
+    # Correction of the camera at the time of the frame; `recorded` applies its vignetting.
     correction: CameraCorrection = field(default_factory=CameraCorrection)
-    motion: FrameMotion | None = None  # Motion of the camera during the frame; None if unknown.
+    # Motion of the camera during the frame, for the rolling shutter; None if unknown.
+    motion: FrameMotion | None = None
 
     @property
     def seen(self) -> np.ndarray:
@@ -287,7 +288,7 @@ class EvaluatedFrames:
         return [frame for frame in (*self.held_out, *self.training) if not frame.is_lost]
 
     def counts(self) -> str:
-        """Return a text with the numbers of held-out frames (A) and training frames (B)."""
+        """Return a text with the numbers of frames for the protocols A and B of `PROTOCOL`."""
         if not self.held_out:
             a = "A: none, because all frames were mapped; use `ldo run --hold-out-every 5`."
         else:
@@ -366,7 +367,7 @@ def evaluate_rendering(
 def evaluate_view(
     view: RenderedView, is_held_out: bool, distance: Distance | None = None
 ) -> Iterator[tuple[str, ViewErrors]]:
-    """Yield the errors of a frame under each protocol (see `PROTOCOL`), after its name.
+    """Yield the name of each protocol (see `PROTOCOL`) and the errors of a frame under it.
 
     Args:
         view: The frame with its rendering.
