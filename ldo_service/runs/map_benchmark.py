@@ -47,7 +47,7 @@ STAGES = ("first rendering", "densification", "iterations", "view", "other")
 class HeldOutErrors(msgspec.Struct, frozen=True, kw_only=True):
     """Errors on the held-out frames before the last keyframe.
 
-    PSNR has the exposure interpolated between keyframes (protocol A).
+    PSNR is that of protocol A in `ldo_service.evaluation.views.PROTOCOL`.
     """
 
     mean_psnr_db: float

@@ -57,7 +57,8 @@ def summarize(
     """Return the summary of a finished run.
 
     The frame rate (FPS) is the number of frames that were not rejected, divided by the time from
-    the first read to the last step. This time includes the refit at the end.
+    the first read to the last step. After the last frame, the map is refitted to keyframes that
+    corrections have moved; the time includes this refit.
 
     Args:
         record: The finished run.
