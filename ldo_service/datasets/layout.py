@@ -34,8 +34,8 @@ class Layout:
             or at the first bytes of a file.
         open: Opens a path that matches. It raises DataError if a file is missing or damaged, and
             ConfigError if the layout does not support the options.
-        has_options: True if `open` accepts options other than the defaults. These register the
-            depth to the color camera.
+        has_options: True if `open` accepts the options that register the depth to the color
+            camera.
         has_topics: True if `open` accepts the options that name topics.
     """
 
