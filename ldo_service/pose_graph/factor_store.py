@@ -36,10 +36,9 @@ from .solver import Name, Variables, point_key
 class FactorStore:
     """Store of all measurements by kind, which builds their factors.
 
-    A factor connects variables, and a condensed keyframe is not a variable. The measurements of a
-    condensed keyframe are therefore transferred to the nearer one of its head and its tail. The
-    head is the last variable before the keyframe, and the tail is the first variable after it (see
-    `condensation.CondensedKeyframes`).
+    A factor connects variables, and a condensed keyframe is not a variable. In its measurements, it
+    is therefore replaced by the nearer one of its head and its tail, the last variable before it
+    and the first variable after it (see `condensation.CondensedKeyframes`).
     """
 
     def __init__(self, noise: NoiseConfig, closures: LoopClosureConfig) -> None:
@@ -48,7 +47,7 @@ class FactorStore:
         self.first_of: dict[int, int] = {}  # First keyframe of each keyframe's component.
         # Keyframes that may still be condensed, ascending: neither condensed nor head of a group.
         self.active: list[int] = []
-        # Odometry measurements by pair of variables, transferred ones included.
+        # Odometry measurements by pair of variables, converted ones included.
         self.odometry: dict[Pair, RelativePose] = {}
         # Measurements that replace groups, each from the head of a group to its tail.
         self.condensed: dict[Pair, RelativePose] = {}
@@ -65,8 +64,8 @@ class FactorStore:
         """Store an odometry measurement and return the name of its factor.
 
         If both keyframes are variables, the measurement replaces an older one of the same pair.
-        Otherwise, it is transferred to the variables that `ends` selects, and stored only if these
-        have no odometry measurement yet.
+        Otherwise, it is converted by `between_variables`, and stored only if the two variables have
+        no odometry measurement yet.
         """
         between = self.between_variables(m)
         pair = between.a, between.b
@@ -79,8 +78,8 @@ class FactorStore:
     ) -> Name | None:
         """Replace a measurement and return the name of the factor that changed.
 
-        If the measured keyframe b is condensed, its pose relative to its head and tail changes, but
-        no factor changes, and None is returned.
+        If keyframe b is condensed, only its pose relative to the variables before and after it
+        changes. No factor changes then, and None is returned.
 
         Args:
             m: New measurement.
@@ -116,8 +115,8 @@ class FactorStore:
 
         One measurement from the first to the last keyframe replaces all measurements and closures
         within the group. Measurements from condensed keyframes to keyframes outside the group are
-        dropped, since the keyframes outside usually have other measurements. Measurements without
-        which the graph would not be connected are transferred to variables instead.
+        dropped, since the latter usually have others. If the graph would not be connected without a
+        measurement, the measurement is converted by `between_variables` and kept.
 
         Args:
             group: Ids of the keyframes, in order.
@@ -183,7 +182,10 @@ class FactorStore:
         return min(share, 1 - share) * float((off / sigmas).max())
 
     def relative(self, without: Pair | None = None) -> Iterable[RelativePose]:
-        """Yield the measurements except closures and `without`, a bridge between components."""
+        """Yield the measurements except loop closures and the bridge edge of the pair `without`.
+
+        A bridge edge is the measurement that merged two components of the graph.
+        """
         yield from self.odometry.values()
         yield from self.condensed.values()
         bridges = (m for pair, m in self.bridges.items() if pair != without)
@@ -212,7 +214,7 @@ class FactorStore:
         return int(self.interpolated.end_variables[row]), self.interpolated.T_tail[row]
 
     def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
-        """Return the two variables to which the keyframes a and b of a measurement are transferred.
+        """Return the two variables that replace the keyframes a and b of a measurement.
 
         A keyframe that is a variable is kept. A condensed keyframe is replaced by the nearer one of
         its head, the last variable before it, and its tail, the first variable after it. If this
@@ -238,13 +240,11 @@ class FactorStore:
         return transfer_measurement(m, se3.inverse(T_a), se3.inverse(T_b), (a, b))
 
     def _ends_covariance(self, m: RelativePose) -> np.ndarray:
-        """Return the covariance [6, 6] that the transfer of a measurement to variables adds.
+        """Return the covariance [6, 6] that `between_variables` adds to a measurement.
 
-        The pose of a condensed keyframe relative to its variable is uncertain. Each condensed
-        keyframe therefore adds a fraction of the covariance of the measurement from its head to its
-        tail. The fraction is the way from the variable to the keyframe, divided by the way from
-        head to tail. The covariance is for perturbations at keyframe b. It is zero if a and b are
-        variables.
+        A condensed keyframe adds the covariance of the measurement from its head to its tail, times
+        the way from its variable to the keyframe divided by the way from head to tail. The
+        covariance is for perturbations at keyframe b. It is zero if a and b are variables.
         """
         total = np.zeros((6, 6))
         T_b_end = se3.inverse(m.T_a_b), np.eye(4)
@@ -324,7 +324,7 @@ class FactorStore:
         return between_factor(m.a, m.b, m.T_a_b, m.information, robust_sigmas)
 
     def _closure(self, m: RelativePose) -> RelativePose:
-        """Return a closure transferred to variables, with the noise of this transfer included."""
+        """Return a closure as a measurement between variables, with the noise that this adds."""
         own = closure_information(m, self._noise, self._ends_covariance(m))
         return self.between_variables(RelativePose(m.a, m.b, m.T_a_b, own))
 

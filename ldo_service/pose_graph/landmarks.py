@@ -113,7 +113,7 @@ class LandmarkObservation:
     keyframe: int
     landmark: int
     box_px: np.ndarray  # x0, y0, x1, y1 in pixels, [4].
-    distribution: np.ndarray  # Class distribution [C]; its sum is one.
+    distribution: np.ndarray  # Class distribution [256]; its sum is one.
     entropy: float  # Entropy of `distribution`, nats.
     is_miss: bool
     camera: np.ndarray  # Width, height, fx, fy, cx, cy in pixels, [6].
@@ -148,10 +148,10 @@ class LandmarkObservation:
 class Landmark:
     """State of a landmark without its position, which is a variable of the pose graph."""
 
-    evidence: Evidence
-    distribution: np.ndarray  # Fused class distribution, [C].
+    evidence: Evidence  # Sums of the observed class distributions.
+    distribution: np.ndarray  # Fused class distribution, [256].
     observations: tuple[BoxObservation, ...] = ()
-    misses: int = 0  # Consecutive misses.
+    misses: int = 0  # Consecutive misses since the last observation; see `LandmarkObservation`.
     last: int = -1  # Id of the last keyframe that observed the landmark; -1 for none.
 
     def knows(self, keyframe: int) -> bool:
@@ -197,7 +197,7 @@ class ObjectLandmarks:
     def needs_update(self) -> bool:
         """Return whether `update_graph` must be called now.
 
-        Call this once per keyframe: if observations stay waiting, it increments `skipped`.
+        Call this once per keyframe: `skipped` counts the calls that leave observations waiting.
         """
         config = self._config
         if not self._waiting:
@@ -364,7 +364,10 @@ class ObjectLandmarks:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return the state; the entry `known` is the same object until `update_graph` is called."""
+        """Return the landmarks (`known`), the stored observations and the counter `skipped`.
+
+        Snapshots between two calls of `update_graph` share one object `known`.
+        """
         self._saved = self._saved or self._packed()
         waiting = [seen.pack() for seen in self._waiting]
         return {"known": self._saved, "waiting": waiting, "skipped": self.skipped}

@@ -360,7 +360,8 @@ class PoseGraph:
         return {"keys": initial[0], "values": initial[1], "known": self._known.pack()}
 
     def snapshot(self) -> dict[str, Any]:
-        """Return `base`, an object that each rebuild of the solver replaces, and later changes."""
+        """Return the state at the last rebuild of the solver (`base`), and the changes after it."""
+        # Snapshots between two rebuilds share one object `base`.
         return {"base": self._base, "changes": list(self._changes)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
